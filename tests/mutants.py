@@ -50,29 +50,29 @@ EYE_FAULTS = (
     ("_eye_limits", "_BRIEF = 0.25", "_BRIEF = 0.30", "eye_trains"),
     ("_eye_limits", "5 * math.pow(groups, -0.25)", "math.pow(groups, -0.25)", "eye_trains"),
     ("_eye_limits", "5 * math.pow(groups, -0.25)", "5 * math.pow(groups, -0.5)", "eye_trains"),
-    ("_eye_limits", "group / together * factor", "group * factor", "eye_trains"),
+    ("_eye_limits", "group_limit / pulses_in_group * factor", "group_limit * factor", "eye_trains"),
     ("_eye_limits", "else math.pow(groups, -0.25)", "else math.pow(groups, -0.5)", "eye_trains"),
     ("_eye_limits", "min(self.single, self.mean, self.repeated)", "min(self.single, self.repeated)", "eye_trains"),
-    ("_eye_limits", "18, absorbed, duration, 0.75", "18, absorbed, duration, 0.7", "eye_limits"),
-    ("_eye_limits", "90, spread, duration, 0.75", "80, spread, duration, 0.75", "eye_trains"),
+    ("_eye_limits", "18, c_a, duration, 0.75", "18, c_a, duration, 0.7", "eye_limits"),
+    ("_eye_limits", "90, c_c, duration, 0.75", "80, c_c, duration, 0.75", "eye_trains"),
     (
         "_eye_limits",
-        "if duration <= 13e-6\n",
-        "if duration <= 5e-6\n",
+        "if duration <= 13e-6",
+        "if duration <= 5e-6",
         "eye_trains",
     ),
     (
         "_eye_limits",
-        "if duration <= 5e-6\n",
-        "if duration <= 18e-6\n",
+        "if duration <= 5e-6",
+        "if duration <= 18e-6",
         "eye_trains",
     ),
     ("_eye_limits", "0.02 * max(0.0, nm - 450)", "0.02 * max(0.0, nm - 440)", "eye_limits"),
     ("_eye_limits", "max(100.0, duration)", "max(10.0, duration)", "eye_limits"),
     ("_eye_limits", "8 + math.pow(10, 0.04 * (nm - 1250))", "8 + math.pow(10, 0.04 * (nm - 1200))", "eye_trains"),
     ("_eye_limits", "0.018 * (nm - 1150)", "0.0018 * (nm - 1150)", "eye_limits"),
-    ("_eye_limits", "1.1e4, absorbed, duration, 0.25", "1.1e5, absorbed, duration, 0.25", "eye_trains"),
-    ("_eye_limits", "2000, absorbed, duration, 1", "4000, absorbed, duration, 1", "eye_limits"),
+    ("_eye_limits", "1.1e4, c_a, duration, 0.25", "1.1e5, c_a, duration, 0.25", "eye_trains"),
+    ("_eye_limits", "2000, c_a, duration, 1", "4000, c_a, duration, 1", "eye_limits"),
     ("_eye_limits", "5600, 1, duration, 0.25", "5600, 1, duration, 0.3", "eye_limits"),
     ("_eye_limits", "squared = -(aperture**2) / 2 /", "squared = -(aperture**2) /", "eye_limits"),
     ("_eye_limits", "1.5 * math.pow(duration, 0.375)", "1.0 * math.pow(duration, 0.375)", "eye_limits"),
@@ -86,8 +86,8 @@ EYE_FAULTS = (
     ("_eye_dazzle", "STEADY = 100.0", "STEADY = 20.0", "eye_dazzle"),
     ("_eye_dazzle", "math.pow(background, 0.466)", "math.pow(background, 0.5)", "eye_dazzle"),
     ("_eye_dazzle", "task.margin * threshold_luminance", "threshold_luminance", "eye_dazzle"),
-    ("_eye_dazzle", "around = task.background * (1 + veil)", "around = task.background", "eye_dazzle"),
-    ("_eye_dazzle", "low * task.background / scatter", "low * task.background * scatter", "eye_dazzle"),
+    ("_eye_dazzle", "total_luminance = task.background * (1 + veil)", "total_luminance = task.background", "eye_dazzle"),
+    ("_eye_dazzle", "seen_veil * task.background / veil_of_lux", "seen_veil * task.background * veil_of_lux", "eye_dazzle"),
     ("_eye_dazzle", "(age - 19) ** 2 / 2160", "(age - 19) ** 2 / 2610", "eye_dazzle"),
     ("_protection", "math.log10(factor) if", "math.log(factor) if", "protection"),
     ("_protection", "(math.sin(angle) / index) ** 2", "math.sin(angle) ** 2 / index", "protection"),
@@ -262,8 +262,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/sensor/_digitization.py",
-        "flat[block].double() * gain",
-        "(flat[block] * gain).double()",
+        "flat_electrons[block].double() * gain",
+        "(flat_electrons[block] * gain).double()",
         within(
             "nodes/sensor",
             "digitization.py::test_no_number_is_further_from_the_exact_product_than_half",
@@ -379,8 +379,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/scene/_exr_picture.py",
-        "opened.channels(number)",
-        "opened.channels(0)",
+        "opened_file.channels(number)",
+        "opened_file.channels(0)",
         within(
             "nodes/scene",
             "exr_picture.py::test_the_part_with_the_picture_is_found_or_chosen_by_name",
@@ -520,8 +520,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/flare/_dirt.py",
-        "rms * draw / draw.norm()",
-        "rms * draw",
+        "rms * normal_numbers / normal_numbers.norm()",
+        "rms * normal_numbers",
         within("nodes/flare", "dirt.py::test_soft_kinds_have_the_asked_strength"),
     ),
     Mutant(
@@ -532,7 +532,7 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/calibrate/_frame_pairs.py",
-        "fitted=level.dark or level.mean - dark <= limit",
+        "fitted=level.dark or level.mean - dark <= largest_signal",
         "fitted=True",
         within(
             "nodes/calibrate/validity",
@@ -541,8 +541,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/calibrate/_frame_pairs.py",
-        "apart = level.second * (1 - change / 2) - level.first * (1 + change / 2)",
-        "apart = level.apart",
+        "differences = level.second * (1 - relative_drift / 2) - level.first * (1 + relative_drift / 2)",
+        "differences = level.apart",
         within(
             "nodes/calibrate/validity",
             "good_cameras.py::test_a_lamp_that_flickers_over_uneven_light_makes_no_row_noise",
@@ -632,8 +632,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/calibrate/_frame_files.py",
-        "end > (size := file.stat().st_size)",
-        "end > (size := file.stat().st_size) + 4000",
+        "end_of_image > (size := file.stat().st_size)",
+        "end_of_image > (size := file.stat().st_size) + 4000",
         within("workflows/cli", "limits.py::test_fits_frames_are_opened_before_the_run"),
     ),
     # Stated errors, and the rooms in which faults survived once.
@@ -675,7 +675,10 @@ MUTANTS = (
     *faults(
         "nodes/sensor/_exposure.py",
         within("nodes", "propagated_errors.py"),
-        ("(light + factor + light * factor)", "(light + factor)"),
+        (
+            "(light_share + factor_share + light_share * factor_share)",
+            "(light_share + factor_share)",
+        ),
         (
             "    if irradiance.rms and irradiance.peak is None:",
             "    if irradiance.rms and irradiance.peak == 0.0:",
@@ -709,13 +712,13 @@ MUTANTS = (
         within("nodes/sensor", "draw_limits.py"),
         ("SURE = math.log(1e4)", "SURE = math.log(1e3)"),
         ("middle + 1.0, dtype", "middle + 2.0, dtype"),
-        ("float(above) > math.exp(-sure)", "float(above) > math.exp(sure)"),
+        ("float(exceeding) > math.exp(-sure)", "float(exceeding) > math.exp(sure)"),
         ("weights + 2.0 * math.sqrt(weights * largest * sure) + 2.0", "weights + 2.0"),
-        ("third = rare_number**2 * sure / 3", "third = rare_number * sure / 30"),
+        ("linear_term = rare_number**2 * sure / 3", "linear_term = rare_number * sure / 30"),
         ("math.log(pixels))", "0.0)"),
         (
-            "largest, weights = min(largest, squares / darkest)",
-            "largest, weights = squares / darkest / pixels",
+            "min(largest_weight, sum_of_squares / darkest)",
+            "sum_of_squares / darkest / pixels",
         ),
     ),
     *faults(
@@ -723,9 +726,9 @@ MUTANTS = (
         within("nodes/sensor", "digitization.py", "draw_limits.py"),
         ("rms * (1.0 - rms) if rms < 0.5 else 0.25", "rms * (1.0 - rms) if rms < 0.5 else 0.5"),
         ("rms * (1.0 - rms) if", "rms if"),
-        ("rms**2 + rare_events(share * pixels) / pixels", "rms**2 + share"),
-        ('line.round_() if rounding == "nearest"', 'line.round_() if rounding != "truncation"'),
-        ("line.clamp_(0, top)", "line.clamp_(0, top + 1)"),
+        ("rms**2 + rare_events(change_of_square * pixels) / pixels", "rms**2 + change_of_square"),
+        ('values.round_() if rounding == "nearest"', 'values.round_() if rounding != "truncation"'),
+        ("values.clamp_(0, top)", "values.clamp_(0, top + 1)"),
         ('low:.2%} at 0 DN", high < 0.5', 'low:.2%} at 0 DN", high <= 0.5'),
         ("largest = max(well, -electrons.min)", "largest = min(well, -electrons.min)"),
         ("electrons.max <= well", "electrons.max < well / 2"),
@@ -733,8 +736,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/sensor/_digitization.py",
-        "math.sqrt(before / max(1, math.prod(result.shape)))",
-        "math.sqrt(max(1, math.prod(result.shape)) / before)",
+        "math.sqrt(pixels_before / max(1, math.prod(result.shape)))",
+        "math.sqrt(max(1, math.prod(result.shape)) / pixels_before)",
         within("nodes", "propagated_errors.py"),
     ),
     *faults(
@@ -784,8 +787,11 @@ MUTANTS = (
             "nodes/laser", "damage_curve.py::test_beyond_ten_microseconds_the_continuous_law_counts"
         ),
         ("math.sqrt(40.0)", "math.sqrt(30.0)"),
-        ("interpolated / SPREAD, steady", "interpolated, steady"),
-        ("torch.maximum(interpolated * SPREAD, steady * high * time)", "steady * high * time"),
+        ("interpolated / SPREAD, spot_factors", "interpolated, spot_factors"),
+        (
+            "torch.maximum(interpolated * SPREAD, spot_factors * high_irradiance * time)",
+            "spot_factors * high_irradiance * time",
+        ),
         (
             "in (ends.continuous.low, ends.continuous.high)\n",
             "in (ends.continuous.high, ends.continuous.low)\n",
@@ -812,8 +818,8 @@ MUTANTS = (
         ),
         ("time < SHORTEST", "time <= SHORTEST"),
         (
-            "start = at_join.clamp_max(ends.pulse.median)",
-            "start = torch.full_like(at_join, ends.pulse.median)",
+            "pulse_fluence = fluence_at_join.clamp_max(ends.pulse.median)",
+            "pulse_fluence = torch.full_like(fluence_at_join, ends.pulse.median)",
         ),
     ),
     *faults(
@@ -838,7 +844,7 @@ MUTANTS = (
             "else double(self.pulse_duration)",
         ),
         ("self.duration / double(self.pulse_duration)", "double(1.0)"),
-        ("share = light.rate * light.caught", "share = light.rate"),
+        ("mean_per_fluence = light.rate * light.caught", "mean_per_fluence = light.rate"),
     ),
     *faults(
         "nodes/laser/_damage_parts.py",
@@ -846,7 +852,10 @@ MUTANTS = (
             "nodes/laser",
             "damage_parts.py::test_of_a_train_that_is_slower_than_the_dwell_one_pulse_warms",
         ),
-        ("torch.maximum(double(self.repetition_rate), once)", "double(self.repetition_rate)"),
+        (
+            "torch.maximum(double(self.repetition_rate), one_in_dwell)",
+            "double(self.repetition_rate)",
+        ),
     ),
     *faults(
         "nodes/laser/_damage_parts.py",
@@ -876,16 +885,16 @@ MUTANTS = (
         ),
         ("INCUBATION = (0.8,", "INCUBATION = (0.85,"),
         ("INCUBATION = (0.8, 0.9,", "INCUBATION = (0.8, 0.95,"),
-        ("count ** (1 - exponent) + duty)", "count ** (1 - exponent))"),
-        ("(1 - duty) / of_pulse", "1 / of_pulse"),
-        (" + share / of_mean)", ")"),
+        ("pulse_count ** (1 - exponent) + duty_cycle)", "pulse_count ** (1 - exponent))"),
+        ("(1 - duty_cycle) / of_pulse", "1 / of_pulse"),
+        ("+ mean_per_fluence / of_mean\n        )", ")"),
         (
-            "low=summed(pulse.threshold.low, steady.low)",
-            "low=summed(pulse.threshold.low, steady.middle)",
+            "low=summed(pulse.threshold.low, mean_threshold.low)",
+            "low=summed(pulse.threshold.low, mean_threshold.middle)",
         ),
         (
-            "high=summed(pulse.threshold.high, steady.high)",
-            "high=summed(pulse.threshold.middle, steady.high)",
+            "high=summed(pulse.threshold.high, mean_threshold.high)",
+            "high=summed(pulse.threshold.middle, mean_threshold.high)",
         ),
     ),
     *faults(
@@ -895,8 +904,8 @@ MUTANTS = (
             "damage_parts.py::test_further_kinds_of_damage_have_the_spread_of_one_figure",
         ),
         (
-            "Bracket(middle / SPREAD, middle, middle * SPREAD)",
-            "Bracket(middle, middle, middle * SPREAD)",
+            "Bracket(threshold / SPREAD, threshold, threshold * SPREAD)",
+            "Bracket(threshold, threshold, threshold * SPREAD)",
         ),
     ),
     *faults(
@@ -906,7 +915,7 @@ MUTANTS = (
             "damage_parts.py::test_the_shutter_or_the_scan_catches_a_part_of_each_pulse",
         ),
         ("double(law.median) / light.caught", "double(law.median)"),
-        ("scale / light.caught if as_pulse", "scale if as_pulse"),
+        ("threshold_factor / light.caught if as_pulse", "threshold_factor if as_pulse"),
         ("bracket.times(1 / light.caught)", "bracket.times(light.caught)"),
         ("MEASURED = 532e-9", "MEASURED = 633e-9"),
     ),
@@ -938,7 +947,7 @@ MUTANTS = (
             "nodes/laser",
             "damage_parts.py::test_the_bracket_of_an_own_law_holds_nine_of_ten_devices_with_what_is_unknown_of_their_median",
         ),
-        ("math.hypot(*deviations)", "sum(deviations)"),
+        ("math.hypot(*log_deviations)", "sum(log_deviations)"),
         ("_QUANTILE = 1.6448536269514722", "_QUANTILE = 1.2815515655446004"),
     ),
     *faults(
@@ -960,7 +969,7 @@ MUTANTS = (
             "nodes/laser",
             "damage_parts.py::test_away_from_the_experiment_the_upper_end_is_that_of_silicon_alone",
         ),
-        ("threshold=bracket.times(factors)", "threshold=bracket"),
+        ("threshold=bracket.times(wavelength_factors)", "threshold=bracket"),
     ),
     *faults(
         "nodes/laser/_damage_parts.py",
@@ -1000,7 +1009,7 @@ MUTANTS = (
             "nodes/laser",
             "damage_laws.py::test_a_narrower_spot_gets_no_bonus_unless_it_is_asked_for",
         ),
-        ("bonus = (published / diameter)", "bonus = (diameter / published)"),
+        ("narrower_factor = (published / diameter)", "narrower_factor = (diameter / published)"),
     ),
     *faults(
         "nodes/laser/_damage_laws.py",
@@ -1061,7 +1070,10 @@ MUTANTS = (
             "absorbed_share(measured) / absorbed_share(wavelength)",
             "absorbed_share(wavelength) / absorbed_share(measured)",
         ),
-        ("min(1.0, alone), max(1.0, alone)", "max(1.0, alone), min(1.0, alone)"),
+        (
+            "min(1.0, silicon_factor), max(1.0, silicon_factor)",
+            "max(1.0, silicon_factor), min(1.0, silicon_factor)",
+        ),
     ),
     *faults(
         "nodes/laser/_damage_laws.py",
@@ -1095,18 +1107,21 @@ MUTANTS = (
             "hit_and_miss.py::test_levels_without_overlap_leave_a_bracket_and_no_spread",
         ),
         (".max() <= levels[damaged > 0]", ".max() < levels[damaged > 0]"),
-        ("math.sqrt(low * high)", "(low + high) / 2"),
-        ("none.max()", "none.min()"),
-        ("every.min()", "every.max()"),
+        (
+            "math.sqrt(highest_undamaged * lowest_damaged)",
+            "(highest_undamaged + lowest_damaged) / 2",
+        ),
+        ("undamaged_levels.max()", "undamaged_levels.min()"),
+        ("damaged_levels.min()", "damaged_levels.max()"),
     ),
     *faults(
         "nodes/laser/_damage_table.py",
         within("nodes/laser", "hit_and_miss.py::test_the_fit_has_the_largest_likelihood"),
-        ("count * density**2", "density**2"),
+        ("count * normal_density**2", "normal_density**2"),
         ("_ROUNDS = 200", "_ROUNDS = 2"),
         ("math.exp(1 / slope)", "math.exp(slope)"),
         ("np.array([-1 / slope,", "np.array([1 / slope,"),
-        ("math.exp(centre - offset / slope)", "math.exp(centre + offset / slope)"),
+        ("math.exp(centre - intercept / slope)", "math.exp(centre + intercept / slope)"),
     ),
     *faults(
         "nodes/laser/_damage_table.py",
@@ -1119,7 +1134,7 @@ MUTANTS = (
             "nodes/laser",
             "hit_and_miss.py::test_a_median_beyond_the_levels_is_as_uncertain_as_it_scatters_from_test_to_test",
         ),
-        ("offset / slope**2", "offset / slope"),
+        ("intercept / slope**2", "intercept / slope"),
     ),
     *faults(
         "workflows/safety/safety_estimate.py",
@@ -1350,9 +1365,15 @@ MUTANTS = (
             "beam.py::test_defocus_is_the_path_at_the_rim_between_the_wavefront_and_the_sphere_of_the_focus",
         ),
         ("- 1 / focus\n", "+ 1 / focus\n"),
-        ("bend = 1 / curvature_radius(beam, distance)", "bend = 1 / distance"),
-        ("diameter**2 / 8 * bend + lens_defocus", "diameter**2 / 2 * bend + lens_defocus"),
-        ("* bend + lens_defocus) / beam.wavelength", "* bend) / beam.wavelength + lens_defocus"),
+        ("curvature = 1 / curvature_radius(beam, distance)", "curvature = 1 / distance"),
+        (
+            "diameter**2 / 8 * curvature + lens_defocus",
+            "diameter**2 / 2 * curvature + lens_defocus",
+        ),
+        (
+            "* curvature + lens_defocus) / beam.wavelength",
+            "* curvature) / beam.wavelength + lens_defocus",
+        ),
         (
             "distance + (2 * beam.waist / beam.divergence) ** 2",
             "distance + (beam.waist / beam.divergence) ** 2",
@@ -1375,10 +1396,19 @@ MUTANTS = (
         "nodes/laser/_damage_distances.py",
         within("nodes/laser", "spot_heat.py"),
         ("/ _AIRY", "/ 1.0"),
-        ("+ (2 * math.pi * waves).square() + near", "+ (math.pi * waves).square() + near"),
-        ("irradiance = 4 * (parts", "irradiance = 2 * (parts"),
-        ("ring / (points + ring) * torch", "ring / (points + 2 * ring) * torch"),
-        ("hottest = (irradiance @ inverse.T).amax(1)", "hottest = (irradiance @ inverse.T)[:, 0]"),
+        (
+            "+ (2 * math.pi * waves).square() + focus_term",
+            "+ (math.pi * waves).square() + focus_term",
+        ),
+        ("irradiance = 4 * (field_parts", "irradiance = 2 * (field_parts"),
+        (
+            "ring_radii\n        / (points + ring_radii)\n        * torch",
+            "ring_radii / (points + 2 * ring_radii) * torch",
+        ),
+        (
+            "hottest = (irradiance @ heat_weights.T).amax(1)",
+            "hottest = (irradiance @ heat_weights.T)[:, 0]",
+        ),
         ("torch.erf(root) / root", "torch.erf(root)"),
     ),
     *faults(
@@ -1409,15 +1439,15 @@ MUTANTS = (
             "veil_over_distance.py::test_the_veil_is_the_integral_of_the_law_over_the_pixel",
         ),
         (
-            "near[index - 1] * (1 - fraction) + near[index] * fraction)",
-            "near[index] * (1 - fraction) + near[index - 1] * fraction)",
+            "ring_mean[upper_index - 1] * (1 - fraction) + ring_mean[upper_index] * fraction\n    )",
+            "ring_mean[upper_index] * (1 - fraction) + ring_mean[upper_index - 1] * fraction)",
         ),
-        ("[left * _beyond(light, square) for", "[_beyond(light, square) for"),
+        ("[remaining * _beyond(light, squared_radius) for", "[_beyond(light, squared_radius) for"),
         (
-            "return torch.where(square <= NEAR**2, inside, far), _total(lobes)",
-            "return torch.where(square <= NEAR**2, inside, far), lobes[0][2]",
+            "return torch.where(squared_radius <= NEAR**2, near_light, far_light), _total(lobes)",
+            "return torch.where(squared_radius <= NEAR**2, near_light, far_light), lobes[0][2]",
         ),
-        ("square <= NEAR**2, inside", "square <= NEAR, inside"),
+        ("squared_radius <= NEAR**2, near_light", "squared_radius <= NEAR, near_light"),
     ),
     *faults(
         "nodes/flare/_stray_light.py",
@@ -1741,7 +1771,10 @@ MUTANTS = (
         within(
             "nodes/laser", "summit.py::test_light_that_the_wings_do_not_explain_may_be_in_one_spot"
         ),
-        ("torch.where(lacking > _WINGS, lacking, beyond_wings)", "beyond_wings"),
+        (
+            "torch.where(missing_share > _WINGS, missing_share, share_beyond_wings)",
+            "share_beyond_wings",
+        ),
         ("1 - light_with_wings(image) / passing", "0 * lacking"),
         ("1 - image.double().sum() / passing", "1 - image.double().sum()"),
     ),
@@ -1751,7 +1784,7 @@ MUTANTS = (
             "nodes/laser",
             "summit.py::test_light_outside_a_window_is_in_no_spot_where_the_wings_explain_it",
         ),
-        ("torch.where(lacking > _WINGS, lacking, beyond_wings)", "lacking"),
+        ("torch.where(missing_share > _WINGS, missing_share, share_beyond_wings)", "missing_share"),
     ),
     *faults(
         "workflows/safety/laser_spots.py",
@@ -1869,10 +1902,16 @@ MUTANTS = (
         ("torch.hypot(y[end], x).pow(3)", "torch.hypot(y[end], x).pow(2)"),
         ("torch.hypot(y, x[end]).pow(3)", "torch.hypot(y, x[end]).pow(2)"),
         ("cube / distance**3", "cube / distance**2"),
-        ("across * narrow[0] + along * narrow[1]", "across * narrow[1] + along * narrow[0]"),
+        (
+            "end_rows * narrow[0] + end_columns * narrow[1]",
+            "end_rows * narrow[1] + end_columns * narrow[0]",
+        ),
         ("max(1, min((n - 1) // 2", "max(1, max((n - 1) // 2"),
-        ("outside = 4 * cube *", "outside = 2 * cube *"),
-        ("half = [n / 2 for n in image.shape]", "half = [float(n) for n in image.shape]"),
+        ("outside_light = 4 * light_times_cube *", "outside_light = 2 * light_times_cube *"),
+        (
+            "half_sides = [n / 2 for n in image.shape]",
+            "half_sides = [float(n) for n in image.shape]",
+        ),
     ),
     *faults(
         "nodes/laser/_bright_pixels.py",
@@ -1882,10 +1921,10 @@ MUTANTS = (
         ),
         ("torch.where(y > 0, 2.0, 1.0) *", "torch.where(y > 0, 1.0, 1.0) *"),
         (
-            "number = torch.where(y < x, 2 * number, number)",
-            "number = torch.where(y <= x, 2 * number, number)",
+            "alike_pixels = torch.where(y < x, 2 * alike_pixels, alike_pixels)",
+            "alike_pixels = torch.where(y <= x, 2 * alike_pixels, alike_pixels)",
         ),
-        ("taken = places.amax(0) + 0.5", "taken = places.amax(0) - 10"),
+        ("inner_half = places.amax(0) + 0.5", "inner_half = places.amax(0) - 10"),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -1948,7 +1987,7 @@ MUTANTS = (
         ),
         ("field.abs().square() * 4", "field.abs() * 2"),
         ("ratio, power = 2 * kappa / v", "ratio, power = kappa / v"),
-        ("ratio, power = -safe / (2 * kappa)", "ratio, power = safe / (2 * kappa)"),
+        ("ratio, power = -safe_v / (2 * kappa)", "ratio, power = safe_v / (2 * kappa)"),
     ),
     *faults(
         "nodes/laser/_round_spot.py",
@@ -1966,9 +2005,15 @@ MUTANTS = (
         within(
             "nodes/laser", "round_spot.py::test_the_edge_of_a_wide_spot_is_that_of_the_integral"
         ),
-        ("lack = turn * root / (-2 * kappa * (unity + place.sqrt()))", "lack = 0 * turn * root"),
-        ("side = torch.where(lit, -1.0, 1.0)", "side = torch.where(lit, 1.0, -1.0)"),
-        ("beam = torch.where(lit, _geometric(v, kappa), 0.0)", "beam = _geometric(v, kappa)"),
+        (
+            "edge_rest = eighth_turn * amplitude / (-2 * kappa * (ones + saddle.sqrt()))",
+            "edge_rest = 0 * eighth_turn * amplitude",
+        ),
+        ("lit_sign = torch.where(is_lit, -1.0, 1.0)", "lit_sign = torch.where(is_lit, 1.0, -1.0)"),
+        (
+            "unobstructed = torch.where(is_lit, _geometric(v, kappa), 0.0)",
+            "unobstructed = _geometric(v, kappa)",
+        ),
     ),
     *faults(
         "nodes/laser/_round_spot.py",
@@ -1978,18 +2023,18 @@ MUTANTS = (
         ),
         (
             (
-                "torch.maximum(\n            largest[ringed], "
-                "_brightest_ring(fill[ringed], low[ringed], high[ringed])\n        )"
+                "torch.maximum(\n            largest[may_ring],\n            _brightest_ring(fill"
+                "[may_ring], least_phase[may_ring], largest_phase[may_ring]),\n        )"
             ),
-            "largest[ringed]",
+            "largest[may_ring]",
         ),
         (
-            "axis = torch.expm1(-fill).square() + 4 * rim * torch.sin(phase / 2).square()",
-            "axis = torch.expm1(-fill).square() + 4 * rim * torch.sin(phase).square()",
+            "numerator = torch.expm1(-fill).square() + 4 * rim * torch.sin(phase / 2).square()",
+            "numerator = torch.expm1(-fill).square() + 4 * rim * torch.sin(phase).square()",
         ),
         (
-            "axis = torch.expm1(-fill).square() + 4 * rim",
-            "axis = torch.expm1(-fill).square() + 2 * rim",
+            "numerator = torch.expm1(-fill).square() + 4 * rim",
+            "numerator = torch.expm1(-fill).square() + 2 * rim",
         ),
     ),
     *faults(
@@ -2017,8 +2062,8 @@ MUTANTS = (
             "nodes/laser", "round_spot.py::test_the_wings_are_exact_in_the_unit_of_their_own_mean"
         ),
         (
-            "last, bessel = bessel, 2 * n / v * bessel - last\n        power",
-            "last, bessel = bessel, 2 * (n + 1) / v * bessel - last\n        power",
+            "previous_bessel, bessel = bessel, 2 * n / v * bessel - previous_bessel\n        power",
+            "previous_bessel, bessel = bessel, 2 * (n + 1) / v * bessel - previous_bessel\n        power",
         ),
         ("_TERMS = 44 ", "_TERMS = 12 "),
     ),
@@ -2029,14 +2074,14 @@ MUTANTS = (
             "bright_pixels.py::test_the_frame_around_a_window_has_every_pixel_of_the_sensor_at_its_distance",
         ),
         (
-            "faint = light * (distance / radius).pow(3)",
-            "faint = light * (distance / radius).pow(2)",
+            "outer_light = light * (distance / radius).pow(3)",
+            "outer_light = light * (distance / radius).pow(2)",
         ),
         (
-            "faint = light * (distance / radius).pow(3)",
-            "faint = light * (distance / radius).pow(3) / 2",
+            "outer_light = light * (distance / radius).pow(3)",
+            "outer_light = light * (distance / radius).pow(3) / 2",
         ),
-        ("number * (outer / number.sum())", "number"),
+        ("ring_pixels * (outer_pixels / ring_pixels.sum())", "ring_pixels"),
     ),
     *faults(
         "nodes/laser/_bright_pixels.py",
@@ -2044,10 +2089,13 @@ MUTANTS = (
             "nodes/laser",
             "bright_pixels.py::test_a_feature_around_the_spot_has_the_light_that_it_encloses",
         ),
-        ("half = feature / math.sqrt(math.pi)", "half = feature / 2"),
-        ("half = feature / math.sqrt(math.pi)", "half = feature"),
-        ("right=True)] / feature**2", "right=True)] / feature"),
-        ("torch.where(radii <= half, torch.maximum(spot, ring), ring)", "ring"),
+        ("disc_radius = feature / math.sqrt(math.pi)", "disc_radius = feature / 2"),
+        ("disc_radius = feature / math.sqrt(math.pi)", "disc_radius = feature"),
+        ("right=True)]\n        / feature**2", "right=True)] / feature"),
+        (
+            "torch.where(\n        radii <= disc_radius, torch.maximum(spot_mean, ring_mean), ring_mean\n    )",
+            "ring_mean",
+        ),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -2282,7 +2330,7 @@ MUTANTS = (
             "nodes/laser",
             "protection.py::test_the_share_of_white_light_is_a_share_of_the_photons_of_daylight",
         ),
-        ("if not last > first:", "if not high > low:"),
+        ("if not band_end > band_start:", "if not high > low:"),
         ("min(high * (1 + edge), _WHITE[1])", "high * (1 + edge)"),
         ("low * (1 - edge)", "low * (1 + edge)"),
     ),
@@ -2408,7 +2456,10 @@ MUTANTS = (
             "digitization.py::test_of_very_many_pixels_the_share_that_changes_its_number_is_the_expected_one",
         ),
         ("if rms < 0.5 else 0.25", "if rms < 0.25 else 0.25"),
-        ("pixels = max(1, math.prod(result.shape))\n    share", "pixels = 1\n    share"),
+        (
+            "pixels = max(1, math.prod(result.shape))\n    change_of_square",
+            "pixels = 1\n    change_of_square",
+        ),
     ),
     *faults(
         "nodes/sensor/_digitization.py",

@@ -122,32 +122,39 @@ def camera(
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2 and 6.6 (photon transfer); Janesick,
             Photon Transfer.
     """
-    fitted, top, first = _used(levels, share)
+    fitted_index, largest_signal, shortest_dark = _used(levels, share)
     dark = (dark_signal, temporal_dark_noise, dark_current)
     parameters = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
     sensor = _Camera(*(torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters))
     sensor = sensor._replace(current=sensor.current / dark_exposure)
+    # index 1 of `ROUNDED` is the variance that rounding adds, DN2
     residuals = _residuals(
-        without_histograms(levels, fitted), top, sensor, first, ROUNDED[rounding][1]
+        without_histograms(levels, fitted_index),
+        largest_signal,
+        sensor,
+        shortest_dark,
+        ROUNDED[rounding][1],
     )
-    squared = residuals.variance[0].square() + residuals.mean[0].square()
-    log = -0.5 * squared - residuals.variance[1] - residuals.mean[1]
-    total = log.where(residuals.possible, -torch.inf).sum(-1)
+    squared_residuals = residuals.variance[0].square() + residuals.mean[0].square()
+    # two normal densities a level: of its log variance and of its mean
+    log_of_level = -0.5 * squared_residuals - residuals.variance[1] - residuals.mean[1]
+    log_likelihood = log_of_level.where(residuals.possible, -torch.inf).sum(-1)
     if not told:
-        return without_details(total)
-    deviance = squared.new_zeros(*squared.shape[:-1], len(levels.mean)).index_copy(
-        -1, fitted, squared
-    )
-    freedom = torch.zeros_like(levels.mean).index_fill(0, fitted, 2.0)
+        return without_details(log_likelihood)
+    deviance = squared_residuals.new_zeros(
+        *squared_residuals.shape[:-1], len(levels.mean)
+    ).index_copy(-1, fitted_index, squared_residuals)
+    # two observations in each level used: its mean and its variance
+    degrees_of_freedom = torch.zeros_like(levels.mean).index_fill(0, fitted_index, 2.0)
     # squared derivatives of a residual and of its log width sum, on average, to the Fisher
     # information
-    mean = levels.mean.expand(*squared.shape[:-1], -1)
+    mean = levels.mean.expand(*squared_residuals.shape[:-1], -1)
     # for the levels used
-    variance = torch.zeros_like(mean).index_copy(-1, fitted, residuals.expected)
+    variance = torch.zeros_like(mean).index_copy(-1, fitted_index, residuals.expected)
     return Likelihood(
-        total,
+        log_likelihood,
         deviance,
-        freedom,
+        degrees_of_freedom,
         torch.cat([*residuals.variance, *residuals.mean], -1),
         mean,
         variance,
@@ -158,26 +165,26 @@ def camera(
 def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
     if not len(result.degrees_of_freedom):
         return []
-    off, fitted = float(result.deviance.sum()), result.degrees_of_freedom > 0
-    count, coarse = int(fitted.sum()), int((levels.variance[fitted] < _QUIET).sum())
+    deviance, fitted = float(result.deviance.sum()), result.degrees_of_freedom > 0
+    count, coarse_count = int(fitted.sum()), int((levels.variance[fitted] < _QUIET).sum())
     checks = [
         Check(
-            f"deviance {off:.4g} for {2 * count} means and variances, from {count} of {len(fitted)}"
-            " levels"
+            f"deviance {deviance:.4g} for {2 * count} means and variances, from {count} of"
+            f" {len(fitted)} levels"
         )
     ]
     dark = levels.photons == 0
-    first, shortest = levels.exposure[fitted & dark].min(), levels.exposure[dark].min()
-    if first > shortest:
+    shortest_fitted, shortest = levels.exposure[fitted & dark].min(), levels.exposure[dark].min()
+    if shortest_fitted > shortest:
         text = (
             f"the dark frames of {float(shortest):.4g} s pile up at an end: dark signal and dark"
             " noise are those of"
         )
-        checks.append(Check(f"{text} {float(first):.4g} s", False))
-    if coarse:
+        checks.append(Check(f"{text} {float(shortest_fitted):.4g} s", False))
+    if coarse_count:
         text = (
-            f"{coarse} levels with a variance below {_QUIET} DN2, where rounding is not independent"
-            " noise"
+            f"{coarse_count} levels with a variance below {_QUIET} DN2, where rounding is not"
+            " independent noise"
         )
         checks.append(Check(text, False))
     return checks
@@ -196,63 +203,88 @@ def expected_levels(levels: Levels, params: Mapping[str, Any]) -> Levels:
     Raises: ValueError as `camera`.
     Source: the model of `camera`.
     """
-    fitted, top, first = _used(levels, params["share"])
-    fitted_levels = without_histograms(levels, fitted)
-    numbers = {
+    fitted_index, largest_signal, shortest_dark = _used(levels, params["share"])
+    fitted_levels = without_histograms(levels, fitted_index)
+    parameters = {
         name: torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS
     }
-    sensor = _Camera(*numbers.values())
+    sensor = _Camera(*parameters.values())
     current = sensor.current / params["dark_exposure"]
     electrons = sensor.efficiency * fitted_levels.photons + current * (
-        fitted_levels.exposure - first
+        fitted_levels.exposure - shortest_dark
     )
     signal = sensor.gain * electrons
+    # fixed point of the response y = K e (1 + bend x + twist x^2), where x depends on y
     for _ in range(_ITERATIONS):
-        x = signal / top
-        signal = sensor.gain * electrons * (1.0 + sensor.bend * x + sensor.twist * x.square())
-    slope = _signal(signal, top, sensor).slope
+        share_of_largest = signal / largest_signal
+        signal = (
+            sensor.gain
+            * electrons
+            * (1.0 + sensor.bend * share_of_largest + sensor.twist * share_of_largest.square())
+        )
+    slope = _signal(signal, largest_signal, sensor).slope
     variance = slope.square() * (sensor.noise.square() + electrons) + ROUNDED[params["rounding"]][1]
-    every_level = without_histograms(levels, torch.arange(len(levels.mean)))
-    return every_level._replace(
-        mean=every_level.mean.index_copy(0, fitted, signal + sensor.signal),
-        variance=every_level.variance.index_copy(0, fitted, variance),
+    all_levels = without_histograms(levels, torch.arange(len(levels.mean)))
+    return all_levels._replace(
+        mean=all_levels.mean.index_copy(0, fitted_index, signal + sensor.signal),
+        variance=all_levels.variance.index_copy(0, fitted_index, variance),
     )
 
 
 def _residuals(
     levels: Levels, top: float, camera: _Camera, first: float, quantization: float
 ) -> _Residuals:
+    """Return the residuals of the measured log variances and means in standard deviations, with
+    the logarithms of these standard deviations.
+
+    ``top`` is the largest signal used and ``quantization`` the variance of rounding (DN, DN2),
+    ``first`` the shortest dark exposure in s.
+    """
     signal = _signal(levels.mean - camera.signal, top, camera)
     variance = signal.slope.square() * (camera.noise.square() + signal.electrons) + quantization
     possible = signal.possible & (variance > quantization)
     variance = variance.where(possible, 1.0)
-    width = (2.0 / levels.degrees_of_freedom + camera.scatter.square()).sqrt()
+    # a variance of nu degrees of freedom has the relative variance 2 / nu
+    log_variance_width = (2.0 / levels.degrees_of_freedom + camera.scatter.square()).sqrt()
     # the mean log variance is below the log of the mean variance by one over the degrees of freedom
-    off = (levels.variance.log() - variance.log() + 1.0 / levels.degrees_of_freedom) / width
-    light = camera.efficiency * levels.photons
-    expected = light + camera.current * (levels.exposure - first)
-    error = (
+    variance_residual = (
+        levels.variance.log() - variance.log() + 1.0 / levels.degrees_of_freedom
+    ) / log_variance_width
+    expected_light = camera.efficiency * levels.photons
+    expected_electrons = expected_light + camera.current * (levels.exposure - first)
+    variance_of_mean = (
         levels.variance / levels.pixels
         + camera.drift.square()
-        + (camera.lamp * light * signal.slope).square()
+        + (camera.lamp * expected_light * signal.slope).square()
     )
-    away = (signal.electrons - expected) * signal.slope / error.sqrt()
-    parts = (off, width.log(), away, 0.5 * error.log(), possible, variance)
-    parts = torch.broadcast_tensors(*parts)  # type: ignore[no-untyped-call]
-    return _Residuals(parts[:2], parts[2:4], *parts[4:])
+    mean_residual = (signal.electrons - expected_electrons) * signal.slope / variance_of_mean.sqrt()
+    # two fields of pairs, then two single fields of `_Residuals`
+    columns = (
+        variance_residual,
+        log_variance_width.log(),
+        mean_residual,
+        0.5 * variance_of_mean.log(),
+        possible,
+        variance,
+    )
+    columns = torch.broadcast_tensors(*columns)  # type: ignore[no-untyped-call]
+    return _Residuals(columns[:2], columns[2:4], *columns[4:])
 
 
 def _signal(signal: Tensor, top: float, camera: _Camera) -> _Signal:
     """Convert measured signals, DN above the dark level, to electrons by the inverse of the
     camera's response.
     """
-    x = signal / top
-    curve = 1.0 + camera.bend * x + camera.twist * x.square()
-    straight = 1.0 - camera.twist * x.square()  # curve - x dcurve/dx
-    possible = (curve > 0) & (straight > 0)
-    curve, straight = curve.where(possible, 1.0), straight.where(possible, 1.0)
+    share_of_top = signal / top
+    response = 1.0 + camera.bend * share_of_top + camera.twist * share_of_top.square()
+    slope_term = 1.0 - camera.twist * share_of_top.square()  # response - x dresponse/dx
+    possible = (response > 0) & (slope_term > 0)
+    response, slope_term = response.where(possible, 1.0), slope_term.where(possible, 1.0)
     return _Signal(
-        signal / (camera.gain * curve), camera.gain * curve.square() / straight, possible
+        # with y = K e c(x): e = y / (K c), dy/de = K c^2 / (c - x dc/dx)
+        signal / (camera.gain * response),
+        camera.gain * response.square() / slope_term,
+        possible,
     )
 
 
@@ -260,29 +292,31 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
     """Return the indices of the light levels to fit, their largest signal in DN, and the
     shortest dark exposure.
     """
-    dark, unclipped = levels.photons == 0, ~_piled(levels)
-    if not bool((dark & unclipped).any()):
+    is_dark, unclipped = levels.photons == 0, ~_piled(levels)
+    if not bool((is_dark & unclipped).any()):
         raise ValueError(
             "no dark level is free of clipped numbers, so the offset of the camera is unknown: "
             "give frames without light"
         )
-    shortest = torch.where(dark & unclipped, levels.exposure, torch.inf).argmin()
+    shortest = torch.where(is_dark & unclipped, levels.exposure, torch.inf).argmin()
     signal = levels.mean - levels.mean[shortest]
-    lit = ~dark
-    if not bool(lit.any()):
+    is_lit = ~is_dark
+    if not bool(is_lit.any()):
         raise ValueError("there are no lit levels: give two or more different light levels")
-    full = float(signal[lit][levels.variance[lit].argmax()])
-    fitted = unclipped & (dark | (signal <= share * full))
-    if len(set(levels.photons[fitted & lit].tolist())) < 2:
+    # of the level of the greatest variance
+    saturation_signal = float(signal[is_lit][levels.variance[is_lit].argmax()])
+    fitted = unclipped & (is_dark | (signal <= share * saturation_signal))
+    if len(set(levels.photons[fitted & is_lit].tolist())) < 2:
         raise ValueError(
-            f"{int((fitted & lit).sum())} lit level(s) below {share:.0%} of saturation ({full:.4g}"
-            " DN above the dark level): give two or more different light levels there"
+            f"{int((fitted & is_lit).sum())} lit level(s) below {share:.0%} of saturation"
+            f" ({saturation_signal:.4g} DN above the dark level): give two or more different light"
+            " levels there"
         )
-    top = float(signal[fitted].max())
-    if top <= 0:
+    largest_signal = float(signal[fitted].max())
+    if largest_signal <= 0:
         raise ValueError(
-            f"the brightest level is {top:.4g} DN above the dark level, which must be positive:"
-            " check `photons` of each level"
+            f"the brightest level is {largest_signal:.4g} DN above the dark level, which must be"
+            " positive: check `photons` of each level"
         )
     if bool((levels.variance[fitted] <= 0).any()):
         wrong_level = int(fitted.nonzero().squeeze(1)[(levels.variance[fitted] <= 0).nonzero()[0]])
@@ -290,14 +324,16 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
             f"level {wrong_level}, of {float(levels.mean[wrong_level]):.4g} DN, has no variance:"
             " give frames whose noise exceeds rounding"
         )
-    return fitted.nonzero().squeeze(1), top, float(levels.exposure[shortest])
+    return fitted.nonzero().squeeze(1), largest_signal, float(levels.exposure[shortest])
 
 
 def _piled(levels: Levels) -> Tensor:
-    """Return a mask of the light levels with a histogram because numbers pile up at an end of
-    the range.
+    """Return a mask of the levels whose numbers pile up at an end of the range.
+
+    Such levels have a histogram; one that has it for coarse numbers alone, with little variance and
+    without the number 0, does not pile up.
     """
-    counted, at_zero = (torch.zeros_like(levels.mean, dtype=torch.bool) for _ in range(2))
-    counted[levels.cell_level] = True
-    at_zero[levels.cell_level[levels.cell_value == 0]] = True
-    return counted & (at_zero | (levels.variance >= _COARSE**2))
+    has_histogram, has_zero = (torch.zeros_like(levels.mean, dtype=torch.bool) for _ in range(2))
+    has_histogram[levels.cell_level] = True
+    has_zero[levels.cell_level[levels.cell_value == 0]] = True
+    return has_histogram & (has_zero | (levels.variance >= _COARSE**2))

@@ -170,31 +170,37 @@ def refuse_descriptor(file: Path) -> None:
 
 
 def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Temporal) -> Levels:
-    numbers = stack([image for _, image in level.images])
-    if measurement.shape and numbers.shape[1:] != measurement.shape:
+    """Return the statistics of one level of a descriptor, which is called ``name``; raise
+    ValueError for images of another size or of more bits than the descriptor says.
+    """
+    images = stack([image for _, image in level.images])
+    if measurement.shape and images.shape[1:] != measurement.shape:
         raise ValueError(
-            f"{name}:{level.line}: image shape {numbers.shape[1:]}, but descriptor shape"
+            f"{name}:{level.line}: image shape {images.shape[1:]}, but descriptor shape"
             f" {measurement.shape} (y, x)"
         )
-    if int(numbers.max()) >= 2**measurement.bits:
+    if int(images.max()) >= 2**measurement.bits:
         raise ValueError(
-            f"{name}:{level.line}: a pixel of {numbers.max()} DN exceeds the {measurement.bits}"
+            f"{name}:{level.line}: a pixel of {images.max()} DN exceeds the {measurement.bits}"
             " bits given in line n"
         )
-    reduced: Levels = reduce(
-        torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter
+    statistics: Levels = reduce(
+        torch.from_numpy(images), photons=level.photons, exposure=level.exposure, scatter=scatter
     )
-    return reduced
+    return statistics
 
 
 def _parsed(path: Path) -> _Measurement:
+    """Return the measurement that a descriptor states, line by line; raise ValueError, with the
+    line, for a mistake.
+    """
     measurement = _Measurement()
     for number, line in _lines(path):
         kind, _, content = line.partition(" ")
         try:
             _take(measurement, kind, content.strip(), path.parent, number)
-        except ValueError as why:
-            raise ValueError(f"{path.name}:{number}: {why}") from None
+        except ValueError as error:
+            raise ValueError(f"{path.name}:{number}: {error}") from None
     for level in measurement.levels:
         if len(level.images) < 2:
             raise ValueError(
@@ -233,6 +239,7 @@ def _take(measurement: _Measurement, kind: str, content: str, folder: Path, line
         # some laboratories write decimal commas
         numbers = [float(word.replace(",", ".")) for word in words]
         if kind == "n":
+            # the line states the width before the height
             measurement.bits, measurement.shape = int(words[0]), (int(words[2]), int(words[1]))
         elif kind == "v":
             measurement.release = words[0].replace(",", ".")
@@ -246,9 +253,11 @@ def _level(line: int, kind: str, numbers: list[float]) -> _Level:
     """Return the light level of a descriptor line; raise ValueError for an invalid exposure or
     number of photons.
     """
+    # a dark line may leave its number of photons, 0, out
     exposure, photons = (*numbers, 0.0)[:2] if kind == "d" else numbers
     if not 0 <= exposure < float("inf") or not (
         0 < photons < float("inf") if kind == "b" else photons == 0
     ):
         raise ValueError
+    # from nanoseconds to seconds
     return _Level(line, photons, exposure * 1e-9)

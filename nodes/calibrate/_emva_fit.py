@@ -54,42 +54,62 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
             saturation, and for a camera without response.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
-    dark = levels.photons == 0
-    _refuse_too_few(dark)
-    nearest = (levels.exposure[~dark, None] - levels.exposure[dark]).abs().argmin(1)
-    lit = without_histograms(levels, ~dark)
-    below = without_histograms(levels, dark.nonzero().squeeze(1)[nearest])
-    mean, variance = lit.mean - below.mean, lit.variance - below.variance
-    full = mean[lit.variance.argmax()]
-    fitted = (mean <= share * full).nonzero().squeeze(1)
-    if len(set(lit.photons[fitted].tolist())) < 2:
-        raise ValueError(
-            f"{len(fitted)} lit level(s) below {share:.0%} of saturation ({float(full):.4g} DN"
-            " above the dark level) cannot define a line: give two or more different light levels"
-            " there"
-        )
-    gain = _slope(mean[fitted], variance[fitted])
-    response = _slope(lit.photons[fitted], mean[fitted])
-    _refuse_falling(gain, response)
-    of_lit, of_dark = (
-        (2 * x.variance.square() / x.degrees_of_freedom)[fitted] for x in (lit, below)
+    is_dark = levels.photons == 0
+    _refuse_too_few(is_dark)
+    # for each lit level, the dark level of the most similar exposure
+    nearest_dark = (levels.exposure[~is_dark, None] - levels.exposure[is_dark]).abs().argmin(1)
+    lit_levels = without_histograms(levels, ~is_dark)
+    darks_of_lit = without_histograms(levels, is_dark.nonzero().squeeze(1)[nearest_dark])
+    mean, variance = (
+        lit_levels.mean - darks_of_lit.mean,
+        lit_levels.variance - darks_of_lit.variance,
     )
-    gain_error = _error(mean[fitted], of_lit, of_dark, nearest[fitted]) / gain
-    of_lit, of_dark = ((x.variance / x.pixels)[fitted] for x in (lit, below))
-    response_error = _error(lit.photons[fitted], of_lit, of_dark, nearest[fitted]) / response
-    noise, noise_error = _dark_noise(levels, dark)
-    efficiency = response / gain
+    saturation_signal = mean[lit_levels.variance.argmax()]
+    fitted_index = (mean <= share * saturation_signal).nonzero().squeeze(1)
+    if len(set(lit_levels.photons[fitted_index].tolist())) < 2:
+        raise ValueError(
+            f"{len(fitted_index)} lit level(s) below {share:.0%} of saturation"
+            f" ({float(saturation_signal):.4g} DN above the dark level) cannot define a line: give"
+            " two or more different light levels there"
+        )
+    gain = _slope(mean[fitted_index], variance[fitted_index])
+    responsivity = _slope(lit_levels.photons[fitted_index], mean[fitted_index])
+    _refuse_falling(gain, responsivity)
+    # variance of a measured variance s^2 of nu degrees of freedom: 2 s^4 / nu
+    lit_variance, dark_variance = (
+        (2 * x.variance.square() / x.degrees_of_freedom)[fitted_index]
+        for x in (lit_levels, darks_of_lit)
+    )
+    gain_error = (
+        _error(mean[fitted_index], lit_variance, dark_variance, nearest_dark[fitted_index]) / gain
+    )
+    # variance of a mean over all pixels
+    lit_variance, dark_variance = (
+        (x.variance / x.pixels)[fitted_index] for x in (lit_levels, darks_of_lit)
+    )
+    responsivity_error = (
+        _error(
+            lit_levels.photons[fitted_index],
+            lit_variance,
+            dark_variance,
+            nearest_dark[fitted_index],
+        )
+        / responsivity
+    )
+    noise_in_numbers, noise_error_in_numbers = _dark_noise(levels, is_dark)
+    efficiency = responsivity / gain
     return LeastSquares(
         gain=gain,
         efficiency=efficiency,
-        temporal_dark_noise=noise / gain,
-        dark_signal=levels.mean[_shortest_dark(levels, dark)],
-        dark_current=_dark_current(levels, dark) / gain,
-        saturation=full / gain,
+        temporal_dark_noise=noise_in_numbers / gain,
+        dark_signal=levels.mean[_shortest_dark(levels, is_dark)],
+        dark_current=_dark_current(levels, is_dark) / gain,
+        saturation=saturation_signal / gain,
         gain_error=gain_error * gain,
-        efficiency_error=efficiency * torch.hypot(gain_error, response_error),
-        temporal_dark_noise_error=torch.hypot(noise_error, gain_error * noise) / gain,
-        fitted=torch.tensor(float(len(fitted)), dtype=torch.float64),
+        efficiency_error=efficiency * torch.hypot(gain_error, responsivity_error),
+        temporal_dark_noise_error=torch.hypot(noise_error_in_numbers, gain_error * noise_in_numbers)
+        / gain,
+        fitted=torch.tensor(float(len(fitted_index)), dtype=torch.float64),
     )
 
 
@@ -136,16 +156,19 @@ def _slope(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
-    """Return the standard error of a fitted slope; ``which`` gives the dark level subtracted
-    from each point.
+    """Return the standard error of the slope (x y) / (x x) of a line through the origin.
+
+    ``own`` is the variance of each lit value, ``dark`` that of the dark value subtracted from it.
+    ``which`` is the number of this dark level: points with the same one share its error.
     """
-    shared = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(
+    dark_errors = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(
         0, which, x * dark.sqrt()
     )
-    return (x.square() @ own + shared.square().sum()).sqrt() / (x @ x)
+    return (x.square() @ own + dark_errors.square().sum()).sqrt() / (x @ x)
 
 
 def _shortest_dark(levels: Levels, dark: Tensor) -> Tensor:
+    """Return the index of the dark level of the shortest exposure."""
     return torch.where(dark, levels.exposure, math.inf).argmin()
 
 
@@ -157,6 +180,7 @@ def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
         x[_shortest_dark(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom)
     )
     noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
+    # d(sqrt(v)) = dv / (2 sqrt(v)), with the relative error sqrt(2 / nu) of v
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
 
 
@@ -165,5 +189,7 @@ def _dark_current(levels: Levels, dark: Tensor) -> Tensor:
     the same exposure.
     """
     time, signal = levels.exposure[dark], levels.mean[dark]
-    apart = time - time.mean()
-    return torch.where(time.max() > time.min(), (apart @ signal) / (apart @ apart), math.nan)
+    centred_time = time - time.mean()
+    return torch.where(
+        time.max() > time.min(), (centred_time @ signal) / (centred_time @ centred_time), math.nan
+    )

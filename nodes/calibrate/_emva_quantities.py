@@ -132,6 +132,7 @@ def photon_transfer(levels: Levels) -> PhotonTransfer:
     dark = np.flatnonzero(photons == 0)
     dark = dark[np.argsort(exposure[dark], kind="stable")]
     lit = np.flatnonzero(photons > 0)
+    # by light, then by exposure
     lit = lit[np.lexsort((exposure[lit], photons[lit]))]
     if not len(dark):
         raise ValueError("a sheet of EMVA 1288 needs dark frames: give a level without light")
@@ -139,20 +140,21 @@ def photon_transfer(levels: Levels) -> PhotonTransfer:
         raise ValueError(
             f"a sheet of EMVA 1288 needs lit levels, and there is {len(lit)}: give two or more"
         )
-    below = dark[np.abs(exposure[lit, None] - exposure[dark]).argmin(1)]
-    top = saturation_point(variance[lit])
+    dark_of_lit = dark[np.abs(exposure[lit, None] - exposure[dark]).argmin(1)]
+    saturation = saturation_point(variance[lit])
+    # in the order of its fields: lit levels, the dark of each, all darks
     return PhotonTransfer(
         photons[lit],
         exposure[lit],
         mean[lit],
         variance[lit],
-        mean[below],
-        variance[below],
+        mean[dark_of_lit],
+        variance[dark_of_lit],
         exposure[dark],
         mean[dark],
         variance[dark],
-        top,
-        top < len(lit) - 1,
+        saturation,
+        saturation < len(lit) - 1,
     )
 
 
@@ -163,13 +165,14 @@ def saturation_point(variance: FloatArray) -> int:
     A peak below half of the greatest variance is noise of levels that are saturated, and does not
     count.
     """
-    top = len(variance) - 1
+    peak = len(variance) - 1
     for i in range(len(variance) - 2, -1, -1):
-        if variance[i] >= variance[top]:
-            top = i
-        elif i == 0 or variance[i - 1] < variance[top]:
+        # down from the brightest level, until both variances below the peak are less than it
+        if variance[i] >= variance[peak]:
+            peak = i
+        elif i == 0 or variance[i - 1] < variance[peak]:
             break
-    return top if variance[top] >= _PLATEAU * variance.max() else int(variance.argmax())
+    return peak if variance[peak] >= _PLATEAU * variance.max() else int(variance.argmax())
 
 
 def slope_through_origin(x: FloatArray, y: FloatArray) -> float:
@@ -181,8 +184,8 @@ def slope_through_origin(x: FloatArray, y: FloatArray) -> float:
 
 def line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     """Return slope and value at 0 of the line that fits (x, y) best."""
-    apart = x - x.mean()
-    slope = float(apart @ y / (apart @ apart))
+    centred_x = x - x.mean()
+    slope = float(centred_x @ y / (centred_x @ centred_x))
     return slope, float(y.mean() - slope * x.mean())
 
 
@@ -190,12 +193,14 @@ def relative_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     """Return slope and value at 0 of the line with the least squares of relative deviations,
     which is linear in y.
     """
-    columns = np.stack([x / y, 1 / y], axis=1)
-    solved: Any = np.linalg.lstsq(
-        columns / np.linalg.norm(columns, axis=0), np.ones_like(y), rcond=None
+    # slope x + start = y, divided by y: both columns times their parameters add up to 1
+    design = np.stack([x / y, 1 / y], axis=1)
+    # columns of equal length keep their digits
+    scaled_parameters: Any = np.linalg.lstsq(
+        design / np.linalg.norm(design, axis=0), np.ones_like(y), rcond=None
     )[0]
-    slope, start = solved / np.linalg.norm(columns, axis=0)
-    return float(slope), float(start)
+    slope, value_at_0 = scaled_parameters / np.linalg.norm(design, axis=0)
+    return float(slope), float(value_at_0)
 
 
 # --- sensitivity ----------------------------------------------------------------------------------
@@ -267,6 +272,7 @@ def dark_noise(transfer: PhotonTransfer) -> tuple[float, bool]:
     only a limit.
     """
     if len(np.unique(transfer.dark_exposure)) > _LINE:
+        # value at the exposure 0
         variance = line(transfer.dark_exposure, transfer.dark_variance)[1]
     else:
         variance = float(transfer.dark_variance[0])
@@ -288,10 +294,10 @@ def linearity(transfer: PhotonTransfer) -> Linearity | None:
 
 def linearity_errors(transfer: PhotonTransfer) -> list[Quantity]:
     """Return LE_min and LE_max, the extreme relative deviations in percent."""
-    ends = (("LE_min", "LE.min", "least"), ("LE_max", "LE.max", "greatest"))
+    extremes = (("LE_min", "LE.min", "least"), ("LE_max", "LE.max", "greatest"))
     blanks = [
         Quantity(key, symbol, f"linearity error, {name} deviation", "%")
-        for key, symbol, name in ends
+        for key, symbol, name in extremes
     ]
     line = linearity(transfer)
     if line is None:
@@ -311,37 +317,38 @@ def dark_current(transfer: PhotonTransfer) -> list[Quantity]:
     """
     of_mean = Quantity("mu_I_mean", "μ_I.mean", "dark current, from the means", "e-/s")
     of_variance = Quantity("mu_I_var", "μ_I.var", "dark current, from the variances", "e-/s")
-    k, times = gain(transfer).value, transfer.dark_exposure
-    count = len(np.unique(times))
-    why = "" if k else _NO_GAIN
+    gain_value, exposures = gain(transfer).value, transfer.dark_exposure
+    count = len(np.unique(exposures))
+    reason = "" if gain_value else _NO_GAIN
     if count <= _LINE:
-        why = f"dark frames at {count} exposure{'s' * (count > 1)}: three or more are needed"
-    if why or not k:
-        return [of_mean.untold(why), of_variance.untold(why)]
-    from_means = _slope(of_mean, times, transfer.dark_mean, k)
+        reason = f"dark frames at {count} exposure{'s' * (count > 1)}: three or more are needed"
+    if reason or not gain_value:
+        return [of_mean.untold(reason), of_variance.untold(reason)]
+    from_means = _slope(of_mean, exposures, transfer.dark_mean, gain_value)
     if dark_noise(transfer)[1]:
         return [from_means, of_variance.untold("rounding hides the variance of the dark")]
-    return [from_means, _slope(of_variance, times, transfer.dark_variance, k**2)]
+    return [from_means, _slope(of_variance, exposures, transfer.dark_variance, gain_value**2)]
 
 
 def _slope(blank: Quantity, times: FloatArray, values: FloatArray, scale: float) -> Quantity:
     """Return the slope of values over exposures in units of ``scale``, if it is at least twice
     its standard error.
     """
-    slope, start = line(times, values)
-    left = values - start - slope * times
-    error = math.sqrt(
-        float(left @ left) / (len(times) - 2) / float(((times - times.mean()) ** 2).sum())
+    slope, value_at_0 = line(times, values)
+    residuals = values - value_at_0 - slope * times
+    slope_error = math.sqrt(
+        float(residuals @ residuals) / (len(times) - 2) / float(((times - times.mean()) ** 2).sum())
     )
-    if slope > 0 and slope >= _SURE * error:
+    if slope > 0 and slope >= _SURE * slope_error:
         return blank.told(slope / scale)
     return blank.untold(
         f"no rise with the exposure: {slope / scale:.3g} {blank.unit}, with a standard error of"
-        f" {error / scale:.2g}"
+        f" {slope_error / scale:.2g}"
     )
 
 
 def _responsivity(transfer: PhotonTransfer, k: Quantity, photons_told: bool) -> Quantity:
+    """Return the responsivity in DN per photon from the levels up to 70 % of saturation."""
     blank = Quantity("R", "R", "responsivity", "DN/photon")
     fitted = transfer.fitted
     if not photons_told or fitted.sum() < 2:
@@ -350,6 +357,7 @@ def _responsivity(transfer: PhotonTransfer, k: Quantity, photons_told: bool) -> 
 
 
 def _efficiency(response: Quantity, k: Quantity, photons_told: bool) -> Quantity:
+    """Return the quantum efficiency in %, responsivity over gain."""
     blank = Quantity("eta", "η", "quantum efficiency", "%")
     if response.value is None or k.value is None:
         return blank.untold(_NO_GAIN if photons_told else _NO_LIGHT)
@@ -357,19 +365,20 @@ def _efficiency(response: Quantity, k: Quantity, photons_told: bool) -> Quantity
 
 
 def _inverse(k: Quantity) -> Quantity:
+    """Return the inverse of the gain in e-/DN."""
     blank = Quantity("inverse_K", "1/K", "inverse of the overall system gain", "e-/DN")
     return blank.untold(k.reason) if k.value is None else blank.told(1 / k.value)
 
 
 def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> list[Quantity]:
     """Return temporal dark noise and dark signal in DN and in electrons."""
-    why = (
+    rounding_reason = (
         f"the dark noise is below the {math.sqrt(COARSE):.2f} DN that the standard sets, because"
         " rounding hides it"
     )
     bound: Bound = "<" if coarse else ""
     in_numbers = Quantity("sigma_y_dark", "σ_y.dark", "temporal dark noise", "DN").told(
-        noise, bound, why * coarse
+        noise, bound, rounding_reason * coarse
     )
     blank = Quantity("sigma_d", "σ_d", "temporal dark noise", "e-")
     signal = Quantity("mu_d", "μ_d", "dark signal, with the offset of the converter", "e-")
@@ -379,7 +388,7 @@ def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> 
     electrons = math.sqrt(noise**2 - QUANTIZATION) / k.value
     return [
         in_numbers,
-        blank.told(electrons, bound, why * coarse),
+        blank.told(electrons, bound, rounding_reason * coarse),
         mean,
         signal.told(float(transfer.dark_mean[0]) / k.value),
     ]
@@ -388,27 +397,36 @@ def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> 
 def _least(
     transfer: PhotonTransfer, k: Quantity, eta: Quantity, noise: float, coarse: bool
 ) -> list[Quantity]:
-    """Return the absolute sensitivity threshold in photons and in electrons."""
+    """Return the absolute sensitivity threshold, the light whose signal equals its noise, in
+    photons and in electrons.
+
+    ``k`` is the gain, ``eta`` the quantum efficiency in %, ``noise`` the dark noise in DN, of which
+    only a limit is known where rounding is ``coarse``.
+    """
     photons = Quantity("mu_p_min", "μ_p.min", "absolute sensitivity threshold", "photons")
     electrons = Quantity("mu_e_min", "μ_e.min", "absolute sensitivity threshold", "e-")
     if k.value is None:
         return [photons.untold(_NO_GAIN), electrons.untold(_NO_GAIN)]
-    value, bound = noise / k.value + 0.5, "<" if coarse else ""
-    why = "a limit, as the dark noise is" if coarse else ""
-    limit: Bound = "<" if bound else ""
-    threshold = electrons.told(value, limit, why)
+    # EMVA 1288: sigma_y.dark / K + 1/2
+    threshold_electrons, bound_sign = noise / k.value + 0.5, "<" if coarse else ""
+    reason = "a limit, as the dark noise is" if coarse else ""
+    bound: Bound = "<" if bound_sign else ""
+    of_electrons = electrons.told(threshold_electrons, bound, reason)
     if eta.value is None:
-        return [photons.untold(eta.reason), threshold]
-    return [photons.told(100 * value / eta.value, limit, why), threshold]
+        return [photons.untold(eta.reason), of_electrons]
+    return [photons.told(100 * threshold_electrons / eta.value, bound, reason), of_electrons]
 
 
 def _greatest(
     transfer: PhotonTransfer, k: Quantity, eta: Quantity, thresholds: list[Quantity]
 ) -> list[Quantity]:
-    """Return saturation in photons and in electrons, the greatest SNR, and the dynamic range."""
+    """Return saturation in photons and in electrons, the greatest SNR, and the dynamic range.
+
+    ``thresholds`` are the absolute sensitivity thresholds in photons and in electrons.
+    """
     saturation = transfer.saturation
     bound: Bound = "" if transfer.saturated else ">"
-    why = (
+    reason = (
         ""
         if transfer.saturated
         else "the variance rises up to the brightest level: saturation was not reached"
@@ -417,34 +435,39 @@ def _greatest(
     in_electrons = Quantity("mu_e_sat", "μ_e.sat", "saturation capacity", "e-")
     photons = in_photons.untold(eta.reason)
     if eta.value is not None:
-        photons = in_photons.told(float(transfer.photons[saturation]), bound, why)
+        photons = in_photons.told(float(transfer.photons[saturation]), bound, reason)
     if k.value is None:
         electrons = in_electrons.untold(_NO_GAIN)
     elif eta.value is not None:
+        # EMVA 1288: mu_e.sat = eta mu_p.sat
         electrons = in_electrons.told(
-            eta.value / 100 * float(transfer.photons[saturation]), bound, why
+            eta.value / 100 * float(transfer.photons[saturation]), bound, reason
         )
     else:
-        electrons = in_electrons.told(float(transfer.signal[saturation]) / k.value, bound, why)
+        electrons = in_electrons.told(float(transfer.signal[saturation]) / k.value, bound, reason)
     return [photons, electrons, *_ratios(electrons, thresholds)]
 
 
 def _ratios(electrons: Quantity, thresholds: list[Quantity]) -> list[Quantity]:
     """Return SNR_max and the dynamic range, each as a number, in dB and in bits."""
+    # in electrons
     threshold = thresholds[1]
-    best = Quantity("SNR_max", "SNR.max", "maximum signal-to-noise ratio", "")
+    greatest_snr = Quantity("SNR_max", "SNR.max", "maximum signal-to-noise ratio", "")
     if electrons.value is None:
-        best = best.untold(electrons.reason)
+        greatest_snr = greatest_snr.untold(electrons.reason)
     else:
-        best = best.told(math.sqrt(electrons.value), electrons.bound, electrons.reason)
-    span = Quantity("DR", "DR", "dynamic range", "")
-    why = "; ".join(dict.fromkeys(q.reason for q in (electrons, threshold) if q.reason))
+        # shot noise alone: sqrt(electrons)
+        greatest_snr = greatest_snr.told(
+            math.sqrt(electrons.value), electrons.bound, electrons.reason
+        )
+    dynamic_range = Quantity("DR", "DR", "dynamic range", "")
+    reason = "; ".join(dict.fromkeys(q.reason for q in (electrons, threshold) if q.reason))
     if electrons.value is None or threshold.value is None:
-        span = span.untold(why)
+        dynamic_range = dynamic_range.untold(reason)
     else:
-        limited: Bound = ">" if electrons.bound or threshold.bound else ""
-        span = span.told(electrons.value / threshold.value, limited, why)
-    return [*_on_three_scales(best), *_on_three_scales(span)]
+        bound: Bound = ">" if electrons.bound or threshold.bound else ""
+        dynamic_range = dynamic_range.told(electrons.value / threshold.value, bound, reason)
+    return [*_on_three_scales(greatest_snr), *_on_three_scales(dynamic_range)]
 
 
 def _on_three_scales(ratio: Quantity) -> list[Quantity]:

@@ -58,13 +58,18 @@ def general_model(transfer: PhotonTransfer) -> GeneralModel | None:
     Source: EMVA Standard 1288, release 4.0 General (characteristic curve, and noise referred to the
             input).
     """
-    below = slice(0, transfer.saturation + 1)
-    light = np.concatenate([[0.0], transfer.photons[below]])
-    signal = np.concatenate([[0.0], transfer.signal[below]])
+    up_to_saturation = slice(0, transfer.saturation + 1)
+    light = np.concatenate([[0.0], transfer.photons[up_to_saturation]])
+    signal = np.concatenate([[0.0], transfer.signal[up_to_saturation]])
     if len(np.unique(light)) < 4 or len(np.unique(light)) < len(light):
         return None
     slope, error = _slopes(light, signal)
-    ratio = light[1:] * slope[1:] / np.sqrt(transfer.variance[below].clip(np.finfo(float).tiny))
+    # slope times light is the signal
+    ratio = (
+        light[1:]
+        * slope[1:]
+        / np.sqrt(transfer.variance[up_to_saturation].clip(np.finfo(float).tiny))
+    )
     return GeneralModel(light[1:], slope, error, np.asarray(ratio))
 
 
@@ -77,34 +82,55 @@ def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> l
     Units:  photons; a number; dB.
     Source: EMVA Standard 1288, release 4.0 General.
     """
-    dimmest = Quantity(
+    threshold_blank = Quantity(
         "mu_p_min_general", "μ_p.min", "absolute sensitivity threshold, no linear model", "photons"
     )
-    best = Quantity("SNR_max_general", "SNR.max", "maximum SNR of the light, no linear model", "dB")
-    span = Quantity("DR_general", "DR", "dynamic range, no linear model", "dB")
+    greatest_snr = Quantity(
+        "SNR_max_general", "SNR.max", "maximum SNR of the light, no linear model", "dB"
+    )
+    dynamic_range = Quantity("DR_general", "DR", "dynamic range, no linear model", "dB")
     model = general_model(transfer)
     if model is None or not (model.slope > 0).all():
-        why = (
+        lacking_reason = (
             "three or more levels of different light up to saturation, all brighter than those"
             " below, are needed"
         )
-        return [blank.untold(why) for blank in (dimmest, best, span)]
-    at_dark, at_best = float(model.error[0]), float(model.error[1 + int(model.ratio.argmax())])
-    top, cut = _end_of_light(transfer)
-    first = best.untold(_SCATTERS.format(at_best))
-    if at_best <= _KNOWN:
-        first = best.told(20 * math.log10(float(model.ratio.max())), top, cut)
-    if at_dark > _KNOWN:
-        why = _SCATTERS.format(at_dark)
-        return [dimmest.untold(why), first, span.untold(why)]
+        return [
+            blank.untold(lacking_reason) for blank in (threshold_blank, greatest_snr, dynamic_range)
+        ]
+    error_at_dark, error_at_greatest = (
+        float(model.error[0]),
+        float(model.error[1 + int(model.ratio.argmax())]),
+    )
+    bound, reason = _end_of_light(transfer)
+    told_snr = greatest_snr.untold(_SCATTERS.format(error_at_greatest))
+    if error_at_greatest <= _KNOWN:
+        told_snr = greatest_snr.told(20 * math.log10(float(model.ratio.max())), bound, reason)
+    if error_at_dark > _KNOWN:
+        lacking_reason = _SCATTERS.format(error_at_dark)
+        return [
+            threshold_blank.untold(lacking_reason),
+            told_snr,
+            dynamic_range.untold(lacking_reason),
+        ]
     threshold = _threshold(transfer, model)
     decibels = 20 * math.log10(float(model.photons[-1]) / threshold)
     if float(transfer.dark_variance[0]) < COARSE:
-        rounded = "rounding hides the dark noise"
-        low, last = dimmest.told(threshold, "<", rounded), span.told(decibels, ">", rounded)
+        rounding_reason = "rounding hides the dark noise"
+        told_threshold, told_range = (
+            threshold_blank.told(threshold, "<", rounding_reason),
+            dynamic_range.told(decibels, ">", rounding_reason),
+        )
     else:
-        low, last = dimmest.told(threshold), span.told(decibels, top, cut)
-    return [low if photons_told else dimmest.untold("the photons are not told"), first, last]
+        told_threshold, told_range = (
+            threshold_blank.told(threshold),
+            dynamic_range.told(decibels, bound, reason),
+        )
+    return [
+        told_threshold if photons_told else threshold_blank.untold("the photons are not told"),
+        told_snr,
+        told_range,
+    ]
 
 
 #: why a slope of the general model is not told
@@ -117,40 +143,61 @@ def _end_of_light(transfer: PhotonTransfer) -> tuple[Bound, str]:
 
 
 def _slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the slope at each point of a parabola through the nearest points, and its relative
-    standard error.
+    """Return the slope at each point of a parabola through the nearest points, and the relative
+    standard error of each slope.
+
+    The scatter of the points is a share of their values, the same share everywhere; it is taken
+    from the deviations of the points from their parabolas.
     """
-    count = min(len(x), max(_WINDOW, 2 * round(_SHARE * len(x) / 2) + 1))
-    slopes, spreads, scatter = [], [], []
+    # an odd number of points: at least `_WINDOW`, and about `_SHARE` of all
+    window_length = min(len(x), max(_WINDOW, 2 * round(_SHARE * len(x) / 2) + 1))
+    slopes, error_weights, relative_residuals = [], [], []
     for index in range(len(x)):
-        first = min(max(0, index - count // 2), len(x) - count)
-        near = slice(first, first + count)
-        scale = float(np.ptp(x[near]))
-        fit = np.linalg.pinv(np.vander((x[near] - x[index]) / scale, 3, increasing=True))
-        slopes.append(float(fit[1] @ y[near]) / scale)
-        spreads.append(float(np.linalg.norm(fit[1] * y[near])) / scale)
-        left = -fit[0]
-        left[index - first] += 1
-        if weight := float(np.linalg.norm(left * y[near])):
-            scatter.append(float(left @ y[near]) / weight)
-    error = math.sqrt(float(np.mean(np.square(scatter)))) * np.array(spreads) / np.abs(slopes)
+        first = min(max(0, index - window_length // 2), len(x) - window_length)
+        neighbours = slice(first, first + window_length)
+        x_range = float(np.ptp(x[neighbours]))
+        # rows: weights of the values for the parabola's value, slope and bend at the point
+        parabola_weights = np.linalg.pinv(
+            np.vander((x[neighbours] - x[index]) / x_range, 3, increasing=True)
+        )
+        slopes.append(float(parabola_weights[1] @ y[neighbours]) / x_range)
+        error_weights.append(float(np.linalg.norm(parabola_weights[1] * y[neighbours])) / x_range)
+        residual_weights = -parabola_weights[0]
+        # weight 1 of the point itself, less its weights in the parabola
+        residual_weights[index - first] += 1
+        if residual_size := float(np.linalg.norm(residual_weights * y[neighbours])):
+            relative_residuals.append(float(residual_weights @ y[neighbours]) / residual_size)
+    error = (
+        math.sqrt(float(np.mean(np.square(relative_residuals))))
+        * np.array(error_weights)
+        / np.abs(slopes)
+    )
     return np.array(slopes), np.asarray(error)
 
 
 def _threshold(transfer: PhotonTransfer, model: GeneralModel) -> float:
     """Return the light whose signal equals its noise in time, in photons."""
-    dark = max(float(transfer.variance_dark[0]), COARSE)
-    rise = max(0.0, float(transfer.excess[0]) / float(model.photons[0]))
+    dark_variance = max(float(transfer.variance_dark[0]), COARSE)
+    variance_per_photon = max(0.0, float(transfer.excess[0]) / float(model.photons[0]))
     slope = float(model.slope[0])
-    near = (rise + math.sqrt(rise**2 + 4 * dark * slope**2)) / (2 * slope**2)
-    if near <= model.photons[0] or not (model.ratio < 1).any():
-        return near
-    last = int(np.flatnonzero(model.ratio < 1).max())  # the brightest level below the threshold
-    if last + 1 == len(model.ratio):
-        return float(model.photons[last])
-    ends = slice(last, last + 2)
+    # (slope x)^2 = dark variance + variance per photon * x
+    threshold = (
+        variance_per_photon + math.sqrt(variance_per_photon**2 + 4 * dark_variance * slope**2)
+    ) / (2 * slope**2)
+    # the line of the variance holds up to the first level only; beyond, look for the ratio 1
+    if threshold <= model.photons[0] or not (model.ratio < 1).any():
+        return threshold
+    brightest_below = int(np.flatnonzero(model.ratio < 1).max())
+    if brightest_below + 1 == len(model.ratio):
+        return float(model.photons[brightest_below])
+    neighbours = slice(brightest_below, brightest_below + 2)
     return float(
-        np.exp(np.interp(0.0, np.log(model.ratio[ends].clip(1e-300)), np.log(model.photons[ends])))
+        # where the ratio is 1, between two levels, in logarithms of both
+        np.exp(
+            np.interp(
+                0.0, np.log(model.ratio[neighbours].clip(1e-300)), np.log(model.photons[neighbours])
+            )
+        )
     )
 
 

@@ -43,11 +43,11 @@ def read(file: Path) -> NDArray[np.int32]:
         )
     with np.errstate(invalid="ignore"):
         numbers = stack.astype(np.int64)
-    bad = (numbers != stack) | (numbers < 0) | (numbers >= _TOP)
-    if bad.any():
+    not_digital = (numbers != stack) | (numbers < 0) | (numbers >= _TOP)
+    if not_digital.any():
         raise ValueError(
-            f"{file} holds {stack[bad][0]}, not a digital number: give raw frames, whole numbers "
-            f"from 0 to {_TOP - 1}"
+            f"{file} holds {stack[not_digital][0]}, not a digital number: give raw frames, whole"
+            f" numbers from 0 to {_TOP - 1}"
         )
     return numbers.astype(np.int32).reshape(-1, *stack.shape[-2:])
 
@@ -68,6 +68,9 @@ def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
 
 
 def _picture(file: Path) -> NDArray[Any]:
+    """Read the pages of a PNG or TIFF file as frames (frame, y, x); raise ValueError for colour,
+    other depths and pages of different sizes.
+    """
     from PIL import Image, ImageSequence, UnidentifiedImageError
 
     try:
@@ -103,11 +106,12 @@ def refuse_page(file: Path, page: Any) -> None:
 
 
 def _exr(file: Path) -> NDArray[Any]:
+    """Read the one channel of an OpenEXR file (y, x); raise ValueError for several channels."""
     import OpenEXR
 
     exr_needs(file, 4 + _WHOLE)
-    with OpenEXR.File(str(file), separate_channels=True) as opened:
-        channels = opened.channels()
+    with OpenEXR.File(str(file), separate_channels=True) as opened_file:
+        channels = opened_file.channels()
         if len(channels) != 1:
             raise ValueError(
                 f"{file} has the channels {', '.join(channels)}: save one channel alone"
@@ -121,8 +125,8 @@ def _fits(file: Path) -> NDArray[Any]:
 
     shape, bits = fits_header(file)
     fits_needs(file, shape, bits)
-    with fits.open(file) as opened:
-        return np.array(_first_image(file, opened).data)
+    with fits.open(file) as opened_file:
+        return np.array(_first_image(file, opened_file).data)
 
 
 def _npy(file: Path) -> NDArray[Any]:
@@ -138,8 +142,8 @@ def fits_header(file: Path) -> tuple[tuple[int, ...], int]:
     from astropy.io import fits
 
     refuse_packed(file)
-    with fits.open(file) as opened:
-        image = _first_image(file, opened)
+    with fits.open(file) as opened_file:
+        image = _first_image(file, opened_file)
         return tuple(image.shape), int(image.header["BITPIX"])
 
 
@@ -155,20 +159,23 @@ def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
     from astropy.io import fits
 
     refuse_packed(file)
-    with fits.open(file) as opened:
-        image = _first_image(file, opened)
-        header, about = image.header, image.fileinfo()
+    with fits.open(file) as opened_file:
+        image = _first_image(file, opened_file)
+        header, positions = image.header, image.fileinfo()
         bits, zero = int(header["BITPIX"]), float(header.get("BZERO", 0))
         lowest = zero - (2 ** (bits - 1) if bits > 8 else 0)  # eight bits have no sign
-        scaled = float(header.get("BSCALE", 1)) != 1 or zero % 1 != 0 or "BLANK" in header
-        doubtful = scaled or bits < 0 or lowest < 0 or lowest + 2**bits > _TOP
+        is_scaled = float(header.get("BSCALE", 1)) != 1 or zero % 1 != 0 or "BLANK" in header
+        may_hold_others = is_scaled or bits < 0 or lowest < 0 or lowest + 2**bits > _TOP
         # its blocks of 2880 bytes, of which the last one may be short
         packed = isinstance(image, fits.CompImageHDU)
-        size = about["datSpan"] - 2879 if packed else math.prod(image.shape) * abs(bits) // 8
-        return tuple(image.shape), int(about["datLoc"] + size), doubtful
+        image_bytes = (
+            positions["datSpan"] - 2879 if packed else math.prod(image.shape) * abs(bits) // 8
+        )
+        return tuple(image.shape), int(positions["datLoc"] + image_bytes), may_hold_others
 
 
 def _first_image(file: Path, opened: Any) -> Any:
+    """Return the first unit of an opened FITS file with an image; raise ValueError for none."""
     image = next((unit for unit in opened if getattr(unit, "is_image", False) and unit.shape), None)
     if image is None:
         raise ValueError(f"{file} holds no image: give a FITS file with an image")
@@ -212,21 +219,26 @@ def frame_problem(file: Path) -> str:
 
 
 def _check_picture(file: Path) -> str:
+    """Return a message for a PNG or TIFF file that is damaged or cut short, or has other than raw
+    grey pixels or digital numbers, else an empty text.
+    """
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(file) as image:
             refuse_page(file, image)
             pages_need(file, image, 2.0)
-            ends = zip(
+            strips = zip(
                 *(_numbers(image, tag) for tag in (_STRIP_STARTS, _STRIP_LENGTHS)), strict=False
             )
+            # the checksums of a PNG; for a TIFF, the end of the last strip against the size of the
+            # file
             if image.format == "PNG":
                 image.verify()
-            elif (last := max(map(sum, ends), default=0)) > file.stat().st_size:
+            elif (end_of_pixels := max(map(sum, strips), default=0)) > file.stat().st_size:
                 return (
-                    f"{file} is damaged (its pixels end at byte {last}, after its end): copy the"
-                    " file again"
+                    f"{file} is damaged (its pixels end at byte {end_of_pixels}, after its end):"
+                    " copy the file again"
                 )
             elif image.mode in ("I", "F"):
                 read(file)
@@ -238,16 +250,20 @@ def _check_picture(file: Path) -> str:
 
 
 def _numbers(image: Any, tag: int) -> tuple[int, ...]:
+    """Return the numbers of a TIFF tag, empty for another file."""
     return tuple(getattr(image, "tag_v2", {}).get(tag, ()))
 
 
 def _numpy(file: Path) -> str:
+    """Return a message for a .npy file that is too large, holds no numbers or no digital numbers,
+    else an empty text.
+    """
     npy_needs(file, 1.0)
-    head = np.load(file, mmap_mode="r", allow_pickle=False)
-    if head.dtype.kind not in "uif":
-        return f"{file} holds values of type {head.dtype}: save raw frames as whole numbers"
-    doubtful = head.dtype.kind != "u" or head.dtype.itemsize > 2
-    return _too_large(file, head.shape) or _wrong_numbers(file, head.shape, doubtful)
+    array = np.load(file, mmap_mode="r", allow_pickle=False)
+    if array.dtype.kind not in "uif":
+        return f"{file} holds values of type {array.dtype}: save raw frames as whole numbers"
+    may_hold_others = array.dtype.kind != "u" or array.dtype.itemsize > 2
+    return _too_large(file, array.shape) or _wrong_numbers(file, array.shape, may_hold_others)
 
 
 def _check_fits(file: Path) -> str:
@@ -257,16 +273,17 @@ def _check_fits(file: Path) -> str:
     with warnings.catch_warnings():
         # astropy warns of a file that is cut short, which is refused here
         warnings.simplefilter("ignore")
-        shape, end, doubtful = fits_image(file)
-    if end > (size := file.stat().st_size):
+        shape, end_of_image, may_hold_others = fits_image(file)
+    if end_of_image > (size := file.stat().st_size):
         return (
-            f"{file} is damaged (its image ends at byte {end}, after its end at {size}): copy the"
-            " file again"
+            f"{file} is damaged (its image ends at byte {end_of_image}, after its end at {size}):"
+            " copy the file again"
         )
-    return _too_large(file, shape) or _wrong_numbers(file, shape, doubtful)
+    return _too_large(file, shape) or _wrong_numbers(file, shape, may_hold_others)
 
 
 def _too_large(file: Path, shape: tuple[int, ...]) -> str:
+    """Return a message for an array of more values than can be read, else an empty text."""
     count = math.prod(map(int, shape))
     if count <= VALUES:
         return ""
@@ -292,6 +309,9 @@ def _wrong_numbers(file: Path, shape: tuple[int, ...], doubtful: bool) -> str:
 
 
 def _check_exr(file: Path) -> str:
+    """Return a message for an OpenEXR file that cannot be read, has several channels or other than
+    digital numbers, else an empty text.
+    """
     try:
         _, names, size = exr_header(file)
     except ParameterError as error:
@@ -359,21 +379,25 @@ def frame_header(file: Path) -> FrameHeader:
     if problem := frame_problem(file):
         raise ValueError(problem)
     suffix = file.suffix.lower()
-    count, shape, bits, said = _HEADERS.get(suffix, _header_of_fits if suffix in FITS else _plain)(
-        file
-    )
-    values = {re.sub(r"[^a-z]", "", str(key).lower()): value for key, value in said.items()}
-    light = next((_number(values[key], False) for key in _LIGHTS if key in values), None)
+    count, shape, bits, stated = _HEADERS.get(
+        suffix, _header_of_fits if suffix in FITS else _plain
+    )(file)
+    # `Exposure Time`, `ExposureTime` and `EXPOSURE_TIME` are one key
+    values = {re.sub(r"[^a-z]", "", str(key).lower()): value for key, value in stated.items()}
+    photons = next((_number(values[key], False) for key in _LIGHTS if key in values), None)
     return FrameHeader(
         count,
         shape,
         bits,
         next((_number(values[key]) for key in _TIMES if key in values), None),
-        light,
+        photons,
     )
 
 
 def _number(value: Any, is_time: bool = True) -> float | None:
+    """Return the number in a value of a header, a time in seconds or (not ``is_time``) a number of
+    photons; None for a text without one, for a time that is not above 0 and for negative photons.
+    """
     match = _NUMBER.fullmatch(str(value))
     try:
         number = float(match[1]) if match else float(value)
@@ -395,17 +419,21 @@ _Found = tuple[int, tuple[int, int], int, Mapping[str, Any]]
 
 
 def _header_of_picture(file: Path) -> _Found:
+    """Return number of frames, size (y, x), bits and stated values of a PNG or TIFF file."""
     from PIL import Image
 
     with Image.open(file) as image:
         pages_need(file, image, 1.0, 0.0)
         exif = image.getexif()
-        said: dict[str, Any] = {**_texts(image.info), **_described(str(exif.get(_DESCRIPTION, "")))}
+        stated: dict[str, Any] = {
+            **_texts(image.info),
+            **_described(str(exif.get(_DESCRIPTION, ""))),
+        }
         for tags in (exif, exif.get_ifd(_EXIF)):
             if _EXPOSURE in tags:
-                said["exposuretime"] = float(tags[_EXPOSURE])
+                stated["exposuretime"] = float(tags[_EXPOSURE])
         frames = int(getattr(image, "n_frames", 1))
-        return frames, (image.height, image.width), _bits_of(image.mode, image.format), said
+        return frames, (image.height, image.width), _bits_of(image.mode, image.format), stated
 
 
 def _bits_of(mode: str, kind: str | None) -> int:
@@ -425,39 +453,42 @@ def _described(text: str) -> dict[str, str]:
 
 
 def _header_of_fits(file: Path) -> _Found:
+    """Return number of frames, size (y, x), bits and stated values of a FITS file."""
     from astropy.io import fits
 
     refuse_packed(file)
-    with fits.open(file) as opened:
+    with fits.open(file) as opened_file:
         header = next(
-            unit.header for unit in opened if getattr(unit, "is_image", False) and unit.shape
+            unit.header for unit in opened_file if getattr(unit, "is_image", False) and unit.shape
         )
-        said = {
+        stated = {
             key: header[key] for key in header if key and isinstance(header[key], int | float | str)
         }
         bits = abs(int(header["BITPIX"]))
     shape = fits_image(file)[0]
-    return *_stack(shape), bits, said
+    return *_stack(shape), bits, stated
 
 
 def _header_of_exr(file: Path) -> _Found:
+    """Return one frame, its size (y, x), 32 bits and the stated values of an OpenEXR file."""
     import OpenEXR
 
     exr_needs(file)
-    with OpenEXR.File(str(file), separate_channels=True) as opened:
-        header = dict(opened.header())
-        shape = next(iter(opened.channels().values())).pixels.shape
-    said = {"exposuretime" if key == "expTime" else key: value for key, value in header.items()}
-    return *_stack(shape), 32, said
+    with OpenEXR.File(str(file), separate_channels=True) as opened_file:
+        header = dict(opened_file.header())
+        shape = next(iter(opened_file.channels().values())).pixels.shape
+    stated = {"exposuretime" if key == "expTime" else key: value for key, value in header.items()}
+    return *_stack(shape), 32, stated
 
 
 def _plain(file: Path) -> _Found:
     npy_needs(file, 1.0)
-    head = np.load(file, mmap_mode="r", allow_pickle=False)
-    return *_stack(head.shape), 8 * head.dtype.itemsize, {}
+    array = np.load(file, mmap_mode="r", allow_pickle=False)
+    return *_stack(array.shape), 8 * array.dtype.itemsize, {}
 
 
 def _stack(shape: tuple[int, ...]) -> tuple[int, tuple[int, int]]:
+    """Return the number of frames and the size (y, x) of an array (y, x) or (frame, y, x)."""
     return (1 if len(shape) == 2 else int(shape[0])), (int(shape[-2]), int(shape[-1]))
 
 

@@ -48,16 +48,22 @@ class Hidden:
 
     def posterior(self) -> tuple[Tensor, Tensor]:
         """Return points of the logarithm and their probabilities, both (point,)."""
-        low = min(0.0, self.estimate) - _REACH * self.error
-        high = max(0.0, self.estimate) + _REACH * self.error
-        points = torch.linspace(0.0 if self.positive else low, high, _POINTS, dtype=torch.float64)
+        lowest = min(0.0, self.estimate) - _REACH * self.error
+        highest = max(0.0, self.estimate) + _REACH * self.error
+        points = torch.linspace(
+            0.0 if self.positive else lowest, highest, _POINTS, dtype=torch.float64
+        )
+        # Cauchy distribution about 0; of a logarithm that cannot be negative, its upper half
         density = 1 / (math.pi * self.scale * (1 + (points / self.scale).square()))
         if self.positive:
             density = 2 * density
-        weight = self._likelihood(points) * density * (points[1] - points[0]) * (1 - self.sound)
+        probability = (
+            self._likelihood(points) * density * (points[1] - points[0]) * (1 - self.sound)
+        )
+        # the value 0 itself has the probability `sound`
         points = torch.cat([points, points.new_zeros(1)])
-        weight = torch.cat([weight, self.sound * self._likelihood(points[-1:])])
-        return points, weight / weight.sum()
+        probability = torch.cat([probability, self.sound * self._likelihood(points[-1:])])
+        return points, probability / probability.sum()
 
     def size(self) -> float:
         """Return the root mean square of the logarithm."""
@@ -68,9 +74,9 @@ class Hidden:
         """Return the likelihood of points relative to that of the likeliest value that is
         possible.
         """
-        best = max(0.0, self.estimate) if self.positive else self.estimate
-        offset = ((best - self.estimate) / self.error) ** 2
-        return (-0.5 * (((points - self.estimate) / self.error).square() - offset)).exp()
+        likeliest = max(0.0, self.estimate) if self.positive else self.estimate
+        least_squares = ((likeliest - self.estimate) / self.error) ** 2
+        return (-0.5 * (((points - self.estimate) / self.error).square() - least_squares)).exp()
 
 
 def probably_sound(pairs: float) -> float:
@@ -89,6 +95,7 @@ def open_errors(hidden: Sequence[Hidden]) -> dict[str, float]:
     "noise" (in DN).
     """
     sizes = [fault.size() for fault in hidden]
+    # independent faults add in squares
     gain = math.hypot(*(fault.gain * size for fault, size in zip(hidden, sizes, strict=True)), 0.0)
     noise = math.hypot(
         *(fault.noise * size for fault, size in zip(hidden, sizes, strict=True)), 0.0
@@ -221,13 +228,14 @@ def prepared(stack: Stack) -> Level:
     """Return the pairs and the histogram of a light level; frame 0 forms a pair with 1, 2 with
     3, and so on.
     """
-    pixels = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
-    value, count = histogram(pixels)
+    unmasked = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
+    numbers, counts = histogram(unmasked)
     frames = _window(stack.frames)
     pairs = len(frames) // 2
     means, centred = _centred(frames, stack.mask)
+    # frames 0, 2, 4 ... and 1, 3, 5 ...
     first, second = centred[: 2 * pairs : 2], centred[1 : 2 * pairs : 2]
-    apart = second - first
+    differences = second - first
     return Level(
         name=stack.name,
         photons=stack.photons,
@@ -235,12 +243,12 @@ def prepared(stack: Stack) -> Level:
         scatter=stack.scatter,
         first=first,
         second=second,
-        apart=apart,
+        apart=differences,
         drift=means[1 : 2 * pairs : 2] - means[: 2 * pairs : 2],
-        variance=_variance(apart),
-        mean=float((value * count).sum()) / float(count.sum()),
-        value=value,
-        pixels=count,
+        variance=_variance(differences),
+        mean=float((numbers * counts).sum()) / float(counts.sum()),
+        value=numbers,
+        pixels=counts,
     )
 
 
@@ -253,11 +261,13 @@ def fitted_levels(levels: Sequence[Level], share: float | None) -> list[Level]:
     to the light of each pixel, is taken off the differences of the pairs.
     """
     dark = min((level.mean for level in levels if level.dark), default=0.0)
-    lit = [level for level in levels if not level.dark and level.paired]
-    full = max(lit, key=lambda level: level.variance).mean - dark if lit else math.inf
-    limit = math.inf if share is None else share * full
+    lit_levels = [level for level in levels if not level.dark and level.paired]
+    saturation_signal = (
+        max(lit_levels, key=lambda level: level.variance).mean - dark if lit_levels else math.inf
+    )
+    largest_signal = math.inf if share is None else share * saturation_signal
     return [
-        _steadied(level, dark)._replace(fitted=level.dark or level.mean - dark <= limit)
+        _steadied(level, dark)._replace(fitted=level.dark or level.mean - dark <= largest_signal)
         for level in levels
     ]
 
@@ -276,8 +286,8 @@ def saturated(levels: Sequence[Level]) -> list[Level]:
     A well that differs from pixel to pixel, or that fills before the read noise is added, makes no
     pile.
     """
-    lit = [level for level in levels if not level.dark and level.paired]
-    peak = max(lit, key=lambda level: level.variance, default=None)
+    lit_levels = [level for level in levels if not level.dark and level.paired]
+    peak = max(lit_levels, key=lambda level: level.variance, default=None)
     if peak is None:
         return [level for level in levels if level.high]
     return [level for level in levels if level.high or _is_flat(level, peak)]
@@ -292,6 +302,9 @@ def tested(levels: Sequence[Level]) -> list[Level]:
 
 
 def _is_flat(level: Level, peak: Level) -> bool:
+    """Return True for a lit level that is brighter than the ``peak`` of the variance and has less
+    than half of its variance.
+    """
     return (
         level.paired
         and not level.dark
@@ -310,16 +323,18 @@ def _steadied(level: Level, dark: float) -> Level:
     signal = level.mean - dark
     if level.dark or not level.paired or signal <= 0:
         return level
-    change = (level.drift / signal)[:, None, None]
-    apart = level.second * (1 - change / 2) - level.first * (1 + change / 2)
-    light = (level.first * level.second).mean((1, 2)).clamp_min(0.0)
-    flicker = float((change[:, 0, 0].square() * light).mean()) / 2
-    return level._replace(apart=apart, variance=_variance(apart), flicker=flicker)
+    relative_drift = (level.drift / signal)[:, None, None]
+    # both frames are brought to the mean of their lights
+    differences = level.second * (1 - relative_drift / 2) - level.first * (1 + relative_drift / 2)
+    pattern_power = (level.first * level.second).mean((1, 2)).clamp_min(0.0)
+    # uneven light, the common pattern of both frames, times the change of the light
+    flicker = float((relative_drift[:, 0, 0].square() * pattern_power).mean()) / 2
+    return level._replace(apart=differences, variance=_variance(differences), flicker=flicker)
 
 
 def _variance(apart: Tensor) -> float:
-    """Return the temporal variance of differences (pair, y, x), without the drift of the mean;
-    NaN without a pair.
+    """Return the temporal variance of differences (pair, y, x) of two frames, without the drift of
+    the mean: half their mean square, with one degree of freedom a pair less; NaN without a pair.
     """
     return (
         float(apart.square().sum()) / 2 / max(1, apart.numel() - len(apart))
@@ -348,26 +363,35 @@ def without_lines(x: Tensor) -> Tensor:
 
 def _window(frames: Tensor) -> Tensor:
     """Return the middle of at most 16 frames, and fewer frames where they are large."""
-    starts = [max(0, n - _WINDOW) // 2 // _BLOCK * _BLOCK for n in frames.shape[1:]]
-    middle = frames[:, starts[0] : starts[0] + _WINDOW, starts[1] : starts[1] + _WINDOW]
-    frame_count = _TESTED // max(1, middle[0].numel()) // 2 * 2
-    return middle[: min(_MOST, max(2, frame_count))]
+    first_pixels = [max(0, n - _WINDOW) // 2 // _BLOCK * _BLOCK for n in frames.shape[1:]]
+    central_window = frames[
+        :, first_pixels[0] : first_pixels[0] + _WINDOW, first_pixels[1] : first_pixels[1] + _WINDOW
+    ]
+    # an even number, for pairs
+    frame_count = _TESTED // max(1, central_window[0].numel()) // 2 * 2
+    return central_window[: min(_MOST, max(2, frame_count))]
 
 
 def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
-    """Return True if the lowest number occurs more often than the next number.
+    """Return True if the lowest number occurs more often than the next number, or the two lowest
+    more often than the next two.
 
     The counts of numbers without a limit fall towards the ends. A full well fills two neighbouring
-    numbers.
+    numbers. Coarse numbers, with few values or little variance, are compared only at 0.
     """
-    last, at_zero = int(value[0]), int(value[0]) == 0
-    counts = [float(count[value == last + i].sum()) for i in range(4)]
+    lowest, at_zero = int(value[0]), int(value[0]) == 0
+    counts = [float(count[value == lowest + i].sum()) for i in range(4)]
     if sum(counts) < _LEAST:
         return False
-    single_numbers, two = counts[:2], (counts[0] + counts[1], counts[2] + counts[3])
-    wide = level.paired and level.variance > 1.0 and len(value) > 8
-    tests = [single_numbers] * (wide or at_zero) + [two] * wide
-    return any(a >= _LEAST and a - b - 2 > _PILED * math.sqrt(a + b) for a, b in tests)
+    first_and_second, pairs_of_numbers = counts[:2], (counts[0] + counts[1], counts[2] + counts[3])
+    is_fine = level.paired and level.variance > 1.0 and len(value) > 8
+    # a list times False is empty: which comparisons are made
+    tests = [first_and_second] * (is_fine or at_zero) + [pairs_of_numbers] * is_fine
+    return any(
+        count_at_end >= _LEAST
+        and count_at_end - count_beside - 2 > _PILED * math.sqrt(count_at_end + count_beside)
+        for count_at_end, count_beside in tests
+    )
 
 
 def strongest(
@@ -380,10 +404,12 @@ def strongest(
     square root of their count; ``others`` are further standard normal numbers. The limit is
     Bonferroni's for all of these, and for both signs with two ``sides``.
     """
-    together = [sum(row) / math.sqrt(len(row)) for row in z if len(row) > 1]
-    every = [*chain.from_iterable(z), *together, *others]
-    strengths = [abs(x) for x in every] if sides == 2 else every
-    return Evidence(max(strengths, default=0.0), normal_limit(ALARM / sides / max(1, len(every))))
+    sums_of_statistics = [sum(row) / math.sqrt(len(row)) for row in z if len(row) > 1]
+    all_numbers = [*chain.from_iterable(z), *sums_of_statistics, *others]
+    strengths = [abs(x) for x in all_numbers] if sides == 2 else all_numbers
+    return Evidence(
+        max(strengths, default=0.0), normal_limit(ALARM / sides / max(1, len(all_numbers)))
+    )
 
 
 def normal_limit(probability: float) -> float:
@@ -415,14 +441,14 @@ def outcome(
         return FrameTest(
             name, evidence.strength, evidence.limit, "modelled", f"{sentence}: {modelled}", shifts
         )
-    worst = max(shifts.values(), default=math.inf)
-    verdict: Verdict = "refused" if worst > REFUSED else "widened"
-    means = (
-        f"an error of {100 * worst:.2g} % may follow"
-        if math.isfinite(worst)
+    largest_shift = max(shifts.values(), default=math.inf)
+    verdict: Verdict = "refused" if largest_shift > REFUSED else "widened"
+    consequence = (
+        f"an error of {100 * largest_shift:.2g} % may follow"
+        if math.isfinite(largest_shift)
         else "no model describes such frames"
     )
-    text = f"{sentence}: {means}{_remedy(name, verdict)}"
+    text = f"{sentence}: {consequence}{_remedy(name, verdict)}"
     return FrameTest(name, evidence.strength, evidence.limit, verdict, text, shifts)
 
 
@@ -443,17 +469,17 @@ def bounded(
     Nothing is corrected. A fault that is found is refused where gain or noise may be wrong by more
     than 2 %, and else widens by its whole size.
     """
-    worst = max(open_errors(hidden).values())
+    largest_error = max(open_errors(hidden).values())
     if not evidence.found:
-        text = f"{passed}; the frames may hide {100 * worst:.2g} %" if hidden else passed
+        text = f"{passed}; the frames may hide {100 * largest_error:.2g} %" if hidden else passed
         return FrameTest(
             name, evidence.strength, evidence.limit, "passed", text, hidden=tuple(hidden)
         )
     verdict: Verdict = "modelled" if modelled else "widened"
-    if worst > REFUSED:
+    if largest_error > REFUSED:
         verdict = "refused"
     text = (
-        f"{sentence}: an error of {100 * worst:.2g} % may follow, and nothing is"
+        f"{sentence}: an error of {100 * largest_error:.2g} % may follow, and nothing is"
         f" corrected{_remedy(name, verdict)}"
     )
     if verdict == "modelled":

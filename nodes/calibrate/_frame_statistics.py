@@ -71,25 +71,26 @@ def reduce(
     if mask is not None:
         frames = _unmasked(frames, mask)
     _refuse_single(frames, scatter)
-    value, count = histogram(frames)
-    total = float(count.sum())
-    mean = float((value * count).sum()) / total
-    spread = float(((value.double() - mean).square() * count).sum())
+    numbers, counts = histogram(frames)
+    total = float(counts.sum())
+    mean = float((numbers * counts).sum()) / total
+    sum_of_squares = float(((numbers.double() - mean).square() * counts).sum())
     if scatter == "all":
-        freedom, variance = total - 1, spread / (total - 1)
+        degrees_of_freedom, variance = total - 1, sum_of_squares / (total - 1)
     else:
-        freedom = total - total / len(frames) - (scatter == "steady") * (len(frames) - 1)
-        variance = _within(frames, scatter == "steady") / freedom
+        # each pixel's mean is fitted, and with `steady` each frame's mean but one
+        degrees_of_freedom = total - total / len(frames) - (scatter == "steady") * (len(frames) - 1)
+        variance = _within(frames, scatter == "steady") / degrees_of_freedom
     keeps_histogram = _kept(
-        value.double(), count.double(), mean, math.sqrt(spread / total), scatter == "all"
+        numbers.double(), counts.double(), mean, math.sqrt(sum_of_squares / total), scatter == "all"
     )
     moments = (
         torch.tensor([x], dtype=torch.float64)
-        for x in (photons, exposure, total, mean, variance, freedom)
+        for x in (photons, exposure, total, mean, variance, degrees_of_freedom)
     )
-    value, count = (value, count) if keeps_histogram else (value[:0], count[:0])
+    numbers, counts = (numbers, counts) if keeps_histogram else (numbers[:0], counts[:0])
     return Levels._make(
-        [*moments, torch.zeros(len(value), dtype=torch.int64), value.double(), count.double()]
+        [*moments, torch.zeros(len(numbers), dtype=torch.int64), numbers.double(), counts.double()]
     )
 
 
@@ -140,10 +141,10 @@ def levels(parts: list[Levels]) -> Levels:
             "there are no light levels to join: connect at least one step that returns a light"
             " level"
         )
-    joined = [torch.cat(columns) for columns in zip(*parts, strict=True)]
+    columns_of_all = [torch.cat(columns) for columns in zip(*parts, strict=True)]
     starts = accumulate((len(level.mean) for level in parts), initial=0)
-    shifted = [level.cell_level + start for level, start in zip(parts, starts, strict=False)]
-    return Levels(*joined)._replace(cell_level=torch.cat(shifted))
+    cell_levels = [level.cell_level + start for level, start in zip(parts, starts, strict=False)]
+    return Levels(*columns_of_all)._replace(cell_level=torch.cat(cell_levels))
 
 
 @levels.check
@@ -158,11 +159,11 @@ def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
     """
     counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
     for piece in _pieces(frames.reshape(1, -1)):
-        of_piece = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
-        of_piece[: len(counts)] += counts
-        counts = of_piece
-    value = counts.nonzero().squeeze(1)
-    return value.cpu(), counts[value].cpu()
+        piece_counts = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
+        piece_counts[: len(counts)] += counts
+        counts = piece_counts
+    numbers = counts.nonzero().squeeze(1)
+    return numbers.cpu(), counts[numbers].cpu()
 
 
 def _pieces(rows: Tensor) -> Iterator[Tensor]:
@@ -176,47 +177,58 @@ def _whole(piece: Tensor) -> Tensor:
     """
     numbers = piece.to(torch.int64)
     low, high = (int(end) for end in torch.aminmax(numbers))
+    # only frames of floating-point numbers may hold fractions
     if (
         low < 0
         or high >= _TOP
         or (piece.is_floating_point() and not bool((numbers == piece).all()))
     ):
-        bad = (numbers < 0) | (numbers >= _TOP) | (numbers != piece)
+        not_digital = (numbers < 0) | (numbers >= _TOP) | (numbers != piece)
         raise ValueError(
-            f"frames hold {float(piece[bad][0]):g}, not a digital number: give whole numbers from 0"
-            f" to {_TOP - 1}, as the camera gives them, neither corrected nor scaled"
+            f"frames hold {float(piece[not_digital][0]):g}, not a digital number: give whole"
+            f" numbers from 0 to {_TOP - 1}, as the camera gives them, neither corrected nor scaled"
         )
     return numbers
 
 
 def _within(frames: Tensor, steady: bool) -> float:
-    """Return the sum of squared deviations from each pixel's mean; ``steady`` also subtracts
-    each frame's mean.
+    """Return the sum of squared deviations of all frames from each pixel's mean over the frames;
+    ``steady`` also subtracts what each frame's mean contributes.
+
+    The frames are taken in pieces of pixels, which need little memory.
     """
-    parts, sums = [], torch.zeros(len(frames), dtype=torch.float64)
+    piece_sums, frame_sums = [], torch.zeros(len(frames), dtype=torch.float64)
     for piece in _pieces(frames.reshape(len(frames), -1)):
         numbers = piece.double()
-        apart = numbers - numbers.mean(0)
-        parts.append(float(apart.square().sum()))
-        sums += apart.sum(1).cpu()
-    common = float(sums.square().sum()) / frames[0].numel() if steady else 0.0
-    return max(0.0, math.fsum(parts) - common)
+        deviations = numbers - numbers.mean(0)
+        piece_sums.append(float(deviations.square().sum()))
+        frame_sums += deviations.sum(1).cpu()
+    sum_by_frame_means = float(frame_sums.square().sum()) / frames[0].numel() if steady else 0.0
+    return max(0.0, math.fsum(piece_sums) - sum_by_frame_means)
 
 
 def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) -> bool:
-    """Return True if the histogram holds information that mean and variance lack."""
+    """Return True if the histogram of a level holds information that mean and variance lack:
+    coarse numbers, or a pile at an end.
+
+    ``sigma`` is the standard deviation in DN; ``alike`` says that pixels are equal, so that they
+    follow one Gaussian distribution.
+    """
     if sigma < _COARSE:
         return True
-    ends = (
+    # each end holds two numbers, which begin half a number below the lower of them
+    both_ends = (
         _End(value - value[0], count, float(value[0]) - 0.5),
         _End(value[-1] - value, count, float(value[-1]) - 1.5),
     )
     total = float(count.sum())
     if alike:
-        return any(_exceeds_gaussian(end.held, total, end.low - mean, sigma, True) for end in ends)
+        return any(
+            _exceeds_gaussian(end.held, total, end.low - mean, sigma, True) for end in both_ends
+        )
     return any(
         _exceeds_gaussian(end.held, total, end.low - mean, sigma, False) and end.rises
-        for end in ends
+        for end in both_ends
     )
 
 
@@ -241,15 +253,20 @@ class _End:
         outermost, next_one, *two_beside = (
             float(self.count[self.away == i].sum()) for i in range(4)
         )
+        # the outermost number against the next one, the two outermost against the two beside them
         pairs = ((outermost, next_one), (outermost + next_one, sum(two_beside)))
         return any(at_end - beside > _SURE * math.sqrt(at_end + beside) for at_end, beside in pairs)
 
 
 def _exceeds_gaussian(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
-    """Return True if the count ``held`` of two neighbouring numbers exceeds the count that a
-    Gaussian gives.
+    """Return True if the count ``held`` of two neighbouring numbers, which begin at ``low`` DN
+    from the mean, clearly exceeds that of a Gaussian.
+
+    Without pixels that are ``alike`` the excess must be several times the expected count, since
+    tails are long then.
     """
     expected = (
+        # total x probability of an interval of 2 DN
         total
         * 0.5
         * abs(math.erf((low + 2.0) / sigma / math.sqrt(2)) - math.erf(low / sigma / math.sqrt(2)))
@@ -288,21 +305,22 @@ def saturation_signal(levels: Levels) -> SaturationSignal | None:
             signal.
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.6; JCGM 100:2008 (GUM), section 4.3.7.
     """
-    dark = levels.photons == 0
-    if not bool(dark.any()) or not bool((~dark).any()):
+    is_dark = levels.photons == 0
+    if not bool(is_dark.any()) or not bool((~is_dark).any()):
         return None
-    nearest = (levels.exposure[~dark, None] - levels.exposure[dark]).abs().argmin(1)
-    order = levels.photons[~dark].argsort()
-    signal = (levels.mean[~dark] - levels.mean[dark][nearest])[order]
-    variance = levels.variance[~dark][order]
-    peak = int(variance.argmax())
-    full = [
+    nearest = (levels.exposure[~is_dark, None] - levels.exposure[is_dark]).abs().argmin(1)
+    order = levels.photons[~is_dark].argsort()
+    signal = (levels.mean[~is_dark] - levels.mean[is_dark][nearest])[order]
+    variance = levels.variance[~is_dark][order]
+    index_of_peak = int(variance.argmax())
+    full_levels = [
         i
-        for i in range(peak + 1, len(signal))
-        if float(variance[i]) < _FLAT * float(variance[peak])
+        for i in range(index_of_peak + 1, len(signal))
+        if float(variance[i]) < _FLAT * float(variance[index_of_peak])
     ]
-    if not full:
+    if not full_levels:
         return None
-    before = full[-2] if len(full) > 1 else peak
-    missing = abs(float(signal[full[-1]] - signal[before]))
-    return SaturationSignal(float(signal[full[-1]]), missing / math.sqrt(3))
+    level_before = full_levels[-2] if len(full_levels) > 1 else index_of_peak
+    missing_signal = abs(float(signal[full_levels[-1]] - signal[level_before]))
+    # root mean square of a rectangular distribution from 0 to the missing signal a: a / sqrt(3)
+    return SaturationSignal(float(signal[full_levels[-1]]), missing_signal / math.sqrt(3))

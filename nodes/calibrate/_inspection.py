@@ -31,7 +31,8 @@ def inspect_frames(
     levels = fitted_levels([prepared(stack) for stack in stacks], share)
     if not levels:
         return []
-    for alone in (*mosaic(levels), codes([level for level in levels if level.fitted])):
-        if alone.verdict == "refused" and alone.explains_all:
-            return [alone]
+    # a mosaic or shifted numbers explain what all other tests would find
+    for frame_test in (*mosaic(levels), codes([level for level in levels if level.fitted])):
+        if frame_test.verdict == "refused" and frame_test.explains_all:
+            return [frame_test]
     return [*noise_tests(levels), *pattern_tests(levels), *number_tests(levels, exact)]

@@ -31,6 +31,7 @@ Text = Annotated[str, BeforeValidator(lambda value: str(value).strip()), Field(m
 def _temperature(value: Any) -> float:
     """Return a temperature such as ``25 °C`` or ``298 K`` in kelvin."""
     match = _CELSIUS.fullmatch(str(value).strip())
+    # a number without a unit
     if match and not match[2]:
         raise ValueError(f"needs a unit: write {value} °C or {value} K")
     kelvin = float(match[1]) + _ZERO if match else read_quantity(value, "K")
@@ -179,6 +180,10 @@ def _of_light(
     law: str = "normal",
     freedom: float = math.inf,
 ) -> Contribution:
+    """Return the contribution of a source of light whose relative standard uncertainty is
+    ``stated`` (None if it is not), with the ``sensitivity`` dy/ds of the quantity to a relative
+    change s of the light.
+    """
     if not sensitivity:
         return Contribution(source, "B", reason=NOT_INVOLVED)
     if stated is None:
@@ -187,6 +192,9 @@ def _of_light(
 
 
 def _of_temperature(name: str, value: float, laboratory: Laboratory) -> Contribution:
+    """Return the contribution of the uncertain temperature to the quantity ``name``, by its
+    coefficient in 1/K.
+    """
     coefficient = laboratory.coefficients.get(name)
     if laboratory.temperature is None:
         return Contribution(TEMPERATURE, "B", reason=NOT_STATED)

@@ -55,11 +55,11 @@ def frames(*, files: DataFiles, divisor: Divisor = 1) -> Tensor:
     numbers = stack(files)
     if divisor == 1:
         return torch.from_numpy(numbers)
-    left = numbers % divisor
-    if left.any():
+    remainders = numbers % divisor
+    if remainders.any():
         raise ValueError(
-            f"{files[0]} and the files of its level hold {numbers[left > 0][0]}, no multiple of"
-            f" {divisor}: leave the divisor out"
+            f"{files[0]} and the files of its level hold {numbers[remainders > 0][0]}, no multiple"
+            f" of {divisor}: leave the divisor out"
         )
     return torch.from_numpy(numbers // divisor)
 
@@ -146,18 +146,20 @@ def expose(
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear (mathematical
             model).
     """
-    flat = torch.full((frames, *shape), photons, device=rng.device)
-    e = photon_noise(
-        flat,
+    flat_field = torch.full((frames, *shape), photons, device=rng.device)
+    electrons = photon_noise(
+        flat_field,
         quantum_efficiency=quantum_efficiency,
         distribution=distribution,
         mean_shift=mean_shift,
         spread=spread,
         rng=rng,
     )
-    e = dark_of(e, mean=dark_current * exposure / dark_exposure, rng=rng)
-    e = well_of(read_of(e, offset=offset, read_noise=read_noise, rng=rng), capacity=full_well)
-    numbers: Tensor = digitize(e, gain=gain, rounding=rounding, bits=bits, rng=rng)
+    electrons = dark_of(electrons, mean=dark_current * exposure / dark_exposure, rng=rng)
+    electrons = well_of(
+        read_of(electrons, offset=offset, read_noise=read_noise, rng=rng), capacity=full_well
+    )
+    numbers: Tensor = digitize(electrons, gain=gain, rounding=rounding, bits=bits, rng=rng)
     return numbers
 
 
@@ -220,13 +222,14 @@ def hot_pixels(*, files: DataFiles, divisor: Divisor = 1) -> Tensor:
             Assoc. 69, 383.
     """
     numbers = torch.from_numpy(stack(files)).double().div(divisor)
-    mean = numbers.mean(0)
-    middle = mean.median()
+    pixel_means = numbers.mean(0)
+    median_of_means = pixel_means.median()
     # the mean of a few whole numbers is a multiple of a step, which hides a smaller deviation
     step = 1 / (12**0.5 * len(numbers))
-    width = _NORMAL * float((mean - middle).abs().median()) + step
-    hot: Tensor = numbers.amin(0) - middle > _FAR * width
-    return hot if float(hot.double().mean()) <= _MOST else torch.zeros_like(hot)
+    width = _NORMAL * float((pixel_means - median_of_means).abs().median()) + step
+    # in each frame: its smallest number is far above the median
+    is_hot: Tensor = numbers.amin(0) - median_of_means > _FAR * width
+    return is_hot if float(is_hot.double().mean()) <= _MOST else torch.zeros_like(is_hot)
 
 
 @hot_pixels.preflight

@@ -63,19 +63,23 @@ def table(
     columns = {
         name: torch.tensor([row[name] for row in rows], dtype=torch.float64) for name in rows[0]
     }
-    measured = columns["variance"] + (columns["drift"].square() / 2 if drift is not None else 0.0)
-    times, number = columns["exposure"] * _SECONDS[exposure_unit], columns["pixels"]
-    none = torch.zeros(0, dtype=torch.float64)
+    # half the squared difference of the means belongs to the variance of a pair
+    total_variance = columns["variance"] + (
+        columns["drift"].square() / 2 if drift is not None else 0.0
+    )
+    exposures, pixel_count = columns["exposure"] * _SECONDS[exposure_unit], columns["pixels"]
+    no_cells = torch.zeros(0, dtype=torch.float64)
     return Levels(
         columns["photons"],
-        times,
-        2 * number,
+        exposures,
+        # pixels of both frames; a pair has one degree of freedom a pixel
+        2 * pixel_count,
         columns["mean"],
-        measured,
-        number,
-        none.long(),
-        none,
-        none,
+        total_variance,
+        pixel_count,
+        no_cells.long(),
+        no_cells,
+        no_cells,
     )
 
 
@@ -116,23 +120,33 @@ def _(result: Levels, **params: Any) -> list[Check]:
 
 
 def _rows(file: Path, columns: dict[str, str]) -> list[dict[str, float]]:
+    """Read the lines of a table as numbers by name; ``columns`` has the heading of each name.
+    Raises ValueError, with line and column, for a cell that is no valid number.
+    """
     rows = csv_rows(file)
     _, header = next(rows, (0, list[str]()))
-    named = ((line, dict(zip(header, row, strict=False))) for line, row in rows)
+    cells_of_line = ((line, dict(zip(header, row, strict=False))) for line, row in rows)
     return [
         {n: _number(row.get(c), n, f"{file.name}:{line}: column {c}") for n, c in columns.items()}
-        for line, row in named
+        for line, row in cells_of_line
     ]
 
 
 def _number(text: str | None, name: str, where: str) -> float:
-    needed = _NUMBERS.get(name, "finite")
+    """Return the number in the cell of a column ``name``; raise ValueError, with the place
+    ``where``, for a text that is no valid number of it.
+    """
+    condition = _NUMBERS.get(name, "finite")
     try:
         number = float(text or "")
     except ValueError:
         number = math.nan
-    valid = {">= 0": number >= 0, "> 0": number > 0, ">= 1": number >= 1 and number.is_integer()}
-    if not math.isfinite(number) or not valid.get(needed, True):
+    fulfilled = {
+        ">= 0": number >= 0,
+        "> 0": number > 0,
+        ">= 1": number >= 1 and number.is_integer(),
+    }
+    if not math.isfinite(number) or not fulfilled.get(condition, True):
         kind = "whole number" if name == "pixels" else "number"
-        raise ValueError(f"{where}: {text!r} is not valid for {name}: write a {kind}, {needed}")
+        raise ValueError(f"{where}: {text!r} is not valid for {name}: write a {kind}, {condition}")
     return number

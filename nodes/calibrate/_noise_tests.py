@@ -50,12 +50,17 @@ def blocks(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
             chance once in 1000.
     Source: ITU-T Recommendation T.81 (JPEG), sections A.3.3 and A.3.4.
     """
-    large = [x for x in white if min(x.shape[1:]) > 2 * _BLOCK]
-    lags = (((0, 1), 2), ((1, 0), 1))
-    across = [[abs(_across(products(x, lag), axis)) for x in large] for lag, axis in lags]
-    bright = sorted(levels, key=lambda level: level.variance)[-_LEVELS:]
-    steps = list(chain.from_iterable(_kept_to(step, bright) for step in _STEPS))
-    evidence = strongest([[x] for x in [*across[0], *across[1], *steps]])
+    large_levels = [x for x in white if min(x.shape[1:]) > 2 * _BLOCK]
+    lags_and_axes = (((0, 1), 2), ((1, 0), 1))
+    # neighbours across a column border differ along x, those across a row border along y
+    border_differences = [
+        [abs(_across(products(x, lag), axis)) for x in large_levels] for lag, axis in lags_and_axes
+    ]
+    noisiest = sorted(levels, key=lambda level: level.variance)[-_LEVELS:]
+    step_numbers = list(chain.from_iterable(_kept_to(step, noisiest) for step in _STEPS))
+    evidence = strongest(
+        [[x] for x in [*border_differences[0], *border_differences[1], *step_numbers]]
+    )
     sentence = (
         "neighbours correlate otherwise across the borders of blocks of 8 pixels, or the cosines of"
         " blocks keep to"
@@ -75,55 +80,66 @@ def products(x: Tensor, lag: tuple[int, int]) -> Tensor:
     """
     down, right = lag
     height, width = x.shape[1:]
-    first = x[:, : height - down, max(0, -right) : width - max(0, right)]
-    other = x[:, down:, max(0, right) : width - max(0, -right)]
-    length = math.inf  # of the line that holds both pixels, if one does
+    pixels = x[:, : height - down, max(0, -right) : width - max(0, right)]
+    neighbours = x[:, down:, max(0, right) : width - max(0, -right)]
+    line_length = math.inf  # of the line that holds both pixels, if one does
     if down == 0:
-        length = width
+        line_length = width
     elif right == 0:
-        length = height
-    return first * other + x.square().mean() / length
+        line_length = height
+    return pixels * neighbours + x.square().mean() / line_length
 
 
 def _across(products: Tensor, axis: int) -> float:
     """Return the difference between products across block borders and products inside blocks, in
     standard errors.
     """
-    border = torch.arange(products.shape[axis]) % _BLOCK == _BLOCK - 1
-    across, inside = (
-        products[(slice(None),) * axis + (places,)].reshape(-1) for places in (border, ~border)
+    # the product of the last pixel of a block is that with the first of the next one
+    is_last_of_block = torch.arange(products.shape[axis]) % _BLOCK == _BLOCK - 1
+    across_border, inside_blocks = (
+        products[(slice(None),) * axis + (places,)].reshape(-1)
+        for places in (is_last_of_block, ~is_last_of_block)
     )
-    error = (across.var() / len(across) + inside.var() / len(inside)).sqrt()
-    return float((inside.mean() - across.mean()) / error.clamp_min(1e-12))
+    standard_error = (
+        across_border.var() / len(across_border) + inside_blocks.var() / len(inside_blocks)
+    ).sqrt()
+    return float((inside_blocks.mean() - across_border.mean()) / standard_error.clamp_min(1e-12))
 
 
 def _kept_to(step: int, levels: Sequence[Level]) -> list[float]:
-    """Return how strongly each cosine keeps to multiples of a step, as standard normal numbers,
-    and all together.
+    """Return how strongly each cosine of the blocks keeps to multiples of a ``step`` in DN, as
+    standard normal numbers, and last all cosines together.
+
+    Levels whose noise does not cover the step evenly are left out; without a level the list is
+    empty.
     """
-    sums, count = torch.zeros(_BLOCK * _BLOCK, dtype=torch.float64), 0
+    sums_of_cosines, block_count = torch.zeros(_BLOCK * _BLOCK, dtype=torch.float64), 0
     for level in levels:
         if level.variance < (_SMOOTH * step) ** 2:
             continue
         cosines = _cosines(level.first[0])
-        sums += (2 * math.pi / step * cosines).cos().sum(0)
-        count += len(cosines)
-    if not count:
+        sums_of_cosines += (2 * math.pi / step * cosines).cos().sum(0)
+        block_count += len(cosines)
+    if not block_count:
         return []
-    z = (sums[1:] / math.sqrt(count / 2)).tolist()
-    return [*z, sum(z) / math.sqrt(len(z))]
+    # the first cosine is the mean of a block; the variance of cos of an even phase is 1/2
+    standard_numbers = (sums_of_cosines[1:] / math.sqrt(block_count / 2)).tolist()
+    return [*standard_numbers, sum(standard_numbers) / math.sqrt(len(standard_numbers))]
 
 
 def _cosines(frame: Tensor) -> Tensor:
     """Return the orthonormal cosine transform (block, 64) of the blocks of a frame (y, x)."""
-    n, m = (min(size, _SIDE) // _BLOCK for size in frame.shape)
-    k, x = (torch.arange(_BLOCK, dtype=torch.float64) for _ in range(2))
-    basis = (math.pi / _BLOCK * k[:, None] * (x + 0.5)).cos() * math.sqrt(2 / _BLOCK)
+    block_rows, block_columns = (min(size, _SIDE) // _BLOCK for size in frame.shape)
+    frequency, pixel = (torch.arange(_BLOCK, dtype=torch.float64) for _ in range(2))
+    # cosine transform of type II, with rows of length 1
+    basis = (math.pi / _BLOCK * frequency[:, None] * (pixel + 0.5)).cos() * math.sqrt(2 / _BLOCK)
     basis[0] /= math.sqrt(2)
     blocks = (
-        frame.double()[: n * _BLOCK, : m * _BLOCK].reshape(n, _BLOCK, m, _BLOCK).transpose(1, 2)
+        frame.double()[: block_rows * _BLOCK, : block_columns * _BLOCK]
+        .reshape(block_rows, _BLOCK, block_columns, _BLOCK)
+        .transpose(1, 2)
     )
-    coefficients: Tensor = (basis @ blocks @ basis.T).reshape(n * m, -1)
+    coefficients: Tensor = (basis @ blocks @ basis.T).reshape(block_rows * block_columns, -1)
     return coefficients
 
 
@@ -165,12 +181,14 @@ def noise_tests(levels: Sequence[Level]) -> list[FrameTest]:
     paired = tested(levels)
     if not paired:
         return []
-    white = [without_lines(level.apart) for level in paired]
-    lines = [_lines(name, axis, paired, white) for name, axis in (("row", 2), ("column", 1))]
+    without_line_means = [without_lines(level.apart) for level in paired]
+    line_tests = [
+        _lines(name, axis, paired, without_line_means) for name, axis in (("row", 2), ("column", 1))
+    ]
     return [
-        _whiteness(paired, white),
-        blocks(paired, white),
-        *lines,
+        _whiteness(paired, without_line_means),
+        blocks(paired, without_line_means),
+        *line_tests,
         *_telegraph(paired),
         _drift(paired),
     ]
@@ -184,26 +202,36 @@ def _correlation(levels: Sequence[Tensor], lag: tuple[int, int]) -> float:
 
 
 def _whiteness(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
-    near, corners, far = (
+    """Test if the noise of neighbouring pixels is independent.
+
+    ``white`` has the differences of each level without the means of their lines. Correlation of an
+    electronic readout, which is in the dark alone, counts as dark noise; any other may have lowered
+    the variance.
+    """
+    # two lags of equal length together: their sum over sqrt(2) is standard normal
+    nearest, diagonal, second_nearest = (
         [sum(studentised(products(x, lag)) for lag in lags) / math.sqrt(2) for x in white]
         for lags in (_NEAR, _CORNERS, _FAR)
     )
-    evidence = strongest([near, corners, far], sides=2)
+    evidence = strongest([nearest, diagonal, second_nearest], sides=2)
     pairs = list(zip(white, levels, strict=True))
-    darks = [x for x, level in pairs if level.dark]
-    lit = [x for x, level in pairs if not level.dark]
-    of_readout = _from_readout(darks, lit)
+    dark_differences = [x for x, level in pairs if level.dark]
+    lit_differences = [x for x, level in pairs if not level.dark]
+    is_readout = _from_readout(dark_differences, lit_differences)
     text = f"{_NOISE} {_correlates(white)}"
     sentence = f"{text}, as in frames that are mixed, denoised, interpolated or compressed"
     modelled = ""
-    if of_readout:
-        sentence = f"in the dark {_NOISE} {_correlates(darks)}, as noise of the readout does"
-        modelled = f"it counts as dark noise; in light it {_correlates(lit)}"
-    hidden = [*_of_mixing(darks, lit, of_readout, evidence.found)]
+    if is_readout:
+        sentence = (
+            f"in the dark {_NOISE} {_correlates(dark_differences)}, as noise of the readout does"
+        )
+        modelled = f"it counts as dark noise; in light it {_correlates(lit_differences)}"
+    hidden = [*_of_mixing(dark_differences, lit_differences, is_readout, evidence.found)]
     return bounded("white noise", evidence, hidden, sentence, text, modelled)
 
 
 def _correlates(levels: Sequence[Tensor]) -> str:
+    """Return the clause of a sentence on the correlation of neighbours along rows and columns."""
     rows, columns = (_correlation(levels, lag) for lag in _NEAR)
     return f"correlates by {rows:.2g} along rows and {columns:.2g} along columns"
 
@@ -217,9 +245,14 @@ def _from_readout(darks: Sequence[Tensor], lit: Sequence[Tensor]) -> bool:
     """
     if not darks or not lit:
         return False
-    (dark, error), (light, other) = (_missing(levels, _NEAR) for levels in (darks, lit))
-    limit = normal_limit(ALARM)
-    return dark < -limit * error and dark - light < -limit * math.hypot(error, other)
+    (dark_log, dark_error), (lit_log, lit_error) = (
+        _missing(levels, _NEAR) for levels in (darks, lit)
+    )
+    largest_by_chance = normal_limit(ALARM)
+    return (
+        dark_log < -largest_by_chance * dark_error
+        and dark_log - lit_log < -largest_by_chance * math.hypot(dark_error, lit_error)
+    )
 
 
 def _of_mixing(
@@ -238,21 +271,23 @@ def _of_mixing(
 
 
 def _missing(levels: Sequence[Tensor], lags: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Return the logarithm of one plus twice the sum of the correlations at lags, and its standard
-    error.
+    """Return the logarithm of one plus twice the sum of the correlations at ``lags``, as a mean
+    over levels, and its standard error.
 
     A linear filter that keeps the mean lowers the variance of white noise by the factor of all
     lags.
     """
-    total, square = 0.0, 0.0
+    sum_of_correlations, sum_of_variances = 0.0, 0.0
     for x in levels:
-        power = float(x.square().sum()) + 1e-12
+        sum_of_squares = float(x.square().sum()) + 1e-12
         for lag in lags:
             product = products(x, lag)
-            total += float(product.sum()) / power
-            square += float(product.square().sum()) / power**2
-    remaining = max(1 + 2 * total / len(levels), 1e-3)
-    return math.log(remaining), max(2 * math.sqrt(square) / len(levels) / remaining, 1e-9)
+            sum_of_correlations += float(product.sum()) / sum_of_squares
+            sum_of_variances += float(product.square().sum()) / sum_of_squares**2
+    variance_factor = max(1 + 2 * sum_of_correlations / len(levels), 1e-3)
+    return math.log(variance_factor), max(
+        2 * math.sqrt(sum_of_variances) / len(levels) / variance_factor, 1e-9
+    )
 
 
 def _lines(name: str, axis: int, levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
@@ -260,45 +295,67 @@ def _lines(name: str, axis: int, levels: Sequence[Level], white: Sequence[Tensor
     them.
     """
     lag = _NEAR[0] if axis == 2 else _NEAR[1]
-    z, shares = [], []
+    standard_numbers, line_shares = [], []
+    # x: differences of a level without the means of their lines
     for level, x in zip(levels, white, strict=True):
-        means = level.apart.mean(axis)
-        freedom = means.numel() - len(means)
-        pixel = (
+        line_means = level.apart.mean(axis)
+        degrees_of_freedom = line_means.numel() - len(line_means)
+        # the means of all lines were fitted: as many degrees of freedom less
+        pixel_variance = (
             float(x.square().mean())
             * x.numel()
-            / max(1, x.numel() - len(x) * (x.shape[1] + x.shape[2] - 1))
+            / max(
+                1,
+                x.numel() - len(x) * (x.shape[1] + x.shape[2] - 1),
+            )
         )
-        together = (
+        # neighbours that correlate make the mean of a line scatter more
+        correlation_factor = (
             1
             + 2 * max(0.0, _correlation([x], lag))
             + 2 * max(0.0, _correlation([x], (2 * lag[0], 2 * lag[1])))
         )
-        ratio = (
-            float((means - means.mean(1, keepdim=True)).square().sum())
+        chi_square = (
+            float((line_means - line_means.mean(1, keepdim=True)).square().sum())
             * level.apart.shape[axis]
-            / (pixel + 1e-12)
+            / (pixel_variance + 1e-12)
         )
-        z.append(_hilferty(ratio / together, freedom))
-        shares.append((ratio / together / freedom - 1) / level.apart.shape[axis])
-    darks = [x for x, level in zip(z, levels, strict=True) if level.dark]
-    evidence = strongest([z], others=[sum(darks) / math.sqrt(len(darks))] if darks else [])
-    dark = [s for s, level in zip(shares, levels, strict=True) if level.dark] or shares
-    noise, gain = (abs(sum(s) / len(s)) / 2 for s in (dark, shares))
+        standard_numbers.append(_hilferty(chi_square / correlation_factor, degrees_of_freedom))
+        # excess of the variance of line means over that of independent pixels
+        line_shares.append(
+            (chi_square / correlation_factor / degrees_of_freedom - 1) / level.apart.shape[axis]
+        )
+    dark_numbers = [x for x, level in zip(standard_numbers, levels, strict=True) if level.dark]
+    evidence = strongest(
+        [standard_numbers],
+        others=[sum(dark_numbers) / math.sqrt(len(dark_numbers))] if dark_numbers else [],
+    )
+    dark_shares = [
+        s for s, level in zip(line_shares, levels, strict=True) if level.dark
+    ] or line_shares
+    noise_share, gain_share = (abs(sum(s) / len(s)) / 2 for s in (dark_shares, line_shares))
     sentence = (
-        f"whole {name}s vary together from frame to frame by {math.sqrt(2 * noise):.2g} of the"
-        " noise of a pixel"
+        f"whole {name}s vary together from frame to frame by {math.sqrt(2 * noise_share):.2g} of"
+        " the noise of a pixel"
     )
     passed = f"whole {name}s do not vary together from frame to frame"
     return outcome(
-        f"no {name} noise", evidence, sentence, {"noise": noise, "gain": 2 * gain}, passed
+        f"no {name} noise",
+        evidence,
+        sentence,
+        {"noise": noise_share, "gain": 2 * gain_share},
+        passed,
     )
 
 
 def _hilferty(chi: float, freedom: float) -> float:
-    """Return a chi-square number as a standard normal number."""
-    third = 2 / (9 * freedom)
-    return float((max(chi, 0.0) / freedom) ** (1 / 3) - (1 - third)) / math.sqrt(third)
+    """Return a chi-square number as a standard normal number (Wilson and Hilferty: its cube root
+    is nearly normal).
+    """
+    cube_root_variance = 2 / (9 * freedom)
+    return float((max(chi, 0.0) / freedom) ** (1 / 3) - (1 - cube_root_variance)) / math.sqrt(
+        cube_root_variance
+    )
 
 
 def _telegraph(levels: Sequence[Level]) -> list[FrameTest]:
@@ -312,35 +369,36 @@ def _telegraph(levels: Sequence[Level]) -> list[FrameTest]:
     darks = [level for level in levels if level.dark and level.variance >= _QUIET]
     if not darks:
         return []
-    fourths = [_fourth(level) for level in darks]
-    evidence = strongest([list(map(_glynn, fourths, [level.apart.numel() for level in darks]))])
-    error = abs(sum(map(_width_over_core, darks)) / len(darks))
-    excess = max(1.0, sum(fourths) / len(fourths) / 3)
+    kurtoses = [_fourth(level) for level in darks]
+    evidence = strongest([list(map(_glynn, kurtoses, [level.apart.numel() for level in darks]))])
+    width_excess = abs(sum(map(_width_over_core, darks)) / len(darks))
+    # the kurtosis of normal noise is 3
+    excess = max(1.0, sum(kurtoses) / len(kurtoses) / 3)
     if evidence.found and _same_in_each_pair(darks):
         # unequal pixels leave the mean of their variances less certain than equal ones
-        unsure = math.sqrt((excess - 1) / 2 / sum(level.apart.numel() for level in darks))
+        variance_error = math.sqrt((excess - 1) / 2 / sum(level.apart.numel() for level in darks))
         text = (
             f"the dark noise differs from pixel to pixel by about {math.sqrt(excess**0.25 - 1):.0%}"
         )
-        text += f", and is {error:.1%} wider than its middle"
-        return [outcome(_JUMPS, evidence, text, {"noise": unsure}, "", _ROOT_MEAN_SQUARE)]
+        text += f", and is {width_excess:.1%} wider than its middle"
+        return [outcome(_JUMPS, evidence, text, {"noise": variance_error}, "", _ROOT_MEAN_SQUARE)]
     sentence = (
-        f"the dark noise has rare large jumps, and is {error:.1%} wider than its middle, as of"
-        " telegraph pixels"
+        f"the dark noise has rare large jumps, and is {width_excess:.1%} wider than its middle, as"
+        " of telegraph pixels"
     )
     passed = "the dark noise is normal: no telegraph pixels"
-    return [outcome(_JUMPS, evidence, sentence, {"noise": error}, passed)]
+    return [outcome(_JUMPS, evidence, sentence, {"noise": width_excess}, passed)]
 
 
 def _fourth(level: Level) -> float:
     """Return the kurtosis of the differences of a level; rounding takes 1/60 from the cumulant."""
-    square = float(level.apart.square().mean())
-    return float(level.apart.pow(4).mean()) / square**2 + 1 / 60 / square**2
+    mean_square = float(level.apart.square().mean())
+    return float(level.apart.pow(4).mean()) / mean_square**2 + 1 / 60 / mean_square**2
 
 
 def _width_over_core(level: Level) -> float:
-    """Return the relative excess of the standard deviation of differences over that of their
-    middle.
+    """Return the relative excess of the standard deviation of a level's differences over that of a
+    normal distribution with the same middle.
     """
     return (
         math.sqrt(float(level.apart.square().mean()))
@@ -350,23 +408,29 @@ def _width_over_core(level: Level) -> float:
 
 
 def _same_in_each_pair(levels: Sequence[Level]) -> bool:
-    """Return True if each pixel has normal noise, of a width that may differ from pixel to
-    pixel, beyond chance.
+    """Return True if each pixel has normal noise in time, of a width that may differ from pixel to
+    pixel, as far as chance lets it be told.
+
+    Then the mean fourth power over 3 of a pixel is the mean product of the squares of two different
+    pairs.
     """
     shapes = [level.apart.shape[1:] for level in levels]
-    common = max(shapes, key=shapes.count)
-    scaled = [
+    common_shape = max(shapes, key=shapes.count)
+    scaled_squares = [
         level.apart.square() / float(level.apart.square().mean())
         for level, shape in zip(levels, shapes, strict=True)
-        if shape == common
+        if shape == common_shape
     ]
-    squares = torch.cat(scaled)
-    count = len(squares)
-    if count < 2:
+    squares = torch.cat(scaled_squares)
+    pair_count = len(squares)
+    if pair_count < 2:
         return False
-    sums, fourths = squares.sum(0), squares.square().sum(0)
-    across = (sums.square() - fourths) / (count * (count - 1))
-    return abs(studentised(fourths / (3 * count) - across)) < normal_limit(ALARM / 2)
+    sum_of_squares, fourth_powers = squares.sum(0), squares.square().sum(0)
+    # (sum of squares)^2 less the squares of each pair, over the number of ordered pairs
+    products_of_pairs = (sum_of_squares.square() - fourth_powers) / (pair_count * (pair_count - 1))
+    return abs(studentised(fourth_powers / (3 * pair_count) - products_of_pairs)) < normal_limit(
+        ALARM / 2
+    )
 
 
 def _glynn(kurtosis: float, n: int) -> float:
@@ -374,54 +438,59 @@ def _glynn(kurtosis: float, n: int) -> float:
     and Glynn 1983).
     """
     variance = 24 * n * (n - 2) * (n - 3) / ((n + 1) ** 2 * (n + 3) * (n + 5))
-    away = (kurtosis - 3 * (n - 1) / (n + 1)) / math.sqrt(variance)
-    skew = (
+    standardised = (kurtosis - 3 * (n - 1) / (n + 1)) / math.sqrt(variance)
+    # of the kurtosis, for which a chi-square law of as many degrees of freedom is taken
+    skewness = (
         6
         * (n * n - 5 * n + 2)
         / ((n + 7) * (n + 9))
         * math.sqrt(6 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3)))
     )
-    freedom = 6 + 8 / skew * (2 / skew + math.sqrt(1 + 4 / skew**2))
-    ratio = (1 - 2 / freedom) / (1 + away * math.sqrt(2 / (freedom - 4)))
-    root = math.copysign(abs(ratio) ** (1 / 3), ratio)
-    return (1 - 2 / (9 * freedom) - root) / math.sqrt(2 / (9 * freedom))
+    degrees_of_freedom = 6 + 8 / skewness * (2 / skewness + math.sqrt(1 + 4 / skewness**2))
+    ratio = (1 - 2 / degrees_of_freedom) / (
+        1 + standardised * math.sqrt(2 / (degrees_of_freedom - 4))
+    )
+    # Wilson and Hilferty: the cube root of such a number is nearly normal
+    cube_root = math.copysign(abs(ratio) ** (1 / 3), ratio)
+    return (1 - 2 / (9 * degrees_of_freedom) - cube_root) / math.sqrt(2 / (9 * degrees_of_freedom))
 
 
 def _core(x: Tensor) -> float:
-    """Return the standard deviation of the normal distribution with the same share of small
-    whole numbers.
+    """Return the standard deviation of the normal distribution that has the same share of small
+    whole numbers as the differences ``x``.
     """
-    end = round(_CORE * float(x.std()))
-    share = float((x.abs() <= end + 0.5).double().mean())
-    width = (end + 0.5) / -float(
-        torch.special.ndtri(torch.tensor((1 - share) / 2, dtype=torch.float64))
+    largest_in_core = round(_CORE * float(x.std()))
+    core_share = float((x.abs() <= largest_in_core + 0.5).double().mean())
+    width = (largest_in_core + 0.5) / -float(
+        torch.special.ndtri(torch.tensor((1 - core_share) / 2, dtype=torch.float64))
     )
+    # whole numbers have 1/12 more variance than the normal distribution that they round
     return math.sqrt(width**2 + 1 / 12)
 
 
 def _drift(levels: Sequence[Level]) -> FrameTest:
     """Test if the mean moves between the frames of a pair."""
-    drifts = list(chain.from_iterable(_drift_over_chance(level) for level in levels))
-    evidence = strongest([[z] for z in drifts], sides=2)
+    drift_numbers = list(chain.from_iterable(_drift_over_chance(level) for level in levels))
+    evidence = strongest([[z] for z in drift_numbers], sides=2)
     dark, lit = dark_and_lit(levels)
-    uneven = sum(level.flicker / (level.variance + _TINY) for level in lit) / max(1, len(lit))
-    moved = _farthest_drift(levels)
+    uneven_share = sum(level.flicker / (level.variance + _TINY) for level in lit) / max(1, len(lit))
+    farthest = _farthest_drift(levels)
     sentence = (
-        f"the mean moves by up to {moved:.3g} DN between two frames of a level, as under a drifting"
-        " lamp"
+        f"the mean moves by up to {farthest:.3g} DN between two frames of a level, as under a"
+        " drifting lamp"
     )
     passed = "the mean keeps from frame to frame"
     if any(level.scatter != "steady" for level in levels):
-        shifts = {"gain": _largest_drift(lit) + uneven, "noise": _largest_drift(dark) / 2}
+        shifts = {"gain": _largest_drift(lit) + uneven_share, "noise": _largest_drift(dark) / 2}
         return outcome(_DRIFT, evidence, sentence, shifts, passed)
-    if uneven < _STEADY:
+    if uneven_share < _STEADY:
         modelled = "`scatter: steady` removes it from the variance"
-        return outcome(_DRIFT, evidence, sentence, {"gain": uneven}, passed, modelled)
+        return outcome(_DRIFT, evidence, sentence, {"gain": uneven_share}, passed, modelled)
     sentence += (
-        f", whose light is uneven: this adds {uneven:.2%} to the variance, which a mean cannot"
-        " remove"
+        f", whose light is uneven: this adds {uneven_share:.2%} to the variance, which a mean"
+        " cannot remove"
     )
-    return outcome(_DRIFT, evidence, sentence, {"gain": uneven}, passed)
+    return outcome(_DRIFT, evidence, sentence, {"gain": uneven_share}, passed)
 
 
 def _farthest_drift(levels: Sequence[Level]) -> float:
@@ -431,10 +500,11 @@ def _farthest_drift(levels: Sequence[Level]) -> float:
 
 def _drift_over_chance(level: Level) -> list[float]:
     """Return the drift of each pair in standard errors."""
-    z: list[float] = (
+    standard_numbers: list[float] = (
+        # a mean of n pixels has the variance s^2 / n, the difference of two means twice that
         level.drift / math.sqrt(2 * level.variance / level.apart[0].numel() + _TINY)
     ).tolist()
-    return z
+    return standard_numbers
 
 
 def _largest_drift(levels: Sequence[Level]) -> float:

@@ -71,24 +71,32 @@ def spatial_series(photons: float, exposure: float, frames: Iterable[Tensor]) ->
             different sizes.
     Source: EMVA Standard 1288, release 4.0 Linear.
     """
-    total, squares, count = torch.zeros(0), torch.zeros(0), 0
+    sum_of_frames, sum_of_squares, count = torch.zeros(0), torch.zeros(0), 0
     for frame in frames:
         numbers = frame.to(torch.int64)
-        if count and numbers.shape != total.shape:
+        if count and numbers.shape != sum_of_frames.shape:
             raise ValueError(
-                f"frames of {tuple(total.shape)} and of {tuple(numbers.shape)} are no series"
+                f"frames of {tuple(sum_of_frames.shape)} and of {tuple(numbers.shape)} are no"
+                " series"
             )
-        total, squares = (total + numbers, squares + numbers**2) if count else (numbers, numbers**2)
+        sum_of_frames, sum_of_squares = (
+            (sum_of_frames + numbers, sum_of_squares + numbers**2)
+            if count
+            else (numbers, numbers**2)
+        )
         count += 1
     if count < 2:
         raise ValueError(f"{count} frame(s) are no series: give two or more")
-    if min(total.shape) < _LEAST:
+    if min(sum_of_frames.shape) < _LEAST:
         raise ValueError(
-            f"frames of {tuple(total.shape)} are too small for a series: give {_LEAST} x {_LEAST}"
-            " or more"
+            f"frames of {tuple(sum_of_frames.shape)} are too small for a series: give {_LEAST} x"
+            f" {_LEAST} or more"
         )
-    spread = (count * squares - total**2).double() / (count * (count - 1))
-    return SpatialSeries(photons, exposure, count, total.cpu().numpy(), float(spread.mean()))
+    # unbiased variance of each pixel: (n sum of squares - square of the sum) / (n (n - 1))
+    temporal_variance = (count * sum_of_squares - sum_of_frames**2).double() / (count * (count - 1))
+    return SpatialSeries(
+        photons, exposure, count, sum_of_frames.cpu().numpy(), float(temporal_variance.mean())
+    )
 
 
 def spatial_variances(series: SpatialSeries) -> SpatialVariances:
@@ -103,20 +111,24 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
             total).
     """
     rows, columns = series.total.shape
-    left = series.temporal / series.count
-    measured = _measured(series)
-    total, by_row, by_column = (
-        measured.total - left,
-        measured.row - left / columns,
-        measured.column - left / rows,
+    # of an average of n frames; the mean of a line has it over its number of pixels
+    temporal_rest = series.temporal / series.count
+    variances = _measured(series)
+    total_variance, row_variance, column_variance = (
+        variances.total - temporal_rest,
+        variances.row - temporal_rest / columns,
+        variances.column - temporal_rest / rows,
     )
-    pixels = rows * columns
-    freedom = pixels - rows - columns
+    pixel_count = rows * columns
+    # rows, columns and pixels that add up to the total: solution of EMVA 1288 for the three parts
+    denominator = pixel_count - rows - columns
     return SpatialVariances(
-        total,
-        ((pixels - columns) * by_row - rows * (total - by_column)) / freedom,
-        ((pixels - rows) * by_column - columns * (total - by_row)) / freedom,
-        pixels * (total - by_column - by_row) / freedom,
+        total_variance,
+        ((pixel_count - columns) * row_variance - rows * (total_variance - column_variance))
+        / denominator,
+        ((pixel_count - rows) * column_variance - columns * (total_variance - row_variance))
+        / denominator,
+        pixel_count * (total_variance - column_variance - row_variance) / denominator,
     )
 
 
@@ -125,21 +137,27 @@ def chance_of_variances(series: SpatialSeries) -> SpatialVariances:
     nonuniformity.
     """
     rows, columns = series.total.shape
-    measured = _measured(series)
-    noise = series.temporal / series.count * math.sqrt(2 / (rows * columns * (series.count - 1)))
-    pixel = math.hypot(measured.total * math.sqrt(2 / (rows * columns)), noise)
-    row, column = measured.row * math.sqrt(2 / rows), measured.column * math.sqrt(2 / columns)
+    variances = _measured(series)
+    error_by_time = (
+        series.temporal / series.count * math.sqrt(2 / (rows * columns * (series.count - 1)))
+    )
+    # a variance of n values has the relative error sqrt(2 / n)
+    pixel_error = math.hypot(variances.total * math.sqrt(2 / (rows * columns)), error_by_time)
+    row_error, column_error = (
+        variances.row * math.sqrt(2 / rows),
+        variances.column * math.sqrt(2 / columns),
+    )
     return SpatialVariances(
-        math.hypot(pixel, row, column),
-        math.hypot(row, pixel / columns),
-        math.hypot(column, pixel / rows),
-        pixel,
+        math.hypot(pixel_error, row_error, column_error),
+        math.hypot(row_error, pixel_error / columns),
+        math.hypot(column_error, pixel_error / rows),
+        pixel_error,
     )
 
 
 def _measured(series: SpatialSeries) -> SpatialVariances:
-    """Return the variances of the averaged frame, of the means of its rows and of the means of
-    its columns.
+    """Return the variances of the averaged frame, of the means of its rows and of the means of its
+    columns, DN2, with what noise in time leaves in them; that of single pixels is NaN.
     """
     image = series.average
     rows, columns = float(image.mean(1).var()), float(image.mean(0).var())
@@ -158,15 +176,20 @@ def nonuniformity(patterns: Nonuniformity, gain: float | None) -> list[Quantity]
 
 
 def _dark(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
+    """Return DSNU1288 in DN and in electrons, in total and of rows, columns and pixels; limits or
+    reasons where the ``series`` of dark frames does not tell them.
+    """
     quantities: list[Quantity] = []
     for i, pattern in enumerate(PARTS):
-        names = _names("DSNU", pattern, "dark signal nonuniformity")
-        in_numbers = Quantity(f"{names[0]}_DN", f"{names[1]}.DN", names[2], "DN")
-        in_electrons = Quantity(names[0], names[1], names[2], "e-")
+        # key, symbol and name
+        naming = _names("DSNU", pattern, "dark signal nonuniformity")
+        in_numbers = Quantity(f"{naming[0]}_DN", f"{naming[1]}.DN", naming[2], "DN")
+        in_electrons = Quantity(naming[0], naming[1], naming[2], "e-")
         if series is None:
-            why = "no series of dark frames is given, only pairs"
-            quantities += [in_numbers.untold(why), in_electrons.untold(why)]
+            reason = "no series of dark frames is given, only pairs"
+            quantities += [in_numbers.untold(reason), in_electrons.untold(reason)]
             continue
+        # i counts the fields of `SpatialVariances`, in the order of `PARTS`
         numbers = _root(in_numbers, spatial_variances(series)[i], chance_of_variances(series)[i])
         quantities.append(numbers)
         if numbers.value is None or gain is None:
@@ -183,26 +206,33 @@ def _dark(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
 
 
 def _lit(patterns: Nonuniformity) -> list[Quantity]:
+    """Return PRNU1288 in percent, in total and of rows, columns and pixels, from the difference of
+    the spatial variances of the lit and the dark series.
+    """
     blanks = [
         Quantity(*_names("PRNU", pattern, "photo response nonuniformity"), "%") for pattern in PARTS
     ]
     if patterns.dark is None or patterns.lit is None:
-        which = "lit frames" if patterns.lit is None else "dark frames"
-        return [blank.untold(f"no series of {which} is given, only pairs") for blank in blanks]
+        missing_frames = "lit frames" if patterns.lit is None else "dark frames"
+        return [
+            blank.untold(f"no series of {missing_frames} is given, only pairs") for blank in blanks
+        ]
     signal = float(patterns.lit.average.mean() - patterns.dark.average.mean())
     if not signal > 0:
         return [blank.untold("the lit series is no brighter than the dark one") for blank in blanks]
-    scale = (100 / signal) ** 2
+    # from DN2 to the square of percent of the signal
+    percent_squared = (100 / signal) ** 2
     variances = zip(spatial_variances(patterns.lit), spatial_variances(patterns.dark), strict=True)
-    chance = zip(chance_of_variances(patterns.lit), chance_of_variances(patterns.dark), strict=True)
-    both = zip(blanks, variances, chance, strict=True)
+    errors = zip(chance_of_variances(patterns.lit), chance_of_variances(patterns.dark), strict=True)
+    rows_of_parts = zip(blanks, variances, errors, strict=True)
     return [
-        _root(blank, (lit - dark) * scale, math.hypot(*errors) * scale)
-        for blank, (lit, dark), errors in both
+        _root(blank, (lit - dark) * percent_squared, math.hypot(*part_errors) * percent_squared)
+        for blank, (lit, dark), part_errors in rows_of_parts
     ]
 
 
 def _names(kind: str, pattern: str, name: str) -> tuple[str, str, str]:
+    """Return key, symbol and name of a quantity of a pattern, which has no suffix in total."""
     if pattern == "total":
         return f"{kind}1288", f"{kind}1288", f"{name}, total"
     return f"{kind}1288_{pattern}", f"{kind}1288.{pattern}", f"{name}, {pattern}s"
@@ -300,24 +330,27 @@ def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
     Source: EMVA Standard 1288, release 4.0 Linear (logarithmic and accumulated histograms).
     """
     low, high = int(total.min()), int(total.max())
+    # whole numbers, so that each class holds as many of them
     width = 1 if high - low < _MOST else (high - low) // _MOST + 1
-    index = (total - low) // width
-    count = np.bincount(index.reshape(-1))
-    starts = low + width * np.arange(len(count))
+    class_index = (total - low) // width
+    count = np.bincount(class_index.reshape(-1))
+    class_starts = low + width * np.arange(len(count))
     mean, sigma = float(total.mean()), float(total.std())
     normal = np.zeros(len(count))
     if sigma > 0:
-        centre = starts + (width - 1) / 2
+        centre = class_starts + (width - 1) / 2
         normal = (
             total.size
             * width
             / (math.sqrt(2 * math.pi) * sigma)
             * np.exp(-(((centre - mean) / sigma) ** 2) / 2)
         )
-    apart = np.sort(np.abs(total.reshape(-1) - mean))
-    distance = np.linspace(0.0, float(apart[-1]), min(_MOST, len(apart)))
+    sorted_distances = np.sort(np.abs(total.reshape(-1) - mean))
+    distance = np.linspace(0.0, float(sorted_distances[-1]), min(_MOST, len(sorted_distances)))
     beyond = np.asarray(
-        100 * (len(apart) - np.searchsorted(apart, distance, side="left")) / len(apart)
+        100
+        * (len(sorted_distances) - np.searchsorted(sorted_distances, distance, side="left"))
+        / len(sorted_distances)
     )
-    deviation, distance = np.asarray((starts - mean) * unit), np.asarray(distance * unit)
+    deviation, distance = np.asarray((class_starts - mean) * unit), np.asarray(distance * unit)
     return DefectHistogram(deviation, count, normal, distance, beyond)

@@ -53,40 +53,64 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     Source: Janesick, Photon Transfer, SPIE Press 2007, chapter 8 (image lag); weighted least
             squares.
     """
-    group = _comparable(levels)
-    patterns = _patterns(group)
-    if len(group) < patterns.shape[1] + _LEAST - 1:
+    comparable_levels = _comparable(levels)
+    patterns = _patterns(comparable_levels)
+    if len(comparable_levels) < patterns.shape[1] + _LEAST - 1:
         return []
     weight = torch.tensor(
-        [max(level.variance, 1e-12) for level in group], dtype=torch.float64
+        [max(level.variance, 1e-12) for level in comparable_levels], dtype=torch.float64
     ).rsqrt()
-    basis = torch.linalg.qr(weight[:, None] * patterns).Q
-    lit = torch.tensor([not level.dark for level in group])
-    lit = lit if bool(lit.any()) else ~lit
-    pairs = min(len(level.apart) for level in group)
-    first, second = [level.first for level in group], [level.second for level in group]
-    products, powers = [], 0.0
+    # orthonormal patterns over the levels, each level in its standard deviations
+    pattern_basis = torch.linalg.qr(weight[:, None] * patterns).Q
+    counted_levels = torch.tensor([not level.dark for level in comparable_levels])
+    # without light, all levels count
+    counted_levels = counted_levels if bool(counted_levels.any()) else ~counted_levels
+    pairs = min(len(level.apart) for level in comparable_levels)
+    first, second = (
+        [level.first for level in comparable_levels],
+        [level.second for level in comparable_levels],
+    )
+    products, total_power = [], 0.0
     for pair in range(pairs):
-        u = _noise_of_pair(first, pair, weight, basis)[lit]
-        v = _noise_of_pair(second, pair, weight, basis)[lit]
-        product_of_pair, power = _product_and_power(u, v)
+        first_noise = _noise_of_pair(first, pair, weight, pattern_basis)[counted_levels]
+        second_noise = _noise_of_pair(second, pair, weight, pattern_basis)[counted_levels]
+        product_of_pair, power = _product_and_power(first_noise, second_noise)
         products.append(product_of_pair)
-        powers += power
-    product = torch.stack(products)
-    evidence = strongest([[studentised(product)]], sides=2)
-    share, error = float(product.sum()) / powers, math.sqrt(float(product.square().sum())) / powers
-    inside = min(max(share, -0.9), 0.9)
-    lost = math.log((1 + inside) / (1 - inside) ** 2)
-    sound = probably_sound(pairs * int(lit.sum()) * group[0].first[0].numel())
-    width = max(3 * error, 1e-9)
-    hidden = [Hidden("lag", lost, width, _KEPT, gain=1.0, noise=0.5, positive=True, sound=sound)]
+        total_power += power
+    product_of_all = torch.stack(products)
+    evidence = strongest([[studentised(product_of_all)]], sides=2)
+    share, error = (
+        float(product_of_all.sum()) / total_power,
+        math.sqrt(float(product_of_all.square().sum())) / total_power,
+    )
+    limited_share = min(max(share, -0.9), 0.9)
+    # the true variance over that of a pair, (1 + L) / (1 - L)^2, in logarithms
+    log_variance_factor = math.log((1 + limited_share) / (1 - limited_share) ** 2)
+    sound = probably_sound(
+        pairs * int(counted_levels.sum()) * comparable_levels[0].first[0].numel()
+    )
+    error_of_log = max(3 * error, 1e-9)
+    hidden = [
+        Hidden(
+            "lag",
+            log_variance_factor,
+            error_of_log,
+            _KEPT,
+            gain=1.0,
+            noise=0.5,
+            positive=True,
+            sound=sound,
+        )
+    ]
     sentence = f"{share:.1%} of the noise of a frame persists in the next frame, as by lag"
     passed = f"the noise of a frame does not persist in the next frame ({share:.2%} ± {error:.2%})"
     return [bounded("no lag", evidence, hidden, sentence, passed)]
 
 
 def _noise_of_pair(frames: Sequence[Tensor], pair: int, weight: Tensor, basis: Tensor) -> Tensor:
-    """Return what the patterns leave of one frame of each level."""
+    """Return what the patterns leave (level, y, x) of one frame of each level, that of the pair
+    number ``pair``, in standard deviations.
+    """
     return _left(torch.stack([of_level[pair].double() for of_level in frames]), weight, basis)
 
 
@@ -104,31 +128,32 @@ def _comparable(levels: Sequence[Level]) -> list[Level]:
     variance.
     """
     shapes = [level.apart.shape[1:] for level in levels]
-    common = max(shapes, key=shapes.count)
-    top = max(levels, key=lambda level: level.variance).mean
+    common_shape = max(shapes, key=shapes.count)
+    mean_at_peak = max(levels, key=lambda level: level.variance).mean
     candidates = zip(levels, shapes, strict=True)
     return [
         level
         for level, shape in candidates
-        if shape == common and (level.dark or level.mean <= top)
+        if shape == common_shape and (level.dark or level.mean <= mean_at_peak)
     ]
 
 
 def _patterns(levels: Sequence[Level]) -> Tensor:
-    """Return the size (level, part) of each part of a pattern in each level, with as many parts
-    as levels allow.
+    """Return the size (level, part) of each part of a pattern in each level, with as many parts as
+    levels allow: an offset, the signal, its square, and the exposure.
     """
-    offset = min((level.mean for level in levels), default=0.0)
-    signal = torch.tensor([level.mean - offset for level in levels], dtype=torch.float64)
+    darkest = min((level.mean for level in levels), default=0.0)
+    signal = torch.tensor([level.mean - darkest for level in levels], dtype=torch.float64)
     exposure = torch.tensor([level.exposure for level in levels], dtype=torch.float64)
     dark = torch.tensor([level.dark for level in levels])
     parts = [torch.ones_like(signal)]
     if not bool(dark.all()):
         parts.append(signal / signal.max().clamp_min(1e-12))
     if int((~dark).sum()) >= _CURVED:
+        # a curved response needs several lit levels
         parts.append(parts[-1].square())
-    times = exposure[dark] if bool(dark.any()) else exposure
-    if len(set(times.tolist())) > 1:
+    exposures_in_dark = exposure[dark] if bool(dark.any()) else exposure
+    if len(set(exposures_in_dark.tolist())) > 1:
         parts.append(exposure / exposure.max())
     return torch.stack(parts[: max(1, len(levels) - _LEAST + 1)], 1)
 
@@ -137,12 +162,14 @@ def _left(frames: Tensor, weight: Tensor, basis: Tensor) -> Tensor:
     """Return frames (level, y, x) over their standard deviations, without patterns and without
     means of lines.
     """
-    flat = weight[:, None] * without_lines(frames).flatten(1)
-    return (flat - basis @ (basis.T @ flat)).view_as(frames)
+    scaled_frames = weight[:, None] * without_lines(frames).flatten(1)
+    # without the projection on the patterns
+    return (scaled_frames - basis @ (basis.T @ scaled_frames)).view_as(frames)
 
 
 def _width(x: Tensor) -> Tensor:
     """Return a robust standard deviation (level, 1, 1) of each level."""
+    # a normal deviation over its median amount
     return 1.4826 * x.abs().flatten(1).median(1).values[:, None, None] + 1e-9
 
 
@@ -172,21 +199,25 @@ def mosaic(levels: Sequence[Level]) -> Iterator[FrameTest]:
     Source: Bayer, US patent 3971065 (1976), for the cell of 2 x 2 pixels.
     """
     dark = min((level.mean for level in levels if level.dark), default=math.inf)
-    bright = max(tested(levels), key=lambda level: level.mean, default=None)
-    if bright is None or bright.dark or bright.mean <= dark:
+    brightest = max(tested(levels), key=lambda level: level.mean, default=None)
+    if brightest is None or brightest.dark or brightest.mean <= dark:
         return
-    signal = bright.mean - dark
-    picture = (bright.first + bright.second).double().mean(0) / 2
+    signal = brightest.mean - dark
+    mean_picture = (brightest.first + brightest.second).double().mean(0) / 2
     for period, cell in _PERIODS.items():
-        number = _difference(picture, period) / signal
-        if number > _UNLIKE:
-            colours = f"the light of pixels differs by {number:.0%} over a cell of {cell}"
+        relative_difference = _difference(mean_picture, period) / signal
+        if relative_difference > _UNLIKE:
+            difference_text = (
+                f"the light of pixels differs by {relative_difference:.0%} over a cell of {cell}"
+            )
             text = (
-                f"{colours}: the frames are a mosaic of colours, whose calibration is not offered;"
-                " give frames of"
+                f"{difference_text}: the frames are a mosaic of colours, whose calibration is not"
+                " offered; give frames of"
             )
             text += " one colour alone, such as every second pixel of every second row"
-            yield FrameTest("one colour", number, _UNLIKE, "refused", text, explains_all=True)
+            yield FrameTest(
+                "one colour", relative_difference, _UNLIKE, "refused", text, explains_all=True
+            )
             return
 
 
@@ -203,12 +234,16 @@ def _difference(picture: Tensor, period: int) -> float:
 
 def _positions(picture: Tensor, period: int) -> tuple[Tensor, float]:
     """Return the mean of each position of a cell (y, x), and the standard error of a mean."""
-    high, wide = (n // period for n in picture.shape)
-    cells = picture[: high * period, : wide * period].reshape(high, period, wide, period)
-    within = cells - cells.mean((1, 3), keepdim=True)
+    cell_rows, cell_columns = (n // period for n in picture.shape)
+    # axes: cell along y, position along y, cell along x, position along x
+    cells = picture[: cell_rows * period, : cell_columns * period].reshape(
+        cell_rows, period, cell_columns, period
+    )
+    # each cell less its mean, so that uneven light does not count
+    deviations = cells - cells.mean((1, 3), keepdim=True)
     means = cells.mean((0, 2))
-    spread = (within - (means - means.mean())[None, :, None, :]).square().mean()
-    return means, math.sqrt(float(spread) / (high * wide))
+    variance = (deviations - (means - means.mean())[None, :, None, :]).square().mean()
+    return means, math.sqrt(float(variance) / (cell_rows * cell_columns))
 
 
 # --- pattern tests --------------------------------------------------------------------------------
@@ -248,11 +283,15 @@ def pattern_tests(levels: Sequence[Level]) -> list[FrameTest]:
 
 
 def _pattern(levels: Sequence[Level]) -> FrameTest:
-    """Test if the pixels of a level differ from each other in all frames, by DSNU and PRNU."""
+    """Test if the pixels of a level differ from each other in all frames, by DSNU and PRNU.
+
+    The temporal variance leaves these differences out; the variance of all pixels and frames counts
+    them as noise.
+    """
     products = [level.first * level.second for level in levels]
     evidence = strongest([[studentised(x) for x in products]])
-    offset = min((level.mean for level in levels if level.dark), default=0.0)
-    dsnu, prnu = _dsnu_and_prnu(levels, [float(x.mean()) for x in products], offset)
+    darkest = min((level.mean for level in levels if level.dark), default=0.0)
+    dsnu, prnu = _dsnu_and_prnu(levels, [float(x.mean()) for x in products], darkest)
     sentence = (
         f"pixels differ by {dsnu:.2g} DN in the dark (DSNU) and by {prnu:.2%} in light (PRNU and"
         " uneven light)"
@@ -261,7 +300,7 @@ def _pattern(levels: Sequence[Level]) -> FrameTest:
     if all(level.scatter != "all" for level in levels):
         modelled = "the temporal variance leaves these differences out"
         lit = [level for level in levels if not level.dark]
-        shifts = {"gain": _pixel_response(lit, offset) ** 2}
+        shifts = {"gain": _pixel_response(lit, darkest) ** 2}
         return outcome(
             "total against temporal variance", evidence, sentence, shifts, passed, modelled
         )
@@ -279,12 +318,17 @@ def _dsnu_and_prnu(
     the variance of the pattern that is ``common`` to the frames of each level.
     """
     pairs = list(zip(common, levels, strict=True))
-    dark = min((variance for variance, level in pairs if level.dark), default=0.0)
-    dsnu = math.sqrt(max(0.0, dark))
-    lit = [(variance - dsnu**2, level.mean) for variance, level in pairs if not level.dark]
-    relative = [
-        math.sqrt(max(0.0, variance)) / (mean - offset) for variance, mean in lit if mean > offset
+    dark_variance = min((variance for variance, level in pairs if level.dark), default=0.0)
+    dsnu = math.sqrt(max(0.0, dark_variance))
+    lit_variances = [
+        (variance - dsnu**2, level.mean) for variance, level in pairs if not level.dark
     ]
+    relative = [
+        math.sqrt(max(0.0, variance)) / (mean - offset)
+        for variance, mean in lit_variances
+        if mean > offset
+    ]
+    # the median of the levels
     return dsnu, sorted(relative)[len(relative) // 2] if relative else 0.0
 
 
@@ -294,13 +338,14 @@ def _pixel_response(lit: Sequence[Level], offset: float) -> float:
 
     Pixels whose gains differ by a share s have a mean gain that is too large by s**2.
     """
-    shares = []
+    squared_shares = []
     for level in lit:
-        first_frames, other = (frames.diff(dim=2) for frames in (level.first, level.second))
-        shares.append(
-            max(0.0, float((first_frames * other).mean()) / 2) / (level.mean - offset) ** 2
+        first_frames, second_frames = (frames.diff(dim=2) for frames in (level.first, level.second))
+        squared_shares.append(
+            # differences of neighbours: twice the variance of a pixel, without smooth light
+            max(0.0, float((first_frames * second_frames).mean()) / 2) / (level.mean - offset) ** 2
         )
-    return math.sqrt(sorted(shares)[len(shares) // 2]) if shares else 0.0
+    return math.sqrt(sorted(squared_shares)[len(squared_shares) // 2]) if squared_shares else 0.0
 
 
 def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> Iterator[Hidden]:
@@ -308,35 +353,45 @@ def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> It
     total dark variance.
     """
     mean = torch.tensor([level.mean for level in levels], dtype=torch.float64)
-    pattern = torch.tensor([float(x.mean()) for x in products], dtype=torch.float64)
-    error = torch.tensor(
+    level_patterns = torch.tensor([float(x.mean()) for x in products], dtype=torch.float64)
+    pattern_error = torch.tensor(
         [math.sqrt(float(x.square().sum())) / x.numel() for x in products], dtype=torch.float64
     )
-    total = pattern + torch.tensor([level.variance for level in levels], dtype=torch.float64)
-    lit = torch.tensor([not level.dark for level in levels])
+    total_variance = level_patterns + torch.tensor(
+        [level.variance for level in levels], dtype=torch.float64
+    )
+    is_lit = torch.tensor([not level.dark for level in levels])
     if len(levels) > 2 and float(mean.max()) > float(mean.min()):
-        weight = total.clamp_min(1e-12).reciprocal()
-        design = torch.stack([torch.ones_like(mean), mean], 1) * weight[:, None]
-        slope = torch.linalg.pinv(design)[1] * weight
+        weights = total_variance.clamp_min(1e-12).reciprocal()
+        design = torch.stack([torch.ones_like(mean), mean], 1) * weights[:, None]
+        # weights of the levels in the slope of a weighted line through their variances
+        slope_weights = torch.linalg.pinv(design)[1] * weights
         yield _share(
-            float(slope @ pattern), float((slope * error).norm()), float(slope @ total), gain=-1.0
+            float(slope_weights @ level_patterns),
+            float((slope_weights * pattern_error).norm()),
+            float(slope_weights @ total_variance),
+            gain=-1.0,
         )
-    if bool((~lit).any()):
-        pattern_variance, unsure, total_variance = (
-            pattern[~lit].mean(),
-            error[~lit].norm() / int((~lit).sum()),
-            total[~lit].mean(),
+    if bool((~is_lit).any()):
+        dark_pattern, dark_error, dark_total = (
+            level_patterns[~is_lit].mean(),
+            pattern_error[~is_lit].norm() / int((~is_lit).sum()),
+            total_variance[~is_lit].mean(),
         )
-        yield _share(float(pattern_variance), float(unsure), float(total_variance), noise=-0.5)
+        yield _share(float(dark_pattern), float(dark_error), float(dark_total), noise=-0.5)
 
 
 def _share(
     pattern: float, error: float, total: float, gain: float = 0.0, noise: float = 0.0
 ) -> Hidden:
-    """Return the fault of a part of the variance that is no noise in time."""
-    left = max(1 - pattern / max(total, 1e-12), 1e-3)
-    error = max(error / max(total, 1e-12) / left, 1e-9)
-    return Hidden("pattern", -math.log(left), error, _UNLIKE_PATTERN, gain, noise, positive=True)
+    """Return the fault of a part of the variance, ``pattern`` with its standard ``error``, that is
+    no noise in time; ``total`` is the whole variance.
+    """
+    temporal_share = max(1 - pattern / max(total, 1e-12), 1e-3)
+    error = max(error / max(total, 1e-12) / temporal_share, 1e-9)
+    return Hidden(
+        "pattern", -math.log(temporal_share), error, _UNLIKE_PATTERN, gain, noise, positive=True
+    )
 
 
 def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTest]:
@@ -347,44 +402,58 @@ def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTes
     before the mean is, which ``full`` levels show.
     """
     dark, lit = dark_and_lit(levels)
-    bright = max(lit, key=lambda level: level.mean, default=None)
-    if bright is None or not dark or min(bright.first.shape[1:]) < 2 * _BLOCKS:
+    brightest = max(lit, key=lambda level: level.mean, default=None)
+    if brightest is None or not dark or min(brightest.first.shape[1:]) < 2 * _BLOCKS:
         return
-    below = min(dark, key=lambda level: abs(level.exposure - bright.exposure))
-    signal = bright.mean - below.mean
+    nearest_dark = min(dark, key=lambda level: abs(level.exposure - brightest.exposure))
+    signal = brightest.mean - nearest_dark.mean
     if signal <= 0:
         return
-    means, chance = _block_means(bright)
-    number = max(0.0, float(means.max() - means.min()) - _NOISE * math.sqrt(chance)) / signal
-    variation = max(0.0, float(means.var()) - chance) / signal**2
-    shift = _BENT * variation + _filled(bright, full, below.mean)
+    means, variance_by_chance = _block_means(brightest)
+    # less what chance explains
+    relative_difference = (
+        max(0.0, float(means.max() - means.min()) - _NOISE * math.sqrt(variance_by_chance)) / signal
+    )
+    variation = max(0.0, float(means.var()) - variance_by_chance) / signal**2
+    # a bent response, and parts of the frame that are nearly full
+    gain_shift = _BENT * variation + _filled(brightest, full, nearest_dark.mean)
     sentence = (
-        f"the brightest and the darkest part of the light differ by {number:.1%}, not at most"
-        f" {_EVEN:.0%}"
+        f"the brightest and the darkest part of the light differ by {relative_difference:.1%}, not"
+        f" at most {_EVEN:.0%}"
     )
     passed = f"the parts of the light differ by less than the {_EVEN:.0%} that the standard allows"
     yield outcome(
-        "homogeneity of the light", Evidence(number, _EVEN), sentence, {"gain": shift}, passed
+        "homogeneity of the light",
+        Evidence(relative_difference, _EVEN),
+        sentence,
+        {"gain": gain_shift},
+        passed,
     )
 
 
 def _block_means(level: Level) -> tuple[Tensor, float]:
-    """Return the means (by, bx) of the parts of a level, DN less that of the level, and their
-    variance by chance.
+    """Return the means (8, 8) of the blocks of a level, DN less that of the level, and their
+    variance by chance, DN2.
     """
-    picture = (level.first + level.second).mean(0)[None, None] / 2
-    side = [n // _BLOCKS for n in picture.shape[2:]]
-    left = picture - avg_pool2d(picture, _SMALL, stride=1, padding=_SMALL // 2)
-    return avg_pool2d(picture, side)[0, 0], float(left.var()) / math.prod(side)
+    mean_picture = (level.first + level.second).mean(0)[None, None] / 2
+    block_size = [n // _BLOCKS for n in mean_picture.shape[2:]]
+    without_light = mean_picture - avg_pool2d(mean_picture, _SMALL, stride=1, padding=_SMALL // 2)
+    return avg_pool2d(mean_picture, block_size)[0, 0], float(without_light.var()) / math.prod(
+        block_size
+    )
 
 
 def _filled(bright: Level, full: Sequence[Level], dark: float) -> float:
-    """Return the share of the light of the brightest level that is in parts of the frame that
-    are nearly full.
+    """Return the share of the light of the brightest level in parts of the frame that are nearly
+    full; the well is that of the ``full`` levels, ``dark`` the mean in the dark, DN.
     """
-    lit = [level for level in full if level.paired and level.first.shape == bright.first.shape]
-    if not lit:
+    comparable_levels = [
+        level for level in full if level.paired and level.first.shape == bright.first.shape
+    ]
+    if not comparable_levels:
         return 0.0
-    well = max(level.mean + float(_block_means(level)[0].max()) for level in lit) - dark
-    signal = bright.mean - dark + _block_means(bright)[0]
-    return float(signal[signal > _NEARLY_FULL * well].sum() / signal.sum())
+    well = (
+        max(level.mean + float(_block_means(level)[0].max()) for level in comparable_levels) - dark
+    )
+    block_signals = bright.mean - dark + _block_means(bright)[0]
+    return float(block_signals[block_signals > _NEARLY_FULL * well].sum() / block_signals.sum())

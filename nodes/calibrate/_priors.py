@@ -69,12 +69,12 @@ def believed(
     The pair is median and factor, or mean and standard deviation for a parameter in ``linear``. A
     fault of the frames that is ``faults_known`` to be "none" cannot hide in them.
     """
-    normals = [_normal(name, pair, name in linear) for name, pair in pairs.items()]
-    if all(math.isnan(width) for _, width in normals):
+    centre_and_width = [_normal(name, pair, name in linear) for name, pair in pairs.items()]
+    if all(math.isnan(width) for _, width in centre_and_width):
         raise ValueError(
             f"no parameter is free: give a prior of at least one of {', '.join(pairs)}"
         )
-    centre, width = torch.tensor(normals, dtype=torch.float64).unbind(1)
+    centre, width = torch.tensor(centre_and_width, dtype=torch.float64).unbind(1)
     hidden = [float(faults_known.get(fault, "unknown") == "unknown") for fault in FAULTS]
     return Prior(centre, width, torch.tensor(hidden, dtype=torch.float64))
 
@@ -91,6 +91,11 @@ def freed(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
 
 
 def _normal(name: str, pair: Pair | None, linear: bool) -> Pair:
+    """Return mean and standard deviation of the normal distribution of a parameter, or of its
+    logarithm unless it is ``linear``; NaN twice for a parameter without a prior.
+
+    Raises ValueError for a median or a width that is not positive.
+    """
     if pair is None:
         return math.nan, math.nan
     if not pair[1] > 0 or not (linear or pair[0] > 0):
@@ -169,6 +174,7 @@ class Free:
 
     @cached_property
     def _normals(self) -> Prior:
+        """Return the prior of the free parameters alone."""
         free = self.prior.width.isfinite()
         return Prior(self.prior.centre[free], self.prior.width[free], self.prior.hidden)
 
@@ -247,46 +253,64 @@ class Coordinates(Free):
     @property
     def labels(self) -> tuple[str, ...]:
         """Return a readable name of each sampler coordinate."""
-        of = {
+        label_of = {
             "gain": "ln slope of the photon-transfer curve",
             "offset": "offset, DN",
             "spread": "ln spread",
         }
-        return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
+        return tuple(
+            label_of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names
+        )
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
         """Convert sensor parameters to sampler coordinates (..., free parameter)."""
-        full = {
+        all_parameters = {
             name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64)
             for name in NAMES
         }
-        slope = full["gain"].log()
-        return torch.stack([self._coordinate(name, full, slope) for name in self.names], -1)
+        log_gain = all_parameters["gain"].log()
+        return torch.stack(
+            [self._coordinate(name, all_parameters, log_gain) for name in self.names], -1
+        )
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         """Convert sampler coordinates (..., free parameter) to sensor parameters."""
-        free = dict(zip(self.names, place.unbind(-1), strict=True))
+        coordinates = dict(zip(self.names, place.unbind(-1), strict=True))
         held = {name: math.log(self.held[name]) for name in ("gain", "spread") if name in self.held}
-        logs = {name: torch.tensor(x, dtype=torch.float64) for name, x in held.items()} | free
-        slope = logs["gain"] - 2.0 * logs["spread"] if "gain" in free else logs["gain"]
+        log_values = {
+            name: torch.tensor(coordinate, dtype=torch.float64) for name, coordinate in held.items()
+        } | coordinates
+        # the coordinate of a free gain is ln(gain spread^2), the slope of the photon-transfer
+        # curve
+        log_gain = (
+            log_values["gain"] - 2.0 * log_values["spread"]
+            if "gain" in coordinates
+            else log_values["gain"]
+        )
         parameters = {}
-        for name, x in free.items():
+        for name, coordinate in coordinates.items():
             if name == "gain":
-                parameters[name] = slope.exp()
+                parameters[name] = log_gain.exp()
             elif name == _LINEAR:
-                parameters[name] = x * (-slope).exp()
+                # from DN to electrons
+                parameters[name] = coordinate * (-log_gain).exp()
             else:
-                parameters[name] = (x if name == "spread" else x - slope).exp()
+                # all others but the spread are in numbers: value times gain
+                parameters[name] = (coordinate if name == "spread" else coordinate - log_gain).exp()
         return parameters
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the log prior density per unit of the sampler coordinates, up to a constant."""
-        total = -0.5 * self.whitened(parameters).square().sum(-1)
+        log_density = -0.5 * self.whitened(parameters).square().sum(-1)
         if _LINEAR in self.names and "gain" in self.names:
-            total = total - parameters["gain"].log()  # Jacobian from offset in DN to electrons
-        return total
+            # Jacobian from offset in DN to electrons
+            log_density = log_density - parameters["gain"].log()
+        return log_density
 
     def _coordinate(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:
+        """Return the sampler coordinate of the parameter ``name``; ``full`` has all parameters by
+        name, and ``slope`` is the logarithm of the gain.
+        """
         if name == "gain":
             return slope + 2.0 * full["spread"].log()
         if name == _LINEAR:
@@ -405,19 +429,28 @@ def guess(
     """
     values = dict(believed)
     try:
-        fit = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
+        # levels of mean and variance alone
+        estimate = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
     except ValueError:
         return values | {"full_well": _well(levels, values, params)}
-    gain = float(fit.gain)
-    dark = float(fit.dark_current) * params["dark_exposure"]
-    first = levels.exposure[levels.photons == 0].min()
-    ahead = float(first) / params["dark_exposure"] * (dark if dark > 0 else 0.0)
+    gain = float(estimate.gain)
+    # e-/s times the exposure in which the parameter counts electrons
+    dark_electrons = float(estimate.dark_current) * params["dark_exposure"]
+    shortest_dark = levels.exposure[levels.photons == 0].min()
+    # electrons in the shortest dark level, which its mean holds beside the offset
+    dark_of_shortest = (
+        float(shortest_dark)
+        / params["dark_exposure"]
+        * (dark_electrons if dark_electrons > 0 else 0.0)
+    )
     values |= {
         "gain": gain,
-        "quantum_efficiency": float(fit.efficiency),
-        "offset": (float(fit.dark_signal) - ROUNDED[params["rounding"]][0]) / gain - ahead,
-        "read_noise": max(float(fit.temporal_dark_noise), _LEAST * believed["read_noise"]),
-        "dark_current": dark if dark > 0 else _LEAST * believed["dark_current"],
+        "quantum_efficiency": float(estimate.efficiency),
+        # index 0 of `ROUNDED` is the shift of the mean by rounding, DN
+        "offset": (float(estimate.dark_signal) - ROUNDED[params["rounding"]][0]) / gain
+        - dark_of_shortest,
+        "read_noise": max(float(estimate.temporal_dark_noise), _LEAST * believed["read_noise"]),
+        "dark_current": dark_electrons if dark_electrons > 0 else _LEAST * believed["dark_current"],
     }
     return values | {"full_well": _well(levels, values, params)}
 
@@ -436,28 +469,30 @@ def guess_camera(
     Raises: ValueError where `least_squares` raises ValueError.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
-    fit = least_squares(levels, share=params["share"])
-    gain = float(fit.gain)
+    estimate = least_squares(levels, share=params["share"])
+    gain = float(estimate.gain)
     values = {
         "gain": gain,
-        "quantum_efficiency": float(fit.efficiency),
-        "dark_signal": float(fit.dark_signal),
-        "temporal_dark_noise": float(fit.temporal_dark_noise),
-        "dark_current": float(fit.dark_current) * params["dark_exposure"],
+        "quantum_efficiency": float(estimate.efficiency),
+        "dark_signal": float(estimate.dark_signal),
+        "temporal_dark_noise": float(estimate.temporal_dark_noise),
+        # in e- of one dark_exposure, as the parameter counts it
+        "dark_current": float(estimate.dark_current) * params["dark_exposure"],
     }
-    usable = {
+    # only the dark signal may be 0 or negative
+    usable_values = {
         name: x
         for name, x in values.items()
         if math.isfinite(x) and (x > 0 or name == "dark_signal")
     }
-    return {**believed, **usable}
+    return {**believed, **usable_values}
 
 
 def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, Any]) -> float:
     """Return the full well at which numbers pile up, or, if none pile up, a full well above
     every number.
     """
-    top, shift, gain = (
+    largest_number, rounding_shift, gain = (
         2 ** params["bits"] - 1,
         ROUNDED[params["rounding"]][0],
         float(values["gain"]),
@@ -465,10 +500,15 @@ def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, 
     means = levels.mean[levels.pixels > 0]
     brightest = max([*means.tolist(), *levels.cell_value.tolist()], default=0.0)
     top_cells = levels.cell_value >= brightest - 2
-    piled = bool(top_cells.any()) and float(levels.cell_count[top_cells].sum()) > 0.5 * float(
+    # the three brightest numbers are frequent, over half of the most frequent number
+    has_pile = bool(top_cells.any()) and float(levels.cell_count[top_cells].sum()) > 0.5 * float(
         levels.cell_count.max()
     )
-    if piled and brightest < top:
-        weight = levels.cell_count[top_cells]
-        return float((levels.cell_value[top_cells] * weight).sum() / weight.sum() - shift) / gain
+    if has_pile and brightest < largest_number:
+        counts = levels.cell_count[top_cells]
+        return (
+            float((levels.cell_value[top_cells] * counts).sum() / counts.sum() - rounding_shift)
+            / gain
+        )
+    # a well above the brightest number changes nothing
     return max(values["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)

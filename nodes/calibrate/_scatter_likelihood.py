@@ -138,37 +138,44 @@ def reduce_rings(frames: Numbers, camera: _Camera, centre: tuple[float, float] |
     that tell nothing.
     """
     _refuse_numbers(frames, camera)
-    size = frames.shape[1:]
-    place = _middle(frames, camera) if centre is None else centre
-    if not all(-0.5 <= c <= n - 0.5 for c, n in zip(place, size, strict=True)):
+    frame_shape = frames.shape[1:]
+    source_position = _middle(frames, camera) if centre is None else centre
+    if not all(-0.5 <= c <= n - 0.5 for c, n in zip(source_position, frame_shape, strict=True)):
         raise ValueError(
-            f"the source at ({place[0]:g}, {place[1]:g}) is not in the frame of {size[0]} x"
-            f" {size[1]} pixels: give `centre` as y and x, in pixels"
+            f"the source at ({source_position[0]:g}, {source_position[1]:g}) is not in the frame of"
+            f" {frame_shape[0]} x {frame_shape[1]} pixels: give `centre` as y and x, in pixels"
         )
-    y, x = np.ogrid[: size[0], : size[1]]
-    square = ((y - place[0]) ** 2 + (x - place[1]) ** 2).astype(np.float64)
-    sector = _part(square)
+    y, x = np.ogrid[: frame_shape[0], : frame_shape[1]]
+    squared_distance = ((y - source_position[0]) ** 2 + (x - source_position[1]) ** 2).astype(
+        np.float64
+    )
+    sector = _part(squared_distance)
     signal = frames / camera.gain - camera.offset
-    cut: NDArray[np.bool_] = np.asarray((frames >= camera.cut).any(0))
-    first = _first_ring(frames, sector // _PARTS, camera)
-    unsaturated = (sector >= first * _PARTS) & ~cut
-    hidden = _cut_rings(square, sector // _PARTS, cut, first)
-    below = (hidden, camera.cut / camera.gain - camera.offset, place)
-    rings = _averaged(signal, square, sector, unsaturated)
-    return Rings(*rings, *(torch.as_tensor(x, dtype=torch.float64) for x in below))
+    is_cut: NDArray[np.bool_] = np.asarray((frames >= camera.cut).any(0))
+    # `sector` numbers the parts of all rings: ring number = part number // _PARTS
+    first_ring = _first_ring(frames, sector // _PARTS, camera)
+    unsaturated = (sector >= first_ring * _PARTS) & ~is_cut
+    cut_squares = _cut_rings(squared_distance, sector // _PARTS, is_cut, first_ring)
+    # the last three fields of `Rings`
+    limits = (cut_squares, camera.cut / camera.gain - camera.offset, source_position)
+    rings = _averaged(signal, squared_distance, sector, unsaturated)
+    return Rings(*rings, *(torch.as_tensor(x, dtype=torch.float64) for x in limits))
 
 
 def _refuse_numbers(frames: Numbers, camera: _Camera) -> None:
-    top = float(frames.max())
-    if top > 2**camera.bits - 1:
+    """Raise ValueError for numbers that the converter cannot give, and for frames without a
+    saturated pixel.
+    """
+    brightest = float(frames.max())
+    if brightest > 2**camera.bits - 1:
         raise ValueError(
-            f"the frames hold {top:.0f} DN, which {camera.bits} bits cannot: give the `bits` of the"
-            " files"
+            f"the frames hold {brightest:.0f} DN, which {camera.bits} bits cannot: give the `bits`"
+            " of the files"
         )
-    if top < camera.cut:
+    if brightest < camera.cut:
         raise ValueError(
-            f"no pixel is saturated: the brightest has {top:.0f} DN of {camera.cut / _CUT:.0f} DN:"
-            " expose longer, or check `bits`, `full_well` and `gain`"
+            f"no pixel is saturated: the brightest has {brightest:.0f} DN of"
+            f" {camera.cut / _CUT:.0f} DN: expose longer, or check `bits`, `full_well` and `gain`"
         )
 
 
@@ -181,35 +188,43 @@ def _middle(frames: Numbers, camera: _Camera) -> tuple[float, float]:
         raise ValueError(
             "no pixel is saturated in every frame: give frames of one exposure, or give `centre`"
         )
-    away = np.hypot(y - np.median(y), x - np.median(x))
-    near = away <= 3 * max(float(np.median(away)), 1.0)
-    return float(y[near].mean()), float(x[near].mean())
+    distance = np.hypot(y - np.median(y), x - np.median(x))
+    is_near = distance <= 3 * max(float(np.median(distance)), 1.0)
+    return float(y[is_near].mean()), float(x[is_near].mean())
 
 
 def _part(square: Numbers) -> NDArray[np.int64]:
-    """Return the number of the part of a ring to which each pixel belongs, for rings that grow
-    from one pixel.
+    """Return the number of the part of a ring to which each pixel belongs, from its squared
+    distance.
+
+    Each ring has `_PARTS` parts. Rings are one pixel wide up to a radius, and grow by the ratio
+    `_WIDER` from there on.
     """
     radius = np.sqrt(square)
-    turn = 1 / (_WIDER - 1)  # below this radius rings are one pixel wide
-    beyond = turn + np.log(np.maximum(radius, turn) / turn) / math.log(_WIDER)
-    ring: NDArray[np.int64] = np.floor(_PARTS * np.where(radius < turn, radius, beyond)).astype(
-        np.int64
-    )
-    return ring
+    first_wide_radius = 1 / (_WIDER - 1)  # below this radius rings are one pixel wide
+    ring_of_wide = first_wide_radius + np.log(
+        np.maximum(radius, first_wide_radius) / first_wide_radius
+    ) / math.log(_WIDER)
+    part_number: NDArray[np.int64] = np.floor(
+        _PARTS * np.where(radius < first_wide_radius, radius, ring_of_wide)
+    ).astype(np.int64)
+    return part_number
 
 
 def _first_ring(frames: Numbers, ring: NDArray[np.int64], camera: _Camera) -> int:
-    """Return the first ring beyond which every ring lies clearly below saturation, lone bright
-    pixels aside.
+    """Return the number of the first ring beyond which every ring lies clearly below saturation,
+    lone bright pixels aside, at least `_LEAST`.
+
+    ``ring`` has the number of each pixel's ring.
     """
-    count = np.bincount(ring.ravel())
-    cut = (frames >= camera.cut).any(0)
-    mean = np.bincount(ring.ravel(), frames.mean(0).ravel()) / count.clip(1)
+    pixel_count = np.bincount(ring.ravel())
+    is_cut = (frames >= camera.cut).any(0)
+    mean = np.bincount(ring.ravel(), frames.mean(0).ravel()) / pixel_count.clip(1)
+    # DN: shot noise K mean above the offset, and read noise
     noise = np.sqrt(np.maximum(mean * camera.gain, 0) + (camera.read_noise * camera.gain) ** 2)
-    many = np.bincount(ring.ravel(), cut.ravel()) > 0.05 * count
-    bright = (mean + _BELOW * noise >= camera.cut) | many
-    return max(int(np.flatnonzero(bright & (count > 0)).max(initial=-1)) + 1, int(_LEAST))
+    many_cut = np.bincount(ring.ravel(), is_cut.ravel()) > 0.05 * pixel_count
+    is_bright = (mean + _BELOW * noise >= camera.cut) | many_cut
+    return max(int(np.flatnonzero(is_bright & (pixel_count > 0)).max(initial=-1)) + 1, int(_LEAST))
 
 
 def _cut_rings(
@@ -218,13 +233,18 @@ def _cut_rings(
     """Return the mean squared distance of each ring inside ``first`` and beyond 16 pixels whose
     every pixel is cut.
     """
-    count, lost, total = (
+    pixel_count, cut_count, sum_of_squares = (
         np.bincount(ring.ravel(), x.ravel()) for x in (np.ones_like(square), cut, square)
     )
-    numbers = np.arange(len(count))
-    hidden = (numbers < first) & (numbers >= _LEAST) & (count > 0) & (lost == count)
-    mean: Numbers = total[hidden] / count[hidden]
-    return mean
+    ring_numbers = np.arange(len(pixel_count))
+    all_cut = (
+        (ring_numbers < first)
+        & (ring_numbers >= _LEAST)
+        & (pixel_count > 0)
+        & (cut_count == pixel_count)
+    )
+    mean_squares: Numbers = sum_of_squares[all_cut] / pixel_count[all_cut]
+    return mean_squares
 
 
 def _averaged(
@@ -233,24 +253,26 @@ def _averaged(
     """Return mean and number of pixels of each ring, and ring, mean squared distance and pixels
     of each part.
     """
-    numbers, group = np.unique(sector[unsaturated], return_inverse=True)
-    count = np.bincount(group).astype(np.float64)
-    distance, mean = (
-        np.bincount(group, values[unsaturated]) / count for values in (square, signal.mean(0))
+    part_numbers, part_of_pixel = np.unique(sector[unsaturated], return_inverse=True)
+    part_pixels = np.bincount(part_of_pixel).astype(np.float64)
+    part_distances, part_means = (
+        np.bincount(part_of_pixel, values[unsaturated]) / part_pixels
+        for values in (square, signal.mean(0))
     )
-    ring, of = np.unique(numbers // _PARTS, return_inverse=True)
-    if len(ring) < _RINGS:
+    ring_numbers, ring_of_part = np.unique(part_numbers // _PARTS, return_inverse=True)
+    if len(ring_numbers) < _RINGS:
         raise ValueError(
-            f"only {len(ring)} rings of pixels lie between the saturated pixels and the edge of the"
-            " frame: expose less, or give a larger frame with the source in it"
+            f"only {len(ring_numbers)} rings of pixels lie between the saturated pixels and the"
+            " edge of the frame: expose less, or give a larger frame with the source in it"
         )
-    pixels = np.bincount(of, count)
+    ring_pixels = np.bincount(ring_of_part, part_pixels)
     columns = (
-        np.bincount(of, count * mean) / pixels,
-        pixels * len(signal),
-        of.astype(np.int64),
-        distance,
-        count,
+        np.bincount(ring_of_part, part_pixels * part_means) / ring_pixels,
+        # of all frames
+        ring_pixels * len(signal),
+        ring_of_part.astype(np.int64),
+        part_distances,
+        part_pixels,
     )
     return tuple(torch.as_tensor(x) for x in columns)
 
@@ -307,27 +329,51 @@ def stray_light(
             the core: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2, the energy
             outside a radius for large radii.
     """
-    source = {"electrons": electrons, "background": background, "core": core, "scatter": scatter}
-    scatter_values = {"b0": b0, "l": l, "s": s, **source}
-    numbers = {
+    source_values = {
+        "electrons": electrons,
+        "background": background,
+        "core": core,
+        "scatter": scatter,
+    }
+    scatter_values = {"b0": b0, "l": l, "s": s, **source_values}
+    parameters = {
         name: torch.as_tensor(x, dtype=torch.float64)[..., None]
         for name, x in scatter_values.items()
     }
-    lens = (wavelength * focal_length / (diameter * pixel_pitch), pixel_pitch / focal_length)
-    mean = _averaged_rings(_light(numbers, rings.square, *lens), rings) + numbers["background"]
-    alone = mean.clamp_min(0) + read_noise**2 + 1 / (12 * gain**2)
-    variance = alone / rings.pixels + (numbers["scatter"] * (mean - numbers["background"])).square()
-    away = (rings.mean - mean) / variance.sqrt()
-    hidden = _light(numbers, rings.cut_square, *lens) + numbers["background"]
-    above = log_ndtr((hidden - rings.cut) / (hidden * torch.hypot(numbers["scatter"], _ripple())))
-    log = -0.5 * (away.square() + variance.log()).sum(-1) + above.sum(-1)
-    total = log.where(_total(numbers)[..., 0] < 1, -torch.inf)
+    # wavelength x f-number in pixels, and the direction cosine of a pixel
+    lens_scales = (wavelength * focal_length / (diameter * pixel_pitch), pixel_pitch / focal_length)
+    ring_mean = (
+        _averaged_rings(_light(parameters, rings.square, *lens_scales), rings)
+        + parameters["background"]
+    )
+    # e-^2: shot noise, read noise and rounding
+    pixel_variance = ring_mean.clamp_min(0) + read_noise**2 + 1 / (12 * gain**2)
+    variance = (
+        pixel_variance / rings.pixels
+        + (parameters["scatter"] * (ring_mean - parameters["background"])).square()
+    )
+    residuals = (rings.mean - ring_mean) / variance.sqrt()
+    cut_signal = _light(parameters, rings.cut_square, *lens_scales) + parameters["background"]
+    # logarithm of the probability that a ring whose every pixel is cut lies above the cut
+    log_above = log_ndtr(
+        (cut_signal - rings.cut) / (cut_signal * torch.hypot(parameters["scatter"], _ripple()))
+    )
+    log_likelihood = -0.5 * (residuals.square() + variance.log()).sum(-1) + log_above.sum(-1)
+    # a surface cannot scatter all light
+    checked_log = log_likelihood.where(_total(parameters)[..., 0] < 1, -torch.inf)
     if not told:
-        return without_details(total)
+        return without_details(checked_log)
     # squared derivatives of a residual and of its log width sum, on average, to the Fisher
     # information
-    rows = torch.cat(torch.broadcast_tensors(away, 0.5 * variance.log()), -1)  # type: ignore[no-untyped-call]
-    return Likelihood(total, away.square(), torch.ones_like(rings.mean), rows, mean, variance)
+    scaled_rows = torch.cat(torch.broadcast_tensors(residuals, 0.5 * variance.log()), -1)  # type: ignore[no-untyped-call]
+    return Likelihood(
+        checked_log,
+        residuals.square(),
+        torch.ones_like(rings.mean),
+        scaled_rows,
+        ring_mean,
+        variance,
+    )
 
 
 @stray_light.check
@@ -338,10 +384,12 @@ def _(result: Likelihood, rings: Rings, **params: Any) -> list[Check]:
 
 
 def _ripple() -> Tensor:
+    """Return the relative deviation of a ring by diffraction fringes, as a tensor."""
     return torch.tensor(_FRINGES, dtype=torch.float64)
 
 
 def _total(numbers: Mapping[str, Tensor]) -> Tensor:
+    """Return the share of the light that the surface scatters (TIS)."""
     return scattered_share(numbers["b0"], numbers["l"], numbers["s"])
 
 
@@ -372,6 +420,7 @@ def diffraction_wing(square: Tensor, fringe: float) -> Tensor:
     """Return the mean share of light per pixel of a round aperture far from the source, with the
     pixel integrated.
     """
+    # second factor: the pixel is integrated, Laplacian of r^-3 over 24
     return fringe / (math.pi**3 * square**1.5) * (1 + 9 / (24 * square))
 
 
@@ -400,7 +449,12 @@ def guess_scatter(
     Error:  a start for a search, not an estimate.
     Source: linear least squares.
     """
-    scale, best, lowest = params["pixel_pitch"] / params["focal_length"], dict(believed), math.inf
+    cosine_of_pixel, best_values, least_misfit = (
+        params["pixel_pitch"] / params["focal_length"],
+        dict(believed),
+        math.inf,
+    )
+    # one over the standard error of each ring's mean
     weight = (
         rings.pixels
         / (rings.mean.clamp_min(0) + params["read_noise"] ** 2 + 1 / params["gain"] ** 2)
@@ -411,25 +465,31 @@ def guess_scatter(
     wing = diffraction_wing(rings.square, fringe)
     for l in (believed["l"] * 3.0**n for n in range(-4, 5)):  # noqa: E741
         for s in (believed["s"] + 0.35 * n for n in range(-4, 5)):
-            unit = lobe(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s, scale)))
-            rows = torch.stack(
+            unit_lobe = lobe(
+                *(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s, cosine_of_pixel))
+            )
+            design = torch.stack(
                 [
-                    _averaged_rings(on_far_pixels(unit, rings.square), rings),
+                    _averaged_rings(on_far_pixels(unit_lobe, rings.square), rings),
                     torch.ones_like(rings.mean),
                 ],
                 1,
             )
-            rows[:, 0] *= believed["electrons"]
+            design[:, 0] *= believed["electrons"]
             scattered = rings.mean - believed["electrons"] * believed["core"] * _averaged_rings(
                 wing, rings
             )
-            fit = torch.linalg.lstsq(
-                rows * weight[:, None], (scattered * weight)[:, None]
+            # b0 and background enter linearly: weighted linear least squares for each l and s
+            solution = torch.linalg.lstsq(
+                design * weight[:, None], (scattered * weight)[:, None]
             ).solution[:, 0]
-            off = float(((rows @ fit - scattered) * weight).square().sum())
-            share = float(fit[0]) * float(
+            misfit = float(((design @ solution - scattered) * weight).square().sum())
+            scattered_light = float(solution[0]) * float(
                 scattered_share(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s)))
             )
-            if off < lowest and 0 < share < 1:
-                lowest, best = off, best | {"b0": float(fit[0]), "l": l, "s": s}
-    return best
+            if misfit < least_misfit and 0 < scattered_light < 1:
+                least_misfit, best_values = (
+                    misfit,
+                    best_values | {"b0": float(solution[0]), "l": l, "s": s},
+                )
+    return best_values

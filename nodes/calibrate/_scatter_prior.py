@@ -112,10 +112,10 @@ class ScatterCoordinates(Free):
     @property
     def labels(self) -> tuple[str, ...]:
         """Return a readable name of each sampler coordinate."""
-        new = {"b0": "ln BSDF", "s": "ln slope"} if self._joint else {}
-        new |= {"electrons": "ln first ring", "background": "last ring"} if self.sight else {}
+        label_of = {"b0": "ln BSDF", "s": "ln slope"} if self._joint else {}
+        label_of |= {"electrons": "ln first ring", "background": "last ring"} if self.sight else {}
         return tuple(
-            new.get(name, ("" if name in self.linear else "ln ") + name) for name in self.names
+            label_of.get(name, ("" if name in self.linear else "ln ") + name) for name in self.names
         )
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
@@ -125,31 +125,38 @@ class ScatterCoordinates(Free):
         }
         columns = dict(zip(self.names, self.scaled(values).unbind(-1), strict=True))
         if self._joint:
-            q = self._square(columns["l"])
-            columns["b0"] = columns["b0"] + values["s"] / 2 * torch.log1p(q)
-            columns["s"] = (-values["s"]).log() + torch.log(q / (1 + q))
+            squared_ratio = self._square(columns["l"])
+            # ln BSDF = ln b0 + s/2 ln(1 + q), with q = (beta / l)^2 between the rings
+            columns["b0"] = columns["b0"] + values["s"] / 2 * torch.log1p(squared_ratio)
+            # the slope of ln BSDF over ln beta is s q / (1 + q)
+            columns["s"] = (-values["s"]).log() + torch.log(squared_ratio / (1 + squared_ratio))
         if self.sight:
-            first, last = self._shares(self.sight, values)
+            share_in_first, share_in_last = self._shares(self.sight, values)
             if "background" in columns:
-                columns["background"] = columns["background"] + self._of("electrons", values) * last
+                columns["background"] = (
+                    columns["background"] + self._of("electrons", values) * share_in_last
+                )
             if "electrons" in columns:
-                columns["electrons"] = columns["electrons"] + first.log()
+                columns["electrons"] = columns["electrons"] + share_in_first.log()
         return torch.stack(torch.broadcast_tensors(*(columns[name] for name in self.names)), -1)  # type: ignore[no-untyped-call]
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         """Convert sampler coordinates (..., free parameter) to parameters of the scatter."""
         columns = dict(zip(self.names, place.unbind(-1), strict=True))
         if self._joint:
-            q = self._square(columns["l"])
-            columns["s"] = -columns["s"].exp() * (1 + q) / q
-            columns["b0"] = columns["b0"] - columns["s"] / 2 * torch.log1p(q)
+            squared_ratio = self._square(columns["l"])
+            # the inverse of `place`
+            columns["s"] = -columns["s"].exp() * (1 + squared_ratio) / squared_ratio
+            columns["b0"] = columns["b0"] - columns["s"] / 2 * torch.log1p(squared_ratio)
         values = {name: x if name in self.linear else x.exp() for name, x in columns.items()}
         if self.sight:
-            first, last = self._shares(self.sight, values)
+            share_in_first, share_in_last = self._shares(self.sight, values)
             if "electrons" in values:
-                values["electrons"] = values["electrons"] / first
+                values["electrons"] = values["electrons"] / share_in_first
             if "background" in values:
-                values["background"] = values["background"] - self._of("electrons", values) * last
+                values["background"] = (
+                    values["background"] - self._of("electrons", values) * share_in_last
+                )
         return values
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
@@ -158,34 +165,39 @@ class ScatterCoordinates(Free):
         The coordinates of electrons and background are shifted by what the other parameters say,
         which leaves volumes as they are; that of s contributes the factor -s.
         """
-        log = -0.5 * self.whitened(parameters).square().sum(-1)
-        return log + (-parameters["s"]).log() if self._joint else log
+        log_density = -0.5 * self.whitened(parameters).square().sum(-1)
+        return log_density + (-parameters["s"]).log() if self._joint else log_density
 
     @property
     def _joint(self) -> bool:
+        """Return True if b0, l and s are all free, so that their coordinates are mixed."""
         return {"b0", "l", "s"} <= set(self.names)
 
     def _of(self, name: str, values: Mapping[str, Tensor]) -> Tensor:
+        """Return the value of a parameter, free or held."""
         return (
             values[name] if name in values else torch.tensor(self.held[name], dtype=torch.float64)
         )
 
     def _shares(self, sight: Sight, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return the shares of the light in a pixel of the first and of the last ring."""
-        numbers = {name: self._of(name, values)[..., None] for name in ("b0", "l", "s", "core")}
-        square = torch.tensor([sight.inner**2, sight.outer**2], dtype=torch.float64)
-        first, last = share_of_light(numbers, square, sight.fringe, sight.scale).unbind(-1)
-        return first, last
+        parameters = {name: self._of(name, values)[..., None] for name in ("b0", "l", "s", "core")}
+        squared_radii = torch.tensor([sight.inner**2, sight.outer**2], dtype=torch.float64)
+        share_in_first, share_in_last = share_of_light(
+            parameters, squared_radii, sight.fringe, sight.scale
+        ).unbind(-1)
+        return share_in_first, share_in_last
 
     def _square(self, log_l: Tensor) -> Tensor:
         """Return (beta / l)**2 at the direction cosine beta between the rings, or in the middle
         of the prior of l.
         """
         if self.sight:
-            middle = math.log(self.sight.scale) + 0.5 * math.log(
+            # of the geometric mean of the radii of the first and the last ring
+            log_cosine = math.log(self.sight.scale) + 0.5 * math.log(
                 self.sight.inner * self.sight.outer
             )
-            return (2 * (middle - log_l)).exp()
+            return (2 * (log_cosine - log_l)).exp()
         return (2 * (self.prior.centre[SCATTER_NAMES.index("l")] - log_l)).exp()
 
     def ridges(self, place: Tensor) -> list[Ridge]:
@@ -209,26 +221,27 @@ class ScatterCoordinates(Free):
                 "l: only a lower limit, beyond the frame",
             )
         ]
+        # the narrowest lobe that still scatters a moderate share of the light
         for factor in (_FAR, 10.0, 3.0):
-            rise = float(factor ** -float(s))
-            if float(scattered_share(lobe_values["b0"] * rise, l / factor, s)) < _MOST:
+            peak_factor = float(factor ** -float(s))
+            if float(scattered_share(lobe_values["b0"] * peak_factor, l / factor, s)) < _MOST:
                 text = "b0 and l only as b0 l^(-s): l lies within the saturated pixels"
-                narrow = self._moved(lobe_values, rise, 1 / factor)
-                return [*ridges, Ridge(narrow, {"l": "upper", "b0": "lower"}, text)]
+                narrow_lobe = self._moved(lobe_values, peak_factor, 1 / factor)
+                return [*ridges, Ridge(narrow_lobe, {"l": "upper", "b0": "lower"}, text)]
         return ridges
 
     def _moved(self, lobe_values: Mapping[str, Tensor], peak: float, width: float) -> Tensor:
-        """Return the coordinates with b0 and l multiplied, and the brightness of core and
-        scatter as before.
+        """Return the coordinates with b0 times ``peak`` and l times ``width``, where a free core,
+        or else the electrons, keep the brightness of the core as before.
         """
         b0, l, s = lobe_values["b0"] * peak, lobe_values["l"] * width, lobe_values["s"]  # noqa: E741
         core, electrons = lobe_values["core"], lobe_values["electrons"]
-        before, after = (
+        unscattered_before, unscattered_after = (
             1 - scattered_share(*x) for x in ((lobe_values["b0"], lobe_values["l"], s), (b0, l, s))
         )
-        rise = before / after.clamp_min(1 - _MOST)
+        core_factor = unscattered_before / unscattered_after.clamp_min(1 - _MOST)
         if "core" in self.names:
-            core = core * rise
+            core = core * core_factor
         elif "electrons" in self.names:
-            b0, electrons = b0 / rise, electrons * rise
+            b0, electrons = b0 / core_factor, electrons * core_factor
         return self.place({**lobe_values, "b0": b0, "l": l, "core": core, "electrons": electrons})

@@ -65,15 +65,16 @@ def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
     moments = torch.stack(
         [levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1
     )
-    outer = torch.ones(len(levels.cell_level), dtype=torch.bool)
+    keeps_cell = torch.ones(len(levels.cell_level), dtype=torch.bool)
     for level in sorted(set(levels.cell_level.tolist())):
         cells_of_level = levels.cell_level == level
-        sd = math.sqrt(float(levels.variance[level]))
-        inner, moments[level] = _inner(
-            levels.cell_value[cells_of_level], levels.cell_count[cells_of_level], sd
+        deviation = math.sqrt(float(levels.variance[level]))
+        # the middle becomes mean and variance; the cells near both ends stay
+        is_inner, moments[level] = _inner(
+            levels.cell_value[cells_of_level], levels.cell_count[cells_of_level], deviation
         )
-        outer[cells_of_level] = ~inner
-    cells = (x[outer] for x in (levels.cell_level, levels.cell_value, levels.cell_count))
+        keeps_cell[cells_of_level] = ~is_inner
+    cells = (x[keeps_cell] for x in (levels.cell_level, levels.cell_value, levels.cell_count))
     return Sufficient(levels.photons, levels.exposure, *moments.T.contiguous(), *cells)
 
 
@@ -99,19 +100,26 @@ def _(levels: Levels, *, share: float | None = None) -> Sufficient:
             strict=True,
         )
     )
-    rows = torch.stack(
+    moments = torch.stack(
         [levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1
     ).tolist()
-    left = []
-    for level in range(len(rows)):
-        own = [(v, n) for cell_level, v, n in cells if cell_level == level]
-        if own:
-            rows[level], inside = _reference_inner(own, rows[level][2])
-            left += [(level, v, n) for v, n in own if (v, n) not in inside]
-    cell = torch.tensor(left, dtype=torch.float64).reshape(-1, 3).unbind(1)
-    numbers, mean, variance, freedom = torch.tensor(rows, dtype=torch.float64).unbind(1)
+    outer_cells = []
+    for level in range(len(moments)):
+        cells_of_level = [(v, n) for cell_level, v, n in cells if cell_level == level]
+        if cells_of_level:
+            moments[level], inside = _reference_inner(cells_of_level, moments[level][2])
+            outer_cells += [(level, v, n) for v, n in cells_of_level if (v, n) not in inside]
+    columns = torch.tensor(outer_cells, dtype=torch.float64).reshape(-1, 3).unbind(1)
+    numbers, mean, variance, freedom = torch.tensor(moments, dtype=torch.float64).unbind(1)
     return Sufficient(
-        levels.photons, levels.exposure, numbers, mean, variance, freedom, cell[0].long(), *cell[1:]
+        levels.photons,
+        levels.exposure,
+        numbers,
+        mean,
+        variance,
+        freedom,
+        columns[0].long(),
+        *columns[1:],
     )
 
 
@@ -121,48 +129,61 @@ def _reference_inner(
     """Return number, mean, variance and degrees of freedom of the middle of a histogram of numbers
     and counts, and this middle; zeros and nothing if the middle is too narrow.
     """
-    low, high = own[0][0] + _EDGE, own[-1][0] - _EDGE
+    lower_edge, upper_edge = own[0][0] + _EDGE, own[-1][0] - _EDGE
     if not variance**0.5 >= _COARSE:  # or not a number
         return [0.0, 0.0, 0.0, 0.0], []
-    inside = [(v, n) for v, n in own if low < v < high]
-    count = math.fsum(n for _, n in inside)
+    middle_cells = [(v, n) for v, n in own if lower_edge < v < upper_edge]
+    count = math.fsum(n for _, n in middle_cells)
     if count < 2:
         return [0.0, 0.0, 0.0, 0.0], []
-    mean = math.fsum(v * n for v, n in inside) / count
-    square = math.fsum((v - mean) ** 2 * n for v, n in inside)
-    if square < _COARSE**2 * (count - 1):
+    mean = math.fsum(v * n for v, n in middle_cells) / count
+    sum_of_squares = math.fsum((v - mean) ** 2 * n for v, n in middle_cells)
+    if sum_of_squares < _COARSE**2 * (count - 1):
         return [0.0, 0.0, 0.0, 0.0], []
-    return [count, mean, square / (count - 1), count - 1], inside
+    return [count, mean, sum_of_squares / (count - 1), count - 1], middle_cells
 
 
 def _below(levels: Levels, share: float) -> Levels:
     """Return the dark levels, and the lit levels up to a share of saturation."""
-    lit = levels.photons > 0
-    if not bool(lit.any()):
+    is_lit = levels.photons > 0
+    if not bool(is_lit.any()):
         raise ValueError(
             "there are no lit levels, so saturation is unknown: leave out share, or give lit levels"
         )
-    dark = float(levels.mean[~lit].min()) if bool((~lit).any()) else 0.0
-    full = float(levels.mean[lit][levels.variance[lit].argmax()]) - dark
-    used_levels = ~lit | (levels.mean - dark <= share * full)
-    number, cells = used_levels.cumsum(0) - 1, used_levels[levels.cell_level]
+    darkest = float(levels.mean[~is_lit].min()) if bool((~is_lit).any()) else 0.0
+    saturation_signal = float(levels.mean[is_lit][levels.variance[is_lit].argmax()]) - darkest
+    used_levels = ~is_lit | (levels.mean - darkest <= share * saturation_signal)
+    # numbers of the levels that stay, counted anew
+    new_number, kept_cells = used_levels.cumsum(0) - 1, used_levels[levels.cell_level]
+    # the first six fields have one value a level, the others one a cell of a histogram
     columns = [x[used_levels] for x in levels[:6]]
-    counts = (number[levels.cell_level[cells]], levels.cell_value[cells], levels.cell_count[cells])
-    return Levels._make([*columns, *counts])
+    cell_columns = (
+        new_number[levels.cell_level[kept_cells]],
+        levels.cell_value[kept_cells],
+        levels.cell_count[kept_cells],
+    )
+    return Levels._make([*columns, *cell_columns])
 
 
 def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
-    """Return a mask of the digital numbers away from both ends of the range, and the statistics
-    of these numbers.
+    """Return a mask of the digital numbers away from both ends of the range, and (number, mean,
+    variance, degrees of freedom) of their pixels; nothing and zeros where they are too coarse.
     """
-    inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
-    total = float(count[inner].sum())
-    mean = (value[inner] * count[inner]).sum() / max(total, 1.0)
-    variance = ((value[inner] - mean).square() * count[inner]).sum() / max(total - 1, 1.0)
+    is_inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
+    pixel_count = float(count[is_inner].sum())
+    mean = (value[is_inner] * count[is_inner]).sum() / max(pixel_count, 1.0)
+    variance = ((value[is_inner] - mean).square() * count[is_inner]).sum() / max(
+        pixel_count - 1, 1.0
+    )
     if min(sd, math.sqrt(float(variance))) < _COARSE:
-        return torch.zeros_like(inner), torch.zeros(4, dtype=torch.float64)
-    return inner, torch.stack(
-        [torch.tensor(total, dtype=torch.float64), mean, variance, torch.tensor(total - 1.0)]
+        return torch.zeros_like(is_inner), torch.zeros(4, dtype=torch.float64)
+    return is_inner, torch.stack(
+        [
+            torch.tensor(pixel_count, dtype=torch.float64),
+            mean,
+            variance,
+            torch.tensor(pixel_count - 1.0),
+        ]
     )
 
 
@@ -191,13 +212,16 @@ def log_cell(
     Source: s = round(x), floor(x), or floor(x + U(-1/2, 1/2)); NeuSee, Eq. (SensorImage).
     """
     if rounding == "nearest":
-        low = torch.where(value <= 0, -math.inf, value - 0.5)
-        high = torch.where((value >= top) | (value + 0.5 >= well), math.inf, value + 0.5)
-        return torch.where(low < well, _between(low, high, mean, sd), -math.inf)
+        # the numbers 0 and `top` hold all that is below and above; a full pixel ends the signal
+        lower_edge = torch.where(value <= 0, -math.inf, value - 0.5)
+        upper_edge = torch.where((value >= top) | (value + 0.5 >= well), math.inf, value + 0.5)
+        return torch.where(lower_edge < well, _between(lower_edge, upper_edge, mean, sd), -math.inf)
     if rounding == "truncation":
-        low = torch.where(value <= 0, -math.inf, value)
-        high = torch.where((value >= top) | (value + 1.0 > well), math.inf, value + 1.0)
-        return torch.where(low <= well, _between(low, high, mean, sd), -math.inf)
+        lower_edge = torch.where(value <= 0, -math.inf, value)
+        upper_edge = torch.where((value >= top) | (value + 1.0 > well), math.inf, value + 1.0)
+        return torch.where(
+            lower_edge <= well, _between(lower_edge, upper_edge, mean, sd), -math.inf
+        )
     probability = _dithered(value, mean, sd, well, top)
     return torch.where(probability > _LEAST, probability.clamp_min(_LEAST).log(), -math.inf)
 
@@ -206,11 +230,18 @@ def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
     """Return log P(low < x < high) for a Gaussian x, computed in the tail where no digits
     cancel.
     """
-    a, b = (low - mean) / sd, (high - mean) / sd
-    above = a + b > 0
-    a, b = torch.where(above, -b, a), torch.where(above, -a, b)
-    far, near = log_ndtr(a), log_ndtr(b)
-    log_probability: Tensor = near + torch.log(-torch.expm1((far - near).clamp_max(-_LEAST)))
+    lower_z, upper_z = (low - mean) / sd, (high - mean) / sd
+    is_above = lower_z + upper_z > 0
+    # above the mean, mirrored into the lower tail
+    lower_z, upper_z = (
+        torch.where(is_above, -upper_z, lower_z),
+        torch.where(is_above, -lower_z, upper_z),
+    )
+    log_far, log_near = log_ndtr(lower_z), log_ndtr(upper_z)
+    # log(exp(near) - exp(far)) without cancellation
+    log_probability: Tensor = log_near + torch.log(
+        -torch.expm1((log_far - log_near).clamp_max(-_LEAST))
+    )
     return log_probability
 
 
@@ -224,17 +255,32 @@ def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -
     digits cancel far from the mean; the asymptotes and the triangle at the well add up to 0.
     """
     middle = value + 0.5
-    start, end = middle - 1.0, torch.minimum(torch.maximum(well, middle - 1.0), middle + 1.0)
-    inner = torch.minimum(middle, end)
-    above = middle > mean
-    g0, g1, g2 = (_integral(x, mean, sd, above) for x in (start, inner, end))
-    at_well = torch.where(above, 0.0, (1.0 - (end - middle).abs()))
-    within = at_well + g0 - 2.0 * g1 + g2
-    lowest = torch.where(above, 1.0, middle + 1.0 - torch.maximum(end, middle)) + g2 - g1
-    highest = torch.where(above, 0.0, inner - start) + g0 - g1
-    return torch.where(value <= 0, lowest, torch.where(value >= top, highest, within)).clamp_min(
-        0.0
+    first_corner, last_corner = (
+        middle - 1.0,
+        torch.minimum(torch.maximum(well, middle - 1.0), middle + 1.0),
     )
+    # the well may end the triangle before its middle or its last corner
+    middle_corner = torch.minimum(middle, last_corner)
+    is_above = middle > mean
+    integral_first, integral_middle, integral_last = (
+        _integral(x, mean, sd, is_above) for x in (first_corner, middle_corner, last_corner)
+    )
+    # height of the triangle where the well cuts it off
+    at_well = torch.where(is_above, 0.0, (1.0 - (last_corner - middle).abs()))
+    inner_probability = at_well + integral_first - 2.0 * integral_middle + integral_last
+    lowest_probability = (
+        torch.where(is_above, 1.0, middle + 1.0 - torch.maximum(last_corner, middle))
+        + integral_last
+        - integral_middle
+    )
+    highest_probability = (
+        torch.where(is_above, 0.0, middle_corner - first_corner) + integral_first - integral_middle
+    )
+    return torch.where(
+        value <= 0,
+        lowest_probability,
+        torch.where(value >= top, highest_probability, inner_probability),
+    ).clamp_min(0.0)
 
 
 def _integral(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
@@ -243,9 +289,9 @@ def _integral(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
     """
     z = (x - mean) / sd
     density = torch.exp(-0.5 * z.square()) / math.sqrt(2.0 * math.pi)
-    side = torch.where(above, z, -z)
-    tail = 0.5 * torch.special.erfc(side / math.sqrt(2.0))  # `ndtr` loses all digits below -8
-    integral: Tensor = sd * (density - side * tail)
+    mirrored_z = torch.where(above, z, -z)
+    tail = 0.5 * torch.special.erfc(mirrored_z / math.sqrt(2.0))  # `ndtr` loses all digits below -8
+    integral: Tensor = sd * (density - mirrored_z * tail)
     return integral
 
 
@@ -311,43 +357,55 @@ def likelihood(
 
     Without ``with_details`` only the logarithm is computed, because a sampler needs no other field.
     """
-    signal, (shift, spread), top = _expected(levels, sensor), ROUNDED[rounding], 2**bits - 1
-    mean, variance = signal.mean + shift, signal.variance + spread
-    off = levels.pixels * (levels.mean - mean).square() / variance
-    log = -0.5 * (
+    expected, (rounding_shift, rounding_variance), largest_number = (
+        _expected(levels, sensor),
+        ROUNDED[rounding],
+        2**bits - 1,
+    )
+    mean, variance = expected.mean + rounding_shift, expected.variance + rounding_variance
+    mean_term = levels.pixels * (levels.mean - mean).square() / variance
+    # Gaussian likelihood of mean and variance of a level
+    log_of_moments = -0.5 * (
         (levels.degrees_of_freedom + 1) * variance.log()
         + levels.degrees_of_freedom * levels.variance / variance
-        + off
+        + mean_term
     )
-    counted, measured = _has_cells(levels), levels.pixels > 0
-    below = levels.pixels * log_ndtr((sensor.well - signal.mean) / signal.variance.sqrt())
-    cells = _log_cells(levels, signal, sensor, rounding, top)
-    total = (log + below.where(~counted, 0.0)).where(measured, 0.0).sum(-1) + (
-        levels.cell_count * cells
-    ).sum(-1)
+    has_cells, has_moments = _has_cells(levels), levels.pixels > 0
+    # of a level without a histogram, no pixel may be above the well
+    log_below_well = levels.pixels * log_ndtr(
+        (sensor.well - expected.mean) / expected.variance.sqrt()
+    )
+    log_cells = _log_cells(levels, expected, sensor, rounding, largest_number)
+    log_likelihood = (log_of_moments + log_below_well.where(~has_cells, 0.0)).where(
+        has_moments, 0.0
+    ).sum(-1) + (levels.cell_count * log_cells).sum(-1)
     if not with_details:
-        return without_details(total)
-    ratio = levels.variance.where(measured, 1.0) / variance
+        return without_details(log_likelihood)
+    variance_ratio = levels.variance.where(has_moments, 1.0) / variance
     deviance, freedom = _deviance(
         levels,
-        levels.degrees_of_freedom * (ratio - 1 - ratio.log()) + off,
-        cells,
-        measured & ~counted,
+        levels.degrees_of_freedom * (variance_ratio - 1 - variance_ratio.log()) + mean_term,
+        log_cells,
+        has_moments & ~has_cells,
     )
-    rows = [_scaled(levels, mean, variance).where(measured.repeat(2), 0.0)]
-    rows.append(2.0 * (_pixels(levels)[levels.cell_level] * cells.exp()).sqrt())
+    rows = [_scaled(levels, mean, variance).where(has_moments.repeat(2), 0.0)]
+    # Poisson counts: 2 sqrt(expected count) has the standard deviation 1
+    rows.append(2.0 * (_pixels(levels)[levels.cell_level] * log_cells.exp()).sqrt())
     if rounding != "dithered_floor":  # the well lies anywhere within one number, 1 DN wide
-        rows.append(math.sqrt(12.0) * sensor.well * _cut_off(levels, signal, sensor, top))
-    return Likelihood(total, deviance, freedom, torch.cat(rows, -1), mean, variance)
+        # standard deviation of an even distribution 1 DN wide: 1 / sqrt(12)
+        rows.append(
+            math.sqrt(12.0) * sensor.well * _cut_off(levels, expected, sensor, largest_number)
+        )
+    return Likelihood(log_likelihood, deviance, freedom, torch.cat(rows, -1), mean, variance)
 
 
 def _cut_off(levels: Sufficient, signal: _Expected, sensor: Sensor, top: int) -> Tensor:
     """Return a mask (..., 1) of the sensors whose full well clips numbers that the converter
     could still give.
     """
-    over = _pixels(levels) * ndtr((signal.mean - sensor.well) / signal.variance.sqrt())
-    clips: Tensor = (over.sum(-1, keepdim=True) > 1.0) & (sensor.well < top - 0.5)
-    return clips
+    pixels_above = _pixels(levels) * ndtr((signal.mean - sensor.well) / signal.variance.sqrt())
+    is_clipping: Tensor = (pixels_above.sum(-1, keepdim=True) > 1.0) & (sensor.well < top - 0.5)
+    return is_clipping
 
 
 def without_details(total: Tensor) -> Likelihood:
@@ -370,6 +428,9 @@ def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
 
 
 def _expected(levels: Sufficient, sensor: Sensor) -> _Expected:
+    """Return mean and variance (..., level) of the numbers of each level before rounding: offset,
+    dark signal and light, with read noise and the shot noise of both.
+    """
     dark = sensor.dark * levels.exposure
     mean = sensor.offset + dark + sensor.response * levels.photons
     return _Expected(
@@ -378,6 +439,7 @@ def _expected(levels: Sufficient, sensor: Sensor) -> _Expected:
 
 
 def _has_cells(levels: Sufficient) -> Tensor:
+    """Return a mask of the levels that have a histogram."""
     return torch.zeros_like(levels.pixels, dtype=torch.bool).index_fill_(0, levels.cell_level, True)
 
 
@@ -391,24 +453,30 @@ def _pixels(levels: Sufficient) -> Tensor:
 def _log_cells(
     levels: Sufficient, signal: _Expected, sensor: Sensor, rounding: Rounding, top: int
 ) -> Tensor:
-    """Return the logarithm of the probability of each histogram bin (..., bin)."""
+    """Return the logarithm of the probability of each histogram bin (..., bin).
+
+    For coarse levels of few electrons the probability is summed over their Poisson number, since a
+    Gaussian is too inaccurate there.
+    """
     cell_level = levels.cell_level
     mean, variance = (
         signal.mean.index_select(-1, cell_level),
         signal.variance.index_select(-1, cell_level),
     )
-    continuous = log_cell(levels.cell_value, mean, variance.sqrt(), sensor.well, rounding, top)
-    coarse = (levels.pixels == 0)[cell_level]
+    gaussian = log_cell(levels.cell_value, mean, variance.sqrt(), sensor.well, rounding, top)
+    is_coarse = (levels.pixels == 0)[cell_level]
     electrons = (
         mean - sensor.offset if sensor.counted else sensor.dark * levels.exposure[cell_level]
     ) / sensor.gain
-    few = coarse & (electrons <= _FEW) & (sensor.gain.square() * electrons > _GRAIN * variance)
-    if not bool(few.any()):
-        return continuous
+    has_few = (
+        is_coarse & (electrons <= _FEW) & (sensor.gain.square() * electrons > _GRAIN * variance)
+    )
+    if not bool(has_few.any()):
+        return gaussian
     return torch.where(
-        few,
-        _counted_out(levels, signal, sensor, rounding, top, electrons.expand_as(continuous)),
-        continuous,
+        has_few,
+        _counted_out(levels, signal, sensor, rounding, top, electrons.expand_as(gaussian)),
+        gaussian,
     )
 
 
@@ -424,36 +492,45 @@ def _counted_out(
     electrons.
     """
     cell_level = levels.cell_level
-    count = torch.arange(_MOST + 1, dtype=torch.float64).view(-1, *(1 for _ in electrons.shape))
-    expected = electrons.clamp_min(1e-300)
-    weight = count * expected.log() - expected - torch.lgamma(count + 1)
-    mean = signal.mean[..., cell_level] + sensor.gain * (count - electrons)
+    electron_count = torch.arange(_MOST + 1, dtype=torch.float64).view(
+        -1, *(1 for _ in electrons.shape)
+    )
+    mean_electrons = electrons.clamp_min(1e-300)
+    log_poisson = (
+        electron_count * mean_electrons.log() - mean_electrons - torch.lgamma(electron_count + 1)
+    )
+    mean = signal.mean[..., cell_level] + sensor.gain * (electron_count - electrons)
+    # what is left without the variance of the counted electrons
     other_variance = (
         signal.variance[..., cell_level] - sensor.gain.square() * electrons
     ).clamp_min(0.0) + 1e-300
     log_probability = log_cell(
         levels.cell_value, mean, other_variance.sqrt(), sensor.well, rounding, top
     )
-    return torch.logsumexp(weight + log_probability, 0)
+    return torch.logsumexp(log_poisson + log_probability, 0)
 
 
 def _deviance(
     levels: Sufficient, moments: Tensor, cells: Tensor, measured: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return deviance and degrees of freedom of each light level; both are 0 for a partly
-    clipped level.
+    """Return deviance and degrees of freedom (..., level); both are 0 for a partly clipped level.
+
+    ``moments`` is the deviance of mean and variance where they are ``measured``; elsewhere it is
+    that of the histogram, whose bins have the logarithmic probabilities ``cells``.
     """
     by_cells = levels.pixels == 0
-    count, total = levels.cell_count, _pixels(levels)[levels.cell_level]
-    of_cell = 2.0 * count * ((count / total).log() - cells)
-    summed = torch.zeros_like(moments).index_add(
-        -1, levels.cell_level, of_cell.expand(*moments.shape[:-1], -1)
+    count, pixels_of_level = levels.cell_count, _pixels(levels)[levels.cell_level]
+    # twice the log-likelihood below that of the measured shares
+    cell_deviance = 2.0 * count * ((count / pixels_of_level).log() - cells)
+    level_deviance = torch.zeros_like(moments).index_add(
+        -1, levels.cell_level, cell_deviance.expand(*moments.shape[:-1], -1)
     )
-    distinct = torch.zeros_like(levels.pixels).index_add(
+    bin_count = torch.zeros_like(levels.pixels).index_add(
         0, levels.cell_level, torch.ones_like(count)
     )
-    freedom = torch.where(measured, 2.0, torch.where(by_cells, (distinct - 1).clamp_min(0.0), 0.0))
-    deviance = torch.where(measured, moments, torch.where(by_cells, summed, 0.0))
+    # mean and variance are two; a histogram has one less than its bins
+    freedom = torch.where(measured, 2.0, torch.where(by_cells, (bin_count - 1).clamp_min(0.0), 0.0))
+    deviance = torch.where(measured, moments, torch.where(by_cells, level_deviance, 0.0))
     return torch.where(freedom > 0, deviance, 0.0), freedom
 
 
@@ -510,20 +587,32 @@ def density(
         spread,
     )
     columns = [torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters]
-    alike = torch.broadcast_tensors(*columns)  # type: ignore[no-untyped-call]
-    k, efficiency, bias, read, dark, well, shift, c2 = alike
-    mean_factor = shift + (mean == "additive")
-    variance = c2.square() * (efficiency if drawn_in == "electrons" else efficiency.square())
-    poisson = arrivals == "poisson" and (mean, drawn_in) == ("additive", "electrons")
+    broadcast = torch.broadcast_tensors(*columns)  # type: ignore[no-untyped-call]
+    (
+        gain_k,
+        efficiency,
+        offset_electrons,
+        read_electrons,
+        dark_electrons,
+        well_electrons,
+        mean_change,
+        noise_factor,
+    ) = broadcast
+    mean_factor = mean_change + (mean == "additive")
+    # e-^2 per photon; noise that is drawn in photons is multiplied by the efficiency afterwards
+    variance_per_photon = noise_factor.square() * (
+        efficiency if drawn_in == "electrons" else efficiency.square()
+    )
+    is_poisson = arrivals == "poisson" and (mean, drawn_in) == ("additive", "electrons")
     sensor = Sensor(
-        gain=k,
-        response=k * efficiency * mean_factor,
-        noise=k.square() * variance,
-        offset=k * bias,
-        read=k * read,
-        dark=k * dark / dark_exposure,
-        well=k * well,
-        counted=poisson and bool(((c2 == 1) & (shift == 0)).all()),
+        gain=gain_k,
+        response=gain_k * efficiency * mean_factor,
+        noise=gain_k.square() * variance_per_photon,
+        offset=gain_k * offset_electrons,
+        read=gain_k * read_electrons,
+        dark=gain_k * dark_electrons / dark_exposure,
+        well=gain_k * well_electrons,
+        counted=is_poisson and bool(((noise_factor == 1) & (mean_change == 0)).all()),
     )
     return likelihood(levels, sensor, rounding, bits, told)
 
@@ -532,5 +621,5 @@ def density(
 def _(result: Likelihood, *inputs: Sufficient, **params: Any) -> list[Check]:
     if not len(result.degrees_of_freedom):
         return []
-    off, freedom = float(result.deviance.sum()), float(result.degrees_of_freedom.sum())
-    return [Check(f"deviance {off:.4g} for {freedom:.0f} degrees of freedom")]
+    deviance, freedom = float(result.deviance.sum()), float(result.degrees_of_freedom.sum())
+    return [Check(f"deviance {deviance:.4g} for {freedom:.0f} degrees of freedom")]

@@ -52,25 +52,26 @@ def camera_sources(levels: Levels, params: Mapping[str, Any]) -> dict[str, Tenso
     Error:  exact for the model of `camera`.
     Source: the variance of a mean and of a log variance in `camera`, term by term.
     """
-    fitted, top, _ = _used(levels, params["share"])
-    fitted_levels = without_histograms(levels, fitted)
+    fitted_index, largest_signal, _ = _used(levels, params["share"])
+    fitted_levels = without_histograms(levels, fitted_index)
     camera = _Camera(
         *(torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS)
     )
-    signal = _signal(fitted_levels.mean - camera.signal, top, camera)
-    light = camera.lamp * camera.efficiency * fitted_levels.photons * signal.slope
-    chance, drift = (
+    signal = _signal(fitted_levels.mean - camera.signal, largest_signal, camera)
+    lamp_error = camera.lamp * camera.efficiency * fitted_levels.photons * signal.slope
+    chance_variance, drift_variance = (
         fitted_levels.variance / fitted_levels.pixels,
-        camera.drift.square() * torch.ones_like(light),
+        camera.drift.square() * torch.ones_like(lamp_error),
     )
-    means = {STATISTICS: chance, LAMP: light.square(), DRIFT: drift}
+    means = {STATISTICS: chance_variance, LAMP: lamp_error.square(), DRIFT: drift_variance}
     variances = {
         STATISTICS: 2.0 / fitted_levels.degrees_of_freedom,
-        SCATTER: camera.scatter.square() * torch.ones_like(light),
+        SCATTER: camera.scatter.square() * torch.ones_like(lamp_error),
     }
-    parts = [_shares(squares) for squares in (variances, means)]
-    none = torch.zeros_like(light)
-    rows = {source: [shares.get(source, none) for shares in parts] for source in SOURCES}
+    row_shares = [_shares(squares) for squares in (variances, means)]
+    no_share = torch.zeros_like(lamp_error)
+    rows = {source: [shares.get(source, no_share) for shares in row_shares] for source in SOURCES}
+    # the rows of `camera`: residual and width of each log variance, then of each mean
     return {source: torch.cat([a, a, b, b]) for source, (a, b) in rows.items()}
 
 
@@ -85,15 +86,15 @@ def source_freedom(
     Source: JCGM 100:2008 (GUM), section 4.2.6 and G.3.3.
     """
     fitted, _, _ = _used(levels, params["share"])
-    lit = int((levels.photons[fitted] > 0).sum())
-    response = [name in free for name in ("quantum_efficiency", "bend", "twist")]
-    dark = [name in free for name in ("dark_signal", "dark_current")]
-    noise = [name in free for name in ("gain", "temporal_dark_noise")]
+    lit_count = int((levels.photons[fitted] > 0).sum())
+    response_is_free = [name in free for name in ("quantum_efficiency", "bend", "twist")]
+    dark_is_free = [name in free for name in ("dark_signal", "dark_current")]
+    noise_is_free = [name in free for name in ("gain", "temporal_dark_noise")]
     return {
         STATISTICS: float(levels.degrees_of_freedom[fitted].sum()),
-        LAMP: float(max(1, lit - sum(response))),
-        DRIFT: float(max(1, len(fitted) - lit - sum(dark))),
-        SCATTER: float(max(1, len(fitted) - sum(noise))),
+        LAMP: float(max(1, lit_count - sum(response_is_free))),
+        DRIFT: float(max(1, len(fitted) - lit_count - sum(dark_is_free))),
+        SCATTER: float(max(1, len(fitted) - sum(noise_is_free))),
     }
 
 
@@ -114,16 +115,21 @@ def variance_shares(
     Source: JCGM 100:2008 (GUM), section 5.1, for a least-squares estimate with a prior.
     """
     free = slopes.shape[1]
-    root = torch.linalg.cholesky(slopes.T @ slopes + torch.eye(free, dtype=slopes.dtype))
-    gradient = torch.cholesky_solve(along[:, None], root)[:, 0]
+    # J^T J + 1: the prior has the standard deviation 1 in these units
+    cholesky = torch.linalg.cholesky(slopes.T @ slopes + torch.eye(free, dtype=slopes.dtype))
+    # C times the derivative of the function
+    gradient = torch.cholesky_solve(along[:, None], cholesky)[:, 0]
     response = slopes @ gradient
-    parts = {name: float((share * response.square()).sum()) for name, share in sources.items()}
-    parts["prior"] = float(gradient @ gradient)
-    total = math.fsum(parts.values())
-    return {name: variance / total for name, variance in parts.items()}
+    variance_of_source = {
+        name: float((share * response.square()).sum()) for name, share in sources.items()
+    }
+    variance_of_source["prior"] = float(gradient @ gradient)
+    total = math.fsum(variance_of_source.values())
+    return {name: variance / total for name, variance in variance_of_source.items()}
 
 
 def _shares(parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return each variance over the sum of all, element by element."""
     total = torch.stack(list(parts.values())).sum(0)
     return {name: variance / total for name, variance in parts.items()}
 
@@ -187,7 +193,7 @@ class _Propagation:
     def statistics(self) -> dict[str, list[Contribution]]:
         """Return the contributions of the mean and of the variance of each level, by key."""
         levels = self.levels
-        parts: dict[str, list[Contribution]] = {}
+        contributions: dict[str, list[Contribution]] = {}
         for name, error, freedom in (
             ("mean", (levels.variance / levels.pixels).sqrt(), levels.pixels - 1),
             (
@@ -196,24 +202,30 @@ class _Propagation:
                 levels.degrees_of_freedom,
             ),
         ):
-            for i, (u, nu) in enumerate(zip(error.tolist(), freedom.tolist(), strict=True)):
-                if u > 0:
-                    for key, slope in self._slopes(self._moved(name, i), _STEP * u).items():
-                        parts.setdefault(key, []).append(
-                            Contribution("", "A", "", u, "", slope, nu)
+            for i, (uncertainty, degrees_of_freedom) in enumerate(
+                zip(error.tolist(), freedom.tolist(), strict=True)
+            ):
+                if uncertainty > 0:
+                    for key, slope in self._slopes(
+                        self._moved(name, i), _STEP * uncertainty
+                    ).items():
+                        contributions.setdefault(key, []).append(
+                            # only uncertainty, sensitivity and freedom count: the terms are
+                            # combined later
+                            Contribution("", "A", "", uncertainty, "", slope, degrees_of_freedom)
                         )
-        return parts
+        return contributions
 
     @cached_property
     def light(self) -> Values:
         """Return the root of the sum of squares of dy/de over the lit levels, e the relative
         light of one level.
         """
-        sums: Values = {}
+        sums_of_squares: Values = {}
         for i in (self.levels.photons > 0).nonzero().squeeze(1).tolist():
             for key, slope in self._slopes(self._lit(i), _SCALE).items():
-                sums[key] = sums.get(key, 0.0) + slope**2
-        return {key: math.sqrt(x) for key, x in sums.items()}
+                sums_of_squares[key] = sums_of_squares.get(key, 0.0) + slope**2
+        return {key: math.sqrt(x) for key, x in sums_of_squares.items()}
 
     @cached_property
     def photons(self) -> Values:
@@ -226,10 +238,15 @@ class _Propagation:
     def other_model(self) -> Values:
         """Return the quantities with lines that are fitted up to 35 % of saturation only."""
         levels, transfer = self.levels, self.sheet.transfer
-        full = float(transfer.signal[transfer.saturation])
+        saturation_signal = float(transfer.signal[transfer.saturation])
         darkest = float(transfer.mean_dark.min())
-        above = levels.mean - darkest
-        used_levels = (levels.photons == 0) | (above <= _HALF * full) | (above > SENSITIVITY * full)
+        signal = levels.mean - darkest
+        # lines up to half of the usual range; levels beyond the range tell the saturation
+        used_levels = (
+            (levels.photons == 0)
+            | (signal <= _HALF * saturation_signal)
+            | (signal > SENSITIVITY * saturation_signal)
+        )
         try:
             return self.values(without_histograms(levels, used_levels))
         except ValueError:
@@ -245,12 +262,15 @@ class _Propagation:
             return math.nan, math.nan
         linear_levels = transfer.linear
         order = _lit_order(self.levels)
-        chance = (self.levels.variance / self.levels.pixels).numpy()[order][
+        chance_variance = (self.levels.variance / self.levels.pixels).numpy()[order][
             linear_levels
         ] / transfer.signal[linear_levels] ** 2
         freedom = len(line.deviation) - 2
-        square = float(((line.deviation / 100) ** 2).sum()) / freedom - float(chance.mean())
-        return math.sqrt(max(square, 0.0)), float(freedom)
+        # scatter about the line less what chance explains; a line fits two parameters
+        excess_variance = float(((line.deviation / 100) ** 2).sum()) / freedom - float(
+            chance_variance.mean()
+        )
+        return math.sqrt(max(excess_variance, 0.0)), float(freedom)
 
     @cached_property
     def spacing(self) -> float:
@@ -259,15 +279,26 @@ class _Propagation:
 
         The distribution is rectangular, from the level before to the level after.
         """
-        photons, top = self.sheet.transfer.photons, self.sheet.transfer.saturation
-        around = photons[[max(0, top - 1), min(len(photons) - 1, top + 1)]]
-        return float(np.abs(around - photons[top]).max() / photons[top] / math.sqrt(3))
+        photons, saturation = self.sheet.transfer.photons, self.sheet.transfer.saturation
+        neighbours = photons[[max(0, saturation - 1), min(len(photons) - 1, saturation + 1)]]
+        # the half-width of a rectangular distribution over sqrt(3)
+        return float(
+            np.abs(neighbours - photons[saturation]).max() / photons[saturation] / math.sqrt(3)
+        )
 
     def _slopes(self, levels_at: Callable[[float], Levels], step: float) -> Values:
-        high, low = self.values(levels_at(step)), self.values(levels_at(-step))
-        return {key: (high[key] - low[key]) / (2 * step) for key in high.keys() & low.keys()}
+        """Return the derivative of each quantity by central differences; ``levels_at`` gives the
+        levels for a step of an input to either side.
+        """
+        values_above, values_below = self.values(levels_at(step)), self.values(levels_at(-step))
+        return {
+            key: (values_above[key] - values_below[key]) / (2 * step)
+            for key in values_above.keys() & values_below.keys()
+        }
 
     def _moved(self, name: str, i: int) -> Callable[[float], Levels]:
+        """Return the levels as a function of a step of the field ``name`` of level ``i``."""
+
         def at(step: float) -> Levels:
             return self.levels._replace(**{name: _added(getattr(self.levels, name), i, step)})
 
@@ -277,11 +308,11 @@ class _Propagation:
         """Return the levels as a function of the relative light of level ``i``, which moves mean
         and variance.
         """
-        levels, dark = self.levels, self.levels.photons == 0
-        nearest = torch.where(
-            dark, (levels.exposure - levels.exposure[i]).abs(), torch.inf
+        levels, is_dark = self.levels, self.levels.photons == 0
+        nearest_dark = torch.where(
+            is_dark, (levels.exposure - levels.exposure[i]).abs(), torch.inf
         ).argmin()
-        signal, excess = (float(x[i] - x[nearest]) for x in (levels.mean, levels.variance))
+        signal, excess = (float(x[i] - x[nearest_dark]) for x in (levels.mean, levels.variance))
 
         def at(step: float) -> Levels:
             mean, variance = (
@@ -310,15 +341,20 @@ def sheet_budgets(
     Error:  first order in the uncertainties.
     Source: JCGM 100:2008 (GUM), equation 10; EMVA Standard 1288, release 4.0 Linear.
     """
-    plain = without_histograms(levels, torch.arange(len(levels.mean)))
-    moves = _Propagation(plain, sheet, photons_told)
-    stated = [q for q in sheet.quantities if q.value is not None and not q.bound]
+    without_cells = without_histograms(levels, torch.arange(len(levels.mean)))
+    propagation = _Propagation(without_cells, sheet, photons_told)
+    measured_quantities = [q for q in sheet.quantities if q.value is not None and not q.bound]
     gain = sheet["K"]
     of_measurement = {}
-    for q in stated:
-        own = list(_spatial(q, sheet, moves) if _is_spatial(q) else _of_levels(q, moves))
-        of_measurement[q.key] = own
-    return [_budget(q, of_measurement[q.key], moves, laboratory, gain) for q in stated]
+    for q in measured_quantities:
+        contributions = list(
+            _spatial(q, sheet, propagation) if _is_spatial(q) else _of_levels(q, propagation)
+        )
+        of_measurement[q.key] = contributions
+    return [
+        _budget(q, of_measurement[q.key], propagation, laboratory, gain)
+        for q in measured_quantities
+    ]
 
 
 def _budget(
@@ -328,41 +364,51 @@ def _budget(
     laboratory: Laboratory,
     gain: Quantity,
 ) -> Budget:
+    """Return the budget of a quantity: its ``own`` contributions by the measurement, and those of
+    the laboratory.
+    """
     assert q.value is not None
-    name, sign = _COEFFICIENTS.get(q.key, (q.key, 1.0))
-    key = q.key if q.key in laboratory.coefficients else name
-    photons = moves.photons.get(q.key, 0.0)
-    photons = photons if abs(photons) > _NOTHING * abs(q.value) else 0.0
-    of_laboratory = laboratory_contributions(key, sign * q.value, photons, laboratory)
-    return Budget(q.key, q.name, q.symbol, q.unit, q.value, (*own, *of_laboratory))
+    parameter, sign = _COEFFICIENTS.get(q.key, (q.key, 1.0))
+    # a coefficient of the quantity itself comes before that of its parameter
+    key = q.key if q.key in laboratory.coefficients else parameter
+    photon_slope = moves.photons.get(q.key, 0.0)
+    photon_slope = photon_slope if abs(photon_slope) > _NOTHING * abs(q.value) else 0.0
+    laboratory_terms = laboratory_contributions(key, sign * q.value, photon_slope, laboratory)
+    return Budget(q.key, q.name, q.symbol, q.unit, q.value, (*own, *laboratory_terms))
 
 
 def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
+    """Yield the contributions of the measurement to a quantity of the levels: statistics, lamp,
+    spacing of the levels, and model of the response.
+    """
     assert q.value is not None
-    parts = moves.statistics.get(q.key, [])
-    u = math.hypot(*(c.share or 0.0 for c in parts), 0.0)
-    freedom = welch_satterthwaite(parts)
-    if u > _NOTHING * abs(q.value):
-        yield Contribution(STATISTICS, "A", "normal", u, q.unit, 1.0, freedom)
+    contributions = moves.statistics.get(q.key, [])
+    uncertainty = math.hypot(*(c.share or 0.0 for c in contributions), 0.0)
+    freedom = welch_satterthwaite(contributions)
+    if uncertainty > _NOTHING * abs(q.value):
+        yield Contribution(STATISTICS, "A", "normal", uncertainty, q.unit, 1.0, freedom)
     else:
         yield Contribution(STATISTICS, "A", reason=NOT_INVOLVED)
     yield _of_lamp(moves.light.get(q.key, 0.0), q.value, moves)
     if sensitivity := _LOGARITHMS.get(q.key, _SATURATION.get(q.key, 0.0) * q.value):
         yield Contribution(SPACING, "B", "rectangular", moves.spacing, "relative", sensitivity)
-    other = moves.other_model.get(q.key)
-    if other is None:
+    other_value = moves.other_model.get(q.key)
+    if other_value is None:
         yield Contribution(
             MODEL, "B", reason=f"{NOT_STATED}: too few levels up to 35 % of saturation"
         )
-    elif abs(other - q.value) <= _NOTHING * abs(q.value):
+    elif abs(other_value - q.value) <= _NOTHING * abs(q.value):
         yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
     else:
         yield Contribution(
-            MODEL, "B", "rectangular", _BENT * abs(other - q.value) / math.sqrt(3), q.unit
+            MODEL, "B", "rectangular", _BENT * abs(other_value - q.value) / math.sqrt(3), q.unit
         )
 
 
 def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribution:
+    """Return the contribution of the lamp, from the derivative of a quantity of this ``value`` by
+    the relative light of its levels.
+    """
     scatter, freedom = moves.lamp
     if sensitivity <= _NOTHING * abs(value):
         return Contribution(LAMP, "A", reason=NOT_INVOLVED)
@@ -372,6 +418,7 @@ def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribut
 
 
 def _is_spatial(q: Quantity) -> bool:
+    """Return True for a quantity that series of frames give, not levels."""
     return q.key.startswith(("DSNU1288", "PRNU1288"))
 
 
@@ -379,13 +426,17 @@ def _chance_of_pattern(q: Quantity, sheet: EmvaSheet) -> float:
     """Return the standard error of the square of a quantity of series of frames, by chance."""
     lit, dark = sheet.spatial.lit, sheet.spatial.dark
     pattern = q.key.removesuffix("_DN").partition("_")[2]
+    # in the order of `SpatialVariances`; a total has no suffix
     index = ("", "row", "column", "pixel").index(pattern)
-    of_response = q.key.startswith("PRNU")
-    series = (dark, lit) if of_response else (dark,)
-    error = math.hypot(*(chance_of_variances(frames)[index] for frames in series if frames))
-    if of_response and lit is not None and dark is not None:
-        return error * (100 / float(lit.average.mean() - dark.average.mean())) ** 2
-    return error
+    is_response = q.key.startswith("PRNU")
+    series = (dark, lit) if is_response else (dark,)
+    standard_error = math.hypot(
+        *(chance_of_variances(frames)[index] for frames in series if frames)
+    )
+    if is_response and lit is not None and dark is not None:
+        # PRNU is in percent of the signal
+        return standard_error * (100 / float(lit.average.mean() - dark.average.mean())) ** 2
+    return standard_error
 
 
 def _spatial(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Contribution]:
@@ -394,24 +445,34 @@ def _spatial(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Con
     """
     assert q.value is not None
     gain = sheet["K"].value if q.unit == "e-" else None
-    own = _chance_of_pattern(q, sheet) / (2 * q.value) / (gain or 1.0) ** 2
+    # u(x) = u(x^2) / (2 x), in electrons over the gain squared
+    own_uncertainty = _chance_of_pattern(q, sheet) / (2 * q.value) / (gain or 1.0) ** 2
     dark = sheet.spatial.dark
-    pixels = float(dark.total.size if dark else 1) - 1
+    degrees_of_freedom = float(dark.total.size if dark else 1) - 1
     if not gain:
-        yield Contribution(STATISTICS, "A", "normal", own, q.unit, 1.0, pixels)
+        yield Contribution(
+            STATISTICS, "A", "normal", own_uncertainty, q.unit, 1.0, degrees_of_freedom
+        )
         yield Contribution(LAMP, "A", reason=NOT_INVOLVED)
         yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
         return
     chance, lamp, model = _of_levels(sheet["K"], moves)
+    # a relative change of the gain changes the quantity by as much
     ratio = q.value / gain
-    parts = [Contribution("", "A", "", own, "", 1.0, pixels), _scaled(chance, ratio)]
-    u = math.hypot(*(c.share or 0.0 for c in parts))
-    yield Contribution(STATISTICS, "A", "normal", u, q.unit, 1.0, welch_satterthwaite(parts))
+    contributions = [
+        Contribution("", "A", "", own_uncertainty, "", 1.0, degrees_of_freedom),
+        _scaled(chance, ratio),
+    ]
+    uncertainty = math.hypot(*(c.share or 0.0 for c in contributions))
+    yield Contribution(
+        STATISTICS, "A", "normal", uncertainty, q.unit, 1.0, welch_satterthwaite(contributions)
+    )
     yield _scaled(lamp, ratio)
     yield _scaled(model, ratio)
 
 
 def _scaled(c: Contribution, by: float) -> Contribution:
+    """Return a contribution with its sensitivity multiplied by ``by``."""
     return Contribution(
         c.source,
         c.kind,
@@ -425,9 +486,10 @@ def _scaled(c: Contribution, by: float) -> Contribution:
 
 
 def _added(values: Tensor, i: int, step: float) -> Tensor:
-    moved = values.clone()
-    moved[i] += step
-    return moved
+    """Return a copy of values in which number ``i`` is larger by ``step``."""
+    changed = values.clone()
+    changed[i] += step
+    return changed
 
 
 def _lit_order(levels: Levels) -> NDArray[np.int64]:

@@ -42,18 +42,23 @@ def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) 
     """Darken the pupil amplitude (v, u) in place by each grain and scratch, and return the
     amplitude.
     """
-    scale, middle = grid.diameter / grid.pitch, (grid.samples - 1) / 2
+    scale, middle_sample = grid.diameter / grid.pitch, (grid.samples - 1) / 2
     for mark in marks:
         points = [(mark.v, mark.u)] if isinstance(mark, Grain) else list(mark.points)
-        places = [(v * scale + middle, u * scale + middle) for v, u in points]
-        size = scale * (2 * mark.radius if isinstance(mark, Grain) else mark.width)
-        _darken(amplitude, places, size, mark.opacity)
+        positions = [(v * scale + middle_sample, u * scale + middle_sample) for v, u in points]
+        width_in_samples = scale * (2 * mark.radius if isinstance(mark, Grain) else mark.width)
+        _darken(amplitude, positions, width_in_samples, mark.opacity)
     return amplitude
 
 
 def _darken(
     amplitude: Tensor, places: list[tuple[float, float]], size: float, opacity: float
 ) -> None:
+    """Multiply the amplitude in place by 1 - opacity x covered share of a grain or a scratch.
+
+    ``places`` (v, u) are the points of its line in samples (one for a grain), ``size`` its width in
+    samples. Where segments overlap, the larger share counts.
+    """
     window = _window(places, size / 2 + 1, amplitude.shape[-1])
     if window is None:
         return
@@ -63,23 +68,25 @@ def _darken(
         None, :
     ]
     cover = amplitude.new_zeros(len(y), x.shape[1])
+    # a grain is one segment from its point to itself
     for start, end in zip(places, places[1:] or places, strict=False):
-        near = _window([start, end], size / 2 + 1, amplitude.shape[-1])
-        if near is None:
+        segment_window = _window([start, end], size / 2 + 1, amplitude.shape[-1])
+        if segment_window is None:
             continue
         v, u = (
-            slice(n.start - w.start, n.stop - w.start) for n, w in zip(near, window, strict=True)
+            slice(inner.start - outer.start, inner.stop - outer.start)
+            for inner, outer in zip(segment_window, window, strict=True)
         )
-        new = _cover(_distance(y[v], x[:, u], start, end), size, len(places) == 1)
-        cover[v, u] = torch.maximum(cover[v, u], new)
+        segment_cover = _cover(_distance(y[v], x[:, u], start, end), size, len(places) == 1)
+        cover[v, u] = torch.maximum(cover[v, u], segment_cover)
     amplitude[rows, columns] *= 1 - opacity * cover
 
 
 def _window(
     places: list[tuple[float, float]], margin: float, samples: int
 ) -> tuple[slice, slice] | None:
-    """Return the rows and columns of samples that a grain or scratch can touch, or None if it is
-    outside the grid.
+    """Return the rows and columns of samples within ``margin`` of the points that a grain or
+    scratch can touch, or None if it is outside the grid.
     """
     spans = []
     for axis in (0, 1):
@@ -93,15 +100,15 @@ def _window(
 
 def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float, float]) -> Tensor:
     """Return the distance of each sample, in samples, from the line between two points."""
-    along_y, along_x = end[0] - start[0], end[1] - start[1]
-    length = along_y**2 + along_x**2
-    share = (
-        ((y - start[0]) * along_y + (x - start[1]) * along_x) / length
-        if length > 0
+    line_y, line_x = end[0] - start[0], end[1] - start[1]
+    squared_length = line_y**2 + line_x**2
+    line_share = (
+        ((y - start[0]) * line_y + (x - start[1]) * line_x) / squared_length
+        if squared_length > 0
         else torch.zeros_like(y + x)
     )
-    share = share.clamp(0, 1)
-    return torch.hypot(y - start[0] - share * along_y, x - start[1] - share * along_x)
+    line_share = line_share.clamp(0, 1)
+    return torch.hypot(y - start[0] - line_share * line_y, x - start[1] - line_share * line_x)
 
 
 def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
@@ -109,9 +116,10 @@ def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
     shares sum to the area.
     """
     if round_:
-        square = size**2 / 4
-        edge = math.sqrt(max(square - 1 / 12, 1 / 4))
-        return min(3 * square, 1.0) * (edge + 0.5 - distance).clamp(0, 1)
+        squared_radius = size**2 / 4
+        # the sum over samples of a disc with a linear edge 1 wide is pi (r^2 + 1 / 12)
+        edge_radius = math.sqrt(max(squared_radius - 1 / 12, 1 / 4))
+        return min(3 * squared_radius, 1.0) * (edge_radius + 0.5 - distance).clamp(0, 1)
     return ((size + 1) / 2 - distance).clamp(0, min(size, 1.0))
 
 
@@ -168,18 +176,23 @@ def dirt(
     grid = grid_of(stop)
     grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _streams(5, rng)
     grains = _grains(dust, dust_radius, grains_rng)
-    lines = _scratches(scratches, scratch_length, scratch_width, lines_rng)
-    film, patches = factors(grid, grease_scale, film_rng), factors(grid, smudge_scale, patches_rng)
-    bends = _dents(WAVE * dents, dents_rng)
+    scratch_lines = _scratches(scratches, scratch_length, scratch_width, lines_rng)
+    film_factors, patch_factors = (
+        factors(grid, grease_scale, film_rng),
+        factors(grid, smudge_scale, patches_rng),
+    )
+    dent_terms = _dents(WAVE * dents, dents_rng)
     amplitude, path = (torch.empty(grid.samples, grid.samples) for _ in range(2))
     for rows in stripes(grid):
         amplitude[rows] = (
-            1 - smudges * torch.sigmoid(3 * (patches[0][rows] @ patches[1])) if smudges else 1.0
+            1 - smudges * torch.sigmoid(3 * (patch_factors[0][rows] @ patch_factors[1]))
+            if smudges
+            else 1.0
         )
-        path[rows] = WAVE * grease * (film[0][rows] @ film[1]) if grease else 0.0
-        if bends:
-            path[rows] += surface(bends, grid, rows=rows)
-    return Dirt(stamp(amplitude, [*grains, *lines], grid), path)
+        path[rows] = WAVE * grease * (film_factors[0][rows] @ film_factors[1]) if grease else 0.0
+        if dent_terms:
+            path[rows] += surface(dent_terms, grid, rows=rows)
+    return Dirt(stamp(amplitude, [*grains, *scratch_lines], grid), path)
 
 
 def _streams(count: int, rng: torch.Generator) -> list[torch.Generator]:
@@ -191,6 +204,7 @@ def _streams(count: int, rng: torch.Generator) -> list[torch.Generator]:
 
 
 def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float:
+    """Draw an evenly distributed number from ``low`` to ``high``."""
     return low + (high - low) * float(
         torch.rand((), generator=rng, device=rng.device, dtype=torch.float64)
     )
@@ -206,6 +220,9 @@ def _about(mean: float, spread: float, rng: torch.Generator) -> float:
 
 
 def _grains(mean: float, radius: float, rng: torch.Generator) -> list[Grain]:
+    """Return round dust grains at random positions: radii up to a largest one drawn about
+    ``radius``, numbers drawn about ``mean``.
+    """
     largest = _about(radius, radius / 2, rng)
     return [
         Grain(
@@ -219,6 +236,9 @@ def _grains(mean: float, radius: float, rng: torch.Generator) -> list[Grain]:
 
 
 def _scratches(mean: float, length: float, width: float, rng: torch.Generator) -> list[Scratch]:
+    """Return random scratches: a number drawn about ``mean``, with widths up to a widest one drawn
+    about ``width``.
+    """
     number, widest = round(_about(mean, mean / 6, rng)), _about(width, width / 4, rng)
     return [_scratch(length, widest, rng) for _ in range(number)]
 
@@ -238,9 +258,11 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
     """Return random Zernike coefficients of the dents in a window, whose root sum of squares is
     ``rms``.
     """
-    draw = torch.randn(len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64)
-    parts = (rms * draw / draw.norm()).tolist()
-    return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
+    normal_numbers = torch.randn(
+        len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64
+    )
+    coefficients = (rms * normal_numbers / normal_numbers.norm()).tolist()
+    return dict(zip(DENT_TERMS, coefficients, strict=True)) if rms else {}
 
 
 @dirt.zero_bound
@@ -283,15 +305,19 @@ def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
 
 
 def _effect(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
-    """Return the share of the light that passes the dirt, and the root mean square path in the
-    dirt, in waves.
+    """Return the share of the light that passes the dirt, and the standard deviation of the path
+    in the dirt in waves at 550 nm, over the pupil.
     """
-    sums = torch.zeros(4, dtype=torch.float64)
+    pupil_sums = torch.zeros(4, dtype=torch.float64)
     for rows in stripes(grid):
-        open_ = inside(grid, dirt.path.device, rows)
-        light, waves = dirt.amplitude[rows][open_].double(), dirt.path[rows][open_].double() / WAVE
-        sums += torch.stack(
-            [open_.sum(), light.square().sum(), waves.sum(), waves.square().sum()]
+        in_pupil = inside(grid, dirt.path.device, rows)
+        amplitude, path_waves = (
+            dirt.amplitude[rows][in_pupil].double(),
+            dirt.path[rows][in_pupil].double() / WAVE,
+        )
+        # samples, light, path and squared path, stripe after stripe
+        pupil_sums += torch.stack(
+            [in_pupil.sum(), amplitude.square().sum(), path_waves.sum(), path_waves.square().sum()]
         ).cpu()
-    passed, mean, square = (sums[1:] / sums[0]).tolist()
-    return passed, math.sqrt(max(square - mean**2, 0.0))
+    passed, mean_path, mean_square = (pupil_sums[1:] / pupil_sums[0]).tolist()
+    return passed, math.sqrt(max(mean_square - mean_path**2, 0.0))

@@ -60,34 +60,45 @@ def ghosts(
             f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: "
             "the numbers of bands differ, so compute both from one `line` step"
         )
-    drawn = _draw(count, spread, radius, rng)
+    drawn_ghosts = _draw(count, spread, radius, rng)
     spot = single(spot)
     # a float64 copy of the spot would be twice as large
     flux = spot.sum(-1).sum(-1, dtype=torch.float64)
+    # pixels from the axis to the laser
     y, x = (focal_length * n / pixel_pitch for n in direction.tolist())
-    total = torch.zeros_like(spot)
-    for ghost, colour in zip(drawn, _colours(drawn, bands.centres, flux), strict=True):
+    light_of_ghosts = torch.zeros_like(spot)
+    for ghost, colour in zip(
+        drawn_ghosts, _colours(drawn_ghosts, bands.centres, flux), strict=True
+    ):
         centre = (ghost.magnification * y, ghost.magnification * x)
         _add(
-            total,
+            light_of_ghosts,
             (energy * colour * flux).to(spot.dtype),
             centre,
             _in_pixels(ghost.radius, pixel_pitch),
         )
-    return total
+    return light_of_ghosts
 
 
 def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> list[_Ghost]:
-    draw = torch.rand(count, 5, generator=rng, device=rng.device, dtype=torch.float64).tolist()
-    sizes = [math.exp(2 * row[2]) for row in draw]
+    """Draw ``count`` ghosts; sizes are normalised so that their shares of the energy add up to 1.
+
+    Each ghost takes five random numbers: position, radius, energy and the wavelengths of two
+    coatings.
+    """
+    random_numbers = torch.rand(
+        count, 5, generator=rng, device=rng.device, dtype=torch.float64
+    ).tolist()
+    weights = [math.exp(2 * row[2]) for row in random_numbers]
     drawn = []
-    for (position, r, _, *coats), size in zip(draw, sizes, strict=True):
-        first, second = (400e-9 + 300e-9 * coat for coat in coats)
+    # coatings are tuned to 400 to 700 nm
+    for (position, r, _, *coating_draws), weight in zip(random_numbers, weights, strict=True):
+        first, second = (400e-9 + 300e-9 * coating_draw for coating_draw in coating_draws)
         magnification, drawn_radius = (
             spread * (2 * position - 1),
             radius * (_SMALLEST + (1 - _SMALLEST) * r),
         )
-        drawn.append(_Ghost(magnification, drawn_radius, size / sum(sizes), (first, second)))
+        drawn.append(_Ghost(magnification, drawn_radius, weight / sum(weights), (first, second)))
     return drawn
 
 
@@ -102,14 +113,14 @@ def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Ten
     """Return the gain of each ghost in each band, scaled so that all ghosts together carry the
     flux of the spot.
     """
-    raw = [
+    gains = [
         g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1])
         for g in drawn
     ]
-    moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
-    dark = moved <= 0  # false for NaN, so that NaN reaches the result
-    scale = torch.where(dark, 0.0, flux.sum() / moved.where(~dark, 1.0))
-    return [gain * scale for gain in raw]
+    reflected_light = torch.stack(gains).sum(0).mul(flux).sum() if gains else flux.sum()
+    no_light = reflected_light <= 0  # false for NaN, so that NaN reaches the result
+    scale = torch.where(no_light, 0.0, flux.sum() / reflected_light.where(~no_light, 1.0))
+    return [gain * scale for gain in gains]
 
 
 def _in_pixels(radius: float, pixel_pitch: float) -> float:
@@ -126,12 +137,14 @@ def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: flo
     height, width = total.shape[-2:]
     y, x = centre[0] + height // 2, centre[1] + width // 2
     rows, columns = _reach(y, radius), _reach(x, radius)
+    # the edge is one pixel wide
     disc = (radius + 0.5 - torch.hypot((rows - y)[:, None], (columns - x)[None, :])).clamp(0, 1)
-    inside = (disc / disc.sum())[_part(rows, height), _part(columns, width)].to(total)
-    if inside.numel():
+    # the whole disc has the sum 1, also where the image cuts it
+    visible_disc = (disc / disc.sum())[_part(rows, height), _part(columns, width)].to(total)
+    if visible_disc.numel():
         top, left = max(int(rows[0]), 0), max(int(columns[0]), 0)
-        total[:, top : top + inside.shape[0], left : left + inside.shape[1]] += (
-            energy[:, None, None] * inside
+        total[:, top : top + visible_disc.shape[0], left : left + visible_disc.shape[1]] += (
+            energy[:, None, None] * visible_disc
         )
 
 
@@ -169,6 +182,7 @@ def _(
     """
     if count == 0 or energy == 0:
         return 0.0
+    # of the smallest ghost; 0.8 is on the safe side of 16 %
     area = 0.8 * math.pi * (_in_pixels(_SMALLEST * radius, pixel_pitch) ** 2 + 1 / 12)
     return energy * spot.sum / area
 
@@ -185,13 +199,13 @@ def _(
 
 @ghosts.check
 def _(result: Tensor, spot: Tensor, *_: Any, energy: float, **__: Any) -> list[Check]:
-    spot_energy, moved = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (spot, result))
-    ghost_share = moved / spot_energy if spot_energy > 0 else 0.0
-    bounded = ghost_share <= energy * (1 + 1e-3)
+    spot_energy, ghost_energy = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (spot, result))
+    ghost_share = ghost_energy / spot_energy if spot_energy > 0 else 0.0
+    is_bounded = ghost_share <= energy * (1 + 1e-3)
     return [
         Check(
             f"ghosts in the window have {ghost_share:.3g} of the spot's energy; {energy:.3g} is"
             " reflected",
-            bounded,
+            is_bounded,
         )
     ]

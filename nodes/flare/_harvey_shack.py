@@ -108,41 +108,50 @@ def on_far_pixels(light: Lobe, square: Tensor) -> Tensor:
     the light.
     """
     q = square / light.width.square()
-    bend = light.slope / (light.width.square() * (1 + q)) * (2 + (light.slope - 2) * q / (1 + q))
-    return light.peak * torch.exp(light.slope / 2 * torch.log1p(q)) * (1 + bend / 24)
+    laplacian = (
+        light.slope / (light.width.square() * (1 + q)) * (2 + (light.slope - 2) * q / (1 + q))
+    )
+    return light.peak * torch.exp(light.slope / 2 * torch.log1p(q)) * (1 + laplacian / 24)
 
 
 def _far(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
-    square = y.square() + x.square()
-    value = on_far_pixels(light, square)
-    if float(light.end.detach()) > float(square.max().sqrt()) + 1:
-        return value
-    return value * (light.end - square.sqrt() + 0.5).clamp(0, 1)
+    """Return the light of pixels at the distances ``y`` and ``x`` from the source along both axes,
+    0 beyond the end of the light.
+    """
+    squared_distance = y.square() + x.square()
+    light_of_pixels = on_far_pixels(light, squared_distance)
+    if float(light.end.detach()) > float(squared_distance.max().sqrt()) + 1:
+        return light_of_pixels
+    # a pixel across the end has a part of it
+    return light_of_pixels * (light.end - squared_distance.sqrt() + 0.5).clamp(0, 1)
 
 
 def _exact(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
-    """Return the light of each pixel between the edges ``y`` and ``x``, as second differences of
-    corner integrals.
+    """Return the light of each pixel between the edges ``y`` and ``x``: second differences of the
+    light in the rectangles from the source to the corners.
     """
     distance_y, distance_x = (edge.abs().clamp_min(_CLOSEST) for edge in (y, x))
-    down, along = torch.meshgrid(distance_y, distance_x, indexing="ij")
-    quarter = _triangle(light, down, along) + _triangle(light, along, down)
-    corner = torch.sign(y)[:, None] * torch.sign(x)[None] * quarter
-    return corner.diff(dim=0).diff(dim=1)
+    corner_y, corner_x = torch.meshgrid(distance_y, distance_x, indexing="ij")
+    # two right triangles, on each side of the diagonal
+    rectangle = _triangle(light, corner_y, corner_x) + _triangle(light, corner_x, corner_y)
+    signed_rectangle = torch.sign(y)[:, None] * torch.sign(x)[None] * rectangle
+    return signed_rectangle.diff(dim=0).diff(dim=1)
 
 
 def _triangle(light: Lobe, near: Tensor, across: Tensor) -> Tensor:
-    """Return the light in the right triangle source, foot, corner, with the legs ``near`` and
-    ``across``.
+    """Return the light in the right triangle between the source, the foot of a perpendicular and a
+    corner, with the legs ``near`` (to the foot) and ``across``.
 
-    With the angle tan(phi) = sinh(u) the integrand is smooth on the scale of 1, however narrow the
-    scatter is.
+    The light within the hypotenuse at the angle phi is integrated over phi. With tan(phi) = sinh(u)
+    the integrand is smooth on the scale of 1, however narrow the scatter is.
     """
     nodes, weights = _gauss()
-    end = torch.asinh(across / near)[..., None]
-    stretch = torch.cosh(end * nodes)
+    largest_u = torch.asinh(across / near)[..., None]
+    stretch = torch.cosh(largest_u * nodes)
+    # light up to the far leg, at the distance near / cos(phi) = near cosh(u), per angle
     enclosed = light.peak * _enclosed(light.width, light.slope, near[..., None] * stretch)
-    return (weights * end * enclosed / stretch).sum(-1)
+    # dphi = du / cosh(u)
+    return (weights * largest_u * enclosed / stretch).sum(-1)
 
 
 @cache
@@ -156,13 +165,15 @@ def _gauss() -> tuple[Tensor, Tensor]:
 
 def _enclosed(width: Tensor, slope: Tensor, radius: Tensor) -> Tensor:
     """Return the integral of r (1 + (r / width)**2)**(slope / 2) over r from 0 to ``radius``."""
-    size = torch.log1p((radius / width).square())
-    return width.square() / 2 * size * _growth((slope + 2) / 2 * size)
+    # with z = ln(1 + (r / width)^2): width^2 / 2 times the integral of exp((slope + 2) / 2 z) over
+    # z
+    log_term = torch.log1p((radius / width).square())
+    return width.square() / 2 * log_term * _growth((slope + 2) / 2 * log_term)
 
 
 def _growth(z: Tensor) -> Tensor:
     """Return (exp(z) - 1) / z, which is 1 at z = 0, with exact derivatives there."""
-    small = z.abs() < _SERIES
-    safe = torch.where(small, 1.0, z)
+    is_small = z.abs() < _SERIES
+    safe_z = torch.where(is_small, 1.0, z)
     series = 1 + z / 2 * (1 + z / 3 * (1 + z / 4 * (1 + z / 5)))
-    return torch.where(small, series, torch.expm1(safe) / safe)
+    return torch.where(is_small, series, torch.expm1(safe_z) / safe_z)

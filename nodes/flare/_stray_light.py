@@ -115,28 +115,32 @@ def stray_light(
     """
     _same_bands(psf, pupil)
     lens = _Lens(surfaces, focal_length, pixel_pitch, diameter, wavelength, scaling)
-    y, x = (
+    angle_y, angle_x = (
         a + float(d)
         for a, d in zip(angle, (0.0, 0.0) if direction is None else direction, strict=True)
     )
-    size = (psf.intensity.shape[-2], psf.intensity.shape[-1])
+    window_shape = (psf.intensity.shape[-2], psf.intensity.shape[-1])
     centre = (
-        size[0] // 2 + focal_length * y / pixel_pitch,
-        size[1] // 2 + focal_length * x / pixel_pitch,
+        # pixels from the axis to the source: f x angle / pitch
+        window_shape[0] // 2 + focal_length * angle_y / pixel_pitch,
+        window_shape[1] // 2 + focal_length * angle_x / pixel_pitch,
     )
-    share, intensity, peaks, veil = _transmitted(pupil), [], [], None
+    transmitted, intensity, axis_peaks, veil = _transmitted(pupil), [], [], None
     for band, colour in enumerate(pupil.wavelengths.tolist()):
+        # without a scaling the veil is the same in every band
         if veil is None or scaling != "none":
             lobes = _lobes(lens, colour)
-            veil, axis, scattered = (
-                _veil(lobes, centre, size),
+            veil, axis_light, scattered = (
+                _veil(lobes, centre, window_shape),
                 _veil(lobes, (0.0, 0.0), (1, 1)),
                 _total(lobes),
             )
-        core = single(psf.intensity[band])
-        intensity.append(core * (1 - scattered).to(core) + (share * veil).to(core))
-        peaks.append(psf.clear_peak[band] * (1 - scattered) + axis[0, 0])
-    return psf._replace(intensity=torch.stack(intensity), clear_peak=torch.stack(peaks))
+        unscattered = single(psf.intensity[band])
+        intensity.append(
+            unscattered * (1 - scattered).to(unscattered) + (transmitted * veil).to(unscattered)
+        )
+        axis_peaks.append(psf.clear_peak[band] * (1 - scattered) + axis_light[0, 0])
+    return psf._replace(intensity=torch.stack(intensity), clear_peak=torch.stack(axis_peaks))
 
 
 @node()
@@ -168,11 +172,11 @@ def stray_shares(
     """
     _same_bands(psf, pupil)
     lens = _Lens(surfaces, focal_length, pixel_pitch, diameter, wavelength, scaling)
-    total = torch.stack([_total(_lobes(lens, colour)) for colour in pupil.wavelengths.tolist()])
-    share = _transmitted(pupil)
-    with_veil, without = (x.intensity.double().sum((-2, -1)) for x in (psf, core))
-    inside = with_veil - (1 - total) * without
-    return StrayShares(share * (1 - total), inside, share * total - inside)
+    scattered = torch.stack([_total(_lobes(lens, colour)) for colour in pupil.wavelengths.tolist()])
+    transmitted = _transmitted(pupil)
+    light_with_veil, light_without_veil = (x.intensity.double().sum((-2, -1)) for x in (psf, core))
+    inside = light_with_veil - (1 - scattered) * light_without_veil
+    return StrayShares(transmitted * (1 - scattered), inside, transmitted * scattered - inside)
 
 
 @stray_light.preflight
@@ -190,12 +194,12 @@ def _(
     refuse_impossible_f_number(focal_length, diameter, "diameter")
     lens = _Lens(surfaces, focal_length, pixel_pitch, diameter, wavelength, scaling)
     try:
-        total = float(_total(_lobes(lens, wavelength)))
+        scattered = float(_total(_lobes(lens, wavelength)))
     except ValueError as error:
         raise ParameterError("surfaces", str(error)) from None
     notes = (
-        [f"the lens scatters {total:.2%} of the light at {wavelength * 1e9:.4g} nm"]
-        if total > 0.1
+        [f"the lens scatters {scattered:.2%} of the light at {wavelength * 1e9:.4g} nm"]
+        if scattered > 0.1
         else []
     )
     return [*notes, *_narrowed(pupil, diameter)]
@@ -207,12 +211,12 @@ def _narrowed(pupil: Pupil | None, diameter: float) -> list[str]:
     """
     if pupil is None or pupil.pitch.is_meta:
         return []
-    span = float(pupil.pitch) * pupil.aperture.shape[-1]
-    if diameter <= span * (1 + _ROUNDED):
+    pupil_diameter = float(pupil.pitch) * pupil.aperture.shape[-1]
+    if diameter <= pupil_diameter * (1 + _ROUNDED):
         return []
     text = (
         f"the lens scatters as one of {diameter * 1e3:.4g} mm, and its pupil has"
-        f" {span * 1e3:.4g} mm"
+        f" {pupil_diameter * 1e3:.4g} mm"
     )
     return [f"{text}: see reading.aperture"]
 
@@ -239,9 +243,13 @@ def _(
         return math.inf
     sizes = {name: params[name] for name in ("focal_length", "pixel_pitch", "diameter")}
     lobes = _lobes(_Lens(surfaces, **sizes, wavelength=1.0, scaling="none"), 1.0)
-    total, peak = float(_total(lobes)), float(_veil(lobes, (0.0, 0.0), (1, 1)))
-    core = psf.sum / psf.shape[0] if psf.shape else 1.0
-    return total / (1 - total) * (1 + 1 / core) + max(strength, 1.0) * peak / psf.max
+    scattered, axis_light = float(_total(lobes)), float(_veil(lobes, (0.0, 0.0), (1, 1)))
+    # light of a band in the window, 1 if it is not known
+    light_in_window = psf.sum / psf.shape[0] if psf.shape else 1.0
+    return (
+        scattered / (1 - scattered) * (1 + 1 / light_in_window)
+        + max(strength, 1.0) * axis_light / psf.max
+    )
 
 
 stray_light.hooks.skip_estimated = True
@@ -264,16 +272,16 @@ def _(
 
 
 def _lobes(lens: _Lens, colour: float) -> list[tuple[Tensor, Lobe, Tensor]]:
-    """Return for each surface the light that reaches it, its lobe on the sensor, and its TIS, at
-    one wavelength.
+    """Return for each surface (share of the light that reaches it, its lobe on the sensor, its
+    TIS), at the wavelength ``colour`` in m.
     """
-    scatterers, left = [], torch.ones((), dtype=torch.float64)
+    scatterers, remaining = [], torch.ones((), dtype=torch.float64)
     for name, (b0, l, s, radius) in _scaled(lens, colour):  # noqa: E741
-        scale = lens.diameter / (2 * lens.focal_length) * lens.pixel_pitch / radius
-        light, share = lobe(b0, l, s, scale), scattered_share(b0, l, s)
-        _refuse(name, colour, float(share.detach()), float(light.end.detach()), lens)
-        scatterers.append((left, light, share))
-        left = left * (1 - share)
+        cosine_per_pixel = lens.diameter / (2 * lens.focal_length) * lens.pixel_pitch / radius
+        surface_lobe, scattered = lobe(b0, l, s, cosine_per_pixel), scattered_share(b0, l, s)
+        _refuse(name, colour, float(scattered.detach()), float(surface_lobe.end.detach()), lens)
+        scatterers.append((remaining, surface_lobe, scattered))
+        remaining = remaining * (1 - scattered)
     return scatterers
 
 
@@ -281,15 +289,19 @@ def _scaled(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor, ...
     """Return b0, l, s and beam radius of each surface at the wavelength ``colour``, as float64
     scalars.
     """
+    # smooth surface: b0 goes as wavelength^-4, l as wavelength
     ratio = lens.wavelength / colour if lens.scaling == "roughness" else 1.0
     for name, surface in lens.surfaces.items():
-        beam = lens.diameter / 2 if surface.get("radius") is None else surface["radius"]
-        numbers = (surface["b0"], surface["l"], surface["s"], beam)
-        b0, l, s, radius = (torch.as_tensor(x, dtype=torch.float64) for x in numbers)  # noqa: E741
+        beam_radius = lens.diameter / 2 if surface.get("radius") is None else surface["radius"]
+        values = (surface["b0"], surface["l"], surface["s"], beam_radius)
+        b0, l, s, radius = (torch.as_tensor(x, dtype=torch.float64) for x in values)  # noqa: E741
         yield name, (b0 * ratio**4, l / ratio, s, radius)
 
 
 def _refuse(name: str, colour: float, share: float, end: float, lens: _Lens) -> None:
+    """Raise ValueError for a surface that scatters all light at the wavelength ``colour`` in m,
+    and for one whose light ends at ``end`` pixels, too near to the source.
+    """
     if not share < 1:
         raise ValueError(
             f"surface {name} scatters {share:.3g} of the light at {colour * 1e9:.4g} nm, and the"
@@ -305,25 +317,33 @@ def _refuse(name: str, colour: float, share: float, end: float, lens: _Lens) -> 
 
 def _total(lobes: list[tuple[Tensor, Lobe, Tensor]]) -> Tensor:
     """Return the share of the light that all surfaces scatter, 1 - prod(1 - TIS)."""
-    left, _, share = lobes[-1]
-    return 1 - left * (1 - share)
+    reaching_last, _, scattered_by_last = lobes[-1]
+    return 1 - reaching_last * (1 - scattered_by_last)
 
 
 def _veil(
     lobes: list[tuple[Tensor, Lobe, Tensor]], centre: tuple[float, float], size: tuple[int, int]
 ) -> Tensor:
-    return torch.stack([left * on_pixels(light, centre, size) for left, light, _ in lobes]).sum(0)
+    """Return the light of all lobes in each pixel (y, x) of a window of ``size``, for a source at
+    ``centre``.
+    """
+    return torch.stack(
+        [remaining * on_pixels(light, centre, size) for remaining, light, _ in lobes]
+    ).sum(0)
 
 
 def _transmitted(pupil: Pupil) -> Tensor:
     """Return the share of the clear pupil's light that mask and dirt transmit, float64."""
-    lit, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))
-    refuse_not_finite("no share of its light can be taken", aperture=clear)
-    share: Tensor = lit / clear
-    return share
+    transmitted_light, clear_light = (
+        x.double().square().sum() for x in (pupil.amplitude, pupil.aperture)
+    )
+    refuse_not_finite("no share of its light can be taken", aperture=clear_light)
+    transmitted_share: Tensor = transmitted_light / clear_light
+    return transmitted_share
 
 
 def _same_bands(psf: Psf, pupil: Pupil) -> None:
+    """Raise ValueError unless a PSF has the bands of a pupil."""
     if psf.intensity.ndim != 3 or len(psf.intensity) != len(pupil.wavelengths):
         raise ValueError(
             f"PSF {tuple(psf.intensity.shape)} and pupil of {len(pupil.wavelengths)} bands must"
@@ -354,20 +374,30 @@ def veil_at(
     Source: as `stray_light`.
     """
     lobes = _lobes(_Lens(surfaces, focal_length, pixel_pitch, diameter, 1.0, "none"), 1.0)
-    window = _veil(lobes, (float(NEAR), float(NEAR)), (2 * NEAR + 1, 2 * NEAR + 1)).flatten()
-    offset = torch.arange(-NEAR, NEAR + 1, dtype=torch.float64)
-    places = (offset[:, None].square() + offset.square()).flatten()
-    square = radius.double().square()
-    distances, which = torch.unique(places, return_inverse=True)
-    near = torch.zeros_like(distances).scatter_reduce_(0, which, window, "mean", include_self=False)
-    index = torch.searchsorted(distances, square.flatten().contiguous()).clamp(
-        1, len(distances) - 1
+    near_window = _veil(lobes, (float(NEAR), float(NEAR)), (2 * NEAR + 1, 2 * NEAR + 1)).flatten()
+    pixel_offsets = torch.arange(-NEAR, NEAR + 1, dtype=torch.float64)
+    squared_distances = (pixel_offsets[:, None].square() + pixel_offsets.square()).flatten()
+    squared_radius = radius.double().square()
+    # near the source: mean over the pixels of equal distance, linear in the square of the distance
+    # between
+    ring_distances, ring_of_pixel = torch.unique(squared_distances, return_inverse=True)
+    ring_mean = torch.zeros_like(ring_distances).scatter_reduce_(
+        0, ring_of_pixel, near_window, "mean", include_self=False
     )
-    low, high = distances[index - 1], distances[index]
-    fraction = ((square.flatten() - low) / (high - low)).clamp(0, 1)
-    inside = (near[index - 1] * (1 - fraction) + near[index] * fraction).reshape(square.shape)
-    far = torch.stack([left * _beyond(light, square) for left, light, _ in lobes]).sum(0)
-    return torch.where(square <= NEAR**2, inside, far), _total(lobes)
+    upper_index = torch.searchsorted(ring_distances, squared_radius.flatten().contiguous()).clamp(
+        1, len(ring_distances) - 1
+    )
+    lower_distance, upper_distance = ring_distances[upper_index - 1], ring_distances[upper_index]
+    fraction = (
+        (squared_radius.flatten() - lower_distance) / (upper_distance - lower_distance)
+    ).clamp(0, 1)
+    near_light = (
+        ring_mean[upper_index - 1] * (1 - fraction) + ring_mean[upper_index] * fraction
+    ).reshape(squared_radius.shape)
+    far_light = torch.stack(
+        [remaining * _beyond(light, squared_radius) for remaining, light, _ in lobes]
+    ).sum(0)
+    return torch.where(squared_radius <= NEAR**2, near_light, far_light), _total(lobes)
 
 
 def _beyond(light: Lobe, square: Tensor) -> Tensor:

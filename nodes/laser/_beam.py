@@ -93,14 +93,17 @@ def beam(
             raise ParameterError(
                 name, f"{value:g} is no {name.replace('_', ' ')}: give a finite number above 0"
             )
-    wider = math.sqrt(2) if convention == "1/e" else 1.0
+    # exp(-2 r^2 / w^2) is 1/e at w / sqrt(2)
+    to_e2 = math.sqrt(2) if convention == "1/e" else 1.0
     width, angle, quality = _shape(
-        wavelength, waist and waist * wider, divergence and divergence * wider, m_squared
+        wavelength, waist and waist * to_e2, divergence and divergence * to_e2, m_squared
     )
-    mean, energy, duration, rate = _emission(power, pulse_energy, pulse_duration, repetition_rate)
+    mean_power, energy, duration, rate = _emission(
+        power, pulse_energy, pulse_duration, repetition_rate
+    )
     return Beam(
         wavelength=wavelength,
-        power=mean,
+        power=mean_power,
         pulse_energy=energy,
         pulse_duration=duration,
         repetition_rate=rate,
@@ -113,8 +116,11 @@ def beam(
 def _emission(
     power: float | None, energy: float | None, duration: float | None, rate: float | None
 ) -> tuple[float | None, float | None, float | None, float | None]:
-    """Return power, pulse energy, pulse duration and repetition rate, with the power or the
-    energy of a train.
+    """Return (mean power in W, pulse energy in J, pulse duration in s, repetition rate in Hz),
+    with what follows from the others.
+
+    The last three are None for a continuous laser, and power and rate for a single pulse. Raises
+    ParameterError for statements that are missing or disagree.
     """
     if power is None and energy is None:
         raise ParameterError("power", "no power: give power, or pulse_energy with pulse_duration")
@@ -134,6 +140,7 @@ def _emission(
 
 
 def _no_duration(energy: float | None) -> ParameterError:
+    """Return the error for a pulse without a duration, at the parameter that states the pulses."""
     name = "repetition_rate" if energy is None else "pulse_energy"
     return ParameterError(name, "a pulse needs its duration: give pulse_duration")
 
@@ -178,8 +185,11 @@ def _refuse_long_pulse(duration: float, rate: float) -> None:
 def _shape(
     wavelength: float, waist: float | None, divergence: float | None, m_squared: float | None
 ) -> tuple[float, float, float]:
-    """Return waist, divergence and M2 of a beam at 1/e2 from two or three of them, or from the
-    first or second.
+    """Return (waist in m, divergence in rad, M2) of a beam at 1/e2, from two or three of them, or
+    from waist or divergence alone with M2 = 1.
+
+    Raises ParameterError for an M2 below 1, for neither waist nor divergence, and for three that
+    disagree.
     """
     diffraction = 2 * wavelength / math.pi  # waist x divergence of a perfect Gaussian beam
     if m_squared is not None and m_squared < 1:
@@ -207,15 +217,19 @@ def _implied_quality(
     another M2 is stated.
     """
     implied = waist * divergence / diffraction
-    said = f"waist {waist:.4g} m and divergence {divergence:.4g} rad (1/e2) have M2 = {implied:.4g}"
+    stated_text = (
+        f"waist {waist:.4g} m and divergence {divergence:.4g} rad (1/e2) have M2 = {implied:.4g}"
+    )
     if implied < 1 - _AGREE:
         text = (
-            f"{said}, but no beam has less than 1: at this waist the divergence is at least"
+            f"{stated_text}, but no beam has less than 1: at this waist the divergence is at least"
             f" {diffraction / waist:.4g} rad"
         )
         raise ParameterError("divergence", text)
     if m_squared is not None and not math.isclose(plain(implied), plain(m_squared), rel_tol=_AGREE):
-        raise ParameterError("m_squared", f"{said}, not {m_squared:g}: leave one of the three out")
+        raise ParameterError(
+            "m_squared", f"{stated_text}, not {m_squared:g}: leave one of the three out"
+        )
     return implied
 
 
@@ -295,12 +309,12 @@ def sensor_density(
     last factor is 1 for a beam that overfills the aperture. Times the power it is the peak
     irradiance; times the energy of a pulse it is the radiant exposure of one pulse.
     """
-    share = share_through(beam, distance, diameter, transmittance)
-    clear = math.pi * diameter**2 / 4 / (beam.wavelength * focal_length) ** 2
+    passing_share = share_through(beam, distance, diameter, transmittance)
+    even_gain = math.pi * diameter**2 / 4 / (beam.wavelength * focal_length) ** 2
     return (
         lens_transmittance
-        * clear
-        * share
+        * even_gain
+        * passing_share
         * underfilled(diameter**2 / (4 * _radius_squared(beam, distance)))
     )
 
@@ -317,8 +331,8 @@ def defocus_at(
     D^2 / (8 lambda) (1 / R' - 1 / R0), with the radius R' of the wavefront (`curvature_radius`) and
     the distance R0 on which the lens is focused, and ``lens_defocus``, in m of path at the rim.
     """
-    bend = 1 / curvature_radius(beam, distance) - 1 / focus
-    return (diameter**2 / 8 * bend + lens_defocus) / beam.wavelength
+    curvature = 1 / curvature_radius(beam, distance) - 1 / focus
+    return (diameter**2 / 8 * curvature + lens_defocus) / beam.wavelength
 
 
 def density_in_spot(
@@ -390,10 +404,10 @@ def peak_on_sensor(
     ``transmittance`` is that of the air. Raises ValueError for a single pulse, which has no mean
     power.
     """
-    share = sensor_density(
+    density = sensor_density(
         beam, distance, diameter, focal_length, lens_transmittance, transmittance
     )
-    return _mean_power(beam) * share
+    return _mean_power(beam) * density
 
 
 def underfilled(x: Number) -> Number:
@@ -401,16 +415,18 @@ def underfilled(x: Number) -> Number:
     = (D / (2 w))^2.
     """
     if isinstance(x, Tensor):
-        safe = x.where(x > _SMALL, 1.0)
-        return torch.where(x > _SMALL, 2 / safe * torch.tanh(safe / 2), 1 - x * x / 12)
+        safe_x = x.where(x > _SMALL, 1.0)
+        return torch.where(x > _SMALL, 2 / safe_x * torch.tanh(safe_x / 2), 1 - x * x / 12)
     return 2 / x * math.tanh(x / 2) if x > _SMALL else 1 - x * x / 12
 
 
 def _radius_squared(beam: Beam, distance: Number) -> Number:
+    """Return the squared 1/e2 radius in m2 of a beam at a distance in m: w0^2 + (theta R / 2)^2."""
     return beam.waist**2 + (beam.divergence / 2 * distance) ** 2
 
 
 def _mean_power(beam: Beam) -> float:
+    """Return the mean power in W of a beam; raise ValueError for a single pulse."""
     if beam.power is None:
         raise ValueError(
             "a single pulse has no mean power: give repetition_rate, or use its energy with"
@@ -461,8 +477,10 @@ def air_transmittance(
             "visibility", f"{visibility:g} m is no visibility: give a number above 0"
         )
     exponent = size_exponent(visibility, law)
-    depth = _KOSCHMIEDER / visibility * math.pow(wavelength / _AT, -exponent) * distance
-    return torch.exp(-depth) if isinstance(depth, Tensor) else math.exp(-depth)
+    optical_depth = _KOSCHMIEDER / visibility * math.pow(wavelength / _AT, -exponent) * distance
+    return (
+        torch.exp(-optical_depth) if isinstance(optical_depth, Tensor) else math.exp(-optical_depth)
+    )
 
 
 def size_exponent(visibility: float, law: Law) -> float:

@@ -26,7 +26,7 @@ from neusee.nodes.values import Bands, Psf
 
 
 RINGS = 160  #: rings about the spot, at equal ratios of their radii
-PARTS = 48  #: groups of as many pixels in each ring, from the faintest to the brightest
+PARTS = 48  #: groups of as many pixels in each ring, from the brightest to the faintest
 _LEVELS = 3000  #: of light, at equal ratios, into which pixels are sorted
 _DECADES = 24.0  #: of light below the brightest pixel; fainter pixels count as 0
 _LAW = 1.5  #: factor on the light of the radial law outside, since wings of a PSF are no smooth law
@@ -86,13 +86,14 @@ def bright_pixels(
     # photons of each wavelength, which fill wells
     weights = (bands.weights * bands.centres).double()
     weights = weights / weights.sum()
-    samples = _samples(pixel_pitch, sample_pitch)
-    bands_of_pixels = (_pixels(band.detach().double(), samples) for band in psf.intensity)
+    samples_across = _samples(pixel_pitch, sample_pitch)
+    bands_of_pixels = (_pixels(band.detach().double(), samples_across) for band in psf.intensity)
     image = torch.as_tensor(
         sum(w * band for w, band in zip(weights.tolist(), bands_of_pixels, strict=True))
     )
-    narrow = [m < n for m, n in zip(image.shape, shape, strict=True)]
-    rim = _rim(image.cpu(), narrow)
+    # along which axes the window of the PSF is smaller than the sensor
+    window_smaller = [m < n for m, n in zip(image.shape, shape, strict=True)]
+    rim = _rim(image.cpu(), window_smaller)
     image = crop(image, shape=(min(shape[0], image.shape[0]), min(shape[1], image.shape[1])))
     smooth = image if feature == 1 else _over_feature(image[None], feature)[0]
     groups = _grouped(image.cpu(), smooth.cpu())
@@ -112,8 +113,8 @@ def _samples(pixel_pitch: float, sample_pitch: float | None) -> int:
 
 
 def _pixels(light: Tensor, samples: int) -> Tensor:
-    """Return the light (y, x) of each pixel from that of its samples; a part of a pixel at the
-    end is left out.
+    """Return the light (y, x) of each pixel, the sum of its ``samples`` x ``samples`` samples; a
+    part of a pixel at the end is left out.
     """
     if min(light.shape) < samples:
         size = f"{light.shape[0]} x {light.shape[1]}"
@@ -121,18 +122,22 @@ def _pixels(light: Tensor, samples: int) -> Tensor:
             f"a PSF of {size} samples holds no pixel, which is {samples} samples wide: enlarge its"
             " window"
         )
+    # the mean over a pixel times its samples is their sum
     return light if samples == 1 else avg_pool2d(light[None], samples)[0] * samples**2
 
 
 def _grouped(image: Tensor, smooth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return radius, pixels, light and smoothed light of groups of pixels, `PARTS` in each ring."""
+    """Return radius, number of pixels, light and smoothed light (group,) of the groups of pixels,
+    `PARTS` in each ring.
+    """
     rows, columns = image.shape
     rings = _rings(rows, columns)
-    light = [
+    ring_lights = [
         _quantiles(picture.double().numpy().ravel(), rings).ravel() for picture in (image, smooth)
     ]
+    # all parts of a ring have its radius and the same number of its pixels
     radius, pixels = np.repeat(rings.radius, PARTS), np.repeat(rings.pixels / PARTS, PARTS)
-    groups = [torch.from_numpy(column) for column in (radius, pixels, *light)]
+    groups = [torch.from_numpy(column) for column in (radius, pixels, *ring_lights)]
     return groups[0], groups[1], groups[2], groups[3]
 
 
@@ -146,63 +151,83 @@ class _Rings(NamedTuple):
 
 @functools.lru_cache(maxsize=1)
 def _rings(rows: int, columns: int) -> _Rings:
-    """Return the rings of a window; those of the last one are kept, since many spots in turn
-    have the same window.
+    """Return the rings of a window of rows x columns pixels; the rings of the last window are
+    kept, since many spots in turn have the same one.
     """
     y, x = ((np.arange(n) - n // 2).astype(np.float64) ** 2 for n in (rows, columns))
-    square = (y[:, None] + x).ravel()
-    last = math.log(max(square.max(), 1.0)) + 1e-9
+    squared_distance = (y[:, None] + x).ravel()
+    log_largest = math.log(max(squared_distance.max(), 1.0)) + 1e-9
     # ring 0 is the pixel of the spot; ring k > 0 ends at equal ratios of the radius
-    ring = np.zeros(square.size, np.int64)
-    around = square > 0
-    ring[around] = 1 + (np.log(square[around]) * ((RINGS - 1) / last)).astype(np.int64)
-    pixels = np.bincount(ring, minlength=RINGS).astype(np.float64)
-    radius = np.sqrt(np.bincount(ring, square, minlength=RINGS) / np.maximum(pixels, 1))
-    return _Rings(ring * (_LEVELS + 1), radius, pixels)
+    ring_number = np.zeros(squared_distance.size, np.int64)
+    off_spot = squared_distance > 0
+    ring_number[off_spot] = 1 + (
+        np.log(squared_distance[off_spot]) * ((RINGS - 1) / log_largest)
+    ).astype(np.int64)
+    pixels = np.bincount(ring_number, minlength=RINGS).astype(np.float64)
+    radius = np.sqrt(
+        np.bincount(ring_number, squared_distance, minlength=RINGS) / np.maximum(pixels, 1)
+    )
+    return _Rings(ring_number * (_LEVELS + 1), radius, pixels)
 
 
 def _quantiles(light: np.ndarray, rings: _Rings) -> np.ndarray:
     """Return the light (ring, part) of the pixels in the middle of each of `PARTS` groups of a
-    ring.
+    ring, from its brightest group to its faintest.
+
+    The pixels are sorted into `_LEVELS` levels of light at equal ratios, so that one count for each
+    ring and level gives the order of all of them.
     """
-    top = float(light.max(initial=0.0))
-    if not top > 0:
+    brightest = float(light.max(initial=0.0))
+    if not brightest > 0:
         return np.zeros((RINGS, PARTS))
-    step = _DECADES * math.log(10) / _LEVELS
-    faintest = top * math.exp(-(_LEVELS + 1) * step)
-    depth = np.log(np.maximum(light, faintest) / top) * (-1 / step)
-    level = np.minimum(depth, _LEVELS).astype(np.int64)
-    table = np.bincount(rings.number + level, minlength=RINGS * (_LEVELS + 1)).reshape(RINGS, -1)
-    rising = table.cumsum(1)
-    ranks = (np.arange(PARTS) + 0.5) / PARTS * rings.pixels[:, None]
-    levels = np.stack([np.searchsorted(row, want) for row, want in zip(rising, ranks, strict=True)])
-    return np.where(levels < _LEVELS, top * np.exp(-(levels + 0.5) * step), 0.0)
+    log_step = _DECADES * math.log(10) / _LEVELS
+    faintest = brightest * math.exp(-(_LEVELS + 1) * log_step)
+    steps_below = np.log(np.maximum(light, faintest) / brightest) * (-1 / log_step)
+    level = np.minimum(steps_below, _LEVELS).astype(np.int64)
+    # one count for each ring and level: `number` is the ring times the number of levels
+    counts = np.bincount(rings.number + level, minlength=RINGS * (_LEVELS + 1)).reshape(RINGS, -1)
+    brighter_counts = counts.cumsum(1)
+    middle_ranks = (np.arange(PARTS) + 0.5) / PARTS * rings.pixels[:, None]
+    levels_at_ranks = np.stack(
+        [
+            np.searchsorted(ring_counts, ring_ranks)
+            for ring_counts, ring_ranks in zip(brighter_counts, middle_ranks, strict=True)
+        ]
+    )
+    # the middle of a level; the last level holds what counts as 0
+    return np.where(
+        levels_at_ranks < _LEVELS, brightest * np.exp(-(levels_at_ranks + 0.5) * log_step), 0.0
+    )
 
 
 def _rim(image: Tensor, narrow: list[bool]) -> Tensor:
-    """Return distance and light of the rim of a window on the sides where the sensor goes on, and
-    the light known.
+    """Return (distance, light of the rim, known light) of a window, of which ``narrow`` says along
+    which axes (y, x) the sensor goes on beyond it.
 
-    The light of the rim is the mean of all its pixels, each brought to this distance by the third
-    power of its own. The light known is that of the window and, `_LAW` times, that of the radial
-    law on the plane outside.
+    The distance, in pixels, is that of the nearest such side. The light of the rim is the mean of
+    all its pixels, each brought to this distance by the third power of its own. The known light is
+    that of the window and, `_LAW` times, that of the radial law on the plane outside. Without a
+    side where the sensor goes on, distance and light are 0.
     """
-    total = image.double().sum()
+    light_of_window = image.double().sum()
     if not any(narrow):
-        return torch.stack([0 * total, 0 * total, total])
+        return torch.stack([0 * light_of_window, 0 * light_of_window, light_of_window])
     distance = float(
         max(1, min((n - 1) // 2 for n, cut in zip(image.shape, narrow, strict=True) if cut))
     )
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in image.shape)
-    across = [image[end].double() * torch.hypot(y[end], x).pow(3) for end in (0, -1)]
-    along = [image[:, end].double() * torch.hypot(y, x[end]).pow(3) for end in (0, -1)]
-    sides = across * narrow[0] + along * narrow[1]
-    cube = torch.cat(sides).mean()
-    half = [n / 2 for n in image.shape]
+    end_rows = [image[end].double() * torch.hypot(y[end], x).pow(3) for end in (0, -1)]
+    end_columns = [image[:, end].double() * torch.hypot(y, x[end]).pow(3) for end in (0, -1)]
+    # a list times False is empty: only the sides where the sensor goes on count
+    sides = end_rows * narrow[0] + end_columns * narrow[1]
+    light_times_cube = torch.cat(sides).mean()
+    half_sides = [n / 2 for n in image.shape]
     # the integral of cube / r^3 outside of a rectangle
-    outside = 4 * cube * math.hypot(*half) / (half[0] * half[1])
-    place = torch.tensor(distance, dtype=torch.float64)
-    return torch.stack([place, cube / distance**3, total + _LAW * outside])
+    outside_light = 4 * light_times_cube * math.hypot(*half_sides) / (half_sides[0] * half_sides[1])
+    rim_distance = torch.tensor(distance, dtype=torch.float64)
+    return torch.stack(
+        [rim_distance, light_times_cube / distance**3, light_of_window + _LAW * outside_light]
+    )
 
 
 def light_with_wings(image: Tensor) -> Tensor:
@@ -220,8 +245,12 @@ def _(*, pixel_pitch: float, sample_pitch: float | None = None, **_: Any) -> lis
 
 @bright_pixels.check
 def _(result: BrightPixels, *inputs: Any, **params: Any) -> list[Check]:
-    top, pixels = float(result.light.max()), float(result.pixels.sum())
-    return [Check(f"{top:.3g} of the light in the brightest of {pixels:.0f} pixels", top > 0)]
+    brightest, pixels = float(result.light.max()), float(result.pixels.sum())
+    return [
+        Check(
+            f"{brightest:.3g} of the light in the brightest of {pixels:.0f} pixels", brightest > 0
+        )
+    ]
 
 
 def with_frame(groups: BrightPixels, shape: tuple[int, int]) -> BrightPixels:
@@ -231,19 +260,21 @@ def with_frame(groups: BrightPixels, shape: tuple[int, int]) -> BrightPixels:
     Far from the spot the light of any aperture with edges falls as the third power of the distance,
     on average. The added pixels have the light of the rim times this power.
     """
-    lacking = shape[0] * shape[1] - float(groups.pixels.sum())
-    if not (lacking >= 1 and float(groups.rim[0]) > 0):
+    missing_pixels = shape[0] * shape[1] - float(groups.pixels.sum())
+    if not (missing_pixels >= 1 and float(groups.rim[0]) > 0):
         return groups
     distance, light, _ = groups.rim.tolist()
     radius, pixels = _shells(
-        shape, shape[0] * shape[1] - lacking, torch.full((1, 2), distance, dtype=torch.float64)
+        shape,
+        shape[0] * shape[1] - missing_pixels,
+        torch.full((1, 2), distance, dtype=torch.float64),
     )
-    faint = light * (distance / radius).pow(3)
+    outer_light = light * (distance / radius).pow(3)
     return BrightPixels(
         radius=torch.cat([groups.radius, radius]),
         pixels=torch.cat([groups.pixels, pixels]),
-        light=torch.cat([groups.light, faint]),
-        smooth=torch.cat([groups.smooth, faint]),
+        light=torch.cat([groups.light, outer_light]),
+        smooth=torch.cat([groups.smooth, outer_light]),
         rim=groups.rim,
     )
 
@@ -277,116 +308,145 @@ def round_pixels(
     Raises: nothing.
     Source: Born and Wolf, Principles of Optics, 7th ed., section 8.8, integrated over the pixel.
     """
-    through = 1.0 if fill < 1e-9 else -math.expm1(-2 * fill) / (2 * fill)
-    scale = peak_light(spread) / through
-    places, number = _inner(shape, spread)
-    inner = scale * _over_squares(places, fill, waves, spread)
-    edges, shells = _shells(shape, float(number.sum()), places)
-    outer = scale * _over_rings(edges, fill, waves, spread)
-    radius = torch.cat([places.square().sum(1).sqrt(), edges])
-    pixels, light = torch.cat([number, shells]), torch.cat([inner, outer])
+    # share of the Gaussian beam on the lens, over that of an even beam
+    passing_share = 1.0 if fill < 1e-9 else -math.expm1(-2 * fill) / (2 * fill)
+    # light of a pixel as bright as the peak, in units of the light that passes
+    scale = peak_light(spread) / passing_share
+    positions, alike_pixels = _inner(shape, spread)
+    inner_light = scale * _over_squares(positions, fill, waves, spread)
+    shell_radii, shell_pixels = _shells(shape, float(alike_pixels.sum()), positions)
+    outer_light = scale * _over_rings(shell_radii, fill, waves, spread)
+    radius = torch.cat([positions.square().sum(1).sqrt(), shell_radii])
+    pixels, light = torch.cat([alike_pixels, shell_pixels]), torch.cat([inner_light, outer_light])
     smooth = light if feature <= 1 else _smoothed(radius, pixels, light, feature)
+    # (distance, light of the rim, known light): the whole sensor counts, all light is known
     rim = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return BrightPixels(radius, pixels, light, smooth, rim)
 
 
 def _inner(shape: tuple[int, int], spread: float) -> tuple[Tensor, Tensor]:
-    """Return the places (pixel, (y, x)) of a part of the pixels around the spot, and how many
-    look like each.
+    """Return the positions (pixel, (y, x)) of the pixels around the spot, of which symmetric ones
+    are listed once, and the number of pixels that each stands for.
+
+    Positions are in pixels from the spot, in one quadrant, and in half of it where the part is
+    square.
     """
-    half = [min(_INNER, (n - 1) // 2) for n in shape]
+    half_sides = [min(_INNER, (n - 1) // 2) for n in shape]
     y, x = torch.meshgrid(
-        *(torch.arange(h + 1.0, dtype=torch.float64) for h in half), indexing="ij"
+        *(torch.arange(half_side + 1.0, dtype=torch.float64) for half_side in half_sides),
+        indexing="ij",
     )
-    number = torch.where(y > 0, 2.0, 1.0) * torch.where(x > 0, 2.0, 1.0)
-    if half[0] == half[1]:  # of a quadrant, one side of its diagonal
-        number = torch.where(y < x, 2 * number, number)
-        side = y <= x
-        y, x, number = y[side], x[side], number[side]
-    return torch.stack([y.flatten(), x.flatten()], 1), number.flatten().double()
+    # a pixel off an axis has a mirror image across it
+    alike_pixels = torch.where(y > 0, 2.0, 1.0) * torch.where(x > 0, 2.0, 1.0)
+    if half_sides[0] == half_sides[1]:  # of a quadrant, one side of its diagonal
+        alike_pixels = torch.where(y < x, 2 * alike_pixels, alike_pixels)
+        half_quadrant = y <= x
+        y, x, alike_pixels = y[half_quadrant], x[half_quadrant], alike_pixels[half_quadrant]
+    return torch.stack([y.flatten(), x.flatten()], 1), alike_pixels.flatten().double()
 
 
 def _shells(shape: tuple[int, int], counted: float, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Return radii beyond the inner pixels, and the number of pixels of the sensor about each of
-    them.
+    """Return the radii in pixels of rings beyond the inner pixels, and the number of pixels of the
+    sensor in each ring.
+
+    ``counted`` pixels at ``places`` are counted one by one already; together with the rings they
+    make the whole sensor.
     """
-    outer = shape[0] * shape[1] - counted
-    if outer <= 0:
+    outer_pixels = shape[0] * shape[1] - counted
+    if outer_pixels <= 0:
         return torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-    half = torch.tensor(shape, dtype=torch.float64) / 2
-    taken = places.amax(0) + 0.5
-    start = float(torch.minimum(taken, half).min())
+    half_sides = torch.tensor(shape, dtype=torch.float64) / 2
+    inner_half = places.amax(0) + 0.5
+    start = float(torch.minimum(inner_half, half_sides).min())
     edges = torch.logspace(
-        math.log10(start), math.log10(float(half.norm())), _SHELLS + 1, dtype=torch.float64
+        math.log10(start), math.log10(float(half_sides.norm())), _SHELLS + 1, dtype=torch.float64
     )
-    middle = (edges[1:] + edges[:-1]) / 2
-    number = (_arc(middle, half) - _arc(middle, taken)).clamp_min(0) * edges.diff()
-    shown = number > 0
-    middle, number = middle[shown], number[shown]
-    return middle, number * (outer / number.sum())
+    radii = (edges[1:] + edges[:-1]) / 2
+    # the area of a ring inside the sensor and outside the inner rectangle
+    ring_pixels = (_arc(radii, half_sides) - _arc(radii, inner_half)).clamp_min(0) * edges.diff()
+    not_empty = ring_pixels > 0
+    radii, ring_pixels = radii[not_empty], ring_pixels[not_empty]
+    # scaled, so that the numbers add up to the pixels that are left
+    return radii, ring_pixels * (outer_pixels / ring_pixels.sum())
 
 
 def _arc(radius: Tensor, half: Tensor) -> Tensor:
     """Return the length of the circle of each radius that lies inside a rectangle of half sides
     (y, x).
     """
-    outside = sum(torch.acos((h / radius).clamp_max(1.0)) for h in half)
-    return 4 * radius * (math.pi / 2 - torch.as_tensor(outside)).clamp_min(0)
+    # of a quadrant: the angles at which the circle is beyond one of the two sides
+    angle_outside = sum(torch.acos((h / radius).clamp_max(1.0)) for h in half)
+    return 4 * radius * (math.pi / 2 - torch.as_tensor(angle_outside)).clamp_min(0)
 
 
 def _over_squares(places: Tensor, fill: float, waves: float, spread: float) -> Tensor:
     """Return the mean irradiance of the pixels at ``places``, from a table over the radius."""
-    reach = float(places.square().sum(1).max().sqrt()) + 0.75
-    steps = math.ceil(reach * math.pi / spread / _FRINGE)
-    radii = torch.linspace(0.0, reach, min(max(steps, 400), 40_000), dtype=torch.float64)
+    # from the middle of a pixel to its corner it is 0.71
+    table_end = float(places.square().sum(1).max().sqrt()) + 0.75
+    steps = math.ceil(table_end * math.pi / spread / _FRINGE)
+    radii = torch.linspace(0.0, table_end, min(max(steps, 400), 40_000), dtype=torch.float64)
+    # the argument is v = pi x / (lambda N), with x in pixels
     table = round_spot(radii * (math.pi / spread), fill, waves)
-    total = torch.zeros(len(places), dtype=torch.float64)
-    near = places.amax(1) <= 2
-    for group, node_limit in ((near, 4 * _FINEST * 4), (~near, _FINEST)):
+    mean_irradiance = torch.zeros(len(places), dtype=torch.float64)
+    near_spot = places.amax(1) <= 2
+    # the spot may be far smaller than one of the nearest pixels, which takes more points
+    for pixels_of_group, node_limit in ((near_spot, 4 * _FINEST * 4), (~near_spot, _FINEST)):
         points, weights = (
             torch.from_numpy(values)
             for values in legendre(min(node_limit, 3 + math.ceil(5 / spread)))
         )
-        total[group] = _mean_of_squares(places[group], points / 2, weights / 2, radii, table)
-    return total
+        # from the interval -1 to 1 to that of a pixel, -1/2 to 1/2
+        mean_irradiance[pixels_of_group] = _mean_of_squares(
+            places[pixels_of_group], points / 2, weights / 2, radii, table
+        )
+    return mean_irradiance
 
 
 def _mean_of_squares(
     places: Tensor, points: Tensor, weights: Tensor, radii: Tensor, table: Tensor
 ) -> Tensor:
-    """Return the weighted mean over points of each square of a function of the radius, which a
-    table gives.
+    """Return the mean over the square of each pixel (pixel,) of a function of the distance from
+    the spot.
+
+    ``places`` has the middles of the pixels, ``points`` and ``weights`` are those of a quadrature
+    from -1/2 to 1/2 along each axis, and ``table`` has the function at evenly spaced ``radii`` from
+    0.
     """
-    total = torch.zeros(len(places), dtype=torch.float64)
+    means = torch.zeros(len(places), dtype=torch.float64)
     step, values = radii[1].item(), table.numpy()
     for y, weight in zip(points.tolist(), weights.tolist(), strict=True):
         radius = torch.hypot(places[:, :1] + y, places[:, 1:] + points)
         irradiance = torch.from_numpy(
             np.interp(radius.numpy() / step, np.arange(len(values)), values)
         )
-        total += weight * (irradiance @ weights)
-    return total
+        means += weight * (irradiance @ weights)
+    return means
 
 
 def _over_rings(radius: Tensor, fill: float, waves: float, spread: float) -> Tensor:
-    """Return the mean irradiance of pixels far from the spot, where rings are nearly straight.
+    """Return the mean irradiance of pixels at distances ``radius`` from the spot, where the rings
+    are nearly straight lines.
 
-    How much a pixel averages over the rings depends on how its square lies to them: each radius has
-    another azimuth.
+    A pixel averages over the rings along one direction alone, and how much depends on the azimuth
+    of the pixel: each radius has another, random one.
     """
     if not len(radius):
         return radius
-    drawn = torch.rand(
+    random_share = torch.rand(
         len(radius), 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )
     # by chance, since even steps are in step with the fringes at some radii
-    azimuth = drawn * (math.pi / 4)
-    across, along = azimuth.cos(), azimuth.sin()
-    count = min(_FINEST, 5 + math.ceil(6 / spread))
-    offset = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * (across + along)
-    weight = ((across + along) / 2 - offset.abs()).minimum(along.clamp_min(1e-3))
-    reach = (radius[:, None] + offset) * (math.pi / spread)
-    return (round_spot(reach, fill, waves) * weight).sum(1) / weight.sum(1)
+    azimuth = random_share * (math.pi / 4)
+    cosine, sine = azimuth.cos(), azimuth.sin()
+    point_count = min(_FINEST, 5 + math.ceil(6 / spread))
+    # from corner to corner, the square is cos + sin wide across the rings
+    offset = ((torch.arange(point_count, dtype=torch.float64) + 0.5) / point_count - 0.5) * (
+        cosine + sine
+    )
+    # length of the square along a ring: a trapezium that falls to 0 at the corners
+    chord = ((cosine + sine) / 2 - offset.abs()).minimum(sine.clamp_min(1e-3))
+    reaches = (radius[:, None] + offset) * (math.pi / spread)
+    return (round_spot(reaches, fill, waves) * chord).sum(1) / chord.sum(1)
 
 
 def _smoothed(radius: Tensor, pixels: Tensor, light: Tensor, feature: float) -> Tensor:
@@ -397,17 +457,28 @@ def _smoothed(radius: Tensor, pixels: Tensor, light: Tensor, feature: float) -> 
     """
     order = radius.argsort()
     radii = radius[order]
-    enclosed = torch.cat([torch.zeros(1, dtype=torch.float64), (light * pixels)[order].cumsum(0)])
-    number = torch.cat([torch.zeros(1, dtype=torch.float64), pixels[order].cumsum(0)])
-    half = feature / math.sqrt(math.pi)
-    low = torch.searchsorted(radii, (radii - half).clamp_min(-1.0))
-    high = torch.searchsorted(radii, radii + half, right=True)
-    ring = (enclosed[high] - enclosed[low]) / (number[high] - number[low]).clamp_min(1e-300)
-    spot = (
-        enclosed[torch.searchsorted(radii, torch.full_like(radii, half), right=True)] / feature**2
+    # light and pixels up to each radius, with 0 before the first
+    enclosed_light = torch.cat(
+        [torch.zeros(1, dtype=torch.float64), (light * pixels)[order].cumsum(0)]
+    )
+    enclosed_pixels = torch.cat([torch.zeros(1, dtype=torch.float64), pixels[order].cumsum(0)])
+    # pi r^2 is the area of the feature
+    disc_radius = feature / math.sqrt(math.pi)
+    first_index = torch.searchsorted(radii, (radii - disc_radius).clamp_min(-1.0))
+    end_index = torch.searchsorted(radii, radii + disc_radius, right=True)
+    # mean over the radii that the disc covers, from differences of the sums
+    ring_mean = (enclosed_light[end_index] - enclosed_light[first_index]) / (
+        enclosed_pixels[end_index] - enclosed_pixels[first_index]
+    ).clamp_min(1e-300)
+    spot_mean = (
+        # all light within the disc around the spot
+        enclosed_light[torch.searchsorted(radii, torch.full_like(radii, disc_radius), right=True)]
+        / feature**2
     )
     smooth = torch.empty_like(light)
-    smooth[order] = torch.where(radii <= half, torch.maximum(spot, ring), ring)
+    smooth[order] = torch.where(
+        radii <= disc_radius, torch.maximum(spot_mean, ring_mean), ring_mean
+    )
     return smooth
 
 
@@ -439,20 +510,23 @@ def summit_gain(image: Tensor) -> Tensor:
     Raises: nothing.
     Source: by definition.
     """
-    top = image.max()
-    if min(image.shape) < 3 or not top > 0:
+    brightest = image.max()
+    if min(image.shape) < 3 or not brightest > 0:
         return torch.ones((), dtype=torch.float64)
     inner = image[1:-1, 1:-1]
-    y, x = (inner > _NEAR * top).nonzero(as_tuple=True)  # a few: no other sample is a summit
-    here, above, below, left, right = (
-        (image[y + 1 + dy, x + 1 + dx].double() / top).clamp_min(_FLOOR).log() for dy, dx in _CROSS
+    # a few samples: no other one is a summit
+    y, x = (inner > _NEAR * brightest).nonzero(as_tuple=True)
+    log_light, above, below, left, right = (
+        (image[y + 1 + dy, x + 1 + dx].double() / brightest).clamp_min(_FLOOR).log()
+        for dy, dx in _CROSS
     )
-    lobe, gain = torch.ones_like(here, dtype=torch.bool), torch.zeros_like(here)
+    is_lobe, log_gain = torch.ones_like(log_light, dtype=torch.bool), torch.zeros_like(log_light)
     for before, after in ((above, below), (left, right)):
-        lobe = lobe & (here >= before) & (here >= after)
-        bend = (2 * here - before - after).clamp_min(_FLOOR)
-        gain = gain + (after - before).square() / (8 * bend)
-    summits = torch.where(lobe, here + gain, 0.0)
+        is_lobe = is_lobe & (log_light >= before) & (log_light >= after)
+        curvature = (2 * log_light - before - after).clamp_min(_FLOOR)
+        # summit of the parabola through three points above the middle one
+        log_gain = log_gain + (after - before).square() / (8 * curvature)
+    summits = torch.where(is_lobe, log_light + log_gain, 0.0)
     return torch.cat([summits, summits.new_zeros(1)]).max().clamp_min(0).exp()
 
 
@@ -473,6 +547,6 @@ def unseen_light(image: Tensor, passing: float) -> Tensor:
     Raises: nothing.
     Source: Cauchy-Schwarz inequality for the field in the pupil; our derivation.
     """
-    lacking = 1 - image.double().sum() / passing
-    beyond_wings = 1 - light_with_wings(image) / passing
-    return torch.where(lacking > _WINGS, lacking, beyond_wings).clamp_min(0)
+    missing_share = 1 - image.double().sum() / passing
+    share_beyond_wings = 1 - light_with_wings(image) / passing
+    return torch.where(missing_share > _WINGS, missing_share, share_beyond_wings).clamp_min(0)

@@ -103,28 +103,29 @@ def distance_intervals(
 
     distances = [near * (far / near) ** (i / (samples - 1)) for i in range(samples - 1)] + [far]
     points = _with_extrema(value, distances, [value(distance) for distance in distances])
-    ends: list[float] = [near] if points[0][1] > 0 else []
-    for (a, first), (b, last) in itertools.pairwise(points):
-        if (first > 0) != (last > 0):
-            ends.append(_crossing(value, a, b, first > 0))
-    if len(ends) % 2:
-        ends.append(far)
-    return list(zip(ends[::2], ends[1::2], strict=True))
+    interval_ends: list[float] = [near] if points[0][1] > 0 else []
+    for (lower, lower_margin), (upper, upper_margin) in itertools.pairwise(points):
+        if (lower_margin > 0) != (upper_margin > 0):
+            interval_ends.append(_crossing(value, lower, upper, lower_margin > 0))
+    # the last interval is still open
+    if len(interval_ends) % 2:
+        interval_ends.append(far)
+    return list(zip(interval_ends[::2], interval_ends[1::2], strict=True))
 
 
 def _with_extrema(
     value: Callable[[float], float], distances: list[float], values: list[float]
 ) -> list[tuple[float, float]]:
-    """Return the samples with one more for each local extremum that may cross 0 between the
-    samples.
+    """Return the samples (distance, margin) in rising order, with one more for each local extremum
+    that may cross 0 between the samples.
     """
     points = list(zip(distances, values, strict=True))
     extrema = []
     for i in range(1, len(distances) - 1):
         # a hidden zone is a maximum below 0, a hidden gap a minimum above 0
         sign = 1.0 if values[i] <= 0 else -1.0
-        before, here, after = (sign * x for x in values[i - 1 : i + 2])
-        if here >= max(before, after) and here > min(before, after):
+        previous, middle, following = (sign * x for x in values[i - 1 : i + 2])
+        if middle >= max(previous, following) and middle > min(previous, following):
             extrema.append(_extremum(value, distances[i - 1], distances[i + 1], sign))
     return sorted({*points, *extrema})
 
@@ -132,23 +133,24 @@ def _with_extrema(
 def _extremum(
     value: Callable[[float], float], a: float, b: float, sign: float
 ) -> tuple[float, float]:
-    """Return the place and the value of the largest ``sign`` x margin between two distances, by
-    golden section.
+    """Return the distance of the largest ``sign`` x margin between the distances a and b, and the
+    margin there, by golden section of the logarithm of the distance.
     """
     low, high = math.log(a), math.log(b)
     for _ in range(_ROUNDS):
+        # two points that divide the interval in the golden ratio
         lower, upper = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
         if sign * value(math.exp(lower)) > sign * value(math.exp(upper)):
             high = upper
         else:
             low = lower
-    place = math.exp((low + high) / 2)
-    return place, value(place)
+    best_distance = math.exp((low + high) / 2)
+    return best_distance, value(best_distance)
 
 
 def _crossing(value: Callable[[float], float], a: float, b: float, above: bool) -> float:
-    """Return the distance between two others at which a margin passes 0; ``above`` says that it
-    is above 0 at a.
+    """Return the distance between a and b at which a margin passes 0, by bisection; ``above`` says
+    that it is above 0 at a.
     """
     for _ in range(_ROUNDS):
         middle = math.sqrt(a * b)
@@ -204,51 +206,59 @@ def spot_heat(fill: Tensor, waves: Tensor) -> Tensor:
     Source: Carslaw, Jaeger, Conduction of Heat in Solids, 2nd ed., section 10.5, for the heat;
             `round_spot` for the irradiance; geometric optics beyond 8 waves.
     """
-    alike = torch.zeros_like(fill.double() + waves.double())
-    fill, waves = fill.double() + alike, waves.double().abs() + alike
-    row = (waves / _TABLE_WAVES * (_WAVE_STEPS - 1)).clamp(0, _WAVE_STEPS)
-    column = (fill / _TABLE_FILL * (_FILL_STEPS - 1)).clamp(0, _FILL_STEPS - 1)
-    share = bilinear(_heat_table(), row, column)
-    rings = (share - 1).clamp_min(0) * (_TABLE_WAVES / waves.clamp_min(_TABLE_WAVES)) ** _FALL
-    return _even_disc(fill, waves) * share.where(waves <= _TABLE_WAVES, 1 + rings) / _AIRY
+    # broadcasts both arguments to one shape
+    zeros = torch.zeros_like(fill.double() + waves.double())
+    fill, waves = fill.double() + zeros, waves.double().abs() + zeros
+    # the last row of the table, beyond the last step, holds the largest of the last wave
+    table_row = (waves / _TABLE_WAVES * (_WAVE_STEPS - 1)).clamp(0, _WAVE_STEPS)
+    table_column = (fill / _TABLE_FILL * (_FILL_STEPS - 1)).clamp(0, _FILL_STEPS - 1)
+    heat_ratio = bilinear(_heat_table(), table_row, table_column)
+    ring_excess = (heat_ratio - 1).clamp_min(0) * (
+        _TABLE_WAVES / waves.clamp_min(_TABLE_WAVES)
+    ) ** _FALL
+    return (
+        _even_disc(fill, waves) * heat_ratio.where(waves <= _TABLE_WAVES, 1 + ring_excess) / _AIRY
+    )
 
 
 def _even_disc(fill: Tensor, waves: Tensor) -> Tensor:
-    """Return the heat in the middle of the spot of straight rays; near focus a smooth function
-    that stays finite.
+    """Return the heat in the middle of the spot of straight rays, in the unit of `spot_heat`
+    before its division by `_AIRY`; near focus a smooth function that stays finite.
     """
-    near = _NEAR / (1 + waves.square() + fill.square() / 4)
-    size = torch.sqrt(fill.square() + (2 * math.pi * waves).square() + near)
+    focus_term = _NEAR / (1 + waves.square() + fill.square() / 4)
+    spot_size = torch.sqrt(fill.square() + (2 * math.pi * waves).square() + focus_term)
     root = torch.sqrt(2 * fill).clamp_min(1e-6)
     # mean of exp(-2 fill rho^2) along a radius
     taper = math.sqrt(math.pi) / 2 * torch.erf(root) / root
-    return 2 / size * taper
+    return 2 / spot_size * taper
 
 
 @functools.lru_cache(maxsize=1)
 def _heat_table() -> Tensor:
-    """Return the heat of the hottest point over `_even_disc`, (waves, fill); last the largest of
-    the last wave.
+    """Return the heat of the hottest point over `_even_disc` as a table (waves, fill), with one
+    more row: the largest values of the last wave of defocus.
     """
     waves = torch.linspace(0, _TABLE_WAVES, _WAVE_STEPS, dtype=torch.float64)
     fills = torch.linspace(0, _TABLE_FILL, _FILL_STEPS, dtype=torch.float64)
+    # middles of rings of the reach v
     reach = (torch.arange(round(_EDGE / _STEP), dtype=torch.float64) + 0.5) * _STEP
-    inverse = _mean_inverse_distance(reach)
-    node, weights = (torch.from_numpy(x) for x in legendre(_NODES))
-    square = (node + 1) / 2
-    bessel = torch.special.bessel_j0(reach[:, None] * square.sqrt())
-    taper = torch.exp(-fills[:, None] * square) * weights / 4
-    # mean of 4 exp(-2 fill) J1(v)^2 / v^2 from there on
-    wings = 4 * torch.exp(-2 * fills) / (math.pi * _EDGE**2) * 0.5
+    heat_weights = _mean_inverse_distance(reach)
+    nodes, weights = (torch.from_numpy(x) for x in legendre(_NODES))
+    # the quadrature is over the squared radius in the pupil, from 0 to 1
+    squared_radius = (nodes + 1) / 2
+    bessel = torch.special.bessel_j0(reach[:, None] * squared_radius.sqrt())
+    taper = torch.exp(-fills[:, None] * squared_radius) * weights / 4
+    # integral beyond `_EDGE` of 4 exp(-2 fill) J1(v)^2 / v^2, with the mean J1^2 = 1 / (pi v)
+    wing_heat = 4 * torch.exp(-2 * fills) / (math.pi * _EDGE**2) * 0.5
     rows = []
     for wave_count in waves.tolist():
-        turns = 2 * math.pi * wave_count * square
-        parts = [(taper * wave) @ bessel.T for wave in (torch.cos(turns), torch.sin(turns))]
-        irradiance = 4 * (parts[0].square() + parts[1].square())
-        hottest = (irradiance @ inverse.T).amax(1) + wings
+        phase = 2 * math.pi * wave_count * squared_radius
+        field_parts = [(taper * wave) @ bessel.T for wave in (torch.cos(phase), torch.sin(phase))]
+        irradiance = 4 * (field_parts[0].square() + field_parts[1].square())
+        hottest = (irradiance @ heat_weights.T).amax(1) + wing_heat
         rows.append(hottest / _even_disc(fills, torch.full_like(fills, wave_count)))
-    last_wave = rows[-round(_WAVE_STEPS / _TABLE_WAVES) :]
-    return torch.stack([*rows, torch.stack(last_wave).amax(0)])
+    last_rows = rows[-round(_WAVE_STEPS / _TABLE_WAVES) :]
+    return torch.stack([*rows, torch.stack(last_rows).amax(0)])
 
 
 def _mean_inverse_distance(reach: Tensor) -> Tensor:
@@ -261,10 +271,16 @@ def _mean_inverse_distance(reach: Tensor) -> Tensor:
     from scipy.special import ellipkm1
 
     points = torch.linspace(0, _HOTTEST, _POINTS, dtype=torch.float64)[:, None, None]
-    within = ((torch.arange(_PARTS, dtype=torch.float64) + 0.5) / _PARTS - 0.5) * _STEP
-    ring = reach[:, None] + within
-    apart = ((points - ring) / (points + ring)).square().clamp_min(1e-14)  # 1 - m
-    kernel = 2 / math.pi * ring / (points + ring) * torch.from_numpy(ellipkm1(apart.numpy()))
+    offsets = ((torch.arange(_PARTS, dtype=torch.float64) + 0.5) / _PARTS - 0.5) * _STEP
+    ring_radii = reach[:, None] + offsets
+    one_minus_m = ((points - ring_radii) / (points + ring_radii)).square().clamp_min(1e-14)
+    kernel = (
+        2
+        / math.pi
+        * ring_radii
+        / (points + ring_radii)
+        * torch.from_numpy(ellipkm1(one_minus_m.numpy()))
+    )
     return kernel.mean(-1) * _STEP
 
 
@@ -309,10 +325,10 @@ def heated_diameter(beam: Beam, distance: Number, diameter: Number, focal_length
     grows as the peak's factor `underfilled` to the power of -1/2. In the limit of a narrow beam it
     is 4 % below the diameter of the Gaussian spot.
     """
-    filled = diameter**2 / (4 * beam_radius(beam, distance) ** 2)
-    overfilled: Number = airy_diameter(beam.wavelength, focal_length / diameter)  # type: ignore[assignment,arg-type]
-    wider: Number = underfilled(filled) ** -0.5
-    return overfilled * wider
+    fill = diameter**2 / (4 * beam_radius(beam, distance) ** 2)
+    airy: Number = airy_diameter(beam.wavelength, focal_length / diameter)  # type: ignore[assignment,arg-type]
+    widening: Number = underfilled(fill) ** -0.5
+    return airy * widening
 
 
 def heated_in_spot(
@@ -351,7 +367,7 @@ def widest_heated_diameter(clear: Number, peak_ratio: Number) -> Number:
     Source: rearrangement inequality for the integral of E / r over the plane; our derivation.
     """
     # of the integral of E along a radius, in wavelengths times f-number and peaks
-    airy = 16 / (3 * math.pi**2)
-    disc = 2 / math.pi  # radius of the disc of equal power and peak, in the same unit
-    wider: Number = clear * (disc / airy) / peak_ratio**0.5
+    airy_heat = 16 / (3 * math.pi**2)
+    disc_heat = 2 / math.pi  # radius of the disc of equal power and peak, in the same unit
+    wider: Number = clear * (disc_heat / airy_heat) / peak_ratio**0.5
     return wider

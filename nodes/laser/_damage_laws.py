@@ -92,15 +92,15 @@ def matching_laws(
     laws: Iterable[DamageLaw], device: str, wavelength: float, duration: float, quantity: Quantity
 ) -> tuple[DamageLaw, ...]:
     """Return the laws that hold for a class of sensors, a wavelength in m and a duration in s."""
-    of_device = [law for law in laws if law.device.casefold() == device.casefold()]
-    of_quantity = [law for law in of_device if law.quantity == quantity]
-    return tuple(law for law in of_quantity if _reaches(law, wavelength, duration))
+    device_laws = [law for law in laws if law.device.casefold() == device.casefold()]
+    quantity_laws = [law for law in device_laws if law.quantity == quantity]
+    return tuple(law for law in quantity_laws if _reaches(law, wavelength, duration))
 
 
 def _reaches(law: DamageLaw, wavelength: float, duration: float) -> bool:
     """Return True if a law holds at a wavelength in m and for a duration in s."""
-    of_light = law.wavelengths[0] <= wavelength <= law.wavelengths[1]
-    return of_light and law.durations[0] <= duration <= law.durations[1]
+    in_wavelengths = law.wavelengths[0] <= wavelength <= law.wavelengths[1]
+    return in_wavelengths and law.durations[0] <= duration <= law.durations[1]
 
 
 def spot_reach(diameter: Number, duration: Number) -> Tensor:
@@ -130,9 +130,9 @@ def spot_factor(
     (published / spot) to the power of the exponent.
     """
     diameter = double(spot)
-    bonus = (published / diameter) ** double(small_spot_exponent)
-    wider = spot_reach(published, duration) / spot_reach(diameter, duration)
-    return torch.where(diameter <= published, bonus, wider)
+    narrower_factor = (published / diameter) ** double(small_spot_exponent)
+    wider_factor = spot_reach(published, duration) / spot_reach(diameter, duration)
+    return torch.where(diameter <= published, narrower_factor, wider_factor)
 
 
 def damage_threshold(
@@ -172,9 +172,15 @@ def damage_at(
     ratio = exposure / damage_threshold(law, spot, duration, small_spot_exponent)
     if law.factor is None or law.median_factor is None:
         return Damage(ratio, None, None, None)
-    away = math.log(ratio) / math.log(law.factor) if ratio > 0 else -math.inf
-    moved = _QUANTILE * math.log(law.median_factor) / math.log(law.factor)
-    return Damage(ratio, _normal(away), _normal(away - moved), _normal(away + moved))
+    # standard deviations of ln threshold by which the exposure is above the median device
+    deviations = math.log(ratio) / math.log(law.factor) if ratio > 0 else -math.inf
+    median_shift = _QUANTILE * math.log(law.median_factor) / math.log(law.factor)
+    return Damage(
+        ratio,
+        _normal(deviations),
+        _normal(deviations - median_shift),
+        _normal(deviations + median_shift),
+    )
 
 
 def _normal(x: float) -> float:
@@ -246,26 +252,29 @@ def first_damage(
     Source: the sources of both laws.
     """
     time = double(duration)
-    steady = _steady(ends.continuous, time, spot, small_spot_exponent)
-    join = torch.full_like(time, CONTINUOUS_FROM)
-    at_join = (
-        _steady(ends.continuous, join, spot, small_spot_exponent)
+    spot_factors = _steady(ends.continuous, time, spot, small_spot_exponent)
+    join_time = torch.full_like(time, CONTINUOUS_FROM)
+    fluence_at_join = (
+        _steady(ends.continuous, join_time, spot, small_spot_exponent)
         * ends.continuous.median
         * CONTINUOUS_FROM
     )
-    start = at_join.clamp_max(ends.pulse.median)
+    # a longer pulse never needs less fluence
+    pulse_fluence = fluence_at_join.clamp_max(ends.pulse.median)
     decades = math.log10(CONTINUOUS_FROM / PULSE_END)
-    slope = torch.log10(at_join / start) / decades
-    interpolated = start * (time.clamp(PULSE_END, CONTINUOUS_FROM) / PULSE_END) ** slope
-    low, high = (
+    # of the logarithm of the fluence over that of the duration
+    slope = torch.log10(fluence_at_join / pulse_fluence) / decades
+    interpolated = pulse_fluence * (time.clamp(PULSE_END, CONTINUOUS_FROM) / PULSE_END) ** slope
+    # a law without a bracket has its median at both ends
+    low_irradiance, high_irradiance = (
         end or ends.continuous.median for end in (ends.continuous.low, ends.continuous.high)
     )
-    middle = torch.maximum(interpolated, steady * ends.continuous.median * time)
-    lower = torch.maximum(interpolated / SPREAD, steady * low * time)
+    middle = torch.maximum(interpolated, spot_factors * ends.continuous.median * time)
+    lower = torch.maximum(interpolated / SPREAD, spot_factors * low_irradiance * time)
     return Bracket(
         low=torch.where(time < SHORTEST, 0.0, lower),
         middle=middle,
-        high=torch.maximum(interpolated * SPREAD, steady * high * time),
+        high=torch.maximum(interpolated * SPREAD, spot_factors * high_irradiance * time),
     )
 
 
@@ -392,12 +401,13 @@ def silicon_absorption(wavelength: float) -> float:
             f"no absorption of silicon at {wavelength * 1e9:.5g} nm: the table has 400 to 1100 nm"
         )
     entries = [first + _STEP * index for index in range(len(_EXTINCTION))]
+    # of the entry below the wavelength; the last entry has no interval above it
     index = min(max(bisect.bisect(entries, wavelength) - 1, 0), len(_EXTINCTION) - 2)
     share = (wavelength - entries[index]) / _STEP
-    logarithm = (1 - share) * math.log(_EXTINCTION[index]) + share * math.log(
+    log_extinction = (1 - share) * math.log(_EXTINCTION[index]) + share * math.log(
         _EXTINCTION[index + 1]
     )
-    return 4 * math.pi * math.exp(logarithm) / wavelength
+    return 4 * math.pi * math.exp(log_extinction) / wavelength
 
 
 def absorbed_share(wavelength: float, depth: float = DEPTH) -> float:
@@ -416,5 +426,6 @@ def absorption_bracket(wavelength: float, measured: float) -> tuple[float, float
     silicon alone absorb. Both are an extrapolation: the true factor is somewhere between, or
     outside where another mechanism damages.
     """
-    alone = absorbed_share(measured) / absorbed_share(wavelength)
-    return min(1.0, alone), max(1.0, alone)
+    # less absorption at the wavelength needs more light
+    silicon_factor = absorbed_share(measured) / absorbed_share(wavelength)
+    return min(1.0, silicon_factor), max(1.0, silicon_factor)

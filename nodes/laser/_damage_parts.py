@@ -90,11 +90,11 @@ class LightInTime:
     @property
     def rate(self) -> Tensor:
         """Return the pulses a second over the dwell time, of which at least one falls into it."""
-        once = 1 / double(self.dwell)
+        one_in_dwell = 1 / double(self.dwell)
         return (
-            once
+            one_in_dwell
             if self.repetition_rate is None
-            else torch.maximum(double(self.repetition_rate), once)
+            else torch.maximum(double(self.repetition_rate), one_in_dwell)
         )
 
     @property
@@ -103,6 +103,7 @@ class LightInTime:
         if self.repetition_rate is None:
             return double(1.0)
         return torch.ceil(
+            # a hair less, so that rounding counts no pulse at the end of the dwell time
             double(self.dwell) * double(self.repetition_rate) * (1 - 1e-12)
         ).clamp_min(1.0)
 
@@ -134,6 +135,7 @@ def state_of(smallest: float, largest: float, open_below: bool = False) -> State
     """
     if math.isnan(smallest) or math.isnan(largest):
         return "not judged"
+    # above even the upper end of the threshold; the largest ratio is to its lower end
     if smallest >= 1:
         return "above"
     if open_below:
@@ -145,9 +147,9 @@ def worst_state(states: Iterable[State]) -> State:
     """Return the state of a whole laser from those of its parts; `below` only if every part is
     judged and below.
     """
-    order: tuple[State, ...] = ("above", "not judged", "within", "below")
+    worst_first: tuple[State, ...] = ("above", "not judged", "within", "below")
     states = tuple(states)
-    return next((state for state in order if state in states), "not judged")
+    return next((state for state in worst_first if state in states), "not judged")
 
 
 def damage_parts(
@@ -169,18 +171,23 @@ def damage_parts(
     Source: of each part; the superposition of heat is our derivation.
     """
     curve = _curve_of(light, device, published)
+    # laws of the user replace the published curve
     pulses = [*_own_parts(light, device, own, "pulse")] or [_first_part(light, curve, "pulse")]
     means = [*_own_parts(light, device, own, "mean")] or [_first_part(light, curve, "mean")]
     pulse, mean = _lowest(pulses), _lowest(means)
-    sums = [_accumulation(light, pulse, mean), _incubation(light, pulse)]
-    others = [judged for judged in (*pulses, *means) if judged is not pulse and judged is not mean]
-    is_own = any(judged.note.startswith(_OWN) for judged in pulses)
-    further = () if is_own else _further(light, device, curve, published)
-    return (pulse, mean, *sums, *others, *further)
+    many_pulse_parts = [_accumulation(light, pulse, mean), _incubation(light, pulse)]
+    other_laws = [
+        judged for judged in (*pulses, *means) if judged is not pulse and judged is not mean
+    ]
+    has_own_law = any(judged.note.startswith(_OWN) for judged in pulses)
+    further_kinds = () if has_own_law else _further(light, device, curve, published)
+    return (pulse, mean, *many_pulse_parts, *other_laws, *further_kinds)
 
 
 def _lowest(parts: Sequence[DamagePart]) -> DamagePart:
-    """Return the part whose middle threshold is lowest."""
+    """Return the part whose middle threshold is lowest; a part without a threshold counts as
+    infinite.
+    """
     return min(
         parts,
         key=lambda judged: (
@@ -194,9 +201,9 @@ def _lowest(parts: Sequence[DamagePart]) -> DamagePart:
 
 def _curve_of(light: LightInTime, device: str, published: Sequence[DamageLaw]) -> CurveEnds | str:
     """Return the ends of the published curve of a device, or the reason why it does not hold."""
-    pulse = _first_law(device, "fluence", published)
-    continuous = _first_law(device, "irradiance", published)
-    if pulse is None or continuous is None:
+    pulse_law = _first_law(device, "fluence", published)
+    continuous_law = _first_law(device, "irradiance", published)
+    if pulse_law is None or continuous_law is None:
         classes = ", ".join(sorted({law.device for law in published}))
         return f"no law of damage for the device {device}: there are published laws for {classes}"
     if not SILICON_RANGE[0] <= light.wavelength <= SILICON_RANGE[1]:
@@ -204,18 +211,21 @@ def _curve_of(light: LightInTime, device: str, published: Sequence[DamageLaw]) -
             f"no law of damage at {light.wavelength * 1e9:.5g} nm: published laws are used from 400"
             " to 1100 nm"
         )
-    return CurveEnds(pulse, continuous)
+    return CurveEnds(pulse_law, continuous_law)
 
 
 def _first_law(device: str, quantity: Quantity, published: Sequence[DamageLaw]) -> DamageLaw | None:
-    """Return the published law of the first damage of a device in a quantity."""
-    first = [law for law in published if law.damage == "point" and law.quantity == quantity]
-    return next((law for law in first if law.device.casefold() == device.casefold()), None)
+    """Return the published law of the first damage (the kind `point`) of a device in a quantity,
+    or None.
+    """
+    first_laws = [law for law in published if law.damage == "point" and law.quantity == quantity]
+    return next((law for law in first_laws if law.device.casefold() == device.casefold()), None)
 
 
 def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part) -> DamagePart:
-    """Return one pulse, or the mean, judged by the published curve of the first damage, or the
-    reason why not.
+    """Return one pulse, or the mean, judged by the published curve of the first damage.
+
+    ``share_of_light`` is "pulse" or "mean"; ``curve`` is the curve, or the reason why none holds.
     """
     as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
     quantity: Quantity = "fluence" if as_pulse else "irradiance"
@@ -223,15 +233,16 @@ def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part
         return DamagePart(share_of_light, "point", quantity, None, reason=curve)
     duration = light.duration if as_pulse else double(light.dwell)
     bracket = first_damage(curve, duration, light.spot, light.small_spot_exponent)
+    # of a whole pulse, of which a share falls into the dwell time; or fluence to irradiance
     bracket = bracket.times(1 / light.caught) if as_pulse else bracket.times(1 / duration)
-    factors, named = _wavelength(light, curve.pulse)
+    wavelength_factors, wavelength_note = _wavelength(light, curve.pulse)
     return DamagePart(
         part=share_of_light,
         kind="point",
         quantity=quantity,
-        threshold=bracket.times(factors),
+        threshold=bracket.times(wavelength_factors),
         source=_curve_source(curve, duration),
-        note="; ".join(text for text in (_duration_note(duration), named) if text),
+        note="; ".join(text for text in (_duration_note(duration), wavelength_note) if text),
         reason=_shorter(duration),
     )
 
@@ -252,6 +263,7 @@ def _curve_source(curve: CurveEnds, duration: Tensor) -> str:
     """Return the sources of the ends of the curve that a duration stands on."""
     if bool((duration >= CONTINUOUS_FROM).all()):
         return curve.continuous.source
+    # of both ends, the second without the name of the publication that they share
     return f"{curve.pulse.source}; {curve.continuous.source.rpartition('; ')[2]}"
 
 
@@ -294,15 +306,19 @@ def _wavelength(light: LightInTime, law: DamageLaw) -> tuple[tuple[float, float]
 def _further(
     light: LightInTime, device: str, curve: CurveEnds | str, published: Sequence[DamageLaw]
 ) -> Iterator[DamagePart]:
-    """Yield the further kinds of damage that are published for pulses of this duration."""
+    """Yield the further kinds of damage (line, cross, destruction, frame) that are published for
+    pulses of this duration.
+    """
     if isinstance(curve, str) or light.pulse_duration is None:
         return
     duration = float(double(light.duration).flatten()[0])
-    factors, named = _wavelength(light, curve.pulse)
+    wavelength_factors, wavelength_note = _wavelength(light, curve.pulse)
     for law in matching_laws(published, device, MEASURED, duration, "fluence"):
         if law.damage != "point":
-            middle = double(law.median) / light.caught
-            bracket = Bracket(middle / SPREAD, middle, middle * SPREAD).times(factors)
+            threshold = double(law.median) / light.caught
+            bracket = Bracket(threshold / SPREAD, threshold, threshold * SPREAD).times(
+                wavelength_factors
+            )
             note = f"one figure, spread {SPREAD:.2g} times to each side"
             yield DamagePart(
                 "pulse",
@@ -310,7 +326,7 @@ def _further(
                 "fluence",
                 bracket,
                 law.source,
-                "; ".join(filter(None, (note, named))),
+                "; ".join(filter(None, (note, wavelength_note))),
             )
 
 
@@ -323,18 +339,21 @@ def _own_parts(
     """Yield one pulse, or the mean, judged by each law of the user that holds for it."""
     as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
     duration = light.duration if as_pulse else double(light.dwell)
-    nominal = float(duration.flatten()[0])
+    # laws are chosen by the first of several durations
+    first_duration = float(duration.flatten()[0])
     quantities: tuple[Quantity, ...] = ("fluence", "irradiance")
     for quantity in quantities:
-        for law in matching_laws(own, device, light.wavelength, nominal, quantity):
-            scale = _to_quantity(law, as_pulse, duration) * _own_spot(law, light, duration)
-            scale = scale / light.caught if as_pulse else scale
+        for law in matching_laws(own, device, light.wavelength, first_duration, quantity):
+            threshold_factor = _to_quantity(law, as_pulse, duration) * _own_spot(
+                law, light, duration
+            )
+            threshold_factor = threshold_factor / light.caught if as_pulse else threshold_factor
             note = _OWN if law.spot is None else f"{_OWN}, for a spot of {law.spot * 1e6:.3g} um"
             yield DamagePart(
                 part=share_of_light,
                 kind=law.damage,
                 quantity="fluence" if as_pulse else "irradiance",
-                threshold=_own_bracket(law).times(scale),
+                threshold=_own_bracket(law).times(threshold_factor),
                 source=law.source,
                 note=note,
                 law=law if law.has_spread else None,
@@ -346,6 +365,7 @@ def _to_quantity(law: DamageLaw, as_pulse: bool, duration: Tensor) -> Tensor:
     irradiance over a dwell.
     """
     if as_pulse:
+        # fluence = irradiance x duration
         return duration if law.quantity == "irradiance" else double(1.0)
     return 1 / duration if law.quantity == "fluence" else double(1.0)
 
@@ -366,11 +386,12 @@ def _own_bracket(law: DamageLaw) -> Bracket:
     median = double(law.median)
     if law.low is not None and law.high is not None:
         return Bracket(double(law.low), median, double(law.high))
-    deviations = [
+    log_deviations = [
         math.log(factor) for factor in (law.factor, law.median_factor) if factor is not None
     ]
-    away = math.exp(_QUANTILE * math.hypot(*deviations)) if deviations else 1.0
-    return Bracket(median / away, median, median * away)
+    # both spreads are independent: their logarithms add in squares
+    bracket_factor = math.exp(_QUANTILE * math.hypot(*log_deviations)) if log_deviations else 1.0
+    return Bracket(median / bracket_factor, median, median * bracket_factor)
 
 
 # --- many pulses ----------------------------------------------------------------------------------
@@ -394,23 +415,28 @@ def _accumulation(light: LightInTime, pulse: DamagePart, mean: DamagePart) -> Da
             mean.reason,
         )
     if pulse.threshold is None or mean.threshold is None:
-        missing = pulse if pulse.threshold is None else mean
-        return DamagePart("accumulation", pulse.kind, "fluence", None, reason=missing.reason)
-    duty = (light.duration * light.rate).clamp_max(1.0)
-    share = light.rate * light.caught  # of the mean irradiance, in 1/s per fluence of a whole pulse
+        unjudged = pulse if pulse.threshold is None else mean
+        return DamagePart("accumulation", pulse.kind, "fluence", None, reason=unjudged.reason)
+    duty_cycle = (light.duration * light.rate).clamp_max(1.0)
+    # mean irradiance over the fluence of a whole pulse, in 1/s
+    mean_per_fluence = light.rate * light.caught
 
     def summed(of_pulse: Tensor, of_mean: Tensor) -> Tensor:
-        return 1 / (torch.where(duty < 1, (1 - duty) / of_pulse, 0.0) + share / of_mean)
+        # damage where (1 - duty) F / F_pulse + mean / mean threshold = 1
+        return 1 / (
+            torch.where(duty_cycle < 1, (1 - duty_cycle) / of_pulse, 0.0)
+            + mean_per_fluence / of_mean
+        )
 
-    steady = mean.threshold
+    mean_threshold = mean.threshold
     return DamagePart(
         part="accumulation",
         kind=pulse.kind,
         quantity="fluence",
         threshold=Bracket(
-            low=summed(pulse.threshold.low, steady.low),
-            middle=summed(pulse.threshold.middle, steady.middle),
-            high=summed(pulse.threshold.high, steady.high),
+            low=summed(pulse.threshold.low, mean_threshold.low),
+            middle=summed(pulse.threshold.middle, mean_threshold.middle),
+            high=summed(pulse.threshold.high, mean_threshold.high),
         ),
         source=_SUPERPOSED,
         note="; ".join(dict.fromkeys(filter(None, (pulse.note, mean.note)))),
@@ -426,18 +452,20 @@ def _incubation(light: LightInTime, pulse: DamagePart) -> DamagePart:
     """
     if pulse.threshold is None:
         return DamagePart("incubation", pulse.kind, pulse.quantity, None, reason=pulse.reason)
-    count = light.pulses
-    duty = (light.duration * light.rate).clamp_max(1.0)
-    smallest, middle, largest = (
-        1 / ((1 - duty) * count ** (1 - exponent) + duty) for exponent in INCUBATION
+    pulse_count = light.pulses
+    duty_cycle = (light.duration * light.rate).clamp_max(1.0)
+    # F_N = F_1 N^(S - 1), with the share 1 - duty as pulses and the share duty as steady light
+    low_factor, middle_factor, high_factor = (
+        1 / ((1 - duty_cycle) * pulse_count ** (1 - exponent) + duty_cycle)
+        for exponent in INCUBATION
     )
     bracket = Bracket(
-        pulse.threshold.low * smallest,
-        pulse.threshold.middle * middle,
-        pulse.threshold.high * largest,
+        pulse.threshold.low * low_factor,
+        pulse.threshold.middle * middle_factor,
+        pulse.threshold.high * high_factor,
     )
-    many = bool((count > 1).any())
-    note = f"{_INCUBATED}; {float(count.max()):.3g} pulses" if many else pulse.note
+    has_train = bool((pulse_count > 1).any())
+    note = f"{_INCUBATED}; {float(pulse_count.max()):.3g} pulses" if has_train else pulse.note
     return DamagePart(
         "incubation", pulse.kind, pulse.quantity, bracket, pulse.source, note, pulse.reason
     )

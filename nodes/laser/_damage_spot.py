@@ -136,26 +136,37 @@ def damage(
     }
     exposed = _exposed(spot, line, light, exposure, choice)
     diameter = heated_spot(exposed.irradiance, pixel_pitch)
+    # a wider spot is heated more, so that its thresholds are lower
     parts = _parts(exposed.time, choice, diameter)
-    missed = exposed.fluence is not None and light is not None and _caught(light) <= 0
+    no_pulse = exposed.fluence is not None and light is not None and _caught(light) <= 0
     pattern = torch.zeros(spot.shape[-2:], dtype=torch.uint8, device=spot.device)
-    rows = []
+    part_rows = []
     for damage_part in parts:
-        fluence = damage_part.quantity == "fluence"
-        image = exposed.fluence if fluence and exposed.fluence is not None else exposed.irradiance
-        rows.append(_row(damage_part, math.nan if missed else float(image.max())))
-        if damage_part.threshold is not None and not missed:
-            above = image >= float(damage_part.threshold.middle) * resilience
-            pattern |= above.to(torch.uint8) << KINDS.index(damage_part.kind)
-    columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, 8).T.contiguous()
-    return SpotDamage._make([*columns, pattern])
+        is_fluence = damage_part.quantity == "fluence"
+        exposure_picture = (
+            exposed.fluence if is_fluence and exposed.fluence is not None else exposed.irradiance
+        )
+        part_rows.append(_row(damage_part, math.nan if no_pulse else float(exposure_picture.max())))
+        if damage_part.threshold is not None and not no_pulse:
+            over_threshold = exposure_picture >= float(damage_part.threshold.middle) * resilience
+            # bit k of the pattern stands for the kind KINDS[k]
+            pattern |= over_threshold.to(torch.uint8) << KINDS.index(damage_part.kind)
+    # one row a part becomes one tensor for each of the first eight fields
+    part_columns = torch.tensor(part_rows, dtype=torch.float64).reshape(-1, 8).T.contiguous()
+    return SpotDamage._make([*part_columns, pattern])
 
 
 def _row(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
-    """Return ratios, probability with its ends, peak and threshold of one part of the light."""
-    none = (-1.0, -1.0, -1.0)
+    """Return (ratio, least, most, probability, low, high, peak, threshold) of one part of the
+    light: the first eight fields of `SpotDamage`.
+
+    ``peak`` is the exposure of the brightest pixel in W/m2, or in J/m2 of one pulse; NaN if no
+    pulse fell into the exposure.
+    """
+    # share of damaged devices with the ends of its interval; -1: not known
+    probability = (-1.0, -1.0, -1.0)
     if damage_part.threshold is None or math.isnan(peak):
-        return (math.nan, math.nan, math.nan, *none, peak, math.nan)
+        return (math.nan, math.nan, math.nan, *probability, peak, math.nan)
     low, middle, high = (
         float(end)
         for end in (
@@ -165,9 +176,17 @@ def _row(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
         )
     )
     if damage_part.law is not None:
-        of_law = damage_at(damage_part.law, peak / middle * damage_part.law.median)
-        none = (of_law.probability, of_law.low, of_law.high)  # type: ignore[assignment]
-    return (peak / middle, peak / high, peak / low if low > 0 else math.inf, *none, peak, middle)
+        # the law holds for another spot: the ratio is that to the threshold of this spot
+        damage_of_law = damage_at(damage_part.law, peak / middle * damage_part.law.median)
+        probability = (damage_of_law.probability, damage_of_law.low, damage_of_law.high)  # type: ignore[assignment]
+    return (
+        peak / middle,
+        peak / high,
+        peak / low if low > 0 else math.inf,
+        *probability,
+        peak,
+        middle,
+    )
 
 
 def _caught(light: LaserLight) -> float:
@@ -181,20 +200,23 @@ def _exposed(
     """Return the fluence of one pulse and the mean irradiance over the dwell time, in each
     pixel.
     """
-    image = spot.detach().sum(0, dtype=torch.float64)
+    mean_irradiance = spot.detach().sum(0, dtype=torch.float64)
     time = _in_time(line, light, exposure, choice)
     if choice["pulse_duration"] is None:
-        return _Exposed(None, image, time)
-    pulses = 1.0 if light is None else _caught(light)
-    fluence = image * (exposure / pulses if pulses > 0 else math.nan)
+        return _Exposed(None, mean_irradiance, time)
+    pulse_count = 1.0 if light is None else _caught(light)
+    # mean irradiance x exposure is the fluence of all pulses of the exposure
+    fluence = mean_irradiance * (exposure / pulse_count if pulse_count > 0 else math.nan)
+    # fluence x pulses a second x share of a pulse in the dwell time
     return _Exposed(fluence, fluence * float(time.rate * time.caught), time)
 
 
 def _in_time(
     line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]
 ) -> LightInTime:
-    """Return the light of a laser in time; a train without a rate has the pulses that fall into
-    the exposure.
+    """Return the duration and the rate of the light of a laser over the dwell time.
+
+    A train without a stated rate has the pulses that fall into the exposure, evenly spread over it.
     """
     rate = choice["repetition_rate"]
     if rate is None and light is not None and not light.pulses.is_meta and float(light.pulses) > 1:
@@ -248,8 +270,8 @@ def _(
 
 
 def _has_sentence(damage_part: DamagePart, continuous: bool) -> bool:
-    """Return True for a part with a sentence of its own: of continuous light, which has equal
-    parts, the mean alone.
+    """Return True if the report has a sentence on this part: on each part of pulsed light, but of
+    continuous light, whose parts are all alike, on the mean alone.
     """
     return damage_part.part == "mean" or not continuous
 
@@ -267,6 +289,7 @@ def _threshold_text(damage_part: DamagePart, continuous: bool) -> str:
     if damage_part.threshold is None:
         return f"{name}: not judged: {damage_part.reason}"
     low, middle, high = (
+        # from 1/m2 to 1/cm2
         float(end) / 1e4
         for end in (
             damage_part.threshold.low,
@@ -310,28 +333,30 @@ def _(
 
 
 def _sentence(damage_part: DamagePart, row: tuple[float, ...], continuous: bool) -> str:
-    """Return what is said of one part of the light: exposure, threshold, ratio with its bracket,
-    and probability.
+    """Return the sentence of a report on one part of the light: exposure, threshold, ratio with
+    its bracket, and probability.
+
+    ``row`` holds the first eight fields of `SpotDamage` for this part.
     """
-    ratio, lowest, highest, chance, low, high, peak, threshold = row
-    name = _name(damage_part, continuous)
+    ratio, least_ratio, most_ratio, share, low, high, peak, threshold = row
+    part_name = _name(damage_part, continuous)
     if math.isnan(ratio):
-        return f"{name}: not judged: {damage_part.reason or _NO_PULSE}"
+        return f"{part_name}: not judged: {damage_part.reason or _NO_PULSE}"
     unit = _UNITS[damage_part.quantity]
     if damage_part.open_below:
-        at_least = f"at least {lowest:.3g} times the threshold"
+        ratio_text = f"at least {least_ratio:.3g} times the threshold"
         return (
-            f"{name}: {peak / 1e4:.3g} {unit}, {at_least}; not judged from below:"
+            f"{part_name}: {peak / 1e4:.3g} {unit}, {ratio_text}; not judged from below:"
             f" {damage_part.reason}"
         )
-    bracket = f" ({lowest:.3g} to {highest:.3g})" if highest > lowest else ""
+    bracket = f" ({least_ratio:.3g} to {most_ratio:.3g})" if most_ratio > least_ratio else ""
     text = (
-        f"{name}: {peak / 1e4:.3g} of {threshold / 1e4:.3g} {unit}, {ratio:.3g}{bracket} times the"
-        " threshold"
+        f"{part_name}: {peak / 1e4:.3g} of {threshold / 1e4:.3g} {unit}, {ratio:.3g}{bracket} times"
+        " the threshold"
     )
-    if chance < 0:
+    if share < 0:
         return text
-    return f"{text}; {chance:.2g} of devices damaged (90 % interval {low:.2g} to {high:.2g})"
+    return f"{text}; {share:.2g} of devices damaged (90 % interval {low:.2g} to {high:.2g})"
 
 
 def parts_before(
@@ -361,9 +386,13 @@ def heated_spot(image: Tensor, pitch: float, lost: float = 0.0) -> float | None:
     peak = float(image.max())
     if not peak > 0:
         return None
-    rim = min(image.shape) / 2 * pitch
-    heat = float(steady_heat(image, pitch).max()) + lost * pitch**2 / (2 * math.pi * rim)
-    return 2 * heat / (peak * math.sqrt(math.pi / 8))
+    rim_distance = min(image.shape) / 2 * pitch
+    # light at the distance r warms a point by E dA / (2 pi r)
+    peak_heat = float(steady_heat(image, pitch).max()) + lost * pitch**2 / (
+        2 * math.pi * rim_distance
+    )
+    # a Gaussian spot of 1/e2 radius w has the heat E w sqrt(pi / 8) at its centre
+    return 2 * peak_heat / (peak * math.sqrt(math.pi / 8))
 
 
 def steady_heat(image: Tensor, pitch: float) -> Tensor:
@@ -374,17 +403,23 @@ def steady_heat(image: Tensor, pitch: float) -> Tensor:
     """
     rows, columns = image.shape
     y, x = (torch.arange(n + 1, dtype=torch.float64, device=image.device) for n in (rows, columns))
-    halves = itertools.product((-0.5, 0.5), repeat=2)
-    corners = [(y[:, None] + j, x + i, 4 * i * j) for j, i in halves]
-    quarter = sum(
+    # the integral of 1 / sqrt(u^2 + v^2) over a pixel is its antiderivative u asinh(v / |u|) + v
+    # asinh(u / |v|) at the four corners, with the signs 4 i j = +1, -1
+    corner_offsets = itertools.product((-0.5, 0.5), repeat=2)
+    signed_corners = [(y[:, None] + j, x + i, 4 * i * j) for j, i in corner_offsets]
+    quarter_kernel = sum(
         sign * (u * torch.asinh(v / u.abs()) + v * torch.asinh(u / v.abs()))
-        for u, v, sign in corners
+        for u, v, sign in signed_corners
     )
-    # distances of a plane that wraps around
-    down, across = (torch.cat([n[:-1], n[1:].flip(0)]).long() for n in (y, x))
-    kernel = torch.as_tensor(quarter)[down][:, across]
-    size = (2 * rows, 2 * columns)
-    heat: Tensor = torch.fft.irfft2(torch.fft.rfft2(image, size) * torch.fft.rfft2(kernel), size)
+    # the kernel is even: distances 0 .. n - 1, n .. 1 make it a circular one of twice the size
+    row_distance, column_distance = (torch.cat([n[:-1], n[1:].flip(0)]).long() for n in (y, x))
+    kernel = torch.as_tensor(quarter_kernel)[row_distance][:, column_distance]
+    padded_size = (2 * rows, 2 * columns)
+    # convolution of the irradiance with 1 / r; twice the size, so that nothing wraps around
+    heat: Tensor = torch.fft.irfft2(
+        torch.fft.rfft2(image, padded_size) * torch.fft.rfft2(kernel), padded_size
+    )
+    # rounding leaves tiny values below 0; with lengths in pixels, dA / r is in units of the pitch
     return heat[:rows, :columns].clamp_min(0) * (pitch / (2 * math.pi))
 
 
@@ -440,23 +475,29 @@ def damaged_pixels(
     pattern = torch.zeros(shape, dtype=torch.uint8, device=raw.device)
     for damage_of_laser in damages or ():
         pattern |= crop(damage_of_laser.pattern, shape=shape).to(raw.device)
+    # as the sensor saturates: at the largest value of its bits or at its full well
     white = float(max(1, min(2**bits - 1, int(full_well * gain - 0.5))))
-    drawn = (
+    damaged_frame = (
         single(raw)
         .masked_fill(_of(pattern, "point"), white)
         .masked_fill(_of(pattern, "destruction"), 0.0)
     )
     if device.casefold() == "ccd":
-        drawn = drawn.masked_fill(_of(pattern, "line").any(-2, keepdim=True), white)
+        damaged_frame = damaged_frame.masked_fill(_of(pattern, "line").any(-2, keepdim=True), white)
     else:
-        drawn = drawn.masked_fill(_of(pattern, "line").any(-1, keepdim=True), 0.0)
+        damaged_frame = damaged_frame.masked_fill(_of(pattern, "line").any(-1, keepdim=True), 0.0)
     cross = _of(pattern, "cross")
-    drawn = drawn.masked_fill(cross.any(-1, keepdim=True) | cross.any(-2, keepdim=True), 0.0)
-    return drawn.masked_fill(_of(pattern, "frame").any(), 0.0)
+    # `any` over an axis, kept: one damaged pixel takes its whole row or column
+    damaged_frame = damaged_frame.masked_fill(
+        cross.any(-1, keepdim=True) | cross.any(-2, keepdim=True), 0.0
+    )
+    return damaged_frame.masked_fill(_of(pattern, "frame").any(), 0.0)
 
 
 def _of(pattern: Tensor, kind: Kind) -> Tensor:
-    """Return True for the pixels (y, x) of a pattern that have a kind of damage."""
+    """Return True for the pixels (y, x) of a pattern that have a kind of damage: bit k stands for
+    the kind KINDS[k].
+    """
     return (pattern & (1 << KINDS.index(kind))) > 0
 
 

@@ -91,51 +91,68 @@ def _separated(levels: Numbers, count: Numbers, damaged: Numbers) -> FittedThres
     """Return the bracket of shots whose levels do not overlap; raise ValueError where one of its
     ends is missing.
     """
-    none, every = levels[damaged == 0], levels[damaged == count]
-    if not none.size:
+    undamaged_levels, damaged_levels = levels[damaged == 0], levels[damaged == count]
+    if not undamaged_levels.size:
         raise ValueError("no level is without damage: add lower levels")
-    if not every.size:
+    if not damaged_levels.size:
         raise ValueError(
             "no level damaged with every shot: add higher levels, or more shots at each level"
         )
-    low, high = float(none.max()), float(every.min())
-    return FittedThreshold(math.sqrt(low * high), None, None, low, high)
+    highest_undamaged, lowest_damaged = float(undamaged_levels.max()), float(damaged_levels.min())
+    # the geometric middle of the bracket
+    return FittedThreshold(
+        math.sqrt(highest_undamaged * lowest_damaged), None, None, highest_undamaged, lowest_damaged
+    )
 
 
 def _probit(logs: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
-    """Return the lognormal law of largest likelihood; raise ValueError for damage that gets
-    rarer with the level.
+    """Return the threshold whose lognormal law has the largest likelihood, from the logarithms of
+    the levels and the numbers of shots and of damaged shots at them.
+
+    The share of damaged shots is Phi(intercept + slope (ln level - centre)). Raises ValueError for
+    damage that gets rarer with the level.
     """
     from scipy.special import ndtr, ndtri
 
     centre = float(logs.mean())
     design = np.stack([np.ones_like(logs), logs - centre], 1)
-    start = ndtri((damaged + 0.5) / (count + 1))
-    values, *_ = np.linalg.lstsq(
-        design * np.sqrt(count)[:, None], start * np.sqrt(count), rcond=None
+    # half a shot keeps the probits of levels with no or only damage finite
+    start_probits = ndtri((damaged + 0.5) / (count + 1))
+    coefficients, *_ = np.linalg.lstsq(
+        design * np.sqrt(count)[:, None], start_probits * np.sqrt(count), rcond=None
     )
     information = np.eye(2)
+    # Fisher scoring: coefficients += information^-1 score
     for _ in range(_ROUNDS):
-        predicted = design @ values
-        share = np.clip(ndtr(predicted), _TINY, 1 - _TINY)
-        density = np.exp(-(predicted**2) / 2) / math.sqrt(2 * math.pi)
-        weight = count * density**2 / (share * (1 - share))
-        information = design.T @ (design * weight[:, None])
-        score = design.T @ (density * (damaged - count * share) / (share * (1 - share)))
-        step = np.linalg.solve(information, score)
-        values = values + step
-        if np.abs(step).max() < _CLOSE * (1 + np.abs(values).max()):
+        probits = design @ coefficients
+        damaged_share = np.clip(ndtr(probits), _TINY, 1 - _TINY)
+        normal_density = np.exp(-(probits**2) / 2) / math.sqrt(2 * math.pi)
+        weights = count * normal_density**2 / (damaged_share * (1 - damaged_share))
+        information = design.T @ (design * weights[:, None])
+        score = design.T @ (
+            normal_density
+            * (damaged - count * damaged_share)
+            / (damaged_share * (1 - damaged_share))
+        )
+        change = np.linalg.solve(information, score)
+        coefficients = coefficients + change
+        if np.abs(change).max() < _CLOSE * (1 + np.abs(coefficients).max()):
             break
-    offset, slope = float(values[0]), float(values[1])
+    intercept, slope = float(coefficients[0]), float(coefficients[1])
     if not (math.isfinite(slope) and slope > 0):
         raise ValueError(
             "damage gets rarer with the level: no threshold can be fitted to these shots"
         )
     covariance = np.linalg.inv(information)
-    gradient = np.array([-1 / slope, offset / slope**2])
+    # ln median = centre - intercept / slope: its gradient by intercept and slope
+    gradient = np.array([-1 / slope, intercept / slope**2])
     deviation = math.sqrt(float(gradient @ covariance @ gradient))
     return FittedThreshold(
-        math.exp(centre - offset / slope), math.exp(1 / slope), math.exp(deviation)
+        # median, factor and median factor: the law is 1/2 at the median, and 1 / slope is one
+        # standard deviation of ln level
+        math.exp(centre - intercept / slope),
+        math.exp(1 / slope),
+        math.exp(deviation),
     )
 
 
@@ -218,43 +235,44 @@ def read_damage_laws(file: Path) -> tuple[DamageLaw, ...]:
     if len(rows) < 2:
         raise ValueError(f"{file.name} has no laws of damage below a header: {_FORM}")
     columns = [_heading(file, rows[0][0], index, cell) for index, cell in enumerate(rows[0][1])]
-    names = {column.quantity for column in columns}
-    has_shots = bool(names & {"level", *_COUNTS})
-    _refuse_columns(file, names, has_shots)
+    quantities = {column.quantity for column in columns}
+    has_shots = bool(quantities & {"level", *_COUNTS})
+    _refuse_columns(file, quantities, has_shots)
     table = [_cells(file, columns, line, cells) for line, cells in rows[1:]]
     return _fitted_laws(table) if has_shots else tuple(map(_law, table))
 
 
 def _refuse_columns(file: Path, names: set[str], has_shots: bool) -> None:
     """Raise ValueError for a column that is missing, and for thresholds beside shots."""
-    needed = (*_SHARED, "level", *_COUNTS) if has_shots else (*_SHARED, "threshold")
-    missing = [name for name in needed if name not in names]
-    if missing:
-        raise ValueError(f"{file.name}: no column {missing[0]}: {_FORM}")
-    beside = sorted(names & {"threshold", "low", "high", "factor", "median factor"})
-    if has_shots and beside:
+    required_columns = (*_SHARED, "level", *_COUNTS) if has_shots else (*_SHARED, "threshold")
+    missing_columns = [name for name in required_columns if name not in names]
+    if missing_columns:
+        raise ValueError(f"{file.name}: no column {missing_columns[0]}: {_FORM}")
+    excluded = sorted(names & {"threshold", "low", "high", "factor", "median factor"})
+    if has_shots and excluded:
         raise ValueError(
-            f"{file.name}: the column {beside[0]} beside shots: the threshold is fitted to the"
+            f"{file.name}: the column {excluded[0]} beside shots: the threshold is fitted to the"
             " shots"
         )
 
 
 def _cells(file: Path, columns: list[Column], line: int, cells: list[str]) -> list[_Cell]:
-    """Return the cells of a row with their places; raise ValueError for another number of cells
-    than headings.
+    """Return the cells of a row with their places in the file; raise ValueError unless the row has
+    one cell for each heading.
     """
     if len(cells) != len(columns):
         text = f"{len(cells)} columns in place of {len(columns)}, the number of headings"
         raise ValueError(f"{file.name}:{line}: {text}: write one cell for each heading")
-    both = enumerate(zip(columns, cells, strict=True))
+    numbered_cells = enumerate(zip(columns, cells, strict=True))
     return [
         _Cell(cell.strip(), place(file, line, index, column), column)
-        for index, (column, cell) in both
+        for index, (column, cell) in numbered_cells
     ]
 
 
 def _heading(file: Path, line: int, index: int, cell: str) -> Column:
     """Return the quantity and the unit of a heading; raise ValueError for one that is not known."""
+    # `wavelength from (nm)`: quantity before the bracket, unit in it
     quantity, _, unit = cell.strip().removesuffix(")").partition("(")
     column = Column(quantity.strip().casefold(), unit.strip())
     if column.quantity not in _UNITS:
@@ -270,88 +288,102 @@ def _heading(file: Path, line: int, index: int, cell: str) -> Column:
 
 
 def _law(cells: list[_Cell]) -> DamageLaw:
-    """Return the law of one row."""
+    """Return the law of damage of one row: median threshold, and the spread of devices or the
+    bracket where the row states it.
+
+    Raises ValueError for only one of factor and median factor, and for the mistakes that `_values`,
+    `_filled` and `_bracket` refuse.
+    """
     values = _values(cells, "threshold")
     threshold = _filled(cells, "threshold")
-    by_name = {cell.column.quantity: cell for cell in cells}
+    cell_of = {cell.column.quantity: cell for cell in cells}
     if (values.get("factor") is None) != (values.get("median factor") is None):
-        cell = by_name.get("factor") or by_name["median factor"]
+        cell = cell_of.get("factor") or cell_of["median factor"]
         text = (
             "one of factor and median factor is given: a probability needs both, so give both or"
             " neither"
         )
         raise ValueError(f"{cell.where}: {text}")
-    low, high = _bracket(by_name, values, threshold)
+    bracket_low, bracket_high = _bracket(cell_of, values, threshold)
     return DamageLaw(
         **_described(values),
         quantity=_quantity(threshold),
         median=cast(float, _value(threshold)),
         factor=values.get("factor"),
         median_factor=values.get("median factor"),
-        low=low,
-        high=high,
+        low=bracket_low,
+        high=bracket_high,
     )
 
 
 def _bracket(
     cells: dict[str, _Cell], values: dict[str, Any], threshold: _Cell
 ) -> tuple[float | None, float | None]:
-    """Return the ends of the bracket of a row, or None twice; raise ValueError for one that does
-    not fit.
+    """Return the lower and the upper end of the bracket of a row in SI units, or None twice if the
+    row has none.
+
+    Raises ValueError for one end alone, for a bracket beside a factor, for ends in another quantity
+    than the threshold, and for ends that do not hold the threshold.
     """
     low, high = values.get("low"), values.get("high")
     if low is None and high is None:
         return None, None
-    cell = cells["high"] if low is None else cells["low"]
+    # the end that is written down, for the message
+    end = cells["high"] if low is None else cells["low"]
     if low is None or high is None:
         raise ValueError(
-            f"{cell.where}: one end of a bracket is given: give low and high, or neither"
+            f"{end.where}: one end of a bracket is given: give low and high, or neither"
         )
     if values.get("factor") is not None:
         raise ValueError(
-            f"{cell.where}: a bracket beside a factor: give the bracket or the spread of devices"
+            f"{end.where}: a bracket beside a factor: give the bracket or the spread of devices"
         )
     if {_quantity(cells[name]) for name in ("low", "high")} != {_quantity(threshold)}:
         raise ValueError(
-            f"{cell.where}: the bracket has another quantity than the threshold of this row"
+            f"{end.where}: the bracket has another quantity than the threshold of this row"
         )
     if not low <= cast(float, _value(threshold)) <= high:
         raise ValueError(
-            f"{cell.where}: the bracket does not hold the threshold: give low <= threshold <= high"
+            f"{end.where}: the bracket does not hold the threshold: give low <= threshold <= high"
         )
     return low, high
 
 
 def _values(cells: list[_Cell], *but: str) -> dict[str, Any]:
-    """Return the values of a row by quantity, without some quantities; raise ValueError for a
-    range that falls.
+    """Return the values of a row by the quantity of their column, but for the quantities in
+    ``but``.
+
+    Numbers are in SI units; an empty cell of an optional column has None. Raises ValueError for a
+    range of wavelengths or durations whose end is before its start.
     """
     values = {
         cell.column.quantity: _value(cell) for cell in cells if cell.column.quantity not in but
     }
-    by_name = {cell.column.quantity: cell for cell in cells}
+    cell_of = {cell.column.quantity: cell for cell in cells}
     for name in ("wavelength", "duration"):
         if values[f"{name} to"] < values[f"{name} from"]:
             raise ValueError(
-                f"{by_name[f'{name} to'].where}: the range ends before it starts: swap the two"
+                f"{cell_of[f'{name} to'].where}: the range ends before it starts: swap the two"
                 f" {name}s"
             )
     return values
 
 
 def _filled(cells: list[_Cell], name: str) -> _Cell:
-    """Return the only filled cell of the columns of a quantity; raise ValueError for none and
-    for several.
+    """Return the one cell of a row with a text, among the columns of a quantity (thresholds may
+    have a column in W/cm2 and one in J/cm2).
+
+    Raises ValueError for no such cell and for several.
     """
-    filled = [cell for cell in cells if cell.column.quantity == name and cell.text]
-    if len(filled) != 1:
+    filled_cells = [cell for cell in cells if cell.column.quantity == name and cell.text]
+    if len(filled_cells) != 1:
         where = next(cell.where for cell in cells if cell.column.quantity == name)
-        text = f"{len(filled)} {name}s in this row"
+        text = f"{len(filled_cells)} {name}s in this row"
         raise ValueError(
             f"{where}: {text}: give one, an irradiance for continuous light or a fluence for a"
             " pulse"
         )
-    return filled[0]
+    return filled_cells[0]
 
 
 def _quantity(cell: _Cell) -> Quantity:
@@ -360,7 +392,9 @@ def _quantity(cell: _Cell) -> Quantity:
 
 
 def _described(values: dict[str, Any]) -> dict[str, Any]:
-    """Return what a law says beside its threshold, from the values of a row."""
+    """Return the arguments of `DamageLaw` beside its threshold and spread, from the values of a
+    row.
+    """
     return {
         "device": values["device"],
         "damage": cast(Kind, values["damage"]),
@@ -372,29 +406,32 @@ def _described(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fitted_laws(table: list[list[_Cell]]) -> tuple[DamageLaw, ...]:
-    """Return the law of each test in a table of shots; raise ValueError, with the first row, for
-    a test without one.
+    """Return one law for each test in a table of shots; a test is all rows that agree in
+    everything but level, shots and damaged.
     """
-    tests: dict[tuple[Any, ...], list[list[_Cell]]] = {}
+    rows_of_test: dict[tuple[Any, ...], list[list[_Cell]]] = {}
     for cells in table:
-        described = _described(_values(cells, "level", *_COUNTS))
-        key = (*described.values(), _quantity(_filled(cells, "level")))
-        tests.setdefault(key, []).append(cells)
-    return tuple(_fitted_law(rows) for rows in tests.values())
+        law_arguments = _described(_values(cells, "level", *_COUNTS))
+        test_key = (*law_arguments.values(), _quantity(_filled(cells, "level")))
+        rows_of_test.setdefault(test_key, []).append(cells)
+    return tuple(_fitted_law(rows) for rows in rows_of_test.values())
 
 
 def _fitted_law(rows: list[list[_Cell]]) -> DamageLaw:
-    """Return the law that is fitted to the shots of one test."""
-    first = _filled(rows[0], "level")
+    """Return the law that is fitted to the shots of one test; raise ValueError, with the place of
+    the first row, where they show no threshold.
+    """
+    first_level = _filled(rows[0], "level")
     try:
         fitted = fit_shots([_shots(cells) for cells in rows])
     except _AtCell as error:
         raise ValueError(str(error)) from None
     except ValueError as error:
-        raise ValueError(f"{first.where}: {error}") from None
+        raise ValueError(f"{first_level.where}: {error}") from None
     return DamageLaw(
+        # all rows of a test agree in these values
         **_described(_values(rows[0], "level", *_COUNTS)),
-        quantity=_quantity(first),
+        quantity=_quantity(first_level),
         median=fitted.median,
         factor=fitted.factor,
         median_factor=fitted.median_factor,
@@ -409,11 +446,11 @@ class _AtCell(ValueError):
 
 def _shots(cells: list[_Cell]) -> Shots:
     """Return the shots of one row; raise `_AtCell` for more damage than shots."""
-    by_name = {cell.column.quantity: cell for cell in cells}
-    count, damaged = (_count(by_name[name]) for name in _COUNTS)
+    cell_of = {cell.column.quantity: cell for cell in cells}
+    count, damaged = (_count(cell_of[name]) for name in _COUNTS)
     if not count > 0 or damaged > count:
         raise _AtCell(
-            f"{by_name['damaged'].where}: {damaged} damaged of {count} shots: give at most as many"
+            f"{cell_of['damaged'].where}: {damaged} damaged of {count} shots: give at most as many"
             " as shots"
         )
     return Shots(cast(float, _value(_filled(cells, "level"))), count, damaged)

@@ -63,14 +63,14 @@ def dazzled_pixels(strength: float, spread: float, sampling: Sampling = "integra
     """
     if strength <= 1:
         return 0.0
-    share = pixel_share(spread) if sampling == "integrated" else 1.0
-    return spread**2 / math.pi * math.pow(4 * strength / (math.pi * share), 2 / 3)
+    mean_over_peak = pixel_share(spread) if sampling == "integrated" else 1.0
+    return spread**2 / math.pi * math.pow(4 * strength / (math.pi * mean_over_peak), 2 / 3)
 
 
 def dazzle_strength(pixels: float, spread: float, sampling: Sampling = "integrated") -> float:
     """Return the strength at which `dazzled_pixels` gives a number of pixels: its inverse."""
-    share = pixel_share(spread) if sampling == "integrated" else 1.0
-    return max(1.0, math.pi * share / 4 * math.pow(math.pi * pixels / spread**2, 1.5))
+    mean_over_peak = pixel_share(spread) if sampling == "integrated" else 1.0
+    return max(1.0, math.pi * mean_over_peak / 4 * math.pow(math.pi * pixels / spread**2, 1.5))
 
 
 def counted_pixels(strength: float, spread: float, sampling: Sampling = "integrated") -> int:
@@ -80,15 +80,22 @@ def counted_pixels(strength: float, spread: float, sampling: Sampling = "integra
     Raises ValueError where the dazzled area reaches beyond 1024 pixels from the axis:
     `dazzled_pixels` holds there.
     """
-    share = pixel_share(spread) if sampling == "integrated" else 1.0
-    radius = spread / math.pi * max(_FIRST_ZERO, (8 * strength / (math.pi * share)) ** (1 / 3)) + 3
+    mean_over_peak = pixel_share(spread) if sampling == "integrated" else 1.0
+    # where the envelope of the rings, 8 / (pi v^3), falls below saturation, and 3 pixels more
+    radius = (
+        spread / math.pi * max(_FIRST_ZERO, (8 * strength / (math.pi * mean_over_peak)) ** (1 / 3))
+        + 3
+    )
     if radius > _WIDEST:
         raise ValueError(
             f"the dazzled area reaches {radius:.0f} pixels from the axis: use dazzled_pixels"
         )
-    rows = _airy_over_pixels(spread, math.ceil(radius), sampling)
-    above = rows >= share / strength
-    return int(above[0, 0]) + 4 * int(above[0, 1:].sum()) + 4 * int(above[1:, 1:].sum())
+    quadrant = _airy_over_pixels(spread, math.ceil(radius), sampling)
+    is_dazzled = quadrant >= mean_over_peak / strength
+    # the axis once; a half axis and the rest of the quadrant four times
+    return (
+        int(is_dazzled[0, 0]) + 4 * int(is_dazzled[0, 1:].sum()) + 4 * int(is_dazzled[1:, 1:].sum())
+    )
 
 
 def dazzle_exposure_limit(
@@ -103,8 +110,8 @@ def dazzle_exposure_limit(
     derivation from the Airy pattern; Ritt (Sensors 19, 3765, 2019) defines the quantity with a
     scatter function of lenses too, which `flare.stray_light` describes.
     """
-    share = pixel_share(spread) if sampling == "integrated" else 1.0
-    return dazzle_strength(pixels, spread, sampling) * saturation / (share * gain)
+    mean_over_peak = pixel_share(spread) if sampling == "integrated" else 1.0
+    return dazzle_strength(pixels, spread, sampling) * saturation / (mean_over_peak * gain)
 
 
 def veil_limit(
@@ -131,21 +138,25 @@ def veil_limit(
 
 @functools.lru_cache(maxsize=8)
 def _airy_over_pixels(spread: float, count: int, sampling: Sampling = "integrated") -> Tensor:
-    """Return the Airy irradiance of the pixels (y, x) of one quadrant from the axis, over the
-    peak of the pattern.
+    """Return the Airy irradiance over its peak of count x count pixels (y, x), one quadrant from
+    the axis on.
+
+    ``spread`` is lambda N / p. Pixels average over their squares, or sample the points in their
+    middles.
     """
     import numpy as np
 
+    # one point with the weight 2 of the interval from -1 to 1
     points, weights = np.zeros(1), np.full(1, 2.0)
     if sampling == "integrated":
         points, weights = np.polynomial.legendre.leggauss(3 + math.ceil(4 / spread))
     pixel = torch.arange(count, dtype=torch.float64)
-    total = torch.zeros(count, count, dtype=torch.float64)
+    irradiance = torch.zeros(count, count, dtype=torch.float64)
     for y, weight_y in zip(points.tolist(), weights.tolist(), strict=True):
         for x, weight_x in zip(points.tolist(), weights.tolist(), strict=True):
             reach = torch.hypot((pixel + y / 2)[:, None], pixel + x / 2) * (math.pi / spread)
-            total += weight_y * weight_x / 4 * _airy(reach)
-    return total
+            irradiance += weight_y * weight_x / 4 * _airy(reach)
+    return irradiance
 
 
 def _airy(reach: Tensor) -> Tensor:
@@ -202,20 +213,25 @@ def dazzle_curve(
     """
     # photons of each wavelength, whose wells they fill
     weights = bands.weights.double() * bands.centres.double()
-    light = torch.zeros(psf.intensity[0].numel(), dtype=torch.float64, device=psf.intensity.device)
+    pixel_light = torch.zeros(
+        psf.intensity[0].numel(), dtype=torch.float64, device=psf.intensity.device
+    )
     for weight, band in zip(weights.tolist(), psf.intensity.detach(), strict=True):
-        light = light + weight * band.flatten().double()
+        pixel_light = pixel_light + weight * band.flatten().double()
     peak = float((weights * psf.clear_peak.detach().cpu()).sum())
     if not transformed():
-        refuse_not_finite("its pixels cannot be counted", psf=light.sum(), clear_peak=peak)
-    multiples = torch.tensor(strengths, dtype=torch.float64)
-    ordered = light.sort().values.cpu()
-    pixels = (len(ordered) - torch.searchsorted(ordered, level * peak / multiples)).double()
-    cut = float(cut_off(psf).mean())
-    averaged_away = math.pi / 4 * cut**2 / float(psf.clear_peak.detach().mean())
-    clear = (4 / math.pi * multiples / level * averaged_away).pow(2 / 3) / (math.pi * cut**2)
+        refuse_not_finite("its pixels cannot be counted", psf=pixel_light.sum(), clear_peak=peak)
+    strength_values = torch.tensor(strengths, dtype=torch.float64)
+    ordered = pixel_light.sort().values.cpu()
+    # number of pixels from the limit on, among those in rising order
+    pixels = (len(ordered) - torch.searchsorted(ordered, level * peak / strength_values)).double()
+    cut_off_frequency = float(cut_off(psf).mean())
+    point_to_pixel_peak = math.pi / 4 * cut_off_frequency**2 / float(psf.clear_peak.detach().mean())
+    clear = (4 / math.pi * strength_values / level * point_to_pixel_peak).pow(2 / 3) / (
+        math.pi * cut_off_frequency**2
+    )
     return DazzleCurve(
-        multiples, pixels, pixels / len(ordered), clear.where(multiples > level, 0.0)
+        strength_values, pixels, pixels / len(ordered), clear.where(strength_values > level, 0.0)
     )
 
 
@@ -291,10 +307,10 @@ def dazzle(
         refuse_not_finite(
             "its dazzled pixels cannot be counted", photons=scene.sum(), laser=veil.sum()
         )
-    room = full_well - offset
-    lost, filled = (scene >= room).any(-3), (scene + veil >= room).any(-3)
-    background, mean = _over_feature(scene, feature), _over_feature(veil, feature)
-    limit = veil_limit(
+    free_well = full_well - offset
+    lost_before, full_with_laser = (scene >= free_well).any(-3), (scene + veil >= free_well).any(-3)
+    background, mean_veil = _over_feature(scene, feature), _over_feature(veil, feature)
+    largest_veil = veil_limit(
         background,
         contrast=contrast,
         feature=feature,
@@ -302,11 +318,13 @@ def dazzle(
         rule=rule,
         read_noise=read_noise,
     )
-    visible = (limit >= 0).any(-3) & ~lost
-    saturated = filled & ~lost
-    veiled = visible & ~filled & ~(mean <= limit).any(-3)
+    # a limit below 0: lost without a laser
+    visible = (largest_veil >= 0).any(-3) & ~lost_before
+    saturated = full_with_laser & ~lost_before
+    # lost in every channel
+    veiled = visible & ~full_with_laser & ~(mean_veil <= largest_veil).any(-3)
     pixels = visible.numel()
-    counts = [x.sum().double() for x in (saturated, veiled, visible)]
+    counts = [mask.sum().double() for mask in (saturated, veiled, visible)]
     return Dazzle(counts[0], counts[1], (counts[0] + counts[1]) / pixels, counts[2] / pixels)
 
 
@@ -315,10 +333,11 @@ def _over_feature(image: Tensor, size: int) -> Tensor:
     pixel.
     """
     rows, columns = image.shape[-2:]
-    mean, half = image[None], size // 2
-    for window, padding in (((size, 1), (half, 0)), ((1, size), (0, half))):
-        mean = avg_pool2d(mean, window, stride=1, padding=padding, count_include_pad=False)
-    return mean[0, ..., :rows, :columns]
+    averaged, half_size = image[None], size // 2
+    # along y, then along x; an even size makes one row and one column too many
+    for window, padding in (((size, 1), (half_size, 0)), ((1, size), (0, half_size))):
+        averaged = avg_pool2d(averaged, window, stride=1, padding=padding, count_include_pad=False)
+    return averaged[0, ..., :rows, :columns]
 
 
 @dazzle.preflight

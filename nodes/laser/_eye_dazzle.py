@@ -53,8 +53,9 @@ def luminous_efficiency(wavelength: float) -> float:
         return 0.0
     import torch
 
-    place = torch.tensor([wavelength], dtype=torch.float64)
-    return float(observer().at(place)[1, 0])
+    wavelengths = torch.tensor([wavelength], dtype=torch.float64)
+    # the second of the three colour-matching functions is V(lambda)
+    return float(observer().at(wavelengths)[1, 0])
 
 
 def veil_per_lux(angle: float, age: float, pigmentation: float) -> float:
@@ -73,9 +74,11 @@ def veil_per_lux(angle: float, age: float, pigmentation: float) -> float:
             f" {_GLARE[1]:g} deg"
         )
         raise ParameterError("angle", text)
-    older = 1 + (age / 62.5) ** 4
+    age_factor = 1 + (age / 62.5) ** 4
     return (
-        10 / angle**3 + (5 / angle**2 + 0.1 * pigmentation / angle) * older + 0.0025 * pigmentation
+        10 / angle**3
+        + (5 / angle**2 + 0.1 * pigmentation / angle) * age_factor
+        + 0.0025 * pigmentation
     )
 
 
@@ -102,25 +105,29 @@ def threshold_luminance(background: float, size: float, age: float) -> float:
 
 
 def _ricco(background: float) -> float:
-    """Return the square root of the flux function, which rules small targets."""
-    decades = math.log10(background)
+    """Return the square root of the flux function of Adrian for a background in cd/m2, which rules
+    small targets (law of Ricco).
+    """
+    log_background = math.log10(background)
     if background >= 0.6:
         return math.log10(4.1925 * math.pow(background, 0.1556)) + 0.1684 * math.pow(
             background, 0.5867
         )
     if background > 0.00418:
-        return math.pow(10, -0.072 + 0.3372 * decades + 0.0866 * decades**2)
-    return math.pow(10, 0.028 + 0.173 * decades)
+        return math.pow(10, -0.072 + 0.3372 * log_background + 0.0866 * log_background**2)
+    return math.pow(10, 0.028 + 0.173 * log_background)
 
 
 def _weber(background: float) -> float:
-    """Return the square root of the luminance function, which rules large targets."""
-    decades = math.log10(background)
+    """Return the square root of the luminance function of Adrian for a background in cd/m2, which
+    rules large targets (law of Weber).
+    """
+    log_background = math.log10(background)
     if background >= 0.6:
         return 0.05946 * math.pow(background, 0.466)
     if background > 0.00418:
-        return math.pow(10, -1.256 + 0.319 * decades)
-    return math.pow(10, -0.891 + 0.5275 * decades + 0.0227 * decades**2)
+        return math.pow(10, -1.256 + 0.319 * log_background)
+    return math.pow(10, -0.891 + 0.5275 * log_background + 0.0227 * log_background**2)
 
 
 def _age_factor(age: float) -> float:
@@ -142,20 +149,21 @@ def dazzle_illuminance(task: DazzleTask) -> float:
     """
     if not task.background > 0:
         raise ParameterError("background", f"{task.background:g} cd/m2: give a background above 0")
-    scatter = veil_per_lux(task.angle, task.age, task.pigmentation)
+    veil_of_lux = veil_per_lux(task.angle, task.age, task.pigmentation)
     difference = task.contrast * task.background
 
     def is_seen(veil: float) -> bool:
-        around = task.background * (1 + veil)
-        return difference >= task.margin * threshold_luminance(around, task.size, task.age)
+        total_luminance = task.background * (1 + veil)
+        return difference >= task.margin * threshold_luminance(total_luminance, task.size, task.age)
 
-    low, high = _VEILS
-    if not is_seen(low):
+    seen_veil, hiding_veil = _VEILS
+    if not is_seen(seen_veil):
         return 0.0
+    # bisection of the logarithm of the veil, in units of the background
     for _ in range(_HALVINGS):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if is_seen(middle) else (low, middle)
-    return low * task.background / scatter
+        middle = math.sqrt(seen_veil * hiding_veil)
+        seen_veil, hiding_veil = (middle, hiding_veil) if is_seen(middle) else (seen_veil, middle)
+    return seen_veil * task.background / veil_of_lux
 
 
 def maximum_dazzle_exposure(wavelength: float, task: DazzleTask) -> float:
@@ -197,6 +205,6 @@ def unsteady(beam: Beam) -> str:
     if beam.repetition_rate is None:
         return "a single pulse dazzles as a flash, for which no model is here"
     if beam.repetition_rate < STEADY:
-        slow = f"pulses at {beam.repetition_rate:g} Hz flicker, for which no model is here"
-        return f"{slow} (from {STEADY:g} Hz on their mean counts)"
+        flicker_text = f"pulses at {beam.repetition_rate:g} Hz flicker, for which no model is here"
+        return f"{flicker_text} (from {STEADY:g} Hz on their mean counts)"
     return ""

@@ -75,13 +75,15 @@ def _strictest(wavelength: float, duration: float) -> _Law:
 
 
 def _power_law(factor: float, weight: float, duration: float, exponent: float) -> _Law:
-    """Return factor x weight x duration^exponent."""
+    """Return the law factor x weight x duration^exponent, in J/m2."""
     limit = factor * weight * math.pow(duration, exponent)
     return _Law(limit, f"{factor:g} * {weight:.7g} * {duration:.7g}**{exponent:g}")
 
 
 def _constant(factor: float, weight: float, duration: float, full: float) -> _Law:
-    """Return factor x weight, for durations shorter than ``full`` s less in proportion."""
+    """Return the law factor x weight; for durations shorter than ``full`` s it is less in
+    proportion to the duration (a constant irradiance).
+    """
     if duration >= full:
         return _Law(factor * weight, f"{factor:g} * {weight:.7g}")
     return _Law(
@@ -103,62 +105,61 @@ def _refuse(wavelength: float, duration: float) -> None:
 
 
 def _near_infrared(nm: float) -> tuple[float, float]:
-    """Return the factors C_A and C_C, which let more of the infrared pass than of visible light."""
-    absorbed = 5.0
+    """Return the factors C_A and C_C of the standard at a wavelength in nm; both are 1 for visible
+    light and raise the limit in the infrared, of which less reaches the retina.
+    """
+    c_a = 5.0
     if nm < 700:
-        absorbed = 1.0
+        c_a = 1.0
     elif nm < 1050:
-        absorbed = math.pow(10, 0.002 * (nm - 700))
+        c_a = math.pow(10, 0.002 * (nm - 700))
     if nm < 1150:
-        return absorbed, 1.0
+        return c_a, 1.0
     if nm < 1200:
-        return absorbed, math.pow(10, 0.018 * (nm - 1150))
-    return absorbed, 8 + math.pow(10, 0.04 * (nm - 1250))
+        return c_a, math.pow(10, 0.018 * (nm - 1150))
+    return c_a, 8 + math.pow(10, 0.04 * (nm - 1250))
 
 
 def _retina(nm: float, duration: float) -> _Law:
     """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry
     below 500 nm.
     """
-    absorbed, spread = _near_infrared(nm)
+    c_a, c_c = _near_infrared(nm)
     if duration >= 10:
-        heat = _power_law(10, absorbed * spread, duration, 1)
-        blue = _power_law(1, math.pow(10, 0.02 * max(0.0, nm - 450)), max(100.0, duration), 1)
-        return heat if nm >= 500 else min(heat, blue)
+        # J/m2 over more than 10 s: constant irradiances in W/m2 times the duration
+        heat_limit = _power_law(10, c_a * c_c, duration, 1)
+        photochemical_limit = _power_law(
+            1, math.pow(10, 0.02 * max(0.0, nm - 450)), max(100.0, duration), 1
+        )
+        return heat_limit if nm >= 500 else min(heat_limit, photochemical_limit)
     if nm < 1050:
         return (
-            _constant(2e-3, absorbed, 1, 0)
-            if duration <= 5e-6
-            else _power_law(18, absorbed, duration, 0.75)
+            _constant(2e-3, c_a, 1, 0) if duration <= 5e-6 else _power_law(18, c_a, duration, 0.75)
         )
-    return (
-        _constant(2e-2, spread, 1, 0)
-        if duration <= 13e-6
-        else _power_law(90, spread, duration, 0.75)
-    )
+    return _constant(2e-2, c_c, 1, 0) if duration <= 13e-6 else _power_law(90, c_c, duration, 0.75)
 
 
 def _skin(nm: float, duration: float) -> _Law:
     """Return the limit of the skin in J/m2 from 700 to 1400 nm."""
-    absorbed, _ = _near_infrared(nm)
+    c_a, _ = _near_infrared(nm)
     if duration >= 10:
-        return _power_law(2000, absorbed, duration, 1)
+        return _power_law(2000, c_a, duration, 1)
     if duration >= 1e-7:
-        return _power_law(1.1e4, absorbed, duration, 0.25)
-    return _constant(200, absorbed, duration, 1e-9)
+        return _power_law(1.1e4, c_a, duration, 0.25)
+    return _constant(200, c_a, duration, 1e-9)
 
 
 def _cornea(nm: float, duration: float) -> _Law:
     """Return the limit in J/m2 from 1400 nm on."""
     if duration >= 10:
         return _power_law(1000, 1, duration, 1)
-    flat, until = 1e3, 1e-3
+    flat_limit, flat_duration = 1e3, 1e-3
     if 1500 <= nm < 1800:
-        flat, until = 1e4, 10.0
+        flat_limit, flat_duration = 1e4, 10.0
     elif nm >= 2600:
-        flat, until = 100.0, 1e-7
-    if duration <= until:
-        return _constant(flat, 1, duration, 1e-9)
+        flat_limit, flat_duration = 100.0, 1e-7
+    if duration <= flat_duration:
+        return _constant(flat_limit, 1, duration, 1e-9)
     return _power_law(5600, 1, duration, 0.25)
 
 
@@ -187,17 +188,19 @@ def hazard_distance(
     / (4 P T)) through an aperture d, then R = 2 sqrt(w^2 - w0^2) / theta. ``transmittance`` is that
     of the optics or of air, the same at every distance.
     """
-    emitted = beam.power if beam.pulse_energy is None else beam.pulse_energy
-    assert emitted is not None  # `beam` has made the one or the other
-    emitted *= transmittance
+    power_or_energy = beam.power if beam.pulse_energy is None else beam.pulse_energy
+    assert power_or_energy is not None  # `beam` has made the one or the other
+    power_or_energy *= transmittance
     if aperture == 0:
-        squared = 2 * emitted / (math.pi * limit)
+        radius_squared = 2 * power_or_energy / (math.pi * limit)
     else:
-        share = eye_share(limit, aperture, emitted)
-        if share >= 1:
+        aperture_share = eye_share(limit, aperture, power_or_energy)
+        if aperture_share >= 1:
+            # the aperture needs more than all of the beam to have the limit
             return 0.0
-        squared = -(aperture**2) / 2 / math.log1p(-share)
-    return 2 * math.sqrt(max(0.0, squared - beam.waist**2)) / beam.divergence
+        radius_squared = -(aperture**2) / 2 / math.log1p(-aperture_share)
+    # w^2 = w0^2 + (theta R / 2)^2
+    return 2 * math.sqrt(max(0.0, radius_squared - beam.waist**2)) / beam.divergence
 
 
 def eye_share(limit: float, aperture: float, emitted: float) -> float:
@@ -302,20 +305,26 @@ def train_limit(
         raise ParameterError("pulse_duration", f"{text}: the pulse is too long")
     single = eye_mpe(wavelength, pulse_duration)
     mean = eye_mpe(wavelength, duration) / max(1.0, duration * repetition_rate)
+    # no rule for repeated pulses beyond the retina's wavelengths
     if wavelength >= 1400e-9:
         return TrainLimit(single, mean, math.inf, 1.0, max(1.0, duration * repetition_rate), 1.0)
-    summed = _summed_time(wavelength)
-    counted = min(duration, _COUNTED) if rule == "IEC 60825-1:2014" else duration
-    pulses = max(1.0, counted * repetition_rate)
-    together = min(pulses, max(1.0, summed * repetition_rate))
-    groups = pulses / together
+    group_time = _summed_time(wavelength)
+    counting_time = min(duration, _COUNTED) if rule == "IEC 60825-1:2014" else duration
+    pulses = max(1.0, counting_time * repetition_rate)
+    pulses_in_group = min(pulses, max(1.0, group_time * repetition_rate))
+    groups = pulses / pulses_in_group
     factor = (
-        _c5(groups, pulse_duration, duration, summed)
+        _c5(groups, pulse_duration, duration, group_time)
         if rule == "IEC 60825-1:2014"
         else math.pow(groups, -0.25)
     )
-    group = eye_mpe(wavelength, max(summed, pulse_duration) if together > 1 else pulse_duration)
-    return TrainLimit(single, mean, group / together * factor, together, groups, factor)
+    # several pulses within T_i count as one of T_i, with the limit of that duration
+    group_limit = eye_mpe(
+        wavelength, max(group_time, pulse_duration) if pulses_in_group > 1 else pulse_duration
+    )
+    return TrainLimit(
+        single, mean, group_limit / pulses_in_group * factor, pulses_in_group, groups, factor
+    )
 
 
 def _summed_time(wavelength: float) -> float:
@@ -324,7 +333,9 @@ def _summed_time(wavelength: float) -> float:
 
 
 def _c5(groups: float, pulse_duration: float, duration: float, summed: float) -> float:
-    """Return C5 of the edition of 2014 for a source below 5 mrad."""
+    """Return C5 of the edition of 2014 for a source below 5 mrad, from the number of groups of
+    pulses, the durations in s and the time ``summed`` (T_i) within which pulses count as one.
+    """
     if pulse_duration > summed or duration <= _BRIEF or groups <= _FEW:
         return 1.0
     return min(1.0, max(_LEAST_C5, 5 * math.pow(groups, -0.25)))

@@ -149,36 +149,38 @@ def light(
             section 4.4.
     """
     if strength is not None:
+        # a laser with a strength has no light in absolute units: all seven fields are 0
         return LaserLight(*torch.zeros(7, dtype=torch.float64))
     if distance is None:
         raise ParameterError("distance", "the distance of the laser is not known: give distance")
     geometry = _Geometry(waist, divergence, m_squared, convention, distance)
     beam = _shaped(line, geometry, power, pulse_energy, pulse_duration, repetition_rate)
-    air = _air(beam.wavelength, distance, air_transmittance, visibility, haze)
+    air_share = _air(beam.wavelength, distance, air_transmittance, visibility, haze)
     pulses = pulses_within(beam, exposure, pulse_delay)
-    mean = beam.power if beam.pulse_energy is None else beam.pulse_energy * pulses / exposure
-    assert mean is not None
-    irradiance = mean * axis_density(beam, distance, air)
+    mean_power = beam.power if beam.pulse_energy is None else beam.pulse_energy * pulses / exposure
+    assert mean_power is not None
+    irradiance = mean_power * axis_density(beam, distance, air_share)
+    # through the aperture that is lit as on the axis
     flux = irradiance * clear_area(stop) * lens_transmittance
-    spot, width = (beam.wavelength * focal_length) ** 2, beam_radius(beam, distance)
-    even = flux * clear_area(stop) / spot
-    # of the irradiance of a Gaussian beam
-    through = irradiance * gaussian_over(stop, width / math.sqrt(2))
-    # its field
-    peak = (
-        axis_density(beam, distance, air)
+    focus_area, radius_at_lens = (beam.wavelength * focal_length) ** 2, beam_radius(beam, distance)
+    even_peak = flux * clear_area(stop) / focus_area
+    # the irradiance is the squared field: its radius is smaller by sqrt(2)
+    power_in_lens = irradiance * gaussian_over(stop, radius_at_lens / math.sqrt(2))
+    # on the sensor: (integral of the field over the pupil / (wavelength x focal length))^2
+    peak_density = (
+        axis_density(beam, distance, air_share)
         * lens_transmittance
-        * gaussian_over(stop, width) ** 2
-        / spot
+        * gaussian_over(stop, radius_at_lens) ** 2
+        / focus_area
     )
     return LaserLight(
-        even_peak=double(even),
+        even_peak=double(even_peak),
         flux=double(flux),
         irradiance=double(irradiance),
-        power=double(through),
-        peak=double(mean * peak),
+        power=double(power_in_lens),
+        peak=double(mean_power * peak_density),
         pulses=double(pulses),
-        pulse_fluence=double((beam.pulse_energy or 0.0) * peak),
+        pulse_fluence=double((beam.pulse_energy or 0.0) * peak_density),
     )
 
 
@@ -215,14 +217,22 @@ def pulses_within(beam: Beam, exposure: float, delay: float) -> float:
         assert beam.pulse_duration is not None
         if beam.repetition_rate is None:
             return min(max(time / beam.pulse_duration, 0.0), 1.0)
-        ended = math.floor(plain(time * beam.repetition_rate))
-        return ended + min(max(time - ended / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0)
+        whole_periods = math.floor(plain(time * beam.repetition_rate))
+        # and the share of the pulse that is on
+        return whole_periods + min(
+            max(time - whole_periods / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0
+        )
 
+    # those since the first, less those before the shutter opens at the time 0
     return begun(exposure - delay) - begun(-delay)
 
 
 def _shaped(line: Bands, shape: _Geometry, *emission: float | None) -> Beam:
-    """Return the beam of a laser line; without power and pulses its power is 1 W."""
+    """Return the beam of a laser line.
+
+    ``emission`` is (power, pulse energy, pulse duration, repetition rate); without it the power is
+    1 W, since the shape of the beam alone counts.
+    """
     power, energy, duration, rate = emission or (1.0, None, None, None)
     return beam(
         mean_wavelength(line),
@@ -244,7 +254,9 @@ def _air(
     visibility: float | None,
     haze: Law | None,
 ) -> float:
-    """Return the transmittance of the air between a laser and a lens."""
+    """Return the transmittance of the air between a laser and a lens: ``share`` if it is stated,
+    that of the ``visibility`` by the law ``haze``, else 1.
+    """
     if share is not None or visibility is None:
         return 1.0 if share is None else share
     if haze is None:
@@ -305,10 +317,12 @@ def _refuse_unknown_light(stated: list[str]) -> None:
 def _refuse_beside_strength(stated: list[str]) -> None:
     """Raise ParameterError for a laser that has a strength and statements in absolute units."""
     if stated:
-        other = f"{', '.join(stated)} state{'s' * (len(stated) == 1)} its light in absolute units"
+        conflict = (
+            f"{', '.join(stated)} state{'s' * (len(stated) == 1)} its light in absolute units"
+        )
         text = (
-            f"a strength states the light of the laser at the sensor, but {other}: leave strength"
-            " or the rest out"
+            f"a strength states the light of the laser at the sensor, but {conflict}: leave"
+            " strength or the rest out"
         )
         raise ParameterError("strength", text)
 
@@ -329,15 +343,16 @@ def _out_of_focus(line: Bands, stop: Stop, params: dict[str, Any]) -> list[str]:
     it.
     """
     shape = {name: params[name] for name in (*_BEAM, "convention", "distance")}
+    # D^2 / (8 lambda R): defocus at the rim of a lens focused at infinity
     waves = float(wavefront(line, **shape).curvature * stop.diameter**2) / 8 / _WAVE
     if waves <= _NEAR:
         return []
-    off = f"its spot is exact to {_RIM * waves / int(stop.samples):.2g} of its peak"
+    accuracy_text = f"its spot is exact to {_RIM * waves / int(stop.samples):.2g} of its peak"
     text = (
         f"a laser at {params['distance']:g} m is {waves:.3g} waves out of focus for a lens focused"
         " at infinity"
     )
-    return [f'{text} ({off}): optics.defocus="-{waves:.3g} waves" focuses it']
+    return [f'{text} ({accuracy_text}): optics.defocus="-{waves:.3g} waves" focuses it']
 
 
 def _pulse_notes(light_of_laser: LaserLight, params: dict[str, Any]) -> list[str]:
@@ -345,12 +360,12 @@ def _pulse_notes(light_of_laser: LaserLight, params: dict[str, Any]) -> list[str
     if not params["pulse_duration"]:
         return []
     count = float(light_of_laser.pulses)
-    missed = (
+    pulse_text = (
         "no pulse falls into the exposure"
         if count == 0
         else f"{count:.4g} pulses fall into the exposure"
     )
     return [
-        f"{missed} of {params['exposure']:g} s, for a global shutter and pulse_delay"
+        f"{pulse_text} of {params['exposure']:g} s, for a global shutter and pulse_delay"
         f" {params['pulse_delay']:g} s"
     ]

@@ -72,18 +72,31 @@ def white_share(low: float, high: float, edge: float = EDGE) -> float:
     import torch
 
     wavelengths = (
+        # every 0.5 nm; the added 0.25 nm keeps the end in despite rounding
         torch.arange(_WHITE[0] * 1e9, _WHITE[1] * 1e9 + 0.25, 0.5, dtype=torch.float64) * 1e-9
     )
+    # power of daylight times wavelength is proportional to photons
     photons = daylight(_DAYLIGHT).at(wavelengths)[0] * wavelengths
     total = torch.trapezoid(photons, wavelengths)
-    first, last = max(low * (1 - edge), _WHITE[0]), min(high * (1 + edge), _WHITE[1])
-    if not last > first:
+    band_start, band_end = max(low * (1 - edge), _WHITE[0]), min(high * (1 + edge), _WHITE[1])
+    if not band_end > band_start:
         return 0.0
-    ends = torch.tensor([first, last], dtype=torch.float64)
-    inside = torch.cat(
-        [ends[:1], wavelengths[(wavelengths > first) & (wavelengths < last)], ends[1:]]
+    band_ends = torch.tensor([band_start, band_end], dtype=torch.float64)
+    # the ends of the band stand beside the table's wavelengths
+    inside_wavelengths = torch.cat(
+        [
+            band_ends[:1],
+            wavelengths[(wavelengths > band_start) & (wavelengths < band_end)],
+            band_ends[1:],
+        ]
     )
-    return float(torch.trapezoid(daylight(_DAYLIGHT).at(inside)[0] * inside, inside) / total)
+    # share of photons, by the same rule as the total
+    return float(
+        torch.trapezoid(
+            daylight(_DAYLIGHT).at(inside_wavelengths)[0] * inside_wavelengths, inside_wavelengths
+        )
+        / total
+    )
 
 
 def field_angle(shape: tuple[int, int], pixel_pitch: float, focal_length: float) -> float:

@@ -54,18 +54,25 @@ def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
     v = reach.double().abs().flatten()
     # the sign of the defocus turns the phase of the field alone
     kappa = complex(fill, -2 * math.pi * abs(waves))
-    size = 2 * abs(kappa)
+    double_kappa = 2 * abs(kappa)
+    # the lens cuts nothing off: a Gaussian spot
     if fill > _DARK:
         return _irradiance(_geometric(v, kappa), reach)
-    far = v > max(_APART * size, _SMALL / 2) + _SMALL / 2
-    near = (v * _APART < size) if size > _SMALL else torch.zeros_like(far)
+    # each region has the series that converges there; what is between is integrated, or taken as a
+    # straight edge for a wide spot
+    is_beyond = v > max(_APART * double_kappa, _SMALL / 2) + _SMALL / 2
+    is_within = (
+        (v * _APART < double_kappa) if double_kappa > _SMALL else torch.zeros_like(is_beyond)
+    )
     field = torch.zeros(len(v), dtype=torch.complex128)
-    field[far] = _beyond(v[far], kappa)
-    if bool(near.any()):
-        field[near] = _within(v[near], kappa)
-    between = ~(far | near)
-    field[between] = (
-        _at_the_edge(v[between], kappa) if size > _LARGE else _integrated(v[between], kappa)
+    field[is_beyond] = _beyond(v[is_beyond], kappa)
+    if bool(is_within.any()):
+        field[is_within] = _within(v[is_within], kappa)
+    is_between = ~(is_beyond | is_within)
+    field[is_between] = (
+        _at_the_edge(v[is_between], kappa)
+        if double_kappa > _LARGE
+        else _integrated(v[is_between], kappa)
     )
     return _irradiance(field, reach)
 
@@ -95,6 +102,8 @@ def _beyond(v: Tensor, kappa: complex) -> Tensor:
         if bool(in_range.any()):
             largest = float(ratio[in_range].max())
             terms = (
+                # the terms fall as ratio^n: as many as reach the smallest term, for the largest
+                # ratio
                 _TERMS
                 if largest > 1 / _APART
                 else math.ceil(_SMALLEST / math.log(max(largest, 1e-9))) + 1
@@ -104,35 +113,40 @@ def _beyond(v: Tensor, kappa: complex) -> Tensor:
 
 
 def _far_series(v: Tensor, kappa: complex, terms: int) -> Tensor:
-    """Return the field for v above |2 kappa| by a number of terms."""
-    last, bessel = torch.special.bessel_j0(v), torch.special.bessel_j1(v)
+    """Return the field for v above |2 kappa| by a number of terms of its series; J(n + 1, v) = 2 n
+    / v J(n, v) - J(n - 1, v).
+    """
+    previous_bessel, bessel = torch.special.bessel_j0(v), torch.special.bessel_j1(v)
     ratio, power = 2 * kappa / v, torch.ones(len(v), dtype=torch.complex128)
-    total = power * bessel
+    series = power * bessel
     for n in range(1, terms):
-        last, bessel = bessel, 2 * n / v * bessel - last
+        previous_bessel, bessel = bessel, 2 * n / v * bessel - previous_bessel
         power = power * ratio
-        total = total + power * bessel
-    field: Tensor = _exp(-kappa) * total / v
+        series = series + power * bessel
+    field: Tensor = _exp(-kappa) * series / v
     return field
 
 
 def _within(v: Tensor, kappa: complex) -> Tensor:
-    """Return the field for v below |2 kappa|: that without a rim, less the wave from the rim."""
-    safe = v.clamp_min(1e-9)
-    last, bessel = torch.special.bessel_j0(safe), torch.special.bessel_j1(safe)
-    ratio, power = -safe / (2 * kappa), torch.ones(len(v), dtype=torch.complex128)
-    total = power * last
+    """Return the field for v below |2 kappa|: that of a beam without a rim, less the wave from the
+    rim, a series of (-v / (2 kappa))^n J(n, v).
+    """
+    safe_v = v.clamp_min(1e-9)
+    bessel_n, bessel_next = torch.special.bessel_j0(safe_v), torch.special.bessel_j1(safe_v)
+    ratio, power = -safe_v / (2 * kappa), torch.ones(len(v), dtype=torch.complex128)
+    series = power * bessel_n
     for n in range(1, _TERMS):
         power = power * ratio
-        total = total + power * bessel
-        last, bessel = bessel, _next(n, safe, last, bessel)
-    field: Tensor = _geometric(v, kappa) - _exp(-kappa) / (2 * kappa) * total
+        series = series + power * bessel_next
+        bessel_n, bessel_next = bessel_next, _next(n, safe_v, bessel_n, bessel_next)
+    field: Tensor = _geometric(v, kappa) - _exp(-kappa) / (2 * kappa) * series
     return field
 
 
 def _next(n: int, v: Tensor, last: Tensor, bessel: Tensor) -> Tensor:
-    """Return J(n + 1, v); beyond the order v, where the recurrence is unstable and J falls fast,
-    return 0.
+    """Return J(n + 1, v) from J(n - 1, v) (``last``) and J(n, v) (``bessel``).
+
+    Beyond the order v the recurrence is unstable while J falls fast: return 0 there.
     """
     following = 2 * n / v * bessel - last
     return torch.where((v > n + 1) | (following.abs() < bessel.abs()), following, 0.0)
@@ -142,18 +156,20 @@ def _integrated(v: Tensor, kappa: complex) -> Tensor:
     """Return the field by Gauss-Legendre quadrature over the square of the radius."""
     if not len(v):
         return torch.zeros(0, dtype=torch.complex128)
-    cycles = abs(kappa) / math.pi + float(v.max()) / (2 * math.pi)
+    # of the phase of the lens and of J0 between axis and rim: a cycle takes about two nodes
+    phase_cycles = abs(kappa) / math.pi + float(v.max()) / (2 * math.pi)
     nodes, weights = (
-        torch.from_numpy(x) for x in legendre(1 << math.ceil(math.log2(24 + 2.2 * cycles)))
+        torch.from_numpy(x) for x in legendre(1 << math.ceil(math.log2(24 + 2.2 * phase_cycles)))
     )
-    square = (nodes + 1) / 2
-    pupil = torch.exp(-kappa * square) * weights / 4
-    root, rows = square.sqrt(), max(1, _PIECE // len(square))
-    pieces = torch.split(v, rows)
-    parts = [
-        torch.special.bessel_j0(piece[:, None] * root).to(pupil.dtype) @ pupil for piece in pieces
+    squared_radius = (nodes + 1) / 2
+    # r dr = d(r^2) / 2, and another 1/2 from the interval -1 to 1 to 0 to 1
+    pupil = torch.exp(-kappa * squared_radius) * weights / 4
+    radius, piece_length = squared_radius.sqrt(), max(1, _PIECE // len(squared_radius))
+    pieces = torch.split(v, piece_length)
+    fields = [
+        torch.special.bessel_j0(piece[:, None] * radius).to(pupil.dtype) @ pupil for piece in pieces
     ]
-    return torch.cat(parts)
+    return torch.cat(fields)
 
 
 def _at_the_edge(v: Tensor, kappa: complex) -> Tensor:
@@ -165,21 +181,24 @@ def _at_the_edge(v: Tensor, kappa: complex) -> Tensor:
     """
     from scipy.special import wofz
 
-    place = -1j * v / (2 * kappa)
-    depth = (complex(kappa) ** 0.5 * (place - 1)).numpy()
-    lit = torch.from_numpy(depth.real < 0)
-    side = torch.where(lit, -1.0, 1.0)
-    edge = torch.from_numpy(wofz(1j * side.numpy() * depth)) * side / (4 * kappa)
-    turn = complex(math.cos(math.pi / 4), math.sin(math.pi / 4))
-    root, wave = 1 / torch.sqrt(2 * math.pi * v), torch.exp(-1j * v)
-    unity = torch.ones_like(place)
-    lack = turn * root / (-2 * kappa * (unity + place.sqrt()))
-    other = root / turn / (1j * v - 2 * kappa) * wave.conj()
-    beam = torch.where(lit, _geometric(v, kappa), 0.0)
-    return beam + _exp(-kappa) * ((edge + lack) * wave + other)
+    # radius in the pupil, complex for a tapered beam, from which the light comes straight to v
+    saddle = -1j * v / (2 * kappa)
+    edge_depth = (complex(kappa) ** 0.5 * (saddle - 1)).numpy()
+    is_lit = torch.from_numpy(edge_depth.real < 0)
+    lit_sign = torch.where(is_lit, -1.0, 1.0)
+    # wofz(i z) is exp(z^2) erfc(z), which neither overflows nor cancels on its side
+    edge_wave = torch.from_numpy(wofz(1j * lit_sign.numpy() * edge_depth)) * lit_sign / (4 * kappa)
+    eighth_turn = complex(math.cos(math.pi / 4), math.sin(math.pi / 4))
+    amplitude, inward_wave = 1 / torch.sqrt(2 * math.pi * v), torch.exp(-1j * v)
+    ones = torch.ones_like(saddle)
+    edge_rest = eighth_turn * amplitude / (-2 * kappa * (ones + saddle.sqrt()))
+    outward_wave = amplitude / eighth_turn / (1j * v - 2 * kappa) * inward_wave.conj()
+    unobstructed = torch.where(is_lit, _geometric(v, kappa), 0.0)
+    return unobstructed + _exp(-kappa) * ((edge_wave + edge_rest) * inward_wave + outward_wave)
 
 
 def _exp(z: complex) -> complex:
+    """Return exp(z) of a complex number."""
     return math.exp(z.real) * complex(math.cos(z.imag), math.sin(z.imag))
 
 
@@ -212,59 +231,81 @@ def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
     Source: Born and Wolf, Principles of Optics, 7th ed., section 8.8; our derivation for the
             tapered beam.
     """
-    alike = torch.zeros_like(fill.double() + waves.double())
-    fill, phase = fill.double() + alike, 2 * math.pi * waves.double().abs() + alike
-    low, high = phase * (1 - within), phase * (1 + within)
+    zeros = torch.zeros_like(fill.double() + waves.double())
+    fill, phase = fill.double() + zeros, 2 * math.pi * waves.double().abs() + zeros
+    least_phase, largest_phase = phase * (1 - within), phase * (1 + within)
     rim = torch.exp(-fill)
     largest = _on_axis(fill, rim, phase)
     if within:
-        trough = math.pi * (2 * torch.ceil(low / (2 * math.pi) - 0.5) + 1)
+        # phase at which the sine on the axis is largest: an odd multiple of pi
+        odd_phase = math.pi * (2 * torch.ceil(least_phase / (2 * math.pi) - 0.5) + 1)
         # the maximum, as 1 / |kappa|^2 falls
-        before = trough - (1 + rim).square() / (rim * trough).clamp_min(1e-12)
-        for angle in (low, high, trough, before):
-            largest = torch.maximum(largest, _on_axis(fill, rim, angle.clamp(low, high)))
-    ringed = (high > 2 * math.pi * _FIRST) & (fill < _TABLE_FILL)
-    if bool(ringed.any()):
+        phase_of_peak = odd_phase - (1 + rim).square() / (rim * odd_phase).clamp_min(1e-12)
+        for angle in (least_phase, largest_phase, odd_phase, phase_of_peak):
+            largest = torch.maximum(
+                largest, _on_axis(fill, rim, angle.clamp(least_phase, largest_phase))
+            )
+    may_ring = (largest_phase > 2 * math.pi * _FIRST) & (fill < _TABLE_FILL)
+    if bool(may_ring.any()):
         largest = largest.clone()
-        largest[ringed] = torch.maximum(
-            largest[ringed], _brightest_ring(fill[ringed], low[ringed], high[ringed])
+        largest[may_ring] = torch.maximum(
+            largest[may_ring],
+            _brightest_ring(fill[may_ring], least_phase[may_ring], largest_phase[may_ring]),
         )
     return largest
 
 
 def _on_axis(fill: Tensor, rim: Tensor, phase: Tensor) -> Tensor:
-    """Return the irradiance on the axis for a phase 2 pi W of the rim; ``rim`` is exp(-fill)."""
-    size = fill.square() + phase.square()
-    axis = torch.expm1(-fill).square() + 4 * rim * torch.sin(phase / 2).square()
-    return torch.where(size > 1e-8, axis / size.where(size > 1e-8, 1.0), 1 - fill)
+    """Return the irradiance on the axis, |1 - exp(-kappa)|^2 / |kappa|^2, for a fill and a
+    ``phase`` 2 pi W at the rim; ``rim`` is exp(-fill).
+    """
+    kappa_squared = fill.square() + phase.square()
+    numerator = torch.expm1(-fill).square() + 4 * rim * torch.sin(phase / 2).square()
+    # near kappa = 0 the first terms of the series
+    return torch.where(
+        kappa_squared > 1e-8, numerator / kappa_squared.where(kappa_squared > 1e-8, 1.0), 1 - fill
+    )
 
 
 def _brightest_ring(fill: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Return the irradiance of the brightest ring, the largest for phases of the rim between
-    two.
+    """Return the irradiance of the brightest ring, the largest for all phases 2 pi W at the rim
+    from ``low`` to ``high``.
     """
     rim = torch.exp(-fill)
     largest = torch.zeros_like(fill)
     phases = [low] if bool((low == high).all()) else [low, high]
     if len(phases) == 2:
-        turn = _RING**2 / (4 * low.clamp_min(1.0))
+        # the phase within the range at which the cosine below is largest: it and the phase of the
+        # ring add up to a multiple of 2 pi
+        ring_phase = _RING**2 / (4 * low.clamp_min(1.0))
         phases.append(
-            (2 * math.pi * torch.ceil((low + turn) / (2 * math.pi)) - turn).clamp(low, high)
+            (2 * math.pi * torch.ceil((low + ring_phase) / (2 * math.pi)) - ring_phase).clamp(
+                low, high
+            )
         )
     for phase in phases:
-        size = fill.square() + phase.square()
-        cosine = torch.cos(phase + phase * _RING**2 / (4 * size))
+        kappa_squared = fill.square() + phase.square()
+        cosine = torch.cos(phase + phase * _RING**2 / (4 * kappa_squared))
         waves = phase / (2 * math.pi)
-        ring = _ring_limit(rim, fill, phase, cosine) * _ring_share(fill, waves)
-        ring = torch.where(waves > _TABLE_WAVES, torch.maximum(ring, _EDGE * rim), ring) / size
-        largest = torch.maximum(largest, ring.where(waves > _FIRST, 0.0))
+        ring_irradiance = _ring_limit(rim, fill, phase, cosine) * _ring_share(fill, waves)
+        ring_irradiance = (
+            torch.where(
+                waves > _TABLE_WAVES, torch.maximum(ring_irradiance, _EDGE * rim), ring_irradiance
+            )
+            / kappa_squared
+        )
+        largest = torch.maximum(largest, ring_irradiance.where(waves > _FIRST, 0.0))
     return largest
 
 
 def _ring_limit(rim: Tensor, fill: Tensor, phase: Tensor, cosine: Tensor) -> Tensor:
-    """Return the irradiance at the first zero of J1 times |kappa|^2 for strong defocus."""
-    size = (fill.square() + phase.square()).clamp_min(1e-300)
-    beam = torch.exp(-fill * _RING**2 / (4 * size))
+    """Return, for strong defocus, the irradiance at the first zero of J1 times |kappa|^2: the beam
+    |exp(-v^2 / (4 kappa))|, the wave from the rim J0 exp(-fill), and their interference.
+
+    ``rim`` is exp(-fill), ``phase`` 2 pi W, and ``cosine`` that of the phase between both waves.
+    """
+    kappa_squared = (fill.square() + phase.square()).clamp_min(1e-300)
+    beam = torch.exp(-fill * _RING**2 / (4 * kappa_squared))
     return beam.square() - 2 * beam * rim * _TROUGH * cosine + (rim * _TROUGH).square()
 
 
@@ -277,63 +318,82 @@ def defocused_peak(waves: float, fill: float = 0.0) -> float:
     beam. Error: 1e-4, at any defocus.
     """
     waves = abs(waves)
-    axis = float(round_spot(torch.zeros(1), fill, waves))
+    on_axis = float(round_spot(torch.zeros(1), fill, waves))
     if waves <= _FIRST or fill > _DARK:
-        return axis
-    edge = 4.4 * math.pi * waves + 8  # a little beyond the geometric edge of the spot
-    reach = torch.linspace(0.0, edge, 64 + math.ceil(edge / _STEP), dtype=torch.float64)
-    return max(axis, float(_summit(round_spot(reach, fill, waves)[None])[0]))
+        return on_axis
+    largest_reach = 4.4 * math.pi * waves + 8  # a little beyond the geometric edge of the spot
+    reaches = torch.linspace(
+        0.0, largest_reach, 64 + math.ceil(largest_reach / _STEP), dtype=torch.float64
+    )
+    return max(on_axis, float(_summit(round_spot(reaches, fill, waves)[None])[0]))
 
 
 def _ring_share(fill: Tensor, waves: Tensor) -> Tensor:
     """Return the irradiance of the brightest ring over `_ring_limit`, which is 1 for strong
     defocus.
     """
-    row = ((waves - _FIRST) / (_TABLE_WAVES - _FIRST) * (_WAVE_STEPS - 1)).clamp(0, _WAVE_STEPS - 1)
-    column = (fill / _TABLE_FILL * (_FILL_STEPS - 1)).clamp(0, _FILL_STEPS - 1)
-    share = _SURE * bilinear(_ring_table(), row, column)
-    return share.where(waves < _TABLE_WAVES, share.clamp_min(1.0))
+    table_row = ((waves - _FIRST) / (_TABLE_WAVES - _FIRST) * (_WAVE_STEPS - 1)).clamp(
+        0, _WAVE_STEPS - 1
+    )
+    table_column = (fill / _TABLE_FILL * (_FILL_STEPS - 1)).clamp(0, _FILL_STEPS - 1)
+    ring_ratio = _SURE * bilinear(_ring_table(), table_row, table_column)
+    return ring_ratio.where(waves < _TABLE_WAVES, ring_ratio.clamp_min(1.0))
 
 
 def bilinear(table: Tensor, row: Tensor, column: Tensor) -> Tensor:
     """Return a table interpolated between its entries, at fractional rows and columns."""
     top = row.floor().long().clamp_max(table.shape[0] - 2)
     left = column.floor().long().clamp_max(table.shape[1] - 2)
-    down, along = row - top, column - left
-    upper = table[top, left] * (1 - along) + table[top, left + 1] * along
-    lower = table[top + 1, left] * (1 - along) + table[top + 1, left + 1] * along
-    return upper * (1 - down) + lower * down
+    row_share, column_share = row - top, column - left
+    upper_value = table[top, left] * (1 - column_share) + table[top, left + 1] * column_share
+    lower_value = (
+        table[top + 1, left] * (1 - column_share) + table[top + 1, left + 1] * column_share
+    )
+    return upper_value * (1 - row_share) + lower_value * row_share
 
 
 @functools.lru_cache(maxsize=1)
 def _ring_table() -> Tensor:
-    """Return the irradiance of the brightest ring over its limit for strong defocus, (waves,
-    fill).
+    """Return the irradiance of the brightest ring over its limit for strong defocus, as a table
+    (waves, fill).
     """
     waves = torch.linspace(_FIRST, _TABLE_WAVES, _WAVE_STEPS, dtype=torch.float64)
     fills = torch.linspace(0, _TABLE_FILL, _FILL_STEPS, dtype=torch.float64)
     reach = torch.linspace(1.5, _WIDEST, 436, dtype=torch.float64)
     nodes, weights = (torch.from_numpy(x) for x in legendre(64))
-    square = (nodes + 1) / 2
-    bessel = torch.special.bessel_j0(reach[:, None] * square.sqrt())
-    taper = torch.exp(-fills[:, None] * square) * weights / 4
+    # the quadrature is over the squared radius in the pupil, from 0 to 1
+    squared_radius = (nodes + 1) / 2
+    bessel = torch.special.bessel_j0(reach[:, None] * squared_radius.sqrt())
+    taper = torch.exp(-fills[:, None] * squared_radius) * weights / 4
     rows = []
     for wave_count in waves.tolist():
-        turns = 2 * math.pi * wave_count * square
-        parts = [(taper * wave) @ bessel.T for wave in (torch.cos(turns), torch.sin(turns))]
-        brightest = _summit(4 * (parts[0].square() + parts[1].square()))
+        phase_in_pupil = 2 * math.pi * wave_count * squared_radius
+        field_parts = [
+            (taper * wave) @ bessel.T
+            for wave in (torch.cos(phase_in_pupil), torch.sin(phase_in_pupil))
+        ]
+        brightest = _summit(4 * (field_parts[0].square() + field_parts[1].square()))
         phase = torch.full_like(fills, 2 * math.pi * wave_count)
-        size = fills.square() + phase.square()
-        cosine = torch.cos(phase + phase * _RING**2 / (4 * size))
-        rows.append(brightest * size / _ring_limit(torch.exp(-fills), fills, phase, cosine))
+        kappa_squared = fills.square() + phase.square()
+        cosine = torch.cos(phase + phase * _RING**2 / (4 * kappa_squared))
+        rows.append(
+            brightest * kappa_squared / _ring_limit(torch.exp(-fills), fills, phase, cosine)
+        )
     return torch.stack(rows)
 
 
 def _summit(values: Tensor) -> Tensor:
     """Return the largest value of each row, with a parabola through it and its neighbours."""
-    place = values[:, 1:-1].argmax(1) + 1
+    index_of_peak = values[:, 1:-1].argmax(1) + 1
     row = torch.arange(len(values))
-    before, here, after = values[row, place - 1], values[row, place], values[row, place + 1]
-    bend = (2 * here - before - after).clamp_min(1e-300)
-    top = (here >= before) & (here >= after)
-    return torch.where(top, here + (after - before).square() / (8 * bend), values.amax(1))
+    previous, peak_value, following = (
+        values[row, index_of_peak - 1],
+        values[row, index_of_peak],
+        values[row, index_of_peak + 1],
+    )
+    curvature = (2 * peak_value - previous - following).clamp_min(1e-300)
+    is_peak = (peak_value >= previous) & (peak_value >= following)
+    # the summit of the parabola through three points above the middle one
+    return torch.where(
+        is_peak, peak_value + (following - previous).square() / (8 * curvature), values.amax(1)
+    )

@@ -51,6 +51,7 @@ class Change:
         ``shape``.
         """
         rows, columns = (max(1, round(side / self.enlarged)) for side in shape)
+        # an odd number of quarter turns exchanges rows and columns
         return (columns, rows) if self.quarters % 2 else (rows, columns)
 
     def of(self, picture: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -72,13 +73,17 @@ class Change:
 
 
 def _saturated(picture: Tensor, factor: float) -> Tensor:
+    """Return a picture (3, y, x) in linear sRGB with the saturation of its colours multiplied by
+    ``factor``.
+    """
     from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
     from kornia.enhance import adjust_saturation_with_gray_subtraction
 
-    changed: Tensor = rgb_to_linear_rgb(
+    # the saturation of kornia is defined for encoded sRGB
+    saturated: Tensor = rgb_to_linear_rgb(
         adjust_saturation_with_gray_subtraction(linear_rgb_to_rgb(picture), factor)
     )
-    return changed
+    return saturated
 
 
 def symmetry(pictures: Tensor, seed: tuple[int, ...]) -> Tensor:
@@ -88,6 +93,7 @@ def symmetry(pictures: Tensor, seed: tuple[int, ...]) -> Tensor:
     rng = np.random.default_rng(seed)
     quarters, mirrored = int(rng.integers(4)), bool(rng.integers(2))
     if pictures.shape[-1] != pictures.shape[-2]:
+        # only half turns keep the shape of a picture that is no square
         quarters -= quarters % 2
     turned = pictures.rot90(quarters, (-2, -1))
     return (turned.flip(-1) if mirrored else turned).contiguous()

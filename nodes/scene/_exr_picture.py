@@ -74,16 +74,23 @@ def _(
 @exr.check
 def _(result: Tensor, *, file: Path, part: str | None = None, **params: Any) -> list[Check]:
     pixels, linear = _linear_pixels(file, part)
-    below, lowest = 0, math.inf
+    negative_count, lowest = 0, math.inf
     for rows in bands_of(pixels.shape[:2]):
         light = linear(pixels[rows])
-        below, lowest = below + int((light < 0).sum()), min(lowest, float(light.min()))
+        negative_count, lowest = (
+            negative_count + int((light < 0).sum()),
+            min(lowest, float(light.min())),
+        )
     text = f"peak {float(result.max()):.4g}, mean {float(result.mean()):.3g}"
     values = 3 * pixels.shape[0] * pixels.shape[1]
     return [
         Check(
             text
-            + (f"; {below} of {values} values were negative, down to {lowest:.2g}" if below else "")
+            + (
+                f"; {negative_count} of {values} values were negative, down to {lowest:.2g}"
+                if negative_count
+                else ""
+            )
         )
     ]
 
@@ -96,25 +103,29 @@ def picture_size(file: Path, part_name: str | None) -> tuple[int, int]:
 
 
 def _chosen(file: Path, part_name: str | None) -> tuple[int, PartHeader, list[str]]:
-    """Return the number and the header of the part with the picture, and the names of the
-    channels to read.
+    """Return (number of the part, its header, names of the channels to read) of the one part of a
+    file that holds a picture.
+
+    ``part_name`` names the part where several hold a picture. Raises ParameterError for a name that
+    no part has, for several pictures without a name, and for no picture.
     """
     parts = part_headers(file)
-    named = [(i, header) for i, header in enumerate(parts) if part_name in (None, header.name)]
-    if part_name is not None and not named:
+    candidates = [(i, header) for i, header in enumerate(parts) if part_name in (None, header.name)]
+    if part_name is not None and not candidates:
         names = _joined_names(parts)
         raise ParameterError("part", f"{file.name} has no part {part_name!r}: name one of {names}")
-    pictures = _with_picture(named)
-    if len(pictures) > 1:
-        several = _joined_names([header for _, header, _ in pictures])
+    parts_with_picture = _with_picture(candidates)
+    if len(parts_with_picture) > 1:
+        names_of_parts = _joined_names([header for _, header, _ in parts_with_picture])
         raise ParameterError(
-            "file", f"{file.name} has a picture in the parts {several}: set part to one of them"
+            "file",
+            f"{file.name} has a picture in the parts {names_of_parts}: set part to one of them",
         )
-    if not pictures:
-        channel_names = "; ".join(", ".join(header.channels) for _, header in named)
-        fix = "but R, G and B, or X, Y and Z, or Y alone, are needed: save the picture as RGB"
-        raise ParameterError("file", f"{file} has the channels {channel_names}, {fix}")
-    return pictures[0]
+    if not parts_with_picture:
+        channel_names = "; ".join(", ".join(header.channels) for _, header in candidates)
+        remedy = "but R, G and B, or X, Y and Z, or Y alone, are needed: save the picture as RGB"
+        raise ParameterError("file", f"{file} has the channels {channel_names}, {remedy}")
+    return parts_with_picture[0]
 
 
 def _with_picture(
@@ -130,13 +141,15 @@ def _with_picture(
 
 
 def _joined_names(parts: Sequence[PartHeader]) -> str:
+    """Return the names of parts of a file, separated by commas."""
     return ", ".join(header.name or "unnamed" for header in parts)
 
 
 def _colour_channels(names: list[str]) -> list[str]:
-    """Return the channels of a picture: R, G and B, or X, Y and Z, or Y alone; an empty list if
-    there is no picture.
+    """Return the channels of a picture among ``names``: R, G and B, or X, Y and Z, or Y alone; an
+    empty list if there is no picture.
     """
+    # RY and BY are colours at half resolution: Y is not alone then
     if {"RY", "BY"} & set(names):
         return []
     return next(
@@ -164,12 +177,10 @@ def _damage(file: Path, part_name: str | None) -> str:
 def _pixels(
     file: Path, part_name: str | None
 ) -> tuple[dict[str, Any], list[str], NDArray[np.float32]]:
-    """Read the header, the names of the channels and the values (channel, y, x) of a picture in
-    an OpenEXR file.
-    """
+    """Read (header, channel names, values (channel, y, x)) of the picture in an OpenEXR file."""
     number, _, names = _chosen(file, part_name)
-    with exr_parts(file) as opened:
-        header, channels = dict(opened.header(number)), opened.channels(number)
+    with exr_parts(file) as opened_file:
+        header, channels = dict(opened_file.header(number)), opened_file.channels(number)
         return (
             header,
             names,
@@ -193,8 +204,8 @@ def _linear_pixels(file: Path, part_name: str | None) -> tuple[NDArray[np.float3
 
 
 def _converted(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
-    """Return linear sRGB (3, y, x) of the values (y, x, channel) of a picture, or of its one
-    channel for no matrix.
+    """Return linear sRGB (3, y, x) of the values (y, x, channel) of a picture; without a matrix
+    its one channel is grey.
     """
     planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
     if matrix is None:
@@ -209,16 +220,17 @@ def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     colour = colour_science()
 
     srgb = colour.RGB_COLOURSPACES["sRGB"]
-    own = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)[6:]
-    white = np.asarray(header.get("adoptedNeutral", own), dtype=np.float64)
+    # the last two numbers of the chromaticities are the white point (x, y)
+    file_white = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)[6:]
+    white = np.asarray(header.get("adoptedNeutral", file_white), dtype=np.float64)
     if np.allclose(white, srgb.whitepoint, atol=1e-4):
-        plain: NDArray[np.float64] = srgb.matrix_XYZ_to_RGB
-        return plain
-    whites = colour.xy_to_XYZ(white), colour.xy_to_XYZ(srgb.whitepoint)
-    adapted: NDArray[np.float64] = colour.adaptation.matrix_chromatic_adaptation_VonKries(
-        *whites, "Bradford"
+        matrix: NDArray[np.float64] = srgb.matrix_XYZ_to_RGB
+        return matrix
+    white_points = colour.xy_to_XYZ(white), colour.xy_to_XYZ(srgb.whitepoint)
+    adaptation: NDArray[np.float64] = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+        *white_points, "Bradford"
     )
-    return np.asarray(srgb.matrix_XYZ_to_RGB @ adapted, dtype=np.float64)
+    return np.asarray(srgb.matrix_XYZ_to_RGB @ adaptation, dtype=np.float64)
 
 
 def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
@@ -228,13 +240,16 @@ def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     """
     colour = colour_science()
 
-    values = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)
-    if np.allclose(values, _REC709, atol=1e-4) and "adoptedNeutral" not in header:
+    chromaticities = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)
+    if np.allclose(chromaticities, _REC709, atol=1e-4) and "adoptedNeutral" not in header:
         return np.eye(3)
-    white = values[6:]
+    # six numbers of the primaries, two of the white point
+    white = chromaticities[6:]
     neutral = np.asarray(header.get("adoptedNeutral", white), dtype=np.float64)
-    own = colour.models.normalised_primary_matrix(values[:6].reshape(3, 2), white)
-    space = colour.RGB_Colourspace("file", values[:6], neutral, matrix_RGB_to_XYZ=own)
+    rgb_to_xyz = colour.models.normalised_primary_matrix(chromaticities[:6].reshape(3, 2), white)
+    space = colour.RGB_Colourspace(
+        "file", chromaticities[:6], neutral, matrix_RGB_to_XYZ=rgb_to_xyz
+    )
     matrix: NDArray[np.float64] = colour.matrix_RGB_to_RGB(
         space, colour.RGB_COLOURSPACES["sRGB"], "Bradford"
     )

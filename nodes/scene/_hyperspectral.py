@@ -47,9 +47,10 @@ def cube_and_wavelengths(
             " stop"
         )
     values = _npy(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
+    # unsigned whole numbers are shares of the largest one
     scale = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
-    first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
-    cube = torch.from_numpy(np.ascontiguousarray(first, dtype=np.float32)) / scale
+    band_first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
+    cube = torch.from_numpy(np.ascontiguousarray(band_first, dtype=np.float32)) / scale
     return cube, torch.linspace(start, stop, len(cube), dtype=torch.float64)
 
 
@@ -101,12 +102,12 @@ def _numpy_header(file: Path) -> tuple[tuple[int, ...], str]:
     """
     npy_needs(file, 1.0, _SINGLE)
     try:
-        head = np.load(file, mmap_mode="r", allow_pickle=False)
+        array = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, SyntaxError) as error:
         raise ParameterError(
             "file", f"{file.name} cannot be read as .npy ({error}): save the cube again"
         ) from None
-    return head.shape, str(head.dtype)
+    return array.shape, str(array.dtype)
 
 
 def exr_size(file: Path) -> tuple[int, int]:
@@ -141,6 +142,7 @@ def _cube_name(file: Path, variable: str | None) -> str:
     only cube.
     """
     variables = _listed(file)
+    # only arrays of three axes
     cubes = [name for name, (size, _) in variables.items() if len(size) == 3]
     if variable in variables:
         return str(variable)
@@ -202,15 +204,16 @@ def hyperspectral(
     """
     cube, wavelengths = cube_and_wavelengths(file, variable, start, stop, layout)
     require_range(bands.centres, wavelengths, f"{file.name} holds")
-    if wrong := int((~torch.isfinite(cube)).sum()):
+    if count := int((~torch.isfinite(cube)).sum()):
         raise ValueError(
-            f"{file.name} holds {wrong} values that are not finite: replace NaN and infinity by"
+            f"{file.name} holds {count} values that are not finite: replace NaN and infinity by"
             " numbers"
         )
-    mixed = (_interpolation(wavelengths, bands.centres).float() @ cube.flatten(1)).reshape(
+    # one matrix product for all pixels
+    interpolated = (_interpolation(wavelengths, bands.centres).float() @ cube.flatten(1)).reshape(
         -1, *cube.shape[1:]
     )
-    return framed(mixed, shape).clamp_min_(0).to(bands.centres.device)
+    return framed(interpolated, shape).clamp_min_(0).to(bands.centres.device)
 
 
 @hyperspectral.preflight
@@ -232,6 +235,7 @@ def _(
 
 
 def _refuse_missing_range(file: Path, start: float | None, stop: float | None) -> None:
+    """Raise ParameterError unless the first and the last wavelength are given and rise."""
     if start is None or stop is None or not start < stop:
         name = "stop" if start is not None else "start"
         text = f"{file.name} has no wavelengths: give start below stop, such as 400 nm and 700 nm"
@@ -258,9 +262,10 @@ def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
 
 
 def _interpolation(own: Tensor, wavelengths: Tensor) -> Tensor:
-    """Return the matrix that interpolates spectra linearly from the ``own`` wavelengths to
-    ``wavelengths``.
+    """Return the matrix (new band, band of the file) that interpolates spectra linearly from the
+    ``own`` wavelengths to ``wavelengths``.
     """
     if len(own) == 1:
         return torch.ones(len(wavelengths), 1, dtype=torch.float64)
+    # the table of unit vectors at the new wavelengths is that matrix
     return Table(own, torch.eye(len(own), dtype=torch.float64)).at(wavelengths).T

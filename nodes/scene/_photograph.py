@@ -90,7 +90,7 @@ def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) 
         raise ParameterError(
             "crop", "the part of a photograph has no size: give shape, such as [768, 768]"
         )
-    profile, turned, size = read_header(file)
+    profile, orientation, size = read_header(file)
     if problem := _damage(file):
         raise ParameterError("file", problem)
     notes = (
@@ -99,7 +99,9 @@ def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) 
         else []
     )
     notes += (
-        [f"{file.name}: picture turned upright by EXIF orientation {turned}"] if turned != 1 else []
+        [f"{file.name}: picture turned upright by EXIF orientation {orientation}"]
+        if orientation != 1
+        else []
     )
     return notes + enlarged(size, shape)
 
@@ -116,8 +118,13 @@ def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
             refuse_large_picture(file, image.height, image.width)
             _refuse(file, image)
             picture_needs(file, image, _LIGHT)
-            turned = image.getexif().get(_ORIENTATION, 1)
-            return _profile(image), turned, image.size if turned in _ROTATED else image.size[::-1]
+            orientation = image.getexif().get(_ORIENTATION, 1)
+            # the size of Pillow is (columns, rows)
+            return (
+                _profile(image),
+                orientation,
+                image.size if orientation in _ROTATED else image.size[::-1],
+            )
     except UnidentifiedImageError:
         raise ParameterError(
             "file", f"{file} is not a readable picture: give a PNG or JPEG file"
@@ -131,12 +138,12 @@ def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
 
 
 def _png_size(file: Path) -> tuple[int, int]:
-    """Return the numbers of rows and columns in the first 24 bytes of a PNG file, or (0, 0) for
-    another file.
+    """Return the numbers of rows and columns in the header of a PNG file, or (0, 0) for another
+    file.
     """
-    head = head_of(file, 24)
-    png = head.startswith(b"\x89PNG") and len(head) == 24
-    return (int.from_bytes(head[20:24]), int.from_bytes(head[16:20])) if png else (0, 0)
+    header = head_of(file, 24)
+    is_png = header.startswith(b"\x89PNG") and len(header) == 24
+    return (int.from_bytes(header[20:24]), int.from_bytes(header[16:20])) if is_png else (0, 0)
 
 
 @once_per_version
@@ -154,6 +161,7 @@ def _damage(file: Path) -> str:
             if image.format == "PNG":
                 image.verify()
             else:
+                # decodes at an eighth of the size, which still reads all data
                 image.draft("RGB", (1, 1))
                 image.load()
     except ParameterError:
@@ -175,17 +183,20 @@ def _(result: Tensor, **params: Any) -> list[Check]:
 
 
 def _refuse(file: Path, image: Any) -> None:
-    fix = _FIX.format(name=file.name, stem=file.stem)
+    """Raise ParameterError for a picture that is no PNG or JPEG, that has transparency, or that is
+    not grey or RGB.
+    """
+    remedy = _FIX.format(name=file.name, stem=file.stem)
     if image.format not in ("PNG", "JPEG", "MPO"):
         raise ParameterError(
             "file",
-            f"{file} has the format {image.format}, not PNG or JPEG: {fix}, or use scene.exr",
+            f"{file} has the format {image.format}, not PNG or JPEG: {remedy}, or use scene.exr",
         )
     if "transparency" in image.info or image.mode.endswith("A"):
-        raise ParameterError("file", f"{file} has transparency, which a scene cannot use: {fix}")
+        raise ParameterError("file", f"{file} has transparency, which a scene cannot use: {remedy}")
     if image.mode not in _MODES:
         raise ParameterError(
-            "file", f"{file} has pixels of type {image.mode}, not grey or RGB: {fix}"
+            "file", f"{file} has pixels of type {image.mode}, not grey or RGB: {remedy}"
         )
 
 
@@ -231,9 +242,9 @@ class _Rows:
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         start, stop, _ = rows.indices(self._image.height)
-        band = self._image.crop((0, start, self._image.width, stop))
-        plain = band.mode.startswith("I") or band.mode == "RGB"
-        values = np.asarray(band if plain else band.convert("RGB"))
+        cropped = self._image.crop((0, start, self._image.width, stop))
+        is_readable = cropped.mode.startswith("I") or cropped.mode == "RGB"
+        values = np.asarray(cropped if is_readable else cropped.convert("RGB"))
         return values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
 
 
@@ -257,16 +268,16 @@ def _codes(file: Path) -> Codes:
     with Image.open(file) as image:
         _refuse(file, image)
         picture_needs(file, image, _LIGHT)
-        turned = image.getexif().get(_ORIENTATION, 1)
+        orientation = image.getexif().get(_ORIENTATION, 1)
         if image.mode == "RGB" and _depth(file) == 16:
-            return _words(file, turned)
-        return _Rows(ImageOps.exif_transpose(image) if turned != 1 else image)  # a copy
+            return _words(file, orientation)
+        return _Rows(ImageOps.exif_transpose(image) if orientation != 1 else image)  # a copy
 
 
 def _depth(file: Path) -> int:
     """Return the number of bits per channel of a PNG or JPEG file, which is always 8 for JPEG."""
-    head = head_of(file, 26)
-    return head[24] if head.startswith(b"\x89PNG") else 8
+    header = head_of(file, 26)
+    return header[24] if header.startswith(b"\x89PNG") else 8
 
 
 def _words(file: Path, turned: int) -> NDArray[Any]:
@@ -276,11 +287,14 @@ def _words(file: Path, turned: int) -> NDArray[Any]:
     from kornia_rs.io import read_image_png_u16
 
     rows, columns = _png_size(file)
+    # 6 bytes of a pixel as it is read, and 12 in linear light
     needs(18.0 * rows * columns, file, f"{columns} x {rows} pixels of 16 bits")
-    values = np.asarray(read_image_png_u16(str(file), "rgb"))
-    values = values.transpose(1, 0, 2) if turned in _ROTATED else values
+    codes = np.asarray(read_image_png_u16(str(file), "rgb"))
+    codes = codes.transpose(1, 0, 2) if turned in _ROTATED else codes
+    # EXIF: 3 is turned by 180 degrees, 2 and 4 are mirrored, 5 to 8 have rows and columns
+    # exchanged
     flip_y, flip_x = turned in (3, 4, 7, 8), turned in (2, 3, 6, 7)
-    return values[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
+    return codes[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
 
 
 # --- photograph folder ----------------------------------------------------------------------------
@@ -315,17 +329,21 @@ def list_photographs(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
 
 
 def _files(root: Path) -> list[Path]:
-    pictures, above = list[Path](), dict[str, frozenset[tuple[int, int]]]()
-    for folder, below, names in os.walk(root, followlinks=True):
-        about, around = os.stat(folder), above.get(os.path.dirname(folder), frozenset())
-        if (place := (about.st_dev, about.st_ino)) in around:  # a link that leads back
-            below.clear()
+    """Return the files with the suffix of a picture below a folder, sorted by path; hidden files
+    and folders are left out, and links that lead back to a folder above are not followed.
+    """
+    pictures, folders_above = list[Path](), dict[str, frozenset[tuple[int, int]]]()
+    for folder, subfolders, file_names in os.walk(root, followlinks=True):
+        status, ancestors = os.stat(folder), folders_above.get(os.path.dirname(folder), frozenset())
+        if (identity := (status.st_dev, status.st_ino)) in ancestors:  # a link that leads back
+            subfolders.clear()
             continue
-        above[folder] = around | {place}
-        below[:] = sorted(name for name in below if not name.startswith("."))
+        folders_above[folder] = ancestors | {identity}
+        # `os.walk` goes into the folders of this list, in its order
+        subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
         pictures += [
             Path(folder, n)
-            for n in names
+            for n in file_names
             if not n.startswith(".") and Path(n).suffix.lower() in _PICTURES
         ]
     return sorted(pictures, key=lambda path: path.relative_to(root).parts)
@@ -336,9 +354,9 @@ def _problem(path: Path) -> str:
     try:
         read_header(path)
         with opened(path) as file:
-            end = _ENDS[file.read(2)]
+            end_mark = _ENDS[file.read(2)]
             file.seek(max(0, path.stat().st_size - _TAIL))
-            return "" if end in file.read(_TAIL) else f"{path.name} stops before its end"
+            return "" if end_mark in file.read(_TAIL) else f"{path.name} stops before its end"
     except (ParameterError, OSError, KeyError, ValueError, SyntaxError) as error:
         return str(error)
 
@@ -375,10 +393,12 @@ def _decoded(path: Path) -> Tensor:
     """
     version = file_version(path)
     if version is None:
-        just_changed: Tensor = photograph(file=path)
-        return just_changed
+        # a file that was written just now has no version yet
+        uncached: Tensor = photograph(file=path)
+        return uncached
     picture: Tensor = _pictures.pop(version) if version in _pictures else photograph(file=path)
     _pictures[version] = picture
+    # the first entry is the one that was not used for longest
     while len(_pictures) > 1 and sum(map(_size, _pictures.values())) > _KEPT:
         del _pictures[next(iter(_pictures))]
     return picture

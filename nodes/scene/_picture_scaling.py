@@ -63,14 +63,12 @@ def drawn_crop(
     ``shape``; negative results of the kernel become black.
     """
     size = (picture.shape[-2], picture.shape[-1])
-    if any(have < want for have, want in zip(size, shape, strict=True)):
+    if any(old < new for old, new in zip(size, shape, strict=True)):
         size = covering(size, shape)
         picture = resize(picture, *size).clamp_min(0.0)
     indices = [index] if isinstance(index, int) else list(index)
-    draw = np.random.default_rng([seed, _PART, *indices])
-    top, left = (
-        int(draw.integers(0, have - want + 1)) for have, want in zip(size, shape, strict=True)
-    )
+    rng = np.random.default_rng([seed, _PART, *indices])
+    top, left = (int(rng.integers(0, old - new + 1)) for old, new in zip(size, shape, strict=True))
     return picture[:, top : top + shape[0], left : left + shape[1]].contiguous()
 
 
@@ -131,6 +129,9 @@ def is_large(pixels: float) -> bool:
 
 
 def _in_bands(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
+    """Return what `linear_light` returns, for a large picture: band after band of its rows is
+    converted, and added to the rows of the result that it reaches.
+    """
     size = (codes.shape[0], codes.shape[1])
     if shape is None or size == tuple(shape):
         picture = torch.empty(3, *size)
@@ -139,18 +140,20 @@ def _in_bands(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
         return picture
     scaled = covering(size, shape)
     antialias = max(old / new for old, new in zip(size, scaled, strict=True)) > 1
-    down, across = (
+    # matrices of resampling, of which only the lines of the central crop are needed
+    row_matrix, column_matrix = (
         resampling(old, new, antialias)[(new - size_of_cut) // 2 :][:size_of_cut]
         for old, new, size_of_cut in zip(size, scaled, shape, strict=True)
     )
     result = np.zeros((3, *shape), np.float32)
     for rows in bands_of(size):
-        block = down[:, rows]
-        reached = np.flatnonzero(np.diff(block.indptr))
-        if len(reached):
-            lines = slice(reached[0], reached[-1] + 1)
+        band_matrix = row_matrix[:, rows]
+        # lines of a sparse matrix that are not empty
+        reached_lines = np.flatnonzero(np.diff(band_matrix.indptr))
+        if len(reached_lines):
+            lines = slice(reached_lines[0], reached_lines[-1] + 1)
             for channel, light in zip(result, linear(codes[rows]).double().numpy(), strict=True):
-                channel[lines] += block[lines] @ (across @ light.T).T
+                channel[lines] += band_matrix[lines] @ (column_matrix @ light.T).T
     return torch.from_numpy(result)
 
 
@@ -170,21 +173,24 @@ def resampling(old: int, new: int, antialias: bool) -> Any:
     """
     from scipy import sparse
 
+    # middle of a new sample, counted in old samples; beyond the last ones they are repeated
     centres = ((np.arange(new) + 0.5) * (old / new) - 0.5).clip(0, old - 1)
-    low = np.floor(centres).astype(np.int64)
-    share = centres - low
-    taps = np.zeros(1, np.int64)
+    lower_sample = np.floor(centres).astype(np.int64)
+    share = centres - lower_sample
+    offsets = np.zeros(1, np.int64)
     weights = np.ones(1)
     if antialias and old > 1:
         sigma = max((old / new - 1.0) / 2.0, 0.001)
-        half = math.floor(max(4.0 * sigma, 3)) // 2
-        taps = np.arange(-half, half + 1)
-        weights = np.exp(-((taps / sigma) ** 2) / 2)
+        # kornia's rule: 4 sigma, at least 3 samples, half to each side
+        half_width = math.floor(max(4.0 * sigma, 3)) // 2
+        offsets = np.arange(-half_width, half_width + 1)
+        weights = np.exp(-((offsets / sigma) ** 2) / 2)
         weights /= weights.sum()
-    places = np.stack([low, np.minimum(low + 1, old - 1)])[..., None] + taps
-    values = np.stack([1 - share, share])[..., None] * weights
-    mirrored = (old - 1) - np.abs((old - 1) - np.abs(places))
-    lines = np.broadcast_to(np.arange(new)[:, None], places.shape)
+    positions = np.stack([lower_sample, np.minimum(lower_sample + 1, old - 1)])[..., None] + offsets
+    sample_weights = np.stack([1 - share, share])[..., None] * weights
+    # mirrored at the first and at the last sample
+    mirrored = (old - 1) - np.abs((old - 1) - np.abs(positions))
+    row_numbers = np.broadcast_to(np.arange(new)[:, None], positions.shape)
     return sparse.coo_matrix(
-        (values.ravel(), (lines.ravel(), mirrored.ravel())), (new, old)
+        (sample_weights.ravel(), (row_numbers.ravel(), mirrored.ravel())), (new, old)
     ).tocsr()

@@ -49,7 +49,7 @@ def _(
 
 def _picture(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[float, float]:
     """Return the work of reading a picture, which is held in whole before it is cropped."""
-    size = float(file.stat().st_size)
+    file_bytes = float(file.stat().st_size)
     try:
         y, x = (
             picture_size(file, params.get("part"))
@@ -57,7 +57,8 @@ def _picture(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[f
             else read_header(file)[2]
         )
     except (OSError, RuntimeError, ValueError):
-        return 4 * size, 4 * size + result.numel()
+        return 4 * file_bytes, 4 * file_bytes + result.numel()
+    # three float32 a pixel
     return 12.0 * y * x, float(3 * y * x + 3 * result.numel())
 
 
@@ -66,8 +67,8 @@ def _(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[float, f
     """Return the memory of the decoded picture, which is less for each pixel of a large one, and
     the operations.
     """
-    held, operations = _picture(result, *inputs, file=file, **params)
-    pixels = held / 12
+    memory, operations = _picture(result, *inputs, file=file, **params)
+    pixels = memory / 12
     if result.numel() == 3 * pixels:  # not scaled: the law counts the result 2.76 times
         return (0.0 if is_large(pixels) else 16.0 * pixels), operations
     return (10.0 if is_large(pixels) else 60.0) * pixels, operations

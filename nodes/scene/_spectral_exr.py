@@ -43,8 +43,9 @@ def write_lines(
     ``header`` has texts and numbers. Raises: ValueError for ``half`` and a value beyond the range
     of float16.
     """
-    order = sorted(range(len(names)), key=lambda i: names[i].encode())
-    planes = [cube[i].detach().cpu().float().numpy() for i in order]
+    # channels stand in alphabetical order in an OpenEXR file
+    channel_order = sorted(range(len(names)), key=lambda i: names[i].encode())
+    planes = [cube[i].detach().cpu().float().numpy() for i in channel_order]
     if half and any(
         np.abs(plane).max(initial=0.0, where=np.isfinite(plane)) > _LARGEST_HALF for plane in planes
     ):
@@ -52,28 +53,35 @@ def write_lines(
             f"values beyond {_LARGEST_HALF:.0f} cannot be written as half floats: write float32"
         )
     height, width = cube.shape[-2:]
-    kind = np.dtype("<f2" if half else "<f4")
-    size = len(names) * width * kind.itemsize
-    start = _head([names[i] for i in order], (height, width), header, half)
-    offsets = accumulate(repeat(8 + size, height - 1), initial=len(start) + 8 * height)
+    number_type = np.dtype("<f2" if half else "<f4")
+    line_bytes = len(names) * width * number_type.itemsize
+    header_bytes = _head([names[i] for i in channel_order], (height, width), header, half)
+    # each line has a number and a size of 4 bytes each before its pixels; the table of offsets has
+    # 8 bytes a line
+    offsets = accumulate(repeat(8 + line_bytes, height - 1), initial=len(header_bytes) + 8 * height)
     with open(path, "wb") as file:
-        file.write(start + np.fromiter(offsets, "<u8", height).tobytes())
-        _write_pixels(file, planes, size, kind)
+        file.write(header_bytes + np.fromiter(offsets, "<u8", height).tobytes())
+        _write_pixels(file, planes, line_bytes, number_type)
 
 
 def _write_pixels(file: IO[bytes], planes: Sequence[Any], size: int, kind: Any) -> None:
-    """Write the lines of the planes, each after its number and its size in bytes."""
+    """Write the lines of the planes, each after its number and its size in bytes.
+
+    ``size`` is the bytes of a line's pixels, ``kind`` the number type. Many lines are written at
+    once.
+    """
     height, width = planes[0].shape
     rows = max(1, min(height, _AT_ONCE // (8 + size)))
     lines = np.empty((rows, 8 + size), np.uint8)
-    numbers, pixels = (
+    line_headers, pixels = (
         lines[:, :8].view("<i4"),
         lines[:, 8:].view(kind).reshape(rows, len(planes), width),
     )
-    numbers[:, 1] = size
+    # column 0 the number of the line, column 1 its size
+    line_headers[:, 1] = size
     for top in range(0, height, rows):
         count = min(rows, height - top)
-        numbers[:count, 0] = np.arange(top, top + count)
+        line_headers[:count, 0] = np.arange(top, top + count)
         for i, plane in enumerate(planes):
             pixels[:count, i] = plane[top : top + count]
         file.write(lines[:count].data)
@@ -83,30 +91,31 @@ def _head(
     names: Sequence[str], shape: tuple[int, int], header: Mapping[str, Any], half: bool
 ) -> bytes:
     """Return the bytes of an OpenEXR file before its table of offsets."""
-    kind, (height, width) = _HALF if half else _FLOAT, shape
-    listed = (
-        b"".join(name.encode() + b"\0" + struct.pack("<i4xii", kind, 1, 1) for name in names)
+    pixel_type, (height, width) = _HALF if half else _FLOAT, shape
+    # per channel: name, type, three unused and a linear flag, sampling along x and y
+    channel_list = (
+        b"".join(name.encode() + b"\0" + struct.pack("<i4xii", pixel_type, 1, 1) for name in names)
         + b"\0"
     )
-    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
-    parts = {
-        "channels": ("chlist", listed),
+    window_bytes = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    attributes = {
+        "channels": ("chlist", channel_list),
         "compression": ("compression", b"\0"),
-        "dataWindow": ("box2i", window),
-        "displayWindow": ("box2i", window),
+        "dataWindow": ("box2i", window_bytes),
+        "displayWindow": ("box2i", window_bytes),
         "lineOrder": ("lineOrder", b"\0"),
         "pixelAspectRatio": ("float", struct.pack("<f", 1.0)),
         "screenWindowCenter": ("v2f", struct.pack("<2f", 0.0, 0.0)),
         "screenWindowWidth": ("float", struct.pack("<f", 1.0)),
         **{name: _attribute(value) for name, value in header.items()},
     }
-    longest = max(len(name.encode()) for name in (*names, *parts))
+    longest = max(len(name.encode()) for name in (*names, *attributes))
     flags = _VERSION | (_LONG_NAMES if longest > 31 else 0)
-    texts = (
-        f"{name}\0{form}\0".encode() + struct.pack("<i", len(raw)) + raw
-        for name, (form, raw) in parts.items()
+    attribute_bytes = (
+        f"{name}\0{type_name}\0".encode() + struct.pack("<i", len(value_bytes)) + value_bytes
+        for name, (type_name, value_bytes) in attributes.items()
     )
-    return struct.pack("<2i", _MAGIC, flags) + b"".join(texts) + b"\0"
+    return struct.pack("<2i", _MAGIC, flags) + b"".join(attribute_bytes) + b"\0"
 
 
 def _attribute(value: Any) -> tuple[str, bytes]:
@@ -144,14 +153,15 @@ def exr_parts(file: Path | str) -> Iterator[Any]:
     import OpenEXR
 
     exr_needs(file)
-    with OpenEXR.File(str(file), header_only=True) as opened:
-        count = len(opened.parts)
+    with OpenEXR.File(str(file), header_only=True) as opened_file:
+        part_count = len(opened_file.parts)
+    # the library prints a warning for a truncated file
     with redirect_stdout(StringIO()):
-        opened = OpenEXR.File(str(file), separate_channels=True)
-    with opened:
-        if len(opened.parts) < count:
+        opened_file = OpenEXR.File(str(file), separate_channels=True)
+    with opened_file:
+        if len(opened_file.parts) < part_count:
             raise ValueError("the pixels end earlier than the header says")
-        yield opened
+        yield opened_file
 
 
 class PartHeader(NamedTuple):
@@ -178,10 +188,15 @@ def part_headers(file: Path) -> list[PartHeader]:
 
 
 def _part(header: dict[str, Any]) -> PartHeader:
-    low, high = ([int(edge) for edge in corner] for corner in header["dataWindow"])
+    """Return name, header, channel names and size of a part of an OpenEXR file from its header."""
+    lower_corner, upper_corner = ([int(edge) for edge in corner] for corner in header["dataWindow"])
     names = [channel.name for channel in header["channels"]]
+    # corners are (x, y), and both belong to the window
     return PartHeader(
-        str(header.get("name", "")), header, names, (high[1] - low[1] + 1, high[0] - low[0] + 1)
+        str(header.get("name", "")),
+        header,
+        names,
+        (upper_corner[1] - lower_corner[1] + 1, upper_corner[0] - lower_corner[0] + 1),
     )
 
 
@@ -222,14 +237,15 @@ def write_spectral(
             "give one wavelength for each band"
         )
     quantity = "S0" if kind == "emissive" else "T"
+    # a point would separate layers: the decimal mark is a comma
     names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
         raise ValueError(f"bands closer than 1e-6 nm would have equal channel names: {names}")
-    about = {
+    layout_attributes = {
         "spectralLayoutVersion": "1.0",
         **({"emissiveUnits": "W.m^-2"} if kind == "emissive" else {}),
     }
-    write_lines(path, names, cube, {**about, **(header or {})}, half)
+    write_lines(path, names, cube, {**layout_attributes, **(header or {})}, half)
 
 
 def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -263,17 +279,21 @@ def spectral_channels(names: Sequence[str]) -> dict[float, str]:
     Reflectance channels are used only if the file has no emission channels.
     """
     matches = [match for match in map(_NAME.fullmatch, names) if match]
+    # a name without a number has no wavelength
     spectral = [match for match in matches if match[2] not in ("", ",")]
     for kind in ("S0", "T"):
-        of_kind = [match for match in spectral if match[1] == kind]
-        if of_kind:
-            return dict(sorted((_wavelength(match), match[0]) for match in of_kind))
+        channels_of_kind = [match for match in spectral if match[1] == kind]
+        if channels_of_kind:
+            return dict(sorted((_wavelength(match), match[0]) for match in channels_of_kind))
     return {}
 
 
 def _wavelength(match: re.Match[str]) -> float:
+    """Return the wavelength in m of a matched channel name: its number with the prefix of its
+    unit, m or Hz.
+    """
     exponent = _PREFIX[match[3] or ""]
     number = float(match[2].replace(",", "."))
     # a division converts nanometres, so that 550,0nm gives the same float64 as 550 / 1e9
-    value = number / 10.0**-exponent if exponent < 0 else number * 10.0**exponent
-    return value if match[4] == "m" else SPEED_OF_LIGHT / value
+    metres_or_hertz = number / 10.0**-exponent if exponent < 0 else number * 10.0**exponent
+    return metres_or_hertz if match[4] == "m" else SPEED_OF_LIGHT / metres_or_hertz

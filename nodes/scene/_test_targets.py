@@ -58,20 +58,27 @@ def _slanted(y: Tensor, x: Tensor) -> Tensor:
     """Return the exact fraction of the area of each pixel on the bright side of a slanted edge
     through the axis.
     """
-    c, s = math.cos(_TILT), math.sin(_TILT)
-    distance = x * c + y * s
-    wide, narrow = (c + s) / 2, (c - s) / 2
-    corners = [(1, wide), (-1, narrow), (-1, -narrow), (1, -wide)]
-    areas = [sign * (distance + off).clamp_min(0) ** 2 / 2 for sign, off in corners]
-    return (sum(areas, torch.zeros_like(distance)) / (c * s)).clamp(0, 1)
+    cosine, sine = math.cos(_TILT), math.sin(_TILT)
+    distance = x * cosine + y * sine
+    far_corner, near_corner = (cosine + sine) / 2, (cosine - sine) / 2
+    # the area of a pixel behind the edge: sum of +-(distance of a corner)^2 / 2 over the corners
+    # that are behind it
+    corners = [(1, far_corner), (-1, near_corner), (-1, -near_corner), (1, -far_corner)]
+    areas = [sign * (distance + offset).clamp_min(0) ** 2 / 2 for sign, offset in corners]
+    return (sum(areas, torch.zeros_like(distance)) / (cosine * sine)).clamp(0, 1)
 
 
 def _siemens(y: Tensor, x: Tensor) -> Tensor:
+    """Return the share of the bright grey of a star with `_CYCLES` cycles: (1 + cos(cycles x
+    azimuth)) / 2, and 1/2 where a cycle is shorter than two pixels and beyond the largest circle.
+    """
     radius = torch.hypot(y, x)
-    edge = min(int(y.numel()), int(x.numel())) / 2 - 1
-    fine = _CYCLES / math.pi  # radius where a cycle is two pixels long
-    inside = (edge - radius + 0.5).clamp(0, 1) * (radius - fine + 0.5).clamp(0, 1)
-    return 0.5 + 0.5 * inside * torch.cos(_CYCLES * torch.atan2(y, x))
+    largest_radius = min(int(y.numel()), int(x.numel())) / 2 - 1
+    resolved_radius = _CYCLES / math.pi  # radius where a cycle is two pixels long
+    star_share = (largest_radius - radius + 0.5).clamp(0, 1) * (
+        radius - resolved_radius + 0.5
+    ).clamp(0, 1)
+    return 0.5 + 0.5 * star_share * torch.cos(_CYCLES * torch.atan2(y, x))
 
 
 #: share of `high` in each pixel, from the distances y and x to the axis

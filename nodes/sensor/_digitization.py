@@ -35,8 +35,8 @@ def is_clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tens
     """Return True for raw values in DN at the full well or at the largest output of the
     converter, and for NaN.
     """
-    marked: Tensor = ~(raw < clipping_number(full_well, gain, bits))  # NaN counts as clipped
-    return marked
+    clipped: Tensor = ~(raw < clipping_number(full_well, gain, bits))  # NaN counts as clipped
+    return clipped
 
 
 def electrons_to_clip(full_well: float, gain: float, bits: int, offset: float = 0.0) -> float:
@@ -126,6 +126,7 @@ def digitize(
     if rounding == "dithered_floor" and rng is None:
         raise ValueError("rounding dithered_floor needs random numbers: give rng=torch.Generator()")
     electrons = single(electrons)
+    # the numbers have no gradient: it is that of the value before rounding
     numbers = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rounding, rng)
     if not (electrons.requires_grad or transformed()):
         return numbers
@@ -143,18 +144,19 @@ def _whole_numbers(
     The product is float64: in float32, one number in a thousand would be off by one.
     """
     result = torch.empty_like(electrons, memory_format=torch.contiguous_format)
-    flat, numbers, dither = electrons.reshape(-1), result.view(-1), None
+    flat_electrons, flat_result, dither = electrons.reshape(-1), result.view(-1), None
     if rounding == "dithered_floor" and rng is not None:
         dither = (
             torch.rand(electrons.shape, generator=rng, device=rng.device, dtype=torch.float32) - 0.5
         )
         dither = dither.to(electrons.device).reshape(-1)
-    for start in range(0, flat.numel(), _BLOCK):
+    # in blocks that stay in the cache of the processor
+    for start in range(0, flat_electrons.numel(), _BLOCK):
         block = slice(start, start + _BLOCK)
-        line = flat[block].double() * gain
-        line = line if dither is None else line.add_(dither[block])
-        line = line.round_() if rounding == "nearest" else line.floor_()
-        numbers[block] = line.clamp_(0, top)
+        values = flat_electrons[block].double() * gain
+        values = values if dither is None else values.add_(dither[block])
+        values = values.round_() if rounding == "nearest" else values.floor_()
+        flat_result[block] = values.clamp_(0, top)
     return result
 
 
@@ -167,16 +169,18 @@ def _(
     bits: int = 16,
     rng: Generator | None = None,
 ) -> Tensor:
-    top, electrons = 2**bits - 1, single(electrons)
-    line = [float(Fraction(x) * Fraction(gain)) for x in electrons.flatten().tolist()]
+    largest, electrons = 2**bits - 1, single(electrons)
+    # exact products, since fractions do not round
+    values = [float(Fraction(x) * Fraction(gain)) for x in electrons.flatten().tolist()]
     if rounding == "nearest":
-        numbers = [round(min(max(x, 0.0), float(top))) for x in line]
+        numbers = [round(min(max(x, 0.0), float(largest))) for x in values]
     elif rounding == "truncation":
-        numbers = [min(max(math.floor(x), 0), top) for x in line]
+        numbers = [min(max(math.floor(x), 0), largest) for x in values]
     else:
         dither = torch.rand(electrons.shape, generator=rng, dtype=torch.float32).flatten().tolist()
         numbers = [
-            min(max(math.floor(x + (d - 0.5)), 0), top) for x, d in zip(line, dither, strict=True)
+            min(max(math.floor(x + (d - 0.5)), 0), largest)
+            for x, d in zip(values, dither, strict=True)
         ]
     return torch.tensor(numbers, dtype=electrons.dtype).reshape(electrons.shape)
 
@@ -200,8 +204,8 @@ def _(rms: float, *, result: TensorStats, **params: Any) -> float:
     more.
     """
     pixels = max(1, math.prod(result.shape))
-    share = rms * (1.0 - rms) if rms < 0.5 else 0.25
-    return math.sqrt(rms**2 + rare_events(share * pixels) / pixels)
+    change_of_square = rms * (1.0 - rms) if rms < 0.5 else 0.25
+    return math.sqrt(rms**2 + rare_events(change_of_square * pixels) / pixels)
 
 
 @digitize.preflight
@@ -236,8 +240,9 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
     Raises: ParameterError before the run, or ValueError, for a window larger than the image.
     Source: NeuSee, Eq. (SensorImage).
     """
-    if problem := _too_small(image, shape):
-        raise ValueError(problem)
+    if message := _too_small(image, shape):
+        raise ValueError(message)
+    # sample m // 2 of the image is the optical axis, and sample n // 2 of the window
     top, left = (m // 2 - n // 2 for n, m in zip(shape, image.shape[-2:], strict=True))
     return image[..., top : top + shape[0], left : left + shape[1]].contiguous()
 
@@ -248,9 +253,9 @@ def _too_small(image: Tensor, shape: Shape) -> str:
     """
     if all(n <= m for n, m in zip(shape, image.shape[-2:], strict=True)):
         return ""
-    window, picture = (f"{y} x {x}" for y, x in (shape, image.shape[-2:]))
+    window_text, image_text = (f"{y} x {x}" for y, x in (shape, image.shape[-2:]))
     return (
-        f"the sensor window of {window} pixels is larger than the image of {picture}: "
+        f"the sensor window of {window_text} pixels is larger than the image of {image_text}: "
         f"enlarge the scene (scene.shape) to at least {list(shape)}, or choose a smaller window"
     )
 
@@ -267,8 +272,8 @@ def _(image: ErrorBound, *, result: TensorStats, **params: Any) -> float:
     """Return an error bound of the cropped image for the worst case, in which all the error is
     inside the window.
     """
-    before = math.prod(image.stats.shape) if image.stats else math.inf
-    return image.rms * math.sqrt(before / max(1, math.prod(result.shape)))
+    pixels_before = math.prod(image.stats.shape) if image.stats else math.inf
+    return image.rms * math.sqrt(pixels_before / max(1, math.prod(result.shape)))
 
 
 @crop.skip_bound

@@ -31,33 +31,37 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
     the channel sums gives the weights.
     """
     if isinstance(image, Channels):
-        mixed = _of_rows(weights, image.rows).to(image.planes)
-        summed: Tensor = torch.tensordot(mixed, image.planes, 1)
-        return summed
+        # the planes of the image are sums over its bands already: combine them
+        plane_weights = _of_rows(weights, image.rows).to(image.planes)
+        channels: Tensor = torch.tensordot(plane_weights, image.planes, 1)
+        return channels
     image = single(image)
-    flat = weights.to(image) @ image.flatten(-2)
-    return flat.reshape(*flat.shape[:-1], *image.shape[-2:])
+    flat_channels = weights.to(image) @ image.flatten(-2)
+    return flat_channels.reshape(*flat_channels.shape[:-1], *image.shape[-2:])
 
 
 def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
-    """Solve ``weights = M rows`` for the matrix M by least squares in float64.
+    """Return the matrix M with ``weights = M rows``, by least squares in float64.
 
-    The gradient reaches the weights.
+    ``rows`` (row, band) are the weights by which the planes of an image were summed over its bands.
+    The gradient reaches the weights. Raises ValueError if no M gives the weights.
     """
     image_rows = rows.detach().cpu().double()
-    scale = image_rows.abs().amax(1, keepdim=True)
-    inverse = (
-        torch.linalg.pinv(image_rows / scale.where(scale > 0, 1.0)) / scale.where(scale > 0, 1.0).T
+    # rows of very different size would lose their digits in the inverse
+    row_maxima = image_rows.abs().amax(1, keepdim=True)
+    inverse_rows = (
+        torch.linalg.pinv(image_rows / row_maxima.where(row_maxima > 0, 1.0))
+        / row_maxima.where(row_maxima > 0, 1.0).T
     )
-    exact = weights.cpu().double()
-    if exact.shape[-1] != image_rows.shape[1]:
+    exact_weights = weights.cpu().double()
+    if exact_weights.shape[-1] != image_rows.shape[1]:
         counts = (
-            f"the weights have {exact.shape[-1]} bands and the sums of the image"
+            f"the weights have {exact_weights.shape[-1]} bands and the sums of the image"
             f" {image_rows.shape[1]} bands"
         )
         raise ValueError(f"{counts}: compute weights and image from the same `bands` step")
-    matrix: Tensor = exact @ inverse
-    _require_combination(exact.detach(), matrix.detach() @ image_rows)
+    matrix: Tensor = exact_weights @ inverse_rows
+    _require_combination(exact_weights.detach(), matrix.detach() @ image_rows)
     return matrix
 
 
@@ -65,9 +69,12 @@ def _require_combination(exact: Tensor, combined: Tensor) -> None:
     """Raise ValueError unless the weights ``combined`` equal ``exact`` within 1e-9 of the
     largest weight.
     """
-    off, largest = (exact - combined).abs().flatten(0, -2), exact.abs().flatten(0, -2).amax(-1)
-    if not bool((off.amax(-1) <= _OFF * largest).all()):
-        worst = float((off.amax(-1) / largest.clamp_min(1e-300)).max())
+    errors, largest = (
+        (exact - combined).abs().flatten(0, -2),
+        exact.abs().flatten(0, -2).amax(-1),
+    )
+    if not bool((errors.amax(-1) <= _OFF * largest).all()):
+        worst = float((errors.amax(-1) / largest.clamp_min(1e-300)).max())
         raise ValueError(
             "the image was summed over its bands with other weights: the weights of this step"
             f" differ by {worst:.2g} (relative error; at most 1e-9) from every combination of these"
@@ -135,6 +142,7 @@ def _(
     weights = channel_weights(bands, responses, level, **sizes)
     if isinstance(irradiance, Channels):
         return weighted(irradiance._replace(planes=irradiance.planes.double()), weights)
+    # in float64, one channel after another
     channels = [
         (row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)
     ]
@@ -160,9 +168,12 @@ def _(
     """
     if irradiance.rms and irradiance.peak is None:
         return math.inf
+    # the others are bands, responses and level
     level = others[2] if len(others) > 2 else None
-    light, factor = irradiance.share, level.share if level else 0.0
-    return (light + factor + light * factor) * max(abs(result.min), abs(result.max))
+    light_share, factor_share = irradiance.share, level.share if level else 0.0
+    return (light_share + factor_share + light_share * factor_share) * max(
+        abs(result.min), abs(result.max)
+    )
 
 
 def channel_weights(
@@ -171,13 +182,16 @@ def channel_weights(
     """Return the photons per unit of irradiance in each band for each colour channel: (channel,
     band) float64.
     """
-    lengths = {len(bands.centres), responses.shape[-1]} | (set() if level is None else {len(level)})
-    if len(lengths) > 1:
+    band_counts = {len(bands.centres), responses.shape[-1]} | (
+        set() if level is None else {len(level)}
+    )
+    if len(band_counts) > 1:
         raise ValueError(
             f"bands {len(bands.centres)}, responses {tuple(responses.shape)}, level"
             f" {None if level is None else tuple(level.shape)} differ in the number of bands: use"
             " one step `bands`"
         )
+    # of one exposure in a pixel under 1 W/m2
     photons = photons_per_joule(bands.centres) * (exposure * pixel_pitch**2)
     weights = responses.double() * photons.to(responses.device)
     return weights if level is None else weights * level.to(weights)
@@ -229,18 +243,24 @@ def level(
                 "rule per_band needs the peak of each band, but this image is summed over its"
                 " bands: use rule channel_sum, or keep the image of all bands"
             )
+        # the peak of each band, over all pictures of a batch
         peaks = plain_image.amax((-2, -1)).reshape(-1, len(bands.centres)).amax(0).double()
         sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
-        top = saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
+        full_pixel = saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
     else:
         photons: Tensor = expose(
             plain_image, bands, responses, pixel_pitch=pixel_pitch, exposure=exposure
         )
         peaks = photons.amax().double().expand(len(bands.centres))
-        top = torch.tensor(photons_that_fill(full_well, quantum_efficiency), dtype=torch.float64)
+        full_pixel = torch.tensor(
+            photons_that_fill(full_well, quantum_efficiency), dtype=torch.float64
+        )
     refuse_not_finite("no level can scale this image", plain_image=peaks)
-    lit = peaks > 0
-    return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
+    has_light = peaks > 0
+    # without light the factor is 0, and nothing is divided by 0
+    return torch.where(
+        has_light, strength * full_pixel.to(peaks) / peaks.where(has_light, 1.0), 0.0
+    )
 
 
 _DARK = (
@@ -277,16 +297,16 @@ def _(
     rule: str = "channel_sum",
     **params: object,
 ) -> list[str]:
-    absolute = white is not None and (white.is_meta or float(white) > 0)
+    has_brightness = white is not None and (white.is_meta or float(white) > 0)
     if strength is None:
-        if not absolute:
+        if not has_brightness:
             raise ParameterError("strength", _DARK)
         if rule == "per_band":
             raise ParameterError(
                 "rule", "lux and cd/m2 are sums over the bands: use rule channel_sum"
             )
         return []
-    if absolute:
+    if has_brightness:
         text = (
             "the brightness of the scene is stated twice, here and in lux or cd/m2: write"
             " sensor.background=null"
@@ -316,15 +336,15 @@ def add_photons(
     Raises: ValueError if a shape differs.
     Source: NeuSee, Eq. (photon_count).
     """
-    total = single(photons)
-    for added in chain(lasers or (), ghosts or ()):
-        if added.shape[-3:] != photons.shape[-3:]:
+    sum_of_photons = single(photons)
+    for laser_light in chain(lasers or (), ghosts or ()):
+        if laser_light.shape[-3:] != photons.shape[-3:]:
             raise ValueError(
-                f"laser light of shape {tuple(added.shape)} cannot be added to a scene of"
+                f"laser light of shape {tuple(laser_light.shape)} cannot be added to a scene of"
                 f" {tuple(photons.shape)}: give laser and scene the same `shape`"
             )
-        total = total + added
-    return total
+        sum_of_photons = sum_of_photons + laser_light
+    return sum_of_photons
 
 
 @add_photons.propagate_error

@@ -51,9 +51,9 @@ def tone_curve_sign(file: Path, values: NDArray[Any], depth: int | None, bits: i
     if _BYTE in (depth, bits) or values.dtype.itemsize == 1:
         return "has 8 bits, as pictures with a tone curve (sRGB, gamma 2.2) have"
     if values.dtype.kind in "ui" and values.any():
-        for factor, done in _TO_SIXTEEN.items():
+        for factor, change in _TO_SIXTEEN.items():
             if not (values % factor).any():
-                return f"has only multiples of {factor}: numbers of 8 bits that were {done} to 16"
+                return f"has only multiples of {factor}: numbers of 8 bits that were {change} to 16"
     with suppress(OSError, struct.error):
         if file.suffix.lower() == ".png":
             return _png_sign(bytes_of(file))
@@ -63,6 +63,9 @@ def tone_curve_sign(file: Path, values: NDArray[Any], depth: int | None, bits: i
 
 
 def _png_sign(content: bytes) -> str:
+    """Return the sign of a tone curve in the chunks of a PNG file (sRGB, gAMA, cICP, iCCP), or an
+    empty text.
+    """
     for kind, data in _chunks(content):
         if kind == b"sRGB":
             return "says of itself that it is sRGB encoded, which is a tone curve"
@@ -80,25 +83,38 @@ def _png_sign(content: bytes) -> str:
 
 def _chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Yield the kind and the data of each chunk of a PNG before its pixels."""
-    place = 8
-    while place + 8 <= len(content):
-        length, kind = struct.unpack(">I4s", content[place : place + 8])
+    # after the signature; a chunk has its length, its kind, the data and a checksum of 4 bytes
+    offset = 8
+    while offset + 8 <= len(content):
+        length, kind = struct.unpack(">I4s", content[offset : offset + 8])
         if kind == b"IDAT":
             return
-        yield kind, content[place + 8 : place + 8 + length]
-        place += length + 12
+        yield kind, content[offset + 8 : offset + 8 + length]
+        offset += length + 12
 
 
 def _tiff_sign(content: bytes) -> str:
-    order = {b"II": "<", b"MM": ">"}.get(content[:2])
-    if order is None or struct.unpack(f"{order}H", content[2:4])[0] != 42:
+    """Return the sign of a tone curve in the first directory of a TIFF file, its colour profile,
+    or an empty text.
+    """
+    byte_order = {b"II": "<", b"MM": ">"}.get(content[:2])
+    # the magic number of TIFF
+    if byte_order is None or struct.unpack(f"{byte_order}H", content[2:4])[0] != 42:
         return ""
-    (first,) = struct.unpack(f"{order}I", content[4:8])
-    (count,) = struct.unpack(f"{order}H", content[first : first + 2])
-    for number in range(min(count, _FIRST_DIRECTORY)):
-        entry = content[first + 2 + 12 * number : first + 14 + 12 * number]
-        tag, _, length, place = struct.unpack(f"{order}HHII", entry)
-        if tag == _ICC_PROFILE and b"linear" not in content[place : place + length].lower():
+    (directory_offset,) = struct.unpack(f"{byte_order}I", content[4:8])
+    (entry_count,) = struct.unpack(
+        f"{byte_order}H", content[directory_offset : directory_offset + 2]
+    )
+    for entry_number in range(min(entry_count, _FIRST_DIRECTORY)):
+        # entries of 12 bytes follow their number, of 2 bytes
+        entry = content[
+            directory_offset + 2 + 12 * entry_number : directory_offset + 14 + 12 * entry_number
+        ]
+        tag, _, data_length, data_offset = struct.unpack(f"{byte_order}HHII", entry)
+        if (
+            tag == _ICC_PROFILE
+            and b"linear" not in content[data_offset : data_offset + data_length].lower()
+        ):
             return "has a colour profile, which has a tone curve"
     return ""
 
@@ -203,6 +219,9 @@ def frame_problem(
 
 
 def _other_channels(name: str, frame_channels: int, channels: int) -> str:
+    """Return why a frame with ``frame_channels`` channels does not fit a camera with ``channels``
+    channels.
+    """
     if frame_channels == 1:
         return (
             f"{name} has one channel, but the camera has {channels}: it may be a raw colour filter"
@@ -216,18 +235,25 @@ def _other_channels(name: str, frame_channels: int, channels: int) -> str:
 
 
 def _other_depth(name: str, depth: int | None, bits: int, curve: Curve | None) -> str:
+    """Return why a frame of 8 bits does not fit a sensor of more bits, or an empty text.
+
+    ``depth`` are the bits of the file, None if it does not state them.
+    """
     if depth is not None and depth < bits and depth == 8:
-        linear = (
+        curve_text = (
             "" if curve == "linear" else f" and {_STATE}, if they have no tone curve (sRGB, gamma)"
         )
         return (
             f"{name} has 8 bits, but sensor.bits is {bits}: save the raw numbers of the camera in"
-            f" 16 bits, or give sensor.bits=8 with the gain of these numbers{linear}"
+            f" 16 bits, or give sensor.bits=8 with the gain of these numbers{curve_text}"
         )
     return ""
 
 
 def _curved(name: str, sign: str) -> str:
+    """Return why a frame with the ``sign`` of a tone curve is refused, or an empty text for no
+    sign.
+    """
     if not sign:
         return ""
     return (
@@ -238,7 +264,10 @@ def _curved(name: str, sign: str) -> str:
 
 
 def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:
-    top = 2**bits - 1
+    """Return why the numbers of a frame are not digital numbers of a converter of ``bits`` bits,
+    or an empty text: they must be finite, whole, from 0 to 2^bits - 1, and not all the same.
+    """
+    largest = 2**bits - 1
     if values.dtype.kind == "f":
         if count := int((~np.isfinite(values)).sum()):
             return (
@@ -249,7 +278,7 @@ def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:
         if broken.any():
             return (
                 f"{name} holds {values[broken][0]:g}, no whole number: give the digital numbers of"
-                f" the camera, from 0 to {top}, without a tone curve and without scaling"
+                f" the camera, from 0 to {largest}, without a tone curve and without scaling"
             )
     lowest, highest = int(values.min()), int(values.max())
     if lowest < 0:
@@ -257,9 +286,9 @@ def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:
             f"{name} holds {lowest}, below 0: give the numbers of the camera with its offset, not"
             " subtracted"
         )
-    if highest > top:
+    if highest > largest:
         return (
-            f"{name} holds {highest} DN, but {bits} bits end at {top}: set sensor.bits to the"
+            f"{name} holds {highest} DN, but {bits} bits end at {largest}: set sensor.bits to the"
             " depth of the converter, or shift the numbers down if the camera moved them to the"
             " upper bits"
         )
@@ -290,76 +319,95 @@ def read_frame(file: Path) -> FrameNumbers:
 
 
 def _png(file: Path) -> FrameNumbers:
+    """Read a frame from a PNG file of 8 or 16 bits, grey or RGB; raise ParameterError for another
+    file.
+    """
     from kornia_rs import io
     from PIL import Image
 
-    head = head_of(file, 26)
-    if not head.startswith(b"\x89PNG") or len(head) < 26:
+    header = head_of(file, 26)
+    if not header.startswith(b"\x89PNG") or len(header) < 26:
         raise ParameterError(
             "file", f"{file.name} is no PNG file, whatever its name says: save the frame as PNG"
         )
-    depth, channels = head[24], _COLOURS.get(head[25], 0)
+    # the header has columns in bytes 16 to 19, rows in 20 to 23, bits in 24 and the colour type in
+    # 25
+    depth, channels = header[24], _COLOURS.get(header[25], 0)
     if not channels or depth not in (8, 16):
         text = (
             f"{file.name} has a palette, transparency or {depth} bits: save raw numbers of 8 or 16"
             " bits"
         )
         raise ParameterError("file", text)
-    rows, columns = int.from_bytes(head[20:24]), int.from_bytes(head[16:20])
+    rows, columns = int.from_bytes(header[20:24]), int.from_bytes(header[16:20])
     refuse_large_picture(file, rows, columns)
     needs(
+        # bytes of a number in the file, and of the float32 number
         rows * columns * channels * (depth // 8 + _SINGLE),
         file,
         f"{columns} x {rows} pixels in {channels} channels",
     )
+    # the check sums, which the reader below does not look at
     with Image.open(file) as image:
         image.verify()
-    read = io.read_image_png_u16 if depth == 16 else io.read_image_png_u8
+    reader = io.read_image_png_u16 if depth == 16 else io.read_image_png_u8
     return FrameNumbers(
-        _first(np.asarray(read(str(file), "rgb" if channels == 3 else "mono"))), depth
+        _first(np.asarray(reader(str(file), "rgb" if channels == 3 else "mono"))), depth
     )
 
 
 def _tiff(file: Path) -> FrameNumbers:
+    """Read a frame from a TIFF file of 8 or 16 bits or of float numbers, grey or RGB; raise
+    ParameterError for another file.
+    """
     from kornia_rs import io
 
-    kinds = (
+    readers = (
         (io.read_image_tiff_u16, 16),
         (io.read_image_tiff_u8, 8),
         (io.read_image_tiff_f32, None),
     )
+    # memory: the file once, and three float32 numbers a pixel
     tiff_needs(file, 1.0, 3 * _SINGLE, first=True)
-    said = ""
-    for read, depth in kinds:
+    reason = ""
+    for reader, depth in readers:
         for mode in ("rgb", "mono"):
             try:  # each reader looks at the kind of pixels first
-                return FrameNumbers(_first(np.asarray(read(str(file), mode))), depth)
+                return FrameNumbers(_first(np.asarray(reader(str(file), mode))), depth)
             except Exception as error:  # another kind of pixels, or a damaged file
-                said = str(error).partition("\n")[0]
+                reason = str(error).partition("\n")[0]
     text = (
-        f"{file.name} cannot be read as grey or RGB of 8 or 16 bits ({said}): save it so, without"
+        f"{file.name} cannot be read as grey or RGB of 8 or 16 bits ({reason}): save it so, without"
         " compression"
     )
     raise ParameterError("file", text)
 
 
 def _exr(file: Path) -> FrameNumbers:
+    """Read a frame from an OpenEXR file, with the channels R, G and B or one channel; raise
+    ParameterError for other channels.
+    """
     import OpenEXR
 
     exr_needs(file, 4 * _SINGLE)
-    with OpenEXR.File(str(file), separate_channels=True) as opened:
-        channels = {name: np.array(channel.pixels) for name, channel in opened.channels().items()}
-    names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else list(channels)
-    if len(names) not in (1, 3):
+    with OpenEXR.File(str(file), separate_channels=True) as picture:
+        channels = {name: np.array(channel.pixels) for name, channel in picture.channels().items()}
+    channel_names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else list(channels)
+    if len(channel_names) not in (1, 3):
         text = (
             f"{file.name} has the channels {', '.join(channels)}: save R, G and B, or one channel"
             " alone"
         )
         raise ParameterError("file", text)
-    return FrameNumbers(np.stack([channels[name].astype(np.float64) for name in names]), None)
+    return FrameNumbers(
+        np.stack([channels[name].astype(np.float64) for name in channel_names]), None
+    )
 
 
 def _npy(file: Path) -> FrameNumbers:
+    """Read a frame from a NumPy array (y, x), (y, x, channel) or (channel, y, x); raise
+    ParameterError for another array.
+    """
     npy_needs(file, 1.0, _SINGLE)
     array = np.load(file, mmap_mode="r", allow_pickle=False)
     refuse_large_array(file, array.shape)

@@ -44,12 +44,14 @@ def rare_events(mean: float, sure: float = SURE) -> int:
     unequal events: Anderson and Samuels, Proc. 5th Berkeley Symp. 1, 1 (1967).
     """
     low, high = -1, max(8, math.ceil(mean + sure + 2.0 * math.sqrt(mean * sure)))
+    # bisection: `low` is exceeded too often, `high` is not
     while high - low > 1:
         middle = (low + high) // 2
-        above = torch.special.gammainc(
+        # probability of more than `middle` events: incomplete gamma function P(middle + 1, mean)
+        exceeding = torch.special.gammainc(
             torch.tensor(middle + 1.0, dtype=torch.float64), torch.tensor(mean, dtype=torch.float64)
         )
-        low, high = (middle, high) if float(above) > math.exp(-sure) else (low, middle)
+        low, high = (middle, high) if float(exceeding) > math.exp(-sure) else (low, middle)
     return high
 
 
@@ -66,10 +68,12 @@ def poisson_rms(mean: float, pixels: int) -> float:
         return 0.0
     sure = SURE + math.log(2.0)
     rare_number = rare_events(mean, sure + math.log(pixels))
-    fourth = mean + 7 * mean**2 + 6 * mean**3 + mean**4
-    third = rare_number**2 * sure / 3
-    excess = third + math.sqrt(third**2 + 2 * pixels * fourth * sure)
-    return min(float(rare_number), math.sqrt((pixels * (mean + mean**2) + excess) / pixels))
+    # of a Poisson number: m + 7 m^2 + 6 m^3 + m^4
+    fourth_moment = mean + 7 * mean**2 + 6 * mean**3 + mean**4
+    # Bernstein: excess t of a sum of bounded terms solves t^2 / (2 (V + c t / 3)) = sure
+    linear_term = rare_number**2 * sure / 3
+    sum_excess = linear_term + math.sqrt(linear_term**2 + 2 * pixels * fourth_moment * sure)
+    return min(float(rare_number), math.sqrt((pixels * (mean + mean**2) + sum_excess) / pixels))
 
 
 def chi_square_limit(weights: float, largest: float, sure: float = SURE) -> float:
@@ -93,12 +97,16 @@ def amplitude_error_drawn(drawn: float, darkest: float, pixels: int) -> float:
     change of the mean e, and e**2 / ``darkest``. The weights are summed for the worst distribution
     of the error over the pixels.
     """
-    squares = pixels * drawn**2
-    largest = math.sqrt(squares)
-    weights = math.sqrt(pixels) * largest
+    sum_of_squares = pixels * drawn**2
+    # all of the error in one pixel; a sum of absolute changes is largest if all are equal
+    largest_weight = math.sqrt(sum_of_squares)
+    sum_of_weights = math.sqrt(pixels) * largest_weight
     if darkest > 0:
-        largest, weights = min(largest, squares / darkest), min(weights, squares / darkest)
-    return math.sqrt(chi_square_limit(weights, largest) / pixels)
+        largest_weight, sum_of_weights = (
+            min(largest_weight, sum_of_squares / darkest),
+            min(sum_of_weights, sum_of_squares / darkest),
+        )
+    return math.sqrt(chi_square_limit(sum_of_weights, largest_weight) / pixels)
 
 
 def amplitude_error(drawn: float, darkest: float) -> float:
@@ -157,8 +165,8 @@ def photon_noise(
     def detected(piece: Tensor) -> Tensor:
         counts = piece.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
         fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
-        drawn = (mean_factor * counts).add_(spread * fluctuation).clamp_min(0)
-        return drawn if drawn_in == "electrons" else drawn * quantum_efficiency
+        noisy_counts = (mean_factor * counts).add_(spread * fluctuation).clamp_min(0)
+        return noisy_counts if drawn_in == "electrons" else noisy_counts * quantum_efficiency
 
     return _by_parts(detected, single(photons), rng)
 
@@ -205,28 +213,40 @@ def _electrons_error(
     spread: float = 1.0,
     **params: Any,
 ) -> float:
+    """Return the error bound of the electrons: that of the mean and that of the noise amplitude,
+    which ``amplitude`` gives from the error of the mean and the darkest mean count.
+    """
     if params["distribution"] == "poisson" and photons.rms > 0:
         return math.inf
-    drawn = photons.rms * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
+    # in the unit in which the noise is drawn
+    count_error = photons.rms * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
     mean_factor = params["mean_shift"] + (params["mean"] == "additive")
-    electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
-    darkest = photons.stats.min * drawn / photons.rms if photons.stats and photons.rms > 0 else 0.0
-    total: float = electrons * (abs(mean_factor) * drawn + spread * amplitude(drawn, darkest))
-    return total
+    electrons_per_count: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
+    darkest_count = (
+        photons.stats.min * count_error / photons.rms if photons.stats and photons.rms > 0 else 0.0
+    )
+    electrons_error: float = electrons_per_count * (
+        abs(mean_factor) * count_error + spread * amplitude(count_error, darkest_count)
+    )
+    return electrons_error
 
 
 def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
-    lit = ~(counts <= _DARK)  # True for NaN, so that NaN reaches the result
+    """Return normal noise of the standard deviation sqrt(counts), 0 where there is no light."""
+    has_light = ~(counts <= _DARK)  # True for NaN, so that NaN reaches the result
     if not (counts.requires_grad or transformed()):
-        return normal(counts, rng).mul_(counts.where(lit, 0.0).sqrt_())
+        return normal(counts, rng).mul_(counts.where(has_light, 0.0).sqrt_())
     # at 0, the square root has no finite gradient
-    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)
+    sigma = counts.where(has_light, 1.0).sqrt().where(has_light, 0.0)
     return sigma * normal(counts, rng)
 
 
 def _poisson(counts: Tensor, rng: Generator) -> Tensor:
-    still = counts.detach()
-    return torch.poisson(still.to(rng.device), generator=rng).to(counts) - still
+    """Return the deviation from their means of Poisson numbers with the means ``counts``; it has
+    no gradient.
+    """
+    means = counts.detach()
+    return torch.poisson(means.to(rng.device), generator=rng).to(counts) - means
 
 
 def _by_parts(compute: Callable[[Tensor], Tensor], numbers: Tensor, rng: Generator) -> Tensor:
@@ -236,17 +256,18 @@ def _by_parts(compute: Callable[[Tensor], Tensor], numbers: Tensor, rng: Generat
     The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by
     another method, so no part is that short.
     """
-    count = numbers.numel()
+    element_count = numbers.numel()
     if (
         torch.is_grad_enabled()
         or {numbers.device.type, rng.device.type} != {"cpu"}
-        or count < 2 * _PART
+        or element_count < 2 * _PART
     ):
         return compute(numbers)
-    result, flat = torch.empty(numbers.shape, dtype=numbers.dtype), numbers.reshape(-1)
-    ends = [*range(_PART, count - _PART, _PART), count]
-    for first, last in pairwise([0, *ends]):
-        result.view(-1)[first:last] = compute(flat[first:last])
+    result, flat_numbers = torch.empty(numbers.shape, dtype=numbers.dtype), numbers.reshape(-1)
+    # the last part takes the remainder, so that none is shorter than `_PART`
+    part_ends = [*range(_PART, element_count - _PART, _PART), element_count]
+    for start, end in pairwise([0, *part_ends]):
+        result.view(-1)[start:end] = compute(flat_numbers[start:end])
     return result
 
 
@@ -286,11 +307,11 @@ def dark_current(
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (dark current).
     """
 
-    total = dark_electrons(mean, exposure)
-    expected = total if mean_of == "sensor" else _sampled_mean(total, rng)
+    mean_electrons = dark_electrons(mean, exposure)
+    exposure_mean = mean_electrons if mean_of == "sensor" else _sampled_mean(mean_electrons, rng)
 
     def with_dark_current(piece: Tensor) -> Tensor:
-        rate = torch.full(piece.shape, expected, dtype=piece.dtype, device=rng.device)
+        rate = torch.full(piece.shape, exposure_mean, dtype=piece.dtype, device=rng.device)
         return piece + torch.poisson(rate, generator=rng).to(piece)
 
     return _by_parts(with_dark_current, single(electrons), rng)
@@ -326,8 +347,11 @@ def _(
 
 
 def _sampled_mean(mean: float, rng: Generator) -> float:
-    drawn = torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
-    return mean * max(0.0, min(_MOST, 1.0 + 0.5 * float(drawn)))
+    """Return the mean dark electrons of one exposure, drawn with a standard deviation of half the
+    mean and limited to 0 and `_MOST` times the mean.
+    """
+    normal_number = torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
+    return mean * max(0.0, min(_MOST, 1.0 + 0.5 * float(normal_number)))
 
 
 @dark_current.skip_bound
@@ -353,11 +377,13 @@ def _(
     mean_of: str = "sensor",
     **params: Any,
 ) -> float:
-    total = dark_electrons(mean, exposure)
-    largest_mean = total if mean_of == "sensor" else _MOST * total
-    usual = math.sqrt(largest_mean + largest_mean**2)
+    mean_electrons = dark_electrons(mean, exposure)
+    largest_mean = mean_electrons if mean_of == "sensor" else _MOST * mean_electrons
+    usual_rms = math.sqrt(largest_mean + largest_mean**2)
     return (
-        poisson_rms(largest_mean, max(1, math.prod(electrons.shape))) / usual if usual > 0 else 1.0
+        poisson_rms(largest_mean, max(1, math.prod(electrons.shape))) / usual_rms
+        if usual_rms > 0
+        else 1.0
     )
 
 
@@ -412,10 +438,13 @@ def _(electrons: TensorStats, *, offset: float, read_noise: float, **params: Any
     pixels, variance = max(1, math.prod(electrons.shape)), read_noise**2
     # half of the probability is for the mean of the noise, half for its square
     sure = SURE + math.log(2.0)
-    mean = abs(offset) * read_noise * math.sqrt(2.0 * sure / pixels)
-    square = chi_square_limit(pixels * variance, variance, sure) / pixels
-    usual = math.hypot(offset, read_noise)
-    return math.sqrt(offset**2 + 2.0 * mean + square) / usual if usual > 0 else 1.0
+    mean_term = abs(offset) * read_noise * math.sqrt(2.0 * sure / pixels)
+    square_limit = chi_square_limit(pixels * variance, variance, sure) / pixels
+    usual_rms = math.hypot(offset, read_noise)
+    # mean square of offset + noise, its limit over its usual root
+    return (
+        math.sqrt(offset**2 + 2.0 * mean_term + square_limit) / usual_rms if usual_rms > 0 else 1.0
+    )
 
 
 @dark_current.skip_scale
@@ -440,11 +469,11 @@ def _share(shift: float, spread: float, electrons: TensorStats, full_well: float
     are below 0. The well alone is not enough, because a dark frame is only noise. The bound is
     exact for one mean and spread everywhere.
     """
-    added = math.hypot(shift, spread)
-    if added == 0:
+    rms_added = math.hypot(shift, spread)
+    if rms_added == 0:
         return 0.0
-    largest = max(
+    largest_rms = max(
         math.hypot(electrons.max + shift, spread), math.hypot(electrons.min + shift, spread)
     )
-    weighed = largest if full_well is None else min(largest, full_well)
-    return added / weighed if weighed > 0 else math.inf
+    reference_signal = largest_rms if full_well is None else min(largest_rms, full_well)
+    return rms_added / reference_signal if reference_signal > 0 else math.inf

@@ -61,33 +61,43 @@ def photon_transfer(
             frames).
     """
 
-    expected = dark_electrons(dark, exposure)
+    dark_mean = dark_electrons(dark, exposure)
 
     def frame(photons: float) -> Tensor:
-        flat = torch.full((pixels,), photons, dtype=torch.float64, device=rng.device)
-        e = photon_noise(
-            flat, quantum_efficiency=quantum_efficiency, distribution=distribution, rng=rng
+        flat_field = torch.full((pixels,), photons, dtype=torch.float64, device=rng.device)
+        electrons = photon_noise(
+            flat_field, quantum_efficiency=quantum_efficiency, distribution=distribution, rng=rng
         )
-        e = read_of(
-            dark_current(e, mean=expected, rng=rng), offset=offset, read_noise=read_noise, rng=rng
+        electrons = read_of(
+            dark_current(electrons, mean=dark_mean, rng=rng),
+            offset=offset,
+            read_noise=read_noise,
+            rng=rng,
         )
-        e = well_of(e, capacity=full_well)
-        dn: Tensor = digitize(e, gain=gain, rounding=rounding, bits=bits, rng=rng)
-        return dn
+        electrons = well_of(electrons, capacity=full_well)
+        numbers: Tensor = digitize(electrons, gain=gain, rounding=rounding, bits=bits, rng=rng)
+        return numbers
 
-    light = _rise(full_well / quantum_efficiency, 1.0 / quantum_efficiency, levels)
-    measured = torch.tensor([_pair(frame(p), frame(p)) for p in light], dtype=torch.float64)
-    signal = measured[:, 0] - measured[0, 0]
-    floor = gain**2 * (read_noise**2 + expected) + (
+    photon_levels = _rise(full_well / quantum_efficiency, 1.0 / quantum_efficiency, levels)
+    pair_statistics = torch.tensor(
+        [_pair(frame(p), frame(p)) for p in photon_levels], dtype=torch.float64
+    )
+    signal = pair_statistics[:, 0] - pair_statistics[0, 0]
+    # DN2: read noise and dark current, and 1/12 of rounding or 1/6 of the dithered floor
+    dark_variance = gain**2 * (read_noise**2 + dark_mean) + (
         1.0 / 6.0 if rounding == "dithered_floor" else 1.0 / 12.0
     )
-    return torch.stack([signal, measured[:, 1], floor + gain * signal], 1)
+    # columns: signal, measured variance, predicted variance
+    return torch.stack([signal, pair_statistics[:, 1], dark_variance + gain * signal], 1)
 
 
 def _rise(top: float, first: float, levels: int) -> list[float]:
-    steps = max(levels - 2, 1)
+    """Return the photons of each level: 0, then geometric steps from ``first`` to 1.2 times
+    ``top``.
+    """
+    step_count = max(levels - 2, 1)
     ratio = 1.2 * top / first
-    return [0.0, *(first * ratio ** (i / steps) for i in range(levels - 1))]
+    return [0.0, *(first * ratio ** (i / step_count) for i in range(levels - 1))]
 
 
 def _pair(first: Tensor, second: Tensor) -> tuple[float, float]:
@@ -120,15 +130,15 @@ def _(
 
 @photon_transfer.check
 def _(result: Tensor, *, full_well: float, gain: float, **params: Any) -> list[Check]:
-    middle = (result[:, 0] > 0.02 * full_well * gain) & (result[:, 0] < 0.7 * full_well * gain)
-    if not bool(middle.any()):
+    in_range = (result[:, 0] > 0.02 * full_well * gain) & (result[:, 0] < 0.7 * full_well * gain)
+    if not bool(in_range.any()):
         return [
             Check(
                 "no flat field lies between 2 and 70 % of the full well, so the variance is not"
                 " checked"
             )
         ]
-    ratio = float((result[middle, 1] / result[middle, 2]).mean())
+    ratio = float((result[in_range, 1] / result[in_range, 2]).mean())
     return [
         Check(
             f"the measured variance is {ratio:.3f} times the predicted variance",

@@ -52,12 +52,16 @@ def line_saturation(
     Source: EMVA Standard 1288, release 4.0, of the channel whose quantum efficiency is the largest
             at the line.
     """
-    share = line.weights.double() / line.weights.double().sum()
-    by_channel = (responses.double() * (share * photons_per_joule(line.centres))).sum(
-        -1
-    ) * quantum_efficiency
-    largest = float(by_channel.amax())
-    return electrons / (largest * exposure * pixel_pitch**2) if largest > 0 else math.inf
+    band_shares = line.weights.double() / line.weights.double().sum()
+    electrons_per_joule = (
+        responses.double() * (band_shares * photons_per_joule(line.centres))
+    ).sum(-1) * quantum_efficiency
+    largest_response = float(electrons_per_joule.amax())
+    return (
+        electrons / (largest_response * exposure * pixel_pitch**2)
+        if largest_response > 0
+        else math.inf
+    )
 
 
 @node(rtol=1e-12)
@@ -78,8 +82,10 @@ def saturation(
             paper's rounded constants give 0.13 % more.
     Source: NeuSee, Eq. (ThresSat).
     """
-    joules = photons_that_fill(full_well, quantum_efficiency) / photons_per_joule(bands.centres)
-    return joules / (exposure * pixel_pitch**2)
+    joules_that_fill = photons_that_fill(full_well, quantum_efficiency) / photons_per_joule(
+        bands.centres
+    )
+    return joules_that_fill / (exposure * pixel_pitch**2)
 
 
 @saturation.check
@@ -118,6 +124,7 @@ def refuse_without_room(
     Source: EMVA Standard 1288, release 4.0: the saturation capacity counts from the dark value.
     """
     if offset + dark >= full_well:
+        # a list times False is empty
         parts = [f"the offset of {offset:.6g} e-"] * (offset > 0) + [
             f"the dark current of {dark:.6g} e-"
         ] * (dark > 0)
@@ -189,9 +196,13 @@ def limits(*, full_well: Well, quantum_efficiency: Efficiency, read_noise: Elect
             counts as 1 e-.
     Source: EMVA Standard 1288, release 4.0 (SNR_max = sqrt(saturation capacity)).
     """
-    decibels = 20.0 * math.log10(full_well / max(read_noise, 1.0))
-    values = (photons_that_fill(full_well, quantum_efficiency), math.sqrt(full_well), decibels)
-    return Limits(*(torch.tensor(v, dtype=torch.float64) for v in values))
+    range_decibels = 20.0 * math.log10(full_well / max(read_noise, 1.0))
+    limit_values = (
+        photons_that_fill(full_well, quantum_efficiency),
+        math.sqrt(full_well),
+        range_decibels,
+    )
+    return Limits(*(torch.tensor(v, dtype=torch.float64) for v in limit_values))
 
 
 @limits.preflight
