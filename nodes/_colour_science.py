@@ -15,8 +15,8 @@ __depends__ = ("unaffected:state",)  # how numbers are printed decides no result
 @functools.cache
 def colour_science() -> Any:
     """Return the module ``colour``."""
-    before = np.get_printoptions()
+    options_before = np.get_printoptions()
     import colour
 
-    np.set_printoptions(**before)
+    np.set_printoptions(**options_before)
     return colour

@@ -100,14 +100,25 @@ def _compile(code: Path, rounding: str, where: Path) -> None:
     compiler = _compiler()
     try:
         where.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=where.parent) as aside:
-            library = Path(aside) / where.name
-            words = compiler.split()
-            options = [word for word in words if word.startswith("-")]
-            command = [*words, *FLAGS, rounding, *options, str(code), "-o", str(library)]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-            if done.returncode:
-                raise NoCompilerError(f"{compiler} failed: {_first_error(done)}")
+        with tempfile.TemporaryDirectory(dir=where.parent) as temporary_folder:
+            library = Path(temporary_folder) / where.name
+            compiler_words = compiler.split()
+            own_options = [word for word in compiler_words if word.startswith("-")]
+            command = [
+                *compiler_words,
+                *FLAGS,
+                rounding,
+                *own_options,
+                str(code),
+                "-o",
+                str(library),
+            ]
+            process = subprocess.run(
+                command, capture_output=True, text=True, timeout=300, check=False
+            )
+            if process.returncode:
+                raise NoCompilerError(f"{compiler} failed: {_first_error(process)}")
+            # atomic, so that another process never reads half a library
             os.replace(library, where)
     except (OSError, subprocess.SubprocessError) as error:
         raise NoCompilerError(f"{compiler} could not be run: {error}") from error
@@ -162,5 +173,6 @@ def compiled(task: str, *sources: Path, rounding: str = FUSED) -> bool:
 
 @functools.cache
 def _say_once(task: str, why: str) -> None:
+    """Warn once that a C++ source is not compiled, so that torch is slower."""
     text = f"the C++ of the {task} is not compiled and torch computes the {task} more slowly: {why}"
     warnings.warn(text, stacklevel=5)

@@ -58,25 +58,26 @@ class TensorStats:
             return cls.of(value[0])
         if not isinstance(value, Tensor):
             return None
-        x = value.detach()
-        shape, dtype = tuple(x.shape), str(x.dtype).removeprefix("torch.")
-        if x.numel() == 0:
+        tensor = value.detach()
+        shape, dtype = tuple(tensor.shape), str(tensor.dtype).removeprefix("torch.")
+        if tensor.numel() == 0:
             return cls(shape, dtype, math.nan, math.nan, 0.0, 0, True)
-        x = x.abs() if x.is_complex() else x
-        few = x.reshape(-1).tolist() if x.numel() <= _FEW else []
-        if few and math.isfinite(total := float(sum(few))):
+        tensor = tensor.abs() if tensor.is_complex() else tensor
+        few_elements = tensor.reshape(-1).tolist() if tensor.numel() <= _FEW else []
+        # a sum in Python is exact enough, and an overflow goes the long way below
+        if few_elements and math.isfinite(total := float(sum(few_elements))):
             return cls(
                 shape,
                 dtype,
-                float(min(few)),
-                float(max(few)),
+                float(min(few_elements)),
+                float(max(few_elements)),
                 total,
-                sum(v != 0 for v in few),
+                sum(v != 0 for v in few_elements),
                 True,
             )
-        low, high, total, support = _measure(x.reshape(-1))
-        finite = all(map(math.isfinite, (low, high, total)))
-        return cls(shape, dtype, low, high, total, support, finite)
+        lowest, highest, total, support = _measure(tensor.reshape(-1))
+        finite = all(map(math.isfinite, (lowest, highest, total)))
+        return cls(shape, dtype, lowest, highest, total, support, finite)
 
     @property
     def largest_rms(self) -> float:
@@ -86,15 +87,18 @@ class TensorStats:
         The squares are largest where all elements but one are at an end of the range. Without a
         finite sum, every element may be at the farther end.
         """
-        low, high, count = self.min, self.max, math.prod(self.shape)
-        farthest = max(abs(low), abs(high))
-        if count == 0 or high <= low or not math.isfinite(self.sum):
-            return farthest
-        at_top = min(max((self.sum - count * low) / (high - low), 0.0), count)
-        between = low + (at_top - math.floor(at_top)) * (high - low)
-        at_bottom = max(count - math.floor(at_top) - 1, 0)
-        squares = math.floor(at_top) * high**2 + between**2 + at_bottom * low**2
-        return min(farthest, math.sqrt(squares / count) * (1 + _SUMMED))
+        lowest, highest, count = self.min, self.max, math.prod(self.shape)
+        largest_absolute = max(abs(lowest), abs(highest))
+        if count == 0 or highest <= lowest or not math.isfinite(self.sum):
+            return largest_absolute
+        # squares are largest with all elements but one at either end, for the given sum
+        count_at_top = min(max((self.sum - count * lowest) / (highest - lowest), 0.0), count)
+        middle_value = lowest + (count_at_top - math.floor(count_at_top)) * (highest - lowest)
+        count_at_bottom = max(count - math.floor(count_at_top) - 1, 0)
+        square_sum = (
+            math.floor(count_at_top) * highest**2 + middle_value**2 + count_at_bottom * lowest**2
+        )
+        return min(largest_absolute, math.sqrt(square_sum / count) * (1 + _SUMMED))
 
 
 def _measure(flat: Tensor) -> tuple[float, float, float, int]:
@@ -103,14 +107,17 @@ def _measure(flat: Tensor) -> tuple[float, float, float, int]:
     """
     import torch
 
-    small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
-    parts = [_measure_piece(piece, small) for piece in torch.split(flat, _PART)]
-    lows, highs, sums, counts = (torch.stack(values) for values in zip(*parts, strict=True))
-    low, high, total = (float(x) for x in (lows.min(), highs.max(), sums.sum()))
+    # truth values and half precision are measured in float32
+    is_small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
+    part_statistics = [_measure_piece(piece, is_small) for piece in torch.split(flat, _PART)]
+    minima, maxima, sums, counts = (
+        torch.stack(values) for values in zip(*part_statistics, strict=True)
+    )
+    lowest, highest, total = (float(x) for x in (minima.min(), maxima.max(), sums.sum()))
     # the sum of a row overflowed
-    if math.isinf(total) and math.isfinite(low) and math.isfinite(high):
+    if math.isinf(total) and math.isfinite(lowest) and math.isfinite(highest):
         total = float(sum(piece.sum(dtype=torch.float64) for piece in torch.split(flat, _PART)))
-    return low, high, total, int(counts.sum())
+    return lowest, highest, total, int(counts.sum())
 
 
 def _measure_piece(piece: Tensor, small: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -336,6 +343,18 @@ class Node:
         before_run: bool = False,
         depends: Sequence[str] = (),
     ) -> None:
+        """Describe a node by its function and by what an engine must know of it.
+
+        ``device`` is where it may run, and ``rtol`` the error that it may have, relative to its
+        reference. ``bands`` names the axis of the bands in inputs and in "return", for a node that
+        treats each band by itself. ``accepts_channel_sums`` names inputs that may be weighted sums
+        over the bands, if the inputs in ``needs_band_invariant`` are the same in every band;
+        ``accepts_low_rank`` names inputs that may be low-rank cubes. ``additive_inputs`` are groups
+        of inputs, the first of which is light that is only added: an entry that is 0 is left out,
+        with the entry of the same number in the rest of the group. A node ``before_run`` has no
+        inputs and is computed before the plan. ``depends`` are texts that name what the function
+        reads beside its arguments, such as "table.csv" or "env:X".
+        """
         functools.update_wrapper(self, fn)
         self.fn, self.device, self.rtol = fn, device, rtol
         self.accepts_channel_sums = tuple(accepts_channel_sums)
@@ -358,12 +377,20 @@ class Node:
 
     def _read_signature(self) -> None:
         """Read inputs, optional inputs, random numbers and parameters from the function."""
-        pars = inspect.signature(self.fn).parameters.values()
-        data = [p for p in pars if p.kind is p.POSITIONAL_OR_KEYWORD]
-        self.inputs = tuple(p.name for p in data)
-        self.optional = frozenset(p.name for p in data if p.default is not p.empty)
-        self.random = any(p.name == "rng" for p in pars)
-        self._keyword_only = [p for p in pars if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
+        arguments = inspect.signature(self.fn).parameters.values()
+        input_arguments = [
+            argument for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD
+        ]
+        self.inputs = tuple(argument.name for argument in input_arguments)
+        self.optional = frozenset(
+            argument.name for argument in input_arguments if argument.default is not argument.empty
+        )
+        self.random = any(argument.name == "rng" for argument in arguments)
+        self._keyword_only = [
+            argument
+            for argument in arguments
+            if argument.kind is argument.KEYWORD_ONLY and argument.name != "rng"
+        ]
 
     def _require_texts(self, depends: Sequence[str]) -> None:
         """Raise ValueError for declared dependencies that are no list of texts."""
@@ -410,16 +437,19 @@ class Node:
     @functools.cached_property
     def path(self) -> str:
         """Return the name of the node in a recipe, such as ``sensor.digitize``."""
-        parts = [
-            p
-            for p in self.fn.__module__.removeprefix("neusee.nodes.").split(".")
-            if not p.startswith("_")
+        public_names = [
+            name
+            for name in self.fn.__module__.removeprefix("neusee.nodes.").split(".")
+            if not name.startswith("_")
         ]
-        return ".".join([*parts, self.fn.__name__])
+        return ".".join([*public_names, self.fn.__name__])
 
     def _declared(self, bands: Mapping[str, int]) -> Mapping[str, int]:
-        unknown = sorted(bands.keys() - {*self.inputs, "return"})
-        if unknown or "return" not in bands or len(bands) < 2:
+        """Return the axes of the bands, unchangeable; raise ValueError unless they name inputs and
+        "return".
+        """
+        unknown_names = sorted(bands.keys() - {*self.inputs, "return"})
+        if unknown_names or "return" not in bands or len(bands) < 2:
             raise ValueError(
                 f"{self.path}: bands={dict(bands)} must name 'return' and at least one of"
                 f" {self.inputs}"
@@ -444,8 +474,11 @@ class Node:
         unknown parameters.
         """
         fields = {
-            p.name: (self.hints[p.name], ... if p.default is p.empty else p.default)
-            for p in self._keyword_only
+            argument.name: (
+                self.hints[argument.name],
+                ... if argument.default is argument.empty else argument.default,
+            )
+            for argument in self._keyword_only
         }
         model: type[BaseModel] = create_model(
             self.fn.__name__, __base__=ParameterModel, __module__=self.fn.__module__, **fields
@@ -482,6 +515,7 @@ class Node:
 
 @functools.lru_cache(1000)
 def _arguments(hook: Callable[..., Any]) -> tuple[str, ...]:
+    """Return the names of the arguments of a hook."""
     return tuple(inspect.signature(hook).parameters)
 
 
@@ -493,10 +527,14 @@ def registered_nodes() -> tuple[Node, ...]:
 
 
 def _variables(depends: Sequence[str]) -> list[str]:
+    """Return the names of the variables of the environment among declared dependencies."""
     return [entry.removeprefix("env:") for entry in depends if entry.startswith("env:")]
 
 
 def _imported(module: str, name: str, files: tuple[str, ...] = (), path: str = "") -> Node:
+    """Return a node of a module that is imported here, with the name ``path`` that a recipe gave to
+    it.
+    """
     import_missing(files, module)
     imported: Node = getattr(importlib.import_module(module), name)
     if path:

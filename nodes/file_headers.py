@@ -50,17 +50,17 @@ def npy_needs(
 
     Raises ParameterError for a file that is shorter than its header says.
     """
-    with opened(file, parameter) as raw:
+    with opened(file, parameter) as open_file:
         try:
-            shape, dtype = _npy_header(raw)
+            shape, dtype = _npy_header(open_file)
         except (ValueError, EOFError, SyntaxError, TypeError):
             return  # NumPy says what a damaged file lacks
-        after = os.fstat(raw.fileno()).st_size - raw.tell()
+        bytes_after = os.fstat(open_file.fileno()).st_size - open_file.tell()
     count = math.prod(map(int, shape))
-    if not dtype.hasobject and count * dtype.itemsize > after:
+    if not dtype.hasobject and count * dtype.itemsize > bytes_after:
         text = (
             f"its header states {in_bytes(count * dtype.itemsize)} of numbers, and"
-            f" {in_bytes(after)} follow"
+            f" {in_bytes(bytes_after)} follow"
         )
         raise ParameterError(
             parameter, f"{file} cannot be read: {text}: copy or save the file again"
@@ -69,17 +69,19 @@ def npy_needs(
 
 
 def _numbers(shape: tuple[int, ...], dtype: Any) -> str:
+    """Return shape and type of an array as a text for messages."""
     return f"{' x '.join(map(str, shape)) or 'one'} numbers of type {dtype}"
 
 
 def _npy_header(raw: Any) -> tuple[tuple[int, ...], "np.dtype[Any]"]:
+    """Return shape and type of the array in an open .npy file."""
     version = np.lib.format.read_magic(raw)
-    read = (
+    read_header = (
         np.lib.format.read_array_header_1_0
         if version == (1, 0)
         else np.lib.format.read_array_header_2_0
     )
-    shape, _, dtype = read(raw)
+    shape, _, dtype = read_header(raw)
     return shape, dtype
 
 
@@ -94,7 +96,7 @@ def npz_needs(
     Raises ParameterError for an array of more bytes than the archive states for it.
     """
     archive_needs(file, copies, parameter)
-    total, count = 0.0, 0
+    total, array_count = 0.0, 0
     for name, after, shape, dtype in _npz_headers(file, parameter):
         size = math.prod(map(int, shape))
         if not dtype.hasobject and size * dtype.itemsize > after:
@@ -102,8 +104,8 @@ def npz_needs(
             raise ParameterError(
                 parameter, f"{file} cannot be read: {text}: copy or save the file again"
             )
-        total, count = total + size * (copies * dtype.itemsize + beside), count + 1
-    needs(total, file, f"{count} arrays", parameter)
+        total, array_count = total + size * (copies * dtype.itemsize + beside), array_count + 1
+    needs(total, file, f"{array_count} arrays", parameter)
 
 
 def _npz_headers(
@@ -113,10 +115,14 @@ def _npz_headers(
     headers can be read.
     """
     headers = []
-    with opened(file, parameter) as raw, suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
+    with (
+        opened(file, parameter) as open_file,
+        suppress(*_BROKEN),
+        zipfile.ZipFile(open_file) as archive,
+    ):
         for entry in archive.infolist():
-            with archive.open(entry) as inner:
-                headers.append((entry.filename, entry.file_size, *_npy_header(inner)))
+            with archive.open(entry) as member:
+                headers.append((entry.filename, entry.file_size, *_npy_header(member)))
     return headers
 
 
@@ -128,12 +134,12 @@ def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> N
     counts as it is.
     """
     sizes = list[int]()
-    with opened(file, parameter) as raw:
-        packed = os.fstat(raw.fileno()).st_size
-        needs(copies * packed, file, f"a file of {in_bytes(packed)}", parameter)
-        with suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
+    with opened(file, parameter) as open_file:
+        file_size = os.fstat(open_file.fileno()).st_size
+        needs(copies * file_size, file, f"a file of {in_bytes(file_size)}", parameter)
+        with suppress(*_BROKEN), zipfile.ZipFile(open_file) as archive:
             sizes = [entry.file_size for entry in archive.infolist()]
-    content = f"{len(sizes)} files of {in_bytes(sum(sizes))} in {in_bytes(packed)}"
+    content = f"{len(sizes)} files of {in_bytes(sum(sizes))} in {in_bytes(file_size)}"
     needs(copies * sum(sizes), file, content, parameter)
 
 
@@ -145,20 +151,22 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
 
     Raises ParameterError for a file whose header states more bytes than the file has.
     """
-    with opened(file, parameter) as raw:
-        size, first = os.fstat(raw.fileno()).st_size, raw.read(8)
-        length = int.from_bytes(first, "little")
-        if len(first) < 8 or length > min(size - 8, _HEADER):
+    with opened(file, parameter) as open_file:
+        size, length_bytes = os.fstat(open_file.fileno()).st_size, open_file.read(8)
+        length = int.from_bytes(length_bytes, "little")
+        if len(length_bytes) < 8 or length > min(size - 8, _HEADER):
             text = f"{in_bytes(length)} of header, and the file has {in_bytes(size)}"
             raise _not_whole(file, text, parameter)
+        # 16 bytes in memory for each one of the header, when it is parsed
         needs(16.0 * length + copies * size, file, f"tensors of {in_bytes(size)}", parameter)
-        stated = _last_byte(raw.read(length))
-    if stated > size - 8 - length:
-        text = f"{in_bytes(stated)} of tensors, and {in_bytes(size - 8 - length)} follow"
+        end_of_tensors = _last_byte(open_file.read(length))
+    if end_of_tensors > size - 8 - length:
+        text = f"{in_bytes(end_of_tensors)} of tensors, and {in_bytes(size - 8 - length)} follow"
         raise _not_whole(file, text, parameter)
 
 
 def _not_whole(file: Path | str, why: str, parameter: str) -> ParameterError:
+    """Return the error of a .safetensors file whose header ``why`` says does not fit the file."""
     text = (
         f"{Path(file).name} is not a safetensors file and cannot be read: its header states {why}"
     )
@@ -176,6 +184,7 @@ def _last_byte(header: bytes) -> int:
 
 
 def _entries(header: Any) -> Iterator[Any]:
+    """Return what a header says of each tensor."""
     return (entry for name, entry in header.items() if name != "__metadata__")
 
 
@@ -191,17 +200,18 @@ def mat_needs(
     Compressed variables are decompressed in small parts to be counted, because a part of one can
     state more than the variable does.
     """
-    with opened(file, parameter) as raw:
-        size = os.fstat(raw.fileno()).st_size
-        total, largest, asked = 0.0, 0.0, float(SMALL)
-        for begins, size_of_part in _mat_sizes(raw, size):
-            total = total + size_of_part if together or not begins else size_of_part
+    with opened(file, parameter) as open_file:
+        size = os.fstat(open_file.fileno()).st_size
+        total, largest, asked_bytes = 0.0, 0.0, float(SMALL)
+        for begins_variable, size_of_part in _mat_sizes(open_file, size):
+            total = total + size_of_part if together or not begins_variable else size_of_part
             largest = max(largest, total)
-            if copies * largest > asked:
+            # ask again only where it grew by `SMALL`, because each question takes time
+            if copies * largest > asked_bytes:
                 needs(
                     copies * largest, file, f"variables of {in_bytes(largest)} or more", parameter
                 )
-                asked = copies * largest + SMALL
+                asked_bytes = copies * largest + SMALL
     needs(copies * largest, file, f"variables of {in_bytes(largest)}", parameter)
 
 
@@ -210,25 +220,31 @@ def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
 
     The first value is True where a variable begins.
     """
-    head = raw.read(128)
-    order = {b"IM": "<", b"MI": ">"}.get(head[126:128])
-    if order is None:
+    header = raw.read(128)
+    # the last two bytes of the header say the order of bytes
+    byte_order = {b"IM": "<", b"MI": ">"}.get(header[126:128])
+    if byte_order is None:
         yield True, size  # version 4 has no compression
         return
-    while len(tag := raw.read(8)) == 8:
-        kind, length = struct.unpack(f"{order}II", tag)
-        after = raw.tell() + length
+    while len(tag_bytes := raw.read(8)) == 8:
+        kind, length = struct.unpack(f"{byte_order}II", tag_bytes)
+        next_element = raw.tell() + length
         if kind == _MAT_COMPRESSED:
-            stored, stated = 0, 0
+            inflated_bytes, stated_bytes = 0, 0
             for piece in _inflated(raw, length):
-                stated = stated or _mat_stated(piece[8:], order)
-                before, stored = stored, stored + len(piece)
-                yield before == 0, max(stored, stated) - (max(before, stated) if before else 0)
+                stated_bytes = stated_bytes or _mat_stated(piece[8:], byte_order)
+                bytes_before, inflated_bytes = inflated_bytes, inflated_bytes + len(piece)
+                # what is stated at first, then what exceeds it
+                yield (
+                    bytes_before == 0,
+                    max(inflated_bytes, stated_bytes)
+                    - (max(bytes_before, stated_bytes) if bytes_before else 0),
+                )
         elif kind == _MAT_MATRIX:
-            yield True, max(min(length, size), _mat_stated(raw.read(min(length, 4096)), order))
+            yield True, max(min(length, size), _mat_stated(raw.read(min(length, 4096)), byte_order))
         else:
             return  # scipy says what is damaged
-        raw.seek(after)
+        raw.seek(next_element)
 
 
 def _mat_stated(piece: bytes, order: str) -> int:
@@ -237,26 +253,27 @@ def _mat_stated(piece: bytes, order: str) -> int:
     """
     if len(piece) < 24:
         return 0
+    # tag and flags of 16 bytes, then the tag of the dimensions
     flags, _, kind, length = struct.unpack(f"{order}8x4I", piece[:24])
-    bytes_each = _MAT_CLASSES.get(flags & 0xFF, 0) * (2 if flags & _MAT_COMPLEX else 1)
-    if kind != _MAT_INT32 or not bytes_each or length > len(piece) - 24:
+    bytes_per_value = _MAT_CLASSES.get(flags & 0xFF, 0) * (2 if flags & _MAT_COMPLEX else 1)
+    if kind != _MAT_INT32 or not bytes_per_value or length > len(piece) - 24:
         return 0
-    return bytes_each * math.prod(
+    return bytes_per_value * math.prod(
         int(n) for n in struct.unpack(f"{order}{length // 4}i", piece[24 : 24 + length // 4 * 4])
     )
 
 
 def _inflated(raw: BinaryIO, length: int) -> Iterator[bytes]:
     """Yield each part of a compressed variable of ``length`` bytes."""
-    stream, left, packed = zlib.decompressobj(), length, b""
+    decompressor, bytes_left, compressed = zlib.decompressobj(), length, b""
     with suppress(zlib.error):  # scipy says what is damaged
-        while not stream.eof:
-            packed = packed or raw.read(min(left, _CHUNK))
-            if not packed:
+        while not decompressor.eof:
+            compressed = compressed or raw.read(min(bytes_left, _CHUNK))
+            if not compressed:
                 return
-            left -= 0 if stream.unconsumed_tail else len(packed)
-            yield stream.decompress(packed, _CHUNK)
-            packed = stream.unconsumed_tail
+            bytes_left -= 0 if decompressor.unconsumed_tail else len(compressed)
+            yield decompressor.decompress(compressed, _CHUNK)
+            compressed = decompressor.unconsumed_tail
 
 
 # --- FITS and HDF5, whose libraries read headers alone --------------------------------------------
@@ -268,9 +285,10 @@ def fits_needs(
     """Ask for the memory of an image of a FITS file: its numbers, scaled to float64, and the
     copy of the caller.
     """
-    count = math.prod(map(int, shape))
+    number_count = math.prod(map(int, shape))
     needs(
-        count * (abs(bits) / 8 + 16),
+        # 8 bytes for the scaled float64 and 8 for the copy
+        number_count * (abs(bits) / 8 + 16),
         file,
         f"{' x '.join(map(str, shape))} numbers of {abs(bits)} bits",
         parameter,
@@ -281,9 +299,10 @@ def refuse_packed(file: Path | str, parameter: str = "file") -> None:
     """Raise ParameterError for a file that is compressed as a whole, which a library would
     unpack without a limit.
     """
-    with opened(file, parameter) as raw:
-        head = raw.read(6)
-    if head.startswith((b"\x1f\x8b", b"BZh", b"PK\x03\x04", b"\xfd7zXZ", b"\x1f\x9d")):
+    with opened(file, parameter) as open_file:
+        magic_bytes = open_file.read(6)
+    # gzip, bzip2, zip, xz and compress
+    if magic_bytes.startswith((b"\x1f\x8b", b"BZh", b"PK\x03\x04", b"\xfd7zXZ", b"\x1f\x9d")):
         raise ParameterError(
             parameter, f"{file} is compressed as a whole: unpack it, such as by gunzip"
         )
@@ -342,10 +361,10 @@ def pages_need(
     if image.format == "TIFF":
         tiff_needs(file, copies, beside, parameter)
         return
-    pages, size = int(getattr(image, "n_frames", 1)), image.width * image.height
+    pages, pixels_a_page = int(getattr(image, "n_frames", 1)), image.width * image.height
     bytes_a_pixel = copies * _IN_MEMORY.get(image.mode, 4) + beside
     needs(
-        pages * size * bytes_a_pixel,
+        pages * pixels_a_page * bytes_a_pixel,
         file,
         f"{pages} pages of {image.width} x {image.height} pixels",
         parameter,
@@ -377,8 +396,8 @@ def tiff_needs(
     """
     count, total, page = 0, 0.0, Page(0, 0, 8, 1, 0)
     # the reader says what a damaged file lacks
-    with opened(file, parameter) as raw, suppress(struct.error):
-        for page in tiff_pages(raw):
+    with opened(file, parameter) as open_file, suppress(struct.error):
+        for page in tiff_pages(open_file):
             count += 1
             total += copies * page.bytes + beside * page.width * page.height
             if first:
@@ -395,35 +414,40 @@ def tiff_pages(raw: BinaryIO) -> Iterator[Page]:
     """Yield the size of each page of an open TIFF file, in its order; end where a page was there
     before.
     """
-    head = raw.read(16)
-    order = {b"II": "<", b"MM": ">"}.get(head[:2])
-    if order is None:
+    header = raw.read(16)
+    byte_order = {b"II": "<", b"MM": ">"}.get(header[:2])
+    if byte_order is None:
         return
-    big = struct.unpack(f"{order}H", head[2:4])[0] == 43
-    (place,) = (
-        struct.unpack(f"{order}Q", head[8:16]) if big else struct.unpack(f"{order}I", head[4:8])
+    # the version is 42, or 43 for files with addresses of 64 bits
+    is_big_tiff = struct.unpack(f"{byte_order}H", header[2:4])[0] == 43
+    (directory_start,) = (
+        struct.unpack(f"{byte_order}Q", header[8:16])
+        if is_big_tiff
+        else struct.unpack(f"{byte_order}I", header[4:8])
     )
-    visited, end = set[int](), os.fstat(raw.fileno()).st_size
-    while 0 < place < end and place not in visited:
-        visited.add(place)
-        page, place = _tiff_page(raw, place, order, big)
+    visited_directories, file_size = set[int](), os.fstat(raw.fileno()).st_size
+    while 0 < directory_start < file_size and directory_start not in visited_directories:
+        visited_directories.add(directory_start)
+        page, directory_start = _tiff_page(raw, directory_start, byte_order, is_big_tiff)
         yield page
 
 
 def _tiff_page(raw: BinaryIO, place: int, order: str, big: bool) -> tuple[Page, int]:
     """Return the page whose directory begins at ``place``, and the place of the next directory."""
-    counting, entry, address = ("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")
+    count_format, entry_format, address_format = ("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")
     raw.seek(place)
-    (count,) = struct.unpack(f"{order}{counting}", raw.read(8 if big else 2))
-    form = struct.Struct(f"{order}{entry}")
+    (count,) = struct.unpack(f"{order}{count_format}", raw.read(8 if big else 2))
+    entry_struct = struct.Struct(f"{order}{entry_format}")
     values: dict[int, int] = {}
     for _ in range(min(count, 65536)):
-        tag, kind, length, value = form.unpack(raw.read(form.size))
-        if tag in _TIFF_TAGS and kind in _TIFF_SIZES:
-            values[tag] = _tiff_number(raw, order, _TIFF_SIZES[kind], length, value)
-    after = raw.read(8 if big else 4)
-    (following,) = (
-        struct.unpack(f"{order}{address}", after) if len(after) == (8 if big else 4) else (0,)
+        tag, value_type, length, value = entry_struct.unpack(raw.read(entry_struct.size))
+        if tag in _TIFF_TAGS and value_type in _TIFF_SIZES:
+            values[tag] = _tiff_number(raw, order, _TIFF_SIZES[value_type], length, value)
+    address_bytes = raw.read(8 if big else 4)
+    (next_directory,) = (
+        struct.unpack(f"{order}{address_format}", address_bytes)
+        if len(address_bytes) == (8 if big else 4)
+        else (0,)
     )
     page = Page(
         values.get(_WIDTH, 0),
@@ -432,18 +456,18 @@ def _tiff_page(raw: BinaryIO, place: int, order: str, big: bool) -> tuple[Page, 
         values.get(_SAMPLES, 1),
         values.get(_TILE_WIDTH, 0) * values.get(_TILE_LENGTH, 0),
     )
-    return page, following
+    return page, next_directory
 
 
 def _tiff_number(raw: BinaryIO, order: str, kind: str, length: int, value: bytes) -> int:
     """Return the first number of a tag, which stands in the entry or where the entry says."""
-    size = struct.calcsize(f"{order}{kind}")
-    if size * length > len(value):
-        back = raw.tell()
+    value_size = struct.calcsize(f"{order}{kind}")
+    if value_size * length > len(value):
+        position = raw.tell()
         raw.seek(int.from_bytes(value, "little" if order == "<" else "big"))
-        value = raw.read(size)
-        raw.seek(back)
-    return int(struct.unpack(f"{order}{kind}", value[:size])[0])
+        value = raw.read(value_size)
+        raw.seek(position)
+    return int(struct.unpack(f"{order}{kind}", value[:value_size])[0])
 
 
 # --- OpenEXR --------------------------------------------------------------------------------------
@@ -469,36 +493,40 @@ def exr_needs(file: Path | str, beside: float = 8.0, parameter: str = "file") ->
     ``beside`` are the bytes for each value of the largest part that the caller makes of them. A
     part with deep samples is refused, because its header does not say how many there are.
     """
-    with opened(file, parameter) as raw:
+    with opened(file, parameter) as open_file:
         try:
-            parts = list(exr_part_sizes(raw))
+            part_sizes = list(exr_part_sizes(open_file))
         except (struct.error, ValueError):
             return  # the library says what a damaged file lacks
-    if any(exr_part.deep for exr_part in parts):
+    if any(exr_part.deep for exr_part in part_sizes):
         raise ParameterError(
             parameter, f"{file} has deep samples, several a pixel: flatten the picture"
         )
     values = max(
-        (exr_part.width * exr_part.height * len(exr_part.channels) for exr_part in parts), default=0
+        (exr_part.width * exr_part.height * len(exr_part.channels) for exr_part in part_sizes),
+        default=0,
     )
-    largest = max(parts, key=lambda exr_part: exr_part.bytes, default=ExrPart(0, 0, {}, False))
+    largest = max(part_sizes, key=lambda exr_part: exr_part.bytes, default=ExrPart(0, 0, {}, False))
     content = f"{largest.width} x {largest.height} pixels in {len(largest.channels)} channels"
-    content += f", and {len(parts) - 1} other parts" if len(parts) > 1 else ""
-    needs(sum(exr_part.bytes for exr_part in parts) + beside * values, file, content, parameter)
+    content += f", and {len(part_sizes) - 1} other parts" if len(part_sizes) > 1 else ""
+    needs(
+        sum(exr_part.bytes for exr_part in part_sizes) + beside * values, file, content, parameter
+    )
 
 
 def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
     """Yield the size of each part of an open OpenEXR file, from its headers; nothing for another
     file.
     """
-    magic, version = struct.unpack("<iI", raw.read(8))
-    if magic != 20000630:
+    magic_number, version = struct.unpack("<iI", raw.read(8))
+    if magic_number != 20000630:
         return
-    end = os.fstat(raw.fileno()).st_size
+    file_size = os.fstat(raw.fileno()).st_size
     while True:
-        attributes = _exr_attributes(raw, end)
+        attributes = _exr_attributes(raw, file_size)
         if not attributes:
             return
+        # the window of a part holds both of its ends
         left, top, right, bottom = struct.unpack("<4i", attributes.get("dataWindow", b""))
         channels = dict(_exr_channels(attributes.get("channels", b"")))
         deep = bool(version & _DEEP) or attributes.get("type", b"").startswith(b"deep")
@@ -533,9 +561,11 @@ def _exr_text(raw: BinaryIO) -> str:
 
 
 def _exr_channels(data: bytes) -> Iterator[tuple[str, int]]:
-    place = 0
-    while place < len(data) and data[place]:
-        end = data.index(b"\0", place)
-        (kind,) = struct.unpack_from("<i", data, end + 1)
-        yield data[place:end].decode("latin-1"), _EXR_SIZES.get(kind, 4)
-        place = end + 17
+    """Yield the name of each channel in an attribute, and the bytes of a pixel of it."""
+    position = 0
+    while position < len(data) and data[position]:
+        name_end = data.index(b"\0", position)
+        (number_type,) = struct.unpack_from("<i", data, name_end + 1)
+        yield data[position:name_end].decode("latin-1"), _EXR_SIZES.get(number_type, 4)
+        # the end of the name, then type, pLinear and samplings: 1 + 4 + 4 + 4 + 4 bytes
+        position = name_end + 17

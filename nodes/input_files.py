@@ -59,14 +59,16 @@ def needs(count: float, file: Path | str, content: str, parameter: str = "file")
     """
     if count <= SMALL:
         return
-    room = _measures[-1]()
-    if count <= room.free:
+    memory_left = _measures[-1]()
+    if count <= memory_left.free:
         return
-    free = max(room.free, 0.0)
-    if room.limit is None:
+    free = max(memory_left.free, 0.0)
+    if memory_left.limit is None:
         room_text, remedy = f"the {in_bytes(free)} that are free", "free memory"
     else:
-        room_text = f"the {in_bytes(free)} that are left of the limit of {in_bytes(room.limit)}"
+        room_text = (
+            f"the {in_bytes(free)} that are left of the limit of {in_bytes(memory_left.limit)}"
+        )
         remedy = "raise the limit by --memory"
     text = (
         f"{file} would need {in_bytes(count)} of memory to read ({content}), more than {room_text}"
@@ -99,12 +101,14 @@ def free_memory() -> Room:
             float(
                 limit
                 - int((_GROUP / "memory.current").read_text())
+                # cached files, which the system gives back when memory is short
                 + int(statistics["inactive_file"])
             )
         )
     addresses = resource.getrlimit(resource.RLIMIT_AS)[0]
     if addresses != resource.RLIM_INFINITY:
         with suppress(OSError, ValueError):
+            # pages of the address space in use
             pages = int(Path("/proc/self/statm").read_text().split()[0])
             rooms.append(float(addresses - pages * resource.getpagesize()))
     return Room(min(rooms))
@@ -145,6 +149,7 @@ def refuse_other_than_file(file: Path | str, parameter: str = "file") -> None:
 
 
 def _refuse(file: Path | str, mode: int, parameter: str) -> None:
+    """Raise ParameterError for the mode of a file that is no regular file."""
     if kind := kind_of(mode):
         raise ParameterError(
             parameter, f"{file} is not a regular file but {kind}: give the path of a file"
@@ -156,13 +161,13 @@ def opened(file: Path | str, parameter: str = "file") -> BufferedReader:
     for anything else.
     """
     refuse_other_than_file(file, parameter)  # some devices do something when they are opened
-    number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _refuse(file, os.fstat(number).st_mode, parameter)
+        _refuse(file, os.fstat(descriptor).st_mode, parameter)
     except BaseException:
-        os.close(number)
+        os.close(descriptor)
         raise
-    return os.fdopen(number, "rb")
+    return os.fdopen(descriptor, "rb")
 
 
 def head_of(file: Path | str, count: int) -> bytes:
@@ -275,11 +280,12 @@ def file_version(file: Path) -> tuple[int, ...] | None:
     entry, which no program can set. A second change within a tick of the clock leaves them as they
     are, so that a file younger than two seconds has no version yet.
     """
-    about = file.stat()
-    changed = max(about.st_mtime_ns, about.st_ctime_ns)
+    status = file.stat()
+    changed = max(status.st_mtime_ns, status.st_ctime_ns)
+    # a second change within the resolution of the clock could leave the same times
     if time.time_ns() - changed < _SETTLED:
         return None
-    return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
@@ -321,17 +327,18 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
     Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more
     rows than the limit.
     """
+    # an empty line in place of a comment keeps the numbers of the lines
     reader = csv.reader("" if line.startswith("#") else line for line in lines_of(file, _CELLS))
-    first = True
+    is_first = True
     try:
         for count, row in enumerate(reader):
             if count > ROWS:
                 raise ValueError(f"{file.name} has more than {ROWS} rows: give a shorter table")
             if not row:
                 continue
-            if first:
+            if is_first:
                 _refuse_separator(file, row)
-            first = False
+            is_first = False
             yield reader.line_num, row
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(
@@ -340,6 +347,7 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _refuse_separator(file: Path, header: list[str]) -> None:
+    """Raise ValueError for a header whose columns another mark than a comma separates."""
     separator = next(
         (name for mark, name in _SEPARATORS.items() if len(header) == 1 and mark in header[0]), None
     )

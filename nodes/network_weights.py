@@ -64,13 +64,13 @@ def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any])
     try:
         with safe_open(weights, framework="pt") as tensors:
             stored = {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
-            trained = (tensors.metadata() or {}).get(OPTIONS)
+            stored_options = (tensors.metadata() or {}).get(OPTIONS)
     except SafetensorError as error:
         raise ParameterError(
             "weights", f"{weights.name} is not a safetensors file: {error}"
         ) from error
-    if trained is not None:
-        _same_options(_options(trained, weights), options, weights)
+    if stored_options is not None:
+        _same_options(_options(stored_options, weights), options, weights)
     for name in sorted(shapes | stored):
         if shapes.get(name) != stored.get(name):
             text = f"{weights.name}: {name} is {stored.get(name)}, {called} has {shapes.get(name)}"
@@ -106,6 +106,7 @@ def wrong_weights(weights: Path, name: str, tensor: Tensor) -> str:
 
 
 def _options(text: str, weights: Path) -> Mapping[str, Any]:
+    """Return the options in the metadata of a file; raise ParameterError for text that is none."""
     try:
         options = json.loads(text)
     except ValueError:
@@ -135,4 +136,5 @@ def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weight
 
 
 def _word(value: object) -> str:
+    """Return an option as a recipe writes it."""
     return value if isinstance(value, str) else json.dumps(value, sort_keys=True)

@@ -57,14 +57,14 @@ def import_file(
     if folder not in sys.path:
         sys.path.append(folder)
     importlib.invalidate_caches()
-    before = set(sys.modules)
+    modules_before = set(sys.modules)
     try:
         module = load(name)
     except BaseException:
-        _forget_modules(name, before)
+        _forget_modules(name, modules_before)
         raise
-    for helper, beside in _helpers(file, path.parent):
-        _refuse_taken(helper, beside)
+    for helper, helper_file in _helpers(file, path.parent):
+        _refuse_taken(helper, helper_file)
     _files[name] = path.absolute()
     return module
 
@@ -111,6 +111,7 @@ def import_missing(files: tuple[str, ...], needed: str) -> None:
 
 
 def _import_if_missing(file: str) -> None:
+    """Import a file, or a module given by its name, unless this process has imported it."""
     if not os.path.isabs(file):
         importlib.import_module(file)
         note_module(file)
@@ -127,12 +128,15 @@ def _top_name(file: str) -> str:
 
 def _refuse_taken(name: str, file: Path) -> None:
     """Raise `ImportError` if ``import name`` does not mean ``file``."""
-    loaded = sys.modules.get(name)
-    taken = getattr(loaded, "__file__", None) if loaded is not None else _found(name)
-    if loaded is not None and taken is None:
+    loaded_module = sys.modules.get(name)
+    file_of_name = (
+        getattr(loaded_module, "__file__", None) if loaded_module is not None else _found(name)
+    )
+    # a module of Python itself has no file
+    if loaded_module is not None and file_of_name is None:
         raise ImportError(f"the name {name} is that of a module of Python: rename {file}")
-    if taken is not None and Path(taken).resolve() != file.resolve():
-        raise ImportError(f"the name {name} is that of {taken}: rename {file}")
+    if file_of_name is not None and Path(file_of_name).resolve() != file.resolve():
+        raise ImportError(f"the name {name} is that of {file_of_name}: rename {file}")
 
 
 def _found(name: str) -> str | None:
@@ -148,19 +152,23 @@ def _found(name: str) -> str | None:
 
 def _helpers(file: Path, folder: Path) -> Iterator[tuple[str, Path]]:
     """Yield name and file of each module beside ``file`` that ``file`` imports."""
-    for top in _imported_tops(file):
-        for beside in (folder / f"{top}.py", folder / top / "__init__.py"):
-            if beside.is_file():
-                yield top, beside
+    for top_name in _imported_tops(file):
+        for candidate in (folder / f"{top_name}.py", folder / top_name / "__init__.py"):
+            if candidate.is_file():
+                yield top_name, candidate
                 break
 
 
 def _imported_tops(file: Path) -> Iterator[str]:
     """Yield the first part of the name of each module that a file imports."""
-    for item in ast.walk(ast.parse(file.read_bytes())):
-        names = [alias.name for alias in item.names] if isinstance(item, ast.Import) else []
-        if isinstance(item, ast.ImportFrom) and item.module and not item.level:
-            names = [item.module]
+    for syntax_node in ast.walk(ast.parse(file.read_bytes())):
+        names = (
+            [alias.name for alias in syntax_node.names]
+            if isinstance(syntax_node, ast.Import)
+            else []
+        )
+        if isinstance(syntax_node, ast.ImportFrom) and syntax_node.module and not syntax_node.level:
+            names = [syntax_node.module]
         yield from {name.partition(".")[0] for name in names}
 
 
@@ -204,24 +212,25 @@ class Architecture:
 
         Raises ValueError for an argument that the class does not take, or that is missing.
         """
-        written = dict(parameters or {})
-        takes = inspect.signature(self.network).parameters.values()
-        named = {
+        arguments_given = dict(parameters or {})
+        class_parameters = inspect.signature(self.network).parameters.values()
+        named_parameters = {
             argument.name: argument
-            for argument in takes
+            for argument in class_parameters
             if argument.kind not in (argument.VAR_KEYWORD, argument.VAR_POSITIONAL)
         }
-        if not any(argument.kind is argument.VAR_KEYWORD for argument in takes):
-            self._refuse_unknown(written, named)
-        defaults = {name: argument.default for name, argument in named.items()}
+        if not any(argument.kind is argument.VAR_KEYWORD for argument in class_parameters):
+            self._refuse_unknown(arguments_given, named_parameters)
+        defaults = {name: argument.default for name, argument in named_parameters.items()}
         for name, default in defaults.items():
-            if name not in written and default is inspect.Parameter.empty:
+            if name not in arguments_given and default is inspect.Parameter.empty:
                 raise ValueError(
                     f"{self} needs the argument {name}: write parameters: {{{name}: VALUE}}"
                 )
-        return defaults | written
+        return defaults | arguments_given
 
     def _refuse_unknown(self, written: Collection[str], named: Collection[str]) -> None:
+        """Raise ValueError for an argument that the class does not take."""
         for name in written:
             if name not in named:
                 raise ValueError(f"{self} takes no argument {name}; {_nearest(str(name), named)}")
@@ -284,6 +293,7 @@ def network_classes(module: ModuleType) -> dict[str, type[nn.Module]]:
 
 
 def _is_network_of(module: ModuleType, value: object) -> bool:
+    """Return True for a concrete class of networks that a module, or one inside it, defines."""
     from torch import nn
 
     if not isinstance(value, type) or not issubclass(value, nn.Module):
@@ -301,8 +311,9 @@ def _nearest(name: str, candidates: Any) -> str:
 
 
 def _imported(name: str, module: str, qualname: str, files: tuple[str, ...]) -> Architecture:
+    """Return the network class of a module that is imported here, by its qualified name."""
     import_missing(files, module)
-    value: Any = importlib.import_module(module)
+    attribute_value: Any = importlib.import_module(module)
     for attribute in qualname.split("."):
-        value = getattr(value, attribute)
-    return Architecture(name, value)
+        attribute_value = getattr(attribute_value, attribute)
+    return Architecture(name, attribute_value)

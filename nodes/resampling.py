@@ -26,6 +26,10 @@ def mirrored(x: Tensor, down: int, right: int) -> Tensor:
 
 
 def _indices(size: int, padded: int, device: torch.device) -> Tensor:
+    """Return the index of the sample that each of ``padded`` places shows, mirrored at both
+    ends.
+    """
+    # forth and back, without the ends a second time
     period = max(2 * size - 2, 1)
     index = torch.arange(padded, device=device) % period
     return torch.minimum(index, period - index).clamp_max(size - 1)
@@ -83,7 +87,11 @@ def _keys(size: int, new: int) -> Tensor:
     with torch.inference_mode(False):  # a later caller of the cached matrix may need gradients
         scale = size / new
         centres = (torch.arange(new, dtype=torch.float64)[:, None] + 0.5) * scale
-        x = (torch.arange(size, dtype=torch.float64) + 0.5 - centres).abs() / max(scale, 1.0)
-        near, far = (1.5 * x - 2.5) * x * x + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
-        weights = near.where(x < 1, far.where(x < 2, 0.0))
+        distance = (torch.arange(size, dtype=torch.float64) + 0.5 - centres).abs() / max(scale, 1.0)
+        # Keys' kernel with a = -1/2, for distances below 1 and below 2
+        inner_kernel, outer_kernel = (
+            (1.5 * distance - 2.5) * distance * distance + 1,
+            ((-0.5 * distance + 2.5) * distance - 4) * distance + 2,
+        )
+        weights = inner_kernel.where(distance < 1, outer_kernel.where(distance < 2, 0.0))
         return weights / weights.sum(1, keepdim=True)

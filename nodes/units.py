@@ -87,6 +87,7 @@ def _with_unit(number: str, si: str) -> str:
 
 
 def _in_si(number: float, si: str, unit: str) -> float:
+    """Return a number of a unit in the SI unit ``si``; a reciprocal unit inverts it."""
     if unit not in _RECIPROCAL:
         return number * _SCALE[si][unit]
     if number == 0:
@@ -134,6 +135,7 @@ class QuantityReader:
 
 
 def _reader(si: str) -> BeforeValidator:
+    """Return the validator that reads a quantity in the SI unit ``si``."""
     return BeforeValidator(QuantityReader(si), json_schema_input_type=str)
 
 
@@ -148,8 +150,8 @@ def in_words(number: float, si: str) -> str:
     }
     if si == "rad" and abs(number) > 0.1:
         return f"{math.degrees(number):.6g} deg"
-    fitting = [unit for unit, scale in units.items() if 1 <= abs(number) / scale < 1000]
-    unit = next(iter(fitting), si)
+    fitting_units = [unit for unit, scale in units.items() if 1 <= abs(number) / scale < 1000]
+    unit = next(iter(fitting_units), si)
     return f"{number / units.get(unit, 1.0):.6g} {unit}".strip()
 
 
@@ -163,14 +165,15 @@ class ElectronsPerSecond(NamedTuple):
 
 
 def _read_dark_current(value: Any) -> float | ElectronsPerSecond:
-    number, unit = str(value).strip(), "e-/s"
-    by_time = not isinstance(value, bool) and number.endswith(tuple(_SCALE[unit]))
-    current = read_quantity(value, unit) if by_time else read_quantity(value, "e-")
+    """Return a dark current in e- of one exposure, or in e-/s if the text has such a unit."""
+    quantity_text, unit = str(value).strip(), "e-/s"
+    is_by_time = not isinstance(value, bool) and quantity_text.endswith(tuple(_SCALE[unit]))
+    current = read_quantity(value, unit) if is_by_time else read_quantity(value, "e-")
     if current < 0:
         raise ValueError("the dark current must be 0 or more")
     if current > _MOST_DARK:
         raise ValueError(f"the dark current must be at most {_MOST_DARK:.0e} e-")
-    return ElectronsPerSecond(current) if by_time else current
+    return ElectronsPerSecond(current) if is_by_time else current
 
 
 #: electrons of one exposure, or electrons per second
@@ -271,6 +274,7 @@ def number_ranges(hint: Any) -> Iterator[NumberRange]:
 
 
 def _ranges(hint: Any, metadata: tuple[Any, ...]) -> Iterator[NumberRange]:
+    """Yield the range of each number in a type, with the constraints that apply to it."""
     if get_origin(hint) is Annotated:
         yield from _ranges(get_args(hint)[0], (*metadata, *_constraints(hint)))
     elif hint in (int, float):
@@ -300,6 +304,7 @@ def _constraints(hint: Any) -> Iterator[Any]:
 
 
 def _unit_of(metadata: tuple[Any, ...]) -> str:
+    """Return the SI unit that a reader among constraints gives, or an empty text."""
     readers = [
         constraint.func for constraint in metadata if isinstance(constraint, BeforeValidator)
     ]
@@ -313,6 +318,7 @@ class IsFile:
 
 
 def _existing(path: Path) -> Path:
+    """Return the path of a regular file; raise ValueError for anything else."""
     try:
         is_folder = path.is_dir()
     except OSError as error:  # such as a path that is too long
@@ -320,8 +326,10 @@ def _existing(path: Path) -> Path:
     if is_folder:
         raise ValueError(f"{path} is a folder, not a file: give a file in this folder")
     if not path.is_file():
-        other = "is not a regular file but a pipe, a device or a socket: give the path of a file"
-        raise ValueError(f"{path} {other}" if path.exists() else f"no such file: {path}")
+        kind_text = (
+            "is not a regular file but a pipe, a device or a socket: give the path of a file"
+        )
+        raise ValueError(f"{path} {kind_text}" if path.exists() else f"no such file: {path}")
     return path
 
 
@@ -341,8 +349,8 @@ def files_of(written: Any) -> list[Path]:
             return [path]
     except OSError as error:
         raise ValueError(f"{str(path)[:40]}… cannot be read: {error.strerror}") from None
-    inside = path.iterdir() if path.is_dir() else map(Path, glob(str(written)))
-    files = sorted(file for file in inside if _is_visible_file(file))
+    candidates = path.iterdir() if path.is_dir() else map(Path, glob(str(written)))
+    files = sorted(file for file in candidates if _is_visible_file(file))
     if not files:
         raise ValueError(f"no such file, and no folder or pattern that matches a file: {path}")
     return files

@@ -349,8 +349,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/metrics/_suppression_ratios.py",
-        "1.0 - inside / through.where(~dark, 1.0)",
-        "1.0 - inside",
+        "1.0 - light_in_window / passed_share.where(~is_dark, 1.0)",
+        "1.0 - light_in_window",
         within(
             "nodes/metrics",
             "background_share.py::test_the_light_outside_is_what_passes_and_misses_the_window",
@@ -449,8 +449,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/input_files.py",
-        "return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns",
-        "return about.st_dev, about.st_size, about.st_mtime_ns",
+        "return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns",
+        "return status.st_dev, status.st_size, status.st_mtime_ns",
         within("nodes/scene", "changed_photographs.py"),
     ),
     Mutant(
@@ -600,8 +600,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/doe/_fabrication.py",
-        "(waves + rounded_up + 0.5 / levels)",
-        "(waves + rounded_up)",
+        "(waves + is_rounded_up + 0.5 / levels)",
+        "(waves + is_rounded_up)",
         within(
             "nodes", "bounds.py::test_what_is_left_out_changes_no_more_than_stated[fabricate-30]"
         ),
@@ -699,13 +699,19 @@ MUTANTS = (
         "nodes/doe/_shade.py",
         within("nodes", "propagated_errors.py"),
         ("ratio.rms * math.sqrt(math.prod(ratio.stats.shape))", "ratio.rms"),
-        ("light.rms * (passed + off)", "light.rms * off"),
+        (
+            "light.rms * (filter_transmittance + largest_ratio_error)",
+            "light.rms * largest_ratio_error",
+        ),
     ),
     *faults(
         "nodes/_node.py",
         within("nodes", "propagated_errors.py"),
-        ("math.floor(at_top) * high**2 + between**2 +", "math.floor(at_top) * high**2 +"),
-        ("at_bottom * low**2", "at_bottom * low"),
+        (
+            "math.floor(count_at_top) * highest**2 + middle_value**2 +",
+            "math.floor(count_at_top) * highest**2 +",
+        ),
+        ("count_at_bottom * lowest**2", "count_at_bottom * lowest"),
     ),
     *faults(
         "nodes/sensor/_noise.py",
@@ -772,8 +778,11 @@ MUTANTS = (
         within("nodes/metrics", "psf_contrast.py"),
         ("_DARK = 1e-30 ", "_DARK = 1e-29 "),
         ("clamp_max(1.0)", "clamp_max(2.0)"),
-        ("ordered[(len(ordered) - 1) // 2]", "ordered[len(ordered) // 2]"),
-        ("ordered[(len(ordered) - 1) // 100]", "ordered[0]"),
+        (
+            "sorted_contrast[(len(sorted_contrast) - 1) // 2]",
+            "sorted_contrast[len(sorted_contrast) // 2]",
+        ),
+        ("sorted_contrast[(len(sorted_contrast) - 1) // 100]", "sorted_contrast[0]"),
         ("[None, : x // 2 + 1]) <= ", "[None, : x // 2 + 1]) < "),
         ("x[None, :]) <= radius", "x[None, :]) < radius"),
         (".ceil().long()", ".floor().long()"),
@@ -1277,13 +1286,13 @@ MUTANTS = (
             "nodes/optics",
             "psf_limits.py::test_a_window_ends_where_the_furthest_pixel_reaches_the_alias",
         ),
-        ("abs(n - 1 - place)", "abs(n - place)"),
-        ("abs(n - 1 - place)", "abs(n - 2 - place)"),
-        ("abs(0 - place)", "abs(1 - place)"),
+        ("abs(n - 1 - spot_place)", "abs(n - spot_place)"),
+        ("abs(n - 1 - spot_place)", "abs(n - 2 - spot_place)"),
+        ("abs(0 - spot_place)", "abs(1 - spot_place)"),
         ('zip("yx", camera.shape', 'zip("yx", camera.shape[::-1]'),
         (
-            'n, place in zip("yx", camera.shape, spot(camera), strict',
-            'n, place in zip("yx", camera.shape, spot(camera)[::-1], strict',
+            'n, spot_place in zip("yx", camera.shape, spot(camera), strict',
+            'n, spot_place in zip("yx", camera.shape, spot(camera)[::-1], strict',
         ),
         ("reach > limit * (1 + 1e-9)", "reach > limit * (1 + 1e-2)"),
     ),
@@ -1334,15 +1343,15 @@ MUTANTS = (
             "pupil_grid.py::test_the_clear_area_is_that_of_the_disc_within_the_square",
         ),
         ("return math.pi * radius**2 - 4 *", "return math.pi * radius**2 - 2 *"),
-        ("4 * half**2\n", "half**2\n"),
-        ("half <= radius * math.sqrt(0.5)", "half <= radius * 0.5"),
+        ("4 * half_width**2\n", "half_width**2\n"),
+        ("half_width <= radius * math.sqrt(0.5)", "half_width <= radius * 0.5"),
     ),
     *faults(
         "nodes/optics/_pupil_grid.py",
         within(
             "nodes/optics", "pupil_grid.py::test_a_gaussian_over_the_stop_is_its_integral_by_rows"
         ),
-        ("(math.pi / 4 - corner)", "(math.pi / 4)"),
+        ("(math.pi / 4 - half_side_angle)", "(math.pi / 4)"),
         (
             "return math.pi * width**2 * _share_within",
             "return 2 * math.pi * width**2 * _share_within",
@@ -1354,7 +1363,10 @@ MUTANTS = (
             "nodes/optics",
             "pupil_grid.py::test_a_wider_aperture_is_refused_with_the_samples_that_hold_it",
         ),
-        ("is_wider(diameter, span):\n        text", "diameter > 2 * span:\n        text"),
+        (
+            "is_wider(diameter, grid_width):\n        text",
+            "diameter > 2 * grid_width:\n        text",
+        ),
         ("diameter / pitch * (1 - _SAME)", "diameter / pitch / 2"),
     ),
     # What a laser does along the axis.
@@ -2368,7 +2380,7 @@ MUTANTS = (
             "psf_contrast.py::test_a_contrast_is_at_most_one_and_light_below_the_darkest_has_none",
         ),
         ("passed_light = otf[0, 0].abs()", "passed_light = otf.abs().max()"),
-        ("passed.where(~dark, 0.0)", "passed.where(~dark, 1.0)"),
+        ("relative_otf.where(~is_dark, 0.0)", "relative_otf.where(~is_dark, 1.0)"),
     ),
     *faults(
         "nodes/metrics/_psf_quality.py",

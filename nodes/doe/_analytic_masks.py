@@ -111,14 +111,22 @@ def cubic(
 def _half_rings(
     grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orientation: float
 ) -> Tensor:
-    """Return the phase of the half-ring mask, in rad."""
+    """Return the phase (v, u) of the half-ring mask in rad: 2 pi a r, with the sign of one side of
+    the axis.
+    """
     v, u = axes(grid)
-    square = v.square() + u.square()
-    annulus = (square * len(waves)).floor_().to(torch.int32).clamp_(max=len(waves) - 1)
+    squared_radius = v.square() + u.square()
+    # annuli of equal area have equal steps of the squared radius
+    annulus = (squared_radius * len(waves)).floor_().to(torch.int32).clamp_(max=len(waves) - 1)
     signed = [-slope if alternate and index % 2 else slope for index, slope in enumerate(waves)]
     slopes = 2 * math.pi * torch.tensor(signed, dtype=torch.float64, device=v.device)
-    side = (u * math.cos(orientation) + v * math.sin(orientation)).sign_()
-    return slopes.index_select(0, annulus.flatten()).view_as(square).mul_(square.sqrt_()).mul_(side)
+    side_sign = (u * math.cos(orientation) + v * math.sin(orientation)).sign_()
+    return (
+        slopes.index_select(0, annulus.flatten())
+        .view_as(squared_radius)
+        .mul_(squared_radius.sqrt_())
+        .mul_(side_sign)
+    )
 
 
 @node()

@@ -36,24 +36,29 @@ def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
     through unchanged.
     """
     with torch.no_grad():
-        level = (height / step).round()
-        level = level.remainder(levels) if cyclic else level.clamp(0, levels - 1)
-        change = level * step - height
+        level_number = (height / step).round()
+        level_number = (
+            level_number.remainder(levels) if cyclic else level_number.clamp(0, levels - 1)
+        )
+        change = level_number * step - height
     return height + change.detach()  # without a tangent too
 
 
 def _refuse(
     material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> None:
+    """Raise ParameterError for limits that no mask can have: a depth below one wave, levels without
+    a depth.
+    """
     if (
         wrap_at is not None
         and max_height is not None
         and wave_height(material, wrap_at) > max_height
     ):
-        wave = f"{wave_height(material, wrap_at) * 1e6:.3f} um"
+        wave_text = f"{wave_height(material, wrap_at) * 1e6:.3f} um"
         text = (
             f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {_name(material)}:"
-            f" needs at least {wave}"
+            f" needs at least {wave_text}"
         )
         raise ParameterError("max_height", text)
     if levels is not None and wrap_at is None and max_height is None:
@@ -100,11 +105,11 @@ def fabricate(
         )
     if max_height is None:
         return height
-    limited = height.clamp(0, max_height)
+    clipped = height.clamp(0, max_height)
     return (
-        limited
+        clipped
         if levels is None
-        else _quantize(limited, max_height / (levels - 1), levels, cyclic=False)
+        else _quantize(clipped, max_height / (levels - 1), levels, cyclic=False)
     )
 
 
@@ -119,16 +124,21 @@ def _(
 ) -> Tensor:
     """Compare each height with every allowed height, and return the nearest allowed height."""
     wave = None if wrap_at is None else wave_height(material, wrap_at)
-    x = height.to(torch.float64)
-    x = x if wave is None else x - wave * (x / wave).floor()
-    x = x if max_height is None else torch.minimum(x, torch.full_like(x, max_height)).clamp(min=0)
-    top = wave or max_height
-    if levels is None or top is None:
-        return x
+    limited = height.to(torch.float64)
+    limited = limited if wave is None else limited - wave * (limited / wave).floor()
+    limited = (
+        limited
+        if max_height is None
+        else torch.minimum(limited, torch.full_like(limited, max_height)).clamp(min=0)
+    )
+    depth = wave or max_height
+    if levels is None or depth is None:
+        return limited
     steps = levels if wave else levels - 1
-    allowed = [top * k / steps for k in range(steps + 1)]
-    table = torch.tensor(allowed, dtype=torch.float64, device=x.device)
-    nearest = table[(x[..., None] - table).abs().argmin(-1)]
+    allowed_heights = [depth * k / steps for k in range(steps + 1)]
+    table = torch.tensor(allowed_heights, dtype=torch.float64, device=limited.device)
+    nearest = table[(limited[..., None] - table).abs().argmin(-1)]
+    # a whole wave of height is the height 0
     return nearest if wave is None else torch.where(nearest == wave, 0.0, nearest)
 
 
@@ -148,15 +158,15 @@ def _(
     of that change at 400 nm, or at the nearest wavelength at which the glass is known. Wrapping
     turns no phase at ``wrap_at``, and counts in full all the same.
     """
-    top = max_height if wrap_at is None else wave_height(material, wrap_at)
-    if not height.finite or top is None:
+    depth = max_height if wrap_at is None else wave_height(material, wrap_at)
+    if not height.finite or depth is None:
         return 0.0 if height.finite else math.inf
-    ends = torch.tensor([height.min, height.max], dtype=getattr(torch, height.dtype))
-    change = _largest_change(ends, top, levels, cyclic=wrap_at is not None)
+    extremes = torch.tensor([height.min, height.max], dtype=getattr(torch, height.dtype))
+    change = _largest_change(extremes, depth, levels, cyclic=wrap_at is not None)
     if change == 0:
         return 0.0
     fabricated = fabricate(
-        ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height
+        extremes, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height
     )
     deepest, phase = (
         float(fabricated.abs().max()),
@@ -169,17 +179,18 @@ def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) 
     """Return an upper bound, in m, of the change of any height within ``ends`` by fabrication;
     exact without levels.
     """
-    low, high = (float(end) for end in ends)
+    lowest, highest = (float(end) for end in ends)
     if not cyclic:
         # the limit in the precision of the height map
         top = float(torch.tensor(top, dtype=ends.dtype))
-        return max(high - top, -low, 0.0 if levels is None else top / (levels - 1) / 2)
-    waves = max(abs(math.floor(low / top)), abs(math.floor(high / top)))
+        # what is cut off above or below, or half a step between levels
+        return max(highest - top, -lowest, 0.0 if levels is None else top / (levels - 1) / 2)
+    waves = max(abs(math.floor(lowest / top)), abs(math.floor(highest / top)))
     if levels is None:
         return top * waves
     # to a whole wave, which is 0
-    rounded_up = high >= top * (1 - 0.5 / levels) * (1 - 4 * torch.finfo(ends.dtype).eps)
-    return top * (waves + rounded_up + 0.5 / levels)
+    is_rounded_up = highest >= top * (1 - 0.5 / levels) * (1 - 4 * torch.finfo(ends.dtype).eps)
+    return top * (waves + is_rounded_up + 0.5 / levels)
 
 
 @fabricate.preflight
@@ -256,10 +267,11 @@ def _average(samples: int, feature: float) -> Tensor:
     """Return the float64 matrix that averages along one axis over a tool spot of ``feature``
     samples; each row sums to 1.
     """
-    sigma = feature / math.sqrt(8 * math.log(2))
+    # full width at half maximum = sqrt(8 ln 2) deviations
+    spot_deviation = feature / math.sqrt(8 * math.log(2))
     index = torch.arange(samples, dtype=torch.float64)
-    weights = torch.exp(-((index[:, None] - index) ** 2) / (2 * sigma**2))
-    weights = weights.where((index[:, None] - index).abs() <= _REACH * sigma + 0.5, 0.0)
+    weights = torch.exp(-((index[:, None] - index) ** 2) / (2 * spot_deviation**2))
+    weights = weights.where((index[:, None] - index).abs() <= _REACH * spot_deviation + 0.5, 0.0)
     return weights / weights.sum(1, keepdim=True)
 
 
@@ -270,12 +282,15 @@ def _(height: Tensor, stop: Stop, *, feature: float) -> Tensor:
     """
     samples, pitch, _ = grid_of(stop)
     sigma = feature / pitch / math.sqrt(8 * math.log(2))
-    x, index = height.double(), torch.arange(samples, dtype=torch.float64)
-    across = (index[:, None, None] - index).square()  # of each spot, over all columns
+    height_map, index = height.double(), torch.arange(samples, dtype=torch.float64)
+    # of each spot, over all columns
+    squared_column_distance = (index[:, None, None] - index).square()
     rows = []
     for v in range(samples):
-        spots = torch.exp(-((index[:, None] - v).square() + across) / (2 * sigma**2))
-        rows.append((spots * x).sum((1, 2)) / spots.sum((1, 2)))
+        spot_weights = torch.exp(
+            -((index[:, None] - v).square() + squared_column_distance) / (2 * sigma**2)
+        )
+        rows.append((spot_weights * height_map).sum((1, 2)) / spot_weights.sum((1, 2)))
     return torch.stack(rows)
 
 
@@ -337,14 +352,14 @@ def height_error(
     refuse_half(height=height)
     grid = grid_of(stop)
     refuse_other_grid(height, grid)
-    deeper = height if depth == 0 else height * (1 + depth)
+    deepened = height if depth == 0 else height * (1 + depth)
     if rms == 0:
-        return deeper
+        return deepened
     rows, columns = factors(grid, scale, rng, height.device)
-    bumps = torch.cat(
+    random_error = torch.cat(
         [(rms * (rows[stripe] @ columns)).to(height.dtype) for stripe in stripes(grid)]
     )
-    return deeper + bumps
+    return deepened + random_error
 
 
 @height_error.skip_bound

@@ -81,13 +81,17 @@ def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:
     Raises ValueError for wavelengths outside the range of the table or the coefficients.
     """
     low, high = glass_range(glass)
-    first, last = (float(end) for end in torch.aminmax(wavelengths.detach()))
-    if first < low * (1 - 1e-12) or last > high * (1 + 1e-12):
-        outside = f"{first * 1e9:.5g} nm" if first < low else f"{last * 1e9:.5g} nm"
-        extent = f"{low * 1e9:.5g} to {high * 1e9:.5g} nm"
+    first_wavelength, last_wavelength = (float(end) for end in torch.aminmax(wavelengths.detach()))
+    if first_wavelength < low * (1 - 1e-12) or last_wavelength > high * (1 + 1e-12):
+        outside_text = (
+            f"{first_wavelength * 1e9:.5g} nm"
+            if first_wavelength < low
+            else f"{last_wavelength * 1e9:.5g} nm"
+        )
+        range_text = f"{low * 1e9:.5g} to {high * 1e9:.5g} nm"
         fix = "an index is not extrapolated: give a longer range, or other wavelengths"
         raise ValueError(
-            f"the index of {_name(glass)} is known from {extent}, not at {outside}; {fix}"
+            f"the index of {_name(glass)} is known from {range_text}, not at {outside_text}; {fix}"
         )
     index_data = _from_file(glass) if isinstance(glass, Path) else glass
     return (
@@ -144,18 +148,19 @@ def _refuse_coefficients(glass: Sellmeier, name: str) -> None:
             " wavelengths"
         )
     index = _formula(glass, torch.linspace(low, high, 1001, dtype=torch.float64))
-    wrong = ~((index > _FROM_AIR) & (index < _LARGEST))
-    if wrong.any():
-        worst = low + (high - low) * int(wrong.nonzero()[0]) / 1000
+    implausible = ~((index > _FROM_AIR) & (index < _LARGEST))
+    if implausible.any():
+        first_bad = low + (high - low) * int(implausible.nonzero()[0]) / 1000
         fix = "give C in um^2 as in a data sheet, not its root, and a range without resonance"
         raise ValueError(
-            f"{name} give no index between 1 and {_LARGEST:g} at {worst * 1e9:.4g} nm: {fix}"
+            f"{name} give no index between 1 and {_LARGEST:g} at {first_bad * 1e9:.4g} nm: {fix}"
         )
 
 
 def _formula(glass: Sellmeier, wavelengths: Tensor) -> Tensor:
-    square = (wavelengths * 1e6).square()
-    terms = [b * square / (square - c) for b, c in zip(glass["B"], glass["C"], strict=True)]
+    """Return the index by the Sellmeier formula, n^2 = 1 + sum of B w^2 / (w^2 - C), w in um."""
+    squared_um = (wavelengths * 1e6).square()
+    terms = [b * squared_um / (squared_um - c) for b, c in zip(glass["B"], glass["C"], strict=True)]
     return (1 + torch.stack(terms).sum(0)).sqrt()
 
 
@@ -165,16 +170,19 @@ def _interpolated(table: Table, wavelengths: Tensor) -> Tensor:
     """
     count = min(4, len(table.wavelengths))
     table_wavelengths, values = table.wavelengths.to(wavelengths), table.values[0].to(wavelengths)
-    flat = wavelengths.reshape(-1)
-    right = torch.searchsorted(table_wavelengths, flat.detach())
-    first = (right - count // 2).clamp(0, len(table_wavelengths) - count)
-    rows = first[:, None] + torch.arange(count, device=flat.device)
-    x, y = table_wavelengths[rows], values[rows]
-    apart = x[:, :, None] - x[:, None, :]
-    own = torch.eye(count, dtype=torch.bool, device=flat.device)
-    ratios = (flat[:, None, None] - x[:, None, :]) / apart.masked_fill(own, 1.0)
-    weights = ratios.masked_fill(own, 1.0).prod(2)
-    return (weights * y).sum(1).reshape(wavelengths.shape)
+    flat_wavelengths = wavelengths.reshape(-1)
+    next_row = torch.searchsorted(table_wavelengths, flat_wavelengths.detach())
+    first = (next_row - count // 2).clamp(0, len(table_wavelengths) - count)
+    rows = first[:, None] + torch.arange(count, device=flat_wavelengths.device)
+    row_wavelengths, row_values = table_wavelengths[rows], values[rows]
+    distances = row_wavelengths[:, :, None] - row_wavelengths[:, None, :]
+    is_same_row = torch.eye(count, dtype=torch.bool, device=flat_wavelengths.device)
+    ratios = (
+        flat_wavelengths[:, None, None] - row_wavelengths[:, None, :]
+    ) / distances.masked_fill(is_same_row, 1.0)
+    # Lagrange's polynomials: the product over all other rows
+    weights = ratios.masked_fill(is_same_row, 1.0).prod(2)
+    return (weights * row_values).sum(1).reshape(wavelengths.shape)
 
 
 @once_per_version
@@ -186,9 +194,9 @@ def _from_file(file: Path) -> Table | Sellmeier:
     index_curve = curves(file, ("1",))
     if len(index_curve.values) != 1:
         raise ValueError(f"{file.name} has {len(index_curve.values) + 1} columns in place of 2")
-    low = (index_curve.values <= _FROM_AIR) | (index_curve.values >= _LARGEST)
+    implausible = (index_curve.values <= _FROM_AIR) | (index_curve.values >= _LARGEST)
     index_curve.refuse(
-        low,
+        implausible,
         lambda n: (
             f"{n:g} is no refractive index: write n, between 1 and {_LARGEST:g}, and not n - 1"
         ),
@@ -207,22 +215,24 @@ def _refuse_gap(index_curve: Curves) -> None:
     table = index_curve.table()
     wavelengths, values = table.wavelengths, table.values[0]
     middle = (wavelengths[1:] + wavelengths[:-1]) / 2
-    off = (_interpolated(table, middle) - (values[1:] + values[:-1]) / 2).abs()
+    deviation = (_interpolated(table, middle) - (values[1:] + values[:-1]) / 2).abs()
     steps = torch.nn.functional.pad(values.diff().abs(), (1, 1))
-    wrong = (off > 1e-5 + torch.stack([steps[:-2], steps[1:-1], steps[2:]]).amax(0) / 2).nonzero()
-    if len(wrong):
-        row = int(wrong[0])
-        ends = f"{float(wavelengths[row]) * 1e9:g} and {float(wavelengths[row + 1]) * 1e9:g} nm"
+    wrong_gaps = (
+        deviation > 1e-5 + torch.stack([steps[:-2], steps[1:-1], steps[2:]]).amax(0) / 2
+    ).nonzero()
+    if len(wrong_gaps):
+        row = int(wrong_gaps[0])
+        gap_text = f"{float(wavelengths[row]) * 1e9:g} and {float(wavelengths[row + 1]) * 1e9:g} nm"
         fix = "give rows there, in steps as small as beside the gap"
         raise ValueError(
             f"{index_curve.file.name}:{index_curve.lines[row + 1]}: the rows do not tell the"
-            f" index between {ends}: {fix}"
+            f" index between {gap_text}: {fix}"
         )
 
 
 def _coefficients(file: Path, rows: Rows) -> Sellmeier:
     """Return the glass of a table of Sellmeier coefficients, one term a row."""
-    area, low, high = _units(file, rows)
+    um2_per_unit, from_unit, to_unit = _units(file, rows)
     values = rows.values
     if len({tuple(row) for row in values[:, 2:]}) > 1:
         raise ValueError(
@@ -230,23 +240,25 @@ def _coefficients(file: Path, rows: Rows) -> Sellmeier:
         )
     glass = Sellmeier(
         B=tuple(map(float, values[:, 0])),
-        C=tuple(float(x) * area for x in values[:, 1]),
-        range=(float(values[0, 2]) * low, float(values[0, 3]) * high),
+        C=tuple(float(x) * um2_per_unit for x in values[:, 1]),
+        range=(float(values[0, 2]) * from_unit, float(values[0, 3]) * to_unit),
     )
     _refuse_coefficients(glass, f"{file.name}: the coefficients")
     return glass
 
 
 def _units(file: Path, rows: Rows) -> tuple[float, float, float]:
-    """Return the units of C in m^2, and of from and to in m; raise ValueError for other columns."""
+    """Return the factors that bring C to um^2, and from and to to m; raise ValueError for other
+    columns.
+    """
     names = [column.quantity.lower() for column in rows.columns]
     if names != ["b", "c", "from", "to"]:
         raise ValueError(
             f"{file.name} has the columns {', '.join(c.heading for c in rows.columns)}"
         )
-    _, c, low, high = (column.unit for column in rows.columns)
-    if c not in _AREAS or low not in LENGTHS or high not in LENGTHS:
+    _, c, from_unit, to_unit = (column.unit for column in rows.columns)
+    if c not in _AREAS or from_unit not in LENGTHS or to_unit not in LENGTHS:
         raise ValueError(
             f"{file.name}: C needs a unit such as um^2, and from and to need a unit such as nm"
         )
-    return _AREAS[c], LENGTHS[low], LENGTHS[high]
+    return _AREAS[c], LENGTHS[from_unit], LENGTHS[to_unit]

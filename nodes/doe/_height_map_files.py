@@ -103,6 +103,7 @@ def read_height_map(file: Path, depth: float, unit: float = 1.0) -> Tensor:
 
 
 def _array(file: Path, suffix: str) -> Tensor:
+    """Return the numbers of a height map in a file other than .png, in the type of the file."""
     if suffix == ".safetensors":
         from safetensors.torch import load_file
 
@@ -140,24 +141,27 @@ def _stated(file: Path, header: dict[str, Any]) -> dict[str, float]:
 
 
 def _npy(file: Path) -> MapHeader:
+    """Return the header of a .npy file."""
     npy_needs(file, 1.0, _SINGLE)
-    head = np.load(file, mmap_mode="r", allow_pickle=False)
-    _refuse_other_than_numbers(file, str(head.dtype), head.dtype.kind in "fiu")
-    return MapHeader(tuple(head.shape), {})
+    header_array = np.load(file, mmap_mode="r", allow_pickle=False)
+    _refuse_other_than_numbers(file, str(header_array.dtype), header_array.dtype.kind in "fiu")
+    return MapHeader(tuple(header_array.shape), {})
 
 
 def _safetensors(file: Path) -> MapHeader:
+    """Return the header of a .safetensors file."""
     from safetensors import safe_open
 
     safetensors_need(file, 2.0)
     with safe_open(file, framework="pt") as tensors:
         heights = tensors.get_slice(_name(file, list(tensors.keys())))
-        kind = str(heights.get_dtype())
-        _refuse_other_than_numbers(file, kind, kind.startswith(("F", "BF", "I", "U")))
+        number_type = str(heights.get_dtype())
+        _refuse_other_than_numbers(file, number_type, number_type.startswith(("F", "BF", "I", "U")))
         return MapHeader(tuple(heights.get_shape()), _stated(file, tensors.metadata() or {}))
 
 
 def _png(file: Path) -> MapHeader:
+    """Return the header of a grey .png file, whose text chunks may state lengths."""
     with _levels(file) as picture:
         return MapHeader(
             (picture.height, picture.width),
@@ -166,6 +170,7 @@ def _png(file: Path) -> MapHeader:
 
 
 def _exr(file: Path) -> MapHeader:
+    """Return the header of an .exr file, whose numbers are read to learn their type."""
     header, _, size = exr_header(file)
     refuse_large_array(file, size)
     _refuse_other_than_numbers(
@@ -175,9 +180,10 @@ def _exr(file: Path) -> MapHeader:
 
 
 def _mat(file: Path) -> MapHeader:
+    """Return the header of a .mat file."""
     name = _mat_name(file)
-    size, kind = _mat_listed(file)[name]
-    _refuse_other_than_numbers(file, kind, kind in _REAL_MAT)
+    size, number_type = _mat_listed(file)[name]
+    _refuse_other_than_numbers(file, number_type, number_type in _REAL_MAT)
     if np.iscomplexobj(_mat_value(file, name)):  # the header of a .mat file does not say
         _refuse_other_than_numbers(file, "complex", real=False)
     words = {word: _mat_value(file, word) for word in _WORDS if word in _mat_listed(file)}
@@ -198,9 +204,10 @@ def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
         text = f"{file.name} holds values of type {kind}: save the heights as real numbers, in m"
         raise ParameterError("file", text)
     if kind in _HALF:
-        coarse = "which resolve 1/2000 of a height, and no height below 0.06 um in m"
+        resolution_text = "which resolve 1/2000 of a height, and no height below 0.06 um in m"
         raise ParameterError(
-            "file", f"{file.name} holds 16-bit floats ({kind}), {coarse}: save 32-bit floats"
+            "file",
+            f"{file.name} holds 16-bit floats ({kind}), {resolution_text}: save 32-bit floats",
         )
 
 
@@ -222,6 +229,9 @@ def _levels(file: Path) -> "Image":
 
 
 def _name(file: Path, names: list[str]) -> str:
+    """Return the name of the height map among the arrays of a file: `height`, or the only one there
+    is.
+    """
     if "height" in names or len(names) == 1:
         return "height" if "height" in names else names[0]
     tensors = ", ".join(sorted(names)) or "nothing"
@@ -249,6 +259,7 @@ def _mat_listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
 
 
 def _mat_name(file: Path) -> str:
+    """Return the name of the height map in a .mat file, other than texts that state lengths."""
     return _name(
         file,
         [
@@ -260,6 +271,7 @@ def _mat_name(file: Path) -> str:
 
 
 def _mat_value(file: Path, name: str) -> NDArray[Any]:
+    """Return the values of one variable of a .mat file."""
     from scipy.io import loadmat
 
     mat_needs(file)

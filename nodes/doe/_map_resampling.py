@@ -67,21 +67,23 @@ def jump(height: Tensor, pitch: float, grid: PupilGrid) -> str:
         (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * (2 * pitch / grid.diameter)
         for n in height.shape
     )
-    clear = height.double().where(y[:, None].square() + x.square() <= 1, torch.nan)
-    low, high = (float(end) for end in torch.aminmax(clear[~clear.isnan()]))
-    worst, place = 0.0, ""
+    clear_heights = height.double().where(y[:, None].square() + x.square() <= 1, torch.nan)
+    lowest, highest = (float(end) for end in torch.aminmax(clear_heights[~clear_heights.isnan()]))
+    tallest, place = 0.0, ""
     for axis, name in ((0, "row"), (1, "column")):
-        steps = clear.diff(dim=axis).abs().nan_to_num(0.0)
-        if steps.numel() and float(steps.max()) > worst:
-            worst = float(steps.max())
+        steps = clear_heights.diff(dim=axis).abs().nan_to_num(0.0)
+        if steps.numel() and float(steps.max()) > tallest:
+            tallest = float(steps.max())
             worst_step = divmod(int(steps.argmax()), steps.shape[1])
             place = (
                 f"from {name} {worst_step[axis]} to {worst_step[axis] + 1}, at"
                 f" {('column', 'row')[axis]} {worst_step[1 - axis]}"
             )
-    if worst <= _JUMP * (high - low):
+    if tallest <= _JUMP * (highest - lowest):
         return ""
-    return f"the height jumps by {worst * 1e6:.4g} um of {(high - low) * 1e6:.4g} um {place}"
+    return (
+        f"the height jumps by {tallest * 1e6:.4g} um of {(highest - lowest) * 1e6:.4g} um {place}"
+    )
 
 
 def _positions(count: int, pitch: float, grid: PupilGrid) -> Tensor:
@@ -93,6 +95,7 @@ def _positions(count: int, pitch: float, grid: PupilGrid) -> Tensor:
 
 
 def _interpolated(height: Tensor, positions: list[Tensor], cubic: bool) -> Tensor:
+    """Return a height map at positions along both axes, in samples of the map, float64."""
     rows, columns = (_weights(x, n, cubic) for x, n in zip(positions, height.shape, strict=True))
     return rows @ height.double() @ columns.T
 
@@ -101,14 +104,15 @@ def _weights(position: Tensor, count: int, cubic: bool) -> Tensor:
     """Return the matrix (position, sample) of linear interpolation, or of the cubic through four
     samples.
     """
-    points = min(4 if cubic else 2, count)
+    point_count = min(4 if cubic else 2, count)
     position = position.clamp(0, count - 1)
-    first = (position.floor().long() - (points - 2) // 2).clamp(0, count - points)
+    first = (position.floor().long() - (point_count - 2) // 2).clamp(0, count - point_count)
     matrix = torch.zeros(len(position), count, dtype=torch.float64)
-    for k in range(points):
-        others = [j for j in range(points) if j != k]
-        parts = [(position - (first + j)) / (k - j) for j in others]
-        share = torch.stack(parts).prod(0) if parts else torch.ones_like(position)
+    for k in range(point_count):
+        others = [j for j in range(point_count) if j != k]
+        # Lagrange's polynomial of each point
+        factors = [(position - (first + j)) / (k - j) for j in others]
+        share = torch.stack(factors).prod(0) if factors else torch.ones_like(position)
         matrix[torch.arange(len(position)), first + k] = share
     return matrix
 

@@ -61,6 +61,9 @@ class Pixels(nn.Module):
         rng: torch.Generator,
         start: Tensor | None = None,
     ) -> None:
+        """Start at random, smooth over ``scale`` of the pupil, or at the height map ``start``
+        in m.
+        """
         super().__init__()
         self.max_height = max_height
         if start is None:
@@ -90,13 +93,19 @@ class Modes(nn.Module):
     def __init__(
         self, count: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
     ) -> None:
+        """Start with random modes of ``waves`` root mean square together, at ``wavelength`` in
+        m.
+        """
         super().__init__()
         self.wavelength, self.material = wavelength, material
-        drawn = torch.randn(count, generator=rng, dtype=torch.float64)
-        self.waves = nn.Parameter((waves * drawn / drawn.norm()).to(torch.float32))
+        random_direction = torch.randn(count, generator=rng, dtype=torch.float64)
+        self.waves = nn.Parameter(
+            (waves * random_direction / random_direction.norm()).to(torch.float32)
+        )
         self._polynomials = lru_cache(maxsize=1)(self._polynomials_on)
 
     def _polynomials_on(self, grid: PupilGrid) -> Tensor:
+        """Return the Zernike polynomials (mode, v, u) on a pupil grid, 0 outside the stop."""
         v, u = axes(grid, self.waves.device)
         polynomials = [
             combine({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples)
@@ -132,15 +141,21 @@ class Rings(nn.Module):
         material: Material,
         rng: torch.Generator,
     ) -> None:
+        """Start with slopes of alternating sign, in waves at the rim, that differ in ``noise``.
+
+        ``sided`` turns the sign of the phase on one side of the axis, as in half rings.
+        """
         super().__init__()
         self.sided, self.wavelength, self.material = sided, wavelength, material
-        fifth = (torch.arange(count) * 5).div(count, rounding_mode="floor")
-        start = (12.0 + 6.0 * fifth) * (1 - 2 * (fifth % 2))
-        self.slopes = nn.Parameter(start + noise * torch.randn(count, generator=rng))
+        fifth_of_rings = (torch.arange(count) * 5).div(count, rounding_mode="floor")
+        # 12, -18, 24, -30 and 36 waves in the five fifths of the rings
+        start_slopes = (12.0 + 6.0 * fifth_of_rings) * (1 - 2 * (fifth_of_rings % 2))
+        self.slopes = nn.Parameter(start_slopes + noise * torch.randn(count, generator=rng))
         self.steps = nn.Parameter(torch.zeros(count))
         self._annuli = lru_cache(maxsize=1)(self._annuli_on)
 
     def _annuli_on(self, grid: PupilGrid) -> Tensor:
+        """Return the number (v, u) of the annulus in which each sample lies."""
         v, u = axes(grid, self.slopes.device)
         return (
             ((v.square() + u.square()) * len(self.slopes))
@@ -155,8 +170,10 @@ class Rings(nn.Module):
         v, u = axes(grid, self.slopes.device)
         annulus = self._annuli(grid)
         phase = self.slopes.double()[annulus] * torch.hypot(v, u) + self.steps.double()[annulus]
-        side = torch.sign(u) if self.sided else torch.ones_like(u)
-        return height_from_phase(2 * math.pi * phase * side, grid, self.wavelength, self.material)
+        side_sign = torch.sign(u) if self.sided else torch.ones_like(u)
+        return height_from_phase(
+            2 * math.pi * phase * side_sign, grid, self.wavelength, self.material
+        )
 
 
 class Drawn(nn.Module):
@@ -199,6 +216,7 @@ class Written(nn.Module):
 
 
 def _pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
+    """Return pixels that start at the height map of `doe.pixelwise` with these parameters."""
     start: Tensor = pixelwise(stop, **params, rng=rng)
     highest = height_range(params["file"], params["depth"])
     return Pixels(int(stop.samples), highest, params["scale"], rng, start.to(rng.device))
@@ -211,19 +229,20 @@ def _freed(mask: Callable[..., Tensor]) -> Start:
 
     def start(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
         height = mask(stop, **params)
-        room = _ROOM * float(height.amax())
+        free_height = _ROOM * float(height.amax())
         return Pixels(
             int(stop.samples),
-            float(height.amax()) + 2 * room,
+            float(height.amax()) + 2 * free_height,
             1.0,
             rng,
-            (height + room).to(rng.device),
+            (height + free_height).to(rng.device),
         )
 
     return start
 
 
 def _drawn(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
+    """Return a height network with the weights of a step of `doe.unet`, or with new ones."""
     width, grid, weights = (
         params["width"],
         min(params["grid"], int(stop.samples)),
@@ -258,10 +277,13 @@ def legendre(position: Tensor, degree: int) -> list[Tensor]:
     """Return the Legendre polynomials of degree 0 to ``degree``, with a root mean square of 1
     over [-1, 1].
     """
-    plain = [torch.ones_like(position), position]
+    unscaled = [torch.ones_like(position), position]
     for k in range(1, degree):
-        plain.append(((2 * k + 1) * position * plain[k] - k * plain[k - 1]) / (k + 1))
-    return [math.sqrt(2 * k + 1) * polynomial for k, polynomial in enumerate(plain[: degree + 1])]
+        # Bonnet's recursion; the mean square of P_k over [-1, 1] is 1 / (2 k + 1)
+        unscaled.append(((2 * k + 1) * position * unscaled[k] - k * unscaled[k - 1]) / (k + 1))
+    return [
+        math.sqrt(2 * k + 1) * polynomial for k, polynomial in enumerate(unscaled[: degree + 1])
+    ]
 
 
 class Polynomials(nn.Module):
@@ -276,20 +298,36 @@ class Polynomials(nn.Module):
     def __init__(
         self, degree: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
     ) -> None:
+        """Start with random products of ``waves`` root mean square together, at ``wavelength`` in
+        m.
+        """
         super().__init__()
         self.degree, self.wavelength, self.material = degree, wavelength, material
-        drawn = torch.randn(len(list(self._exponents())), generator=rng, dtype=torch.float64)
-        self.waves = nn.Parameter((waves * drawn / drawn.norm()).to(torch.float32))
+        random_direction = torch.randn(
+            len(list(self._exponents())), generator=rng, dtype=torch.float64
+        )
+        self.waves = nn.Parameter(
+            (waves * random_direction / random_direction.norm()).to(torch.float32)
+        )
         self._products = lru_cache(maxsize=1)(self._products_on)
 
     def _exponents(self) -> Iterator[tuple[int, int]]:
-        for total in range(2, self.degree + 1):
-            for i in range(total + 1):
-                yield i, total - i
+        """Yield the degrees along both axes of each product; below 2 a mask only shifts the
+        spot.
+        """
+        for total_degree in range(2, self.degree + 1):
+            for row_degree in range(total_degree + 1):
+                yield row_degree, total_degree - row_degree
 
     def _products_on(self, grid: PupilGrid) -> Tensor:
+        """Return the products (product, v, u) on a pupil grid."""
         rows, columns = (legendre(axis, self.degree) for axis in axes(grid, self.waves.device))
-        return torch.stack([rows[i] * columns[j] for i, j in self._exponents()]).to(torch.float32)
+        return torch.stack(
+            [
+                rows[row_degree] * columns[column_degree]
+                for row_degree, column_degree in self._exponents()
+            ]
+        ).to(torch.float32)
 
     def forward(self, stop: Stop) -> Tensor:
         """Return the height map (v, u) on the pupil grid of ``stop``."""
@@ -310,10 +348,15 @@ class Streak(nn.Module):
     def __init__(
         self, degree: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
     ) -> None:
+        """Start with random polynomials along a random direction, of ``waves`` root mean square
+        together.
+        """
         super().__init__()
         self.wavelength, self.material = wavelength, material
-        drawn = torch.randn(degree - 1, generator=rng, dtype=torch.float64)
-        self.waves = nn.Parameter((waves * drawn / drawn.norm()).to(torch.float32))
+        random_direction = torch.randn(degree - 1, generator=rng, dtype=torch.float64)
+        self.waves = nn.Parameter(
+            (waves * random_direction / random_direction.norm()).to(torch.float32)
+        )
         self.angle = nn.Parameter(
             (math.pi * torch.rand(1, generator=rng, dtype=torch.float64)).to(torch.float32)
         )
@@ -322,9 +365,10 @@ class Streak(nn.Module):
         """Return the height map (v, u) on the pupil grid of ``stop``."""
         grid = grid_of(stop)
         v, u = axes(grid, self.waves.device)
-        along = u * self.angle.cos() + v * self.angle.sin()
-        polynomials = legendre(along, len(self.waves) + 1)[2:]
-        phase = torch.tensordot(2 * math.pi * self.waves.to(along), torch.stack(polynomials), 1)
+        position = u * self.angle.cos() + v * self.angle.sin()
+        # from degree 2 on: below it a mask only shifts the spot
+        polynomials = legendre(position, len(self.waves) + 1)[2:]
+        phase = torch.tensordot(2 * math.pi * self.waves.to(position), torch.stack(polynomials), 1)
         return height_from_phase(phase, grid, self.wavelength, self.material)
 
 
@@ -354,5 +398,8 @@ class LearntStop(nn.Module):
         v, u = axes(grid, self.logit.device)
         samples = grid.diameter / grid.pitch
         # a stop of diameter 1 is open up to the rim of the lens
-        rim = self.diameter().double() * (1 + 1 / samples)
-        return (0.5 + (rim - torch.hypot(v, u)) * (samples / 2)).clamp(0, 1).to(torch.float32)
+        rim_radius = self.diameter().double() * (1 + 1 / samples)
+        # falls from 1 to 0 over one sample at the rim
+        return (
+            (0.5 + (rim_radius - torch.hypot(v, u)) * (samples / 2)).clamp(0, 1).to(torch.float32)
+        )

@@ -71,11 +71,11 @@ def excess_index(name: AnyGlass, wavelengths: Tensor) -> Tensor:
     """
     if not isinstance(name, str):
         return glass_index(name, wavelengths) - 1
-    material, square = _DISPERSION[name], (wavelengths * 1e6).square()
+    material, squared_um = _DISPERSION[name], (wavelengths * 1e6).square()
     if material.cauchy:
-        return torch.stack([a / square**k for k, a in enumerate(material.cauchy)]).sum(0) - 1
+        return torch.stack([a / squared_um**k for k, a in enumerate(material.cauchy)]).sum(0) - 1
     return (
-        1 + torch.stack([b * square / (square - c) for b, c in material.sellmeier]).sum(0)
+        1 + torch.stack([b * squared_um / (squared_um - c) for b, c in material.sellmeier]).sum(0)
     ).sqrt() - 1
 
 
@@ -153,15 +153,15 @@ def refuse_material(parameter: str, material: AnyGlass, wavelengths: Tensor | No
 
 @material.check
 def _(result: Tensor, bands: Bands, *, material: AnyGlass) -> list[Check]:
-    name, (low, high) = _name_and_range(material)
+    name, (shortest, longest) = _name_and_range(material)
     text = f"{name}: n - 1 from {float(result[0]):.4f} to {float(result[-1]):.4f}"
-    extent = f"formula fitted over {low * 1e9:.0f} to {high * 1e9:.0f} nm"
+    range_text = f"formula fitted over {shortest * 1e9:.0f} to {longest * 1e9:.0f} nm"
     if not isinstance(material, str):
-        extent = f"known from {low * 1e9:.0f} to {high * 1e9:.0f} nm"
-    fitted = low <= float(bands.centres.min()) and float(bands.centres.max()) <= high
+        range_text = f"known from {shortest * 1e9:.0f} to {longest * 1e9:.0f} nm"
+    is_covered = shortest <= float(bands.centres.min()) and float(bands.centres.max()) <= longest
     return [
         Check(text, bool((result > 0).all())),
-        Check(extent if fitted else f"{extent}, used outside it", fitted),
+        Check(range_text if is_covered else f"{range_text}, used outside it", is_covered),
     ]
 
 
@@ -187,17 +187,17 @@ def height_from_phase(
 
     The height outside the stop is 0 too.
     """
-    open_ = inside(grid, phase.device)
-    raised = phase - torch.where(open_, phase, math.inf).min()
-    return torch.where(open_, raised * (wave_height(material, wavelength) / (2 * math.pi)), 0.0).to(
-        torch.float32
-    )
+    in_stop = inside(grid, phase.device)
+    phase_from_lowest = phase - torch.where(in_stop, phase, math.inf).min()
+    return torch.where(
+        in_stop, phase_from_lowest * (wave_height(material, wavelength) / (2 * math.pi)), 0.0
+    ).to(torch.float32)
 
 
 def height_checks(height: Tensor, *_: Any, **__: Any) -> list[Check]:
     """Check that all heights are finite and at least 0, and state the least and the greatest
     height.
     """
-    low, high = (float(value) for value in torch.aminmax(height))
-    sound = math.isfinite(low) and math.isfinite(high) and low >= 0
-    return [Check(f"height map from {low * 1e6:.3g} to {high * 1e6:.4g} um", sound)]
+    lowest, highest = (float(value) for value in torch.aminmax(height))
+    is_valid = math.isfinite(lowest) and math.isfinite(highest) and lowest >= 0
+    return [Check(f"height map from {lowest * 1e6:.3g} to {highest * 1e6:.4g} um", is_valid)]

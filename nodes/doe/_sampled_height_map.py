@@ -69,14 +69,14 @@ def pixelwise(
     Source: by definition.
     """
     if file is None:
-        noise = screen(grid_of(stop), scale, rng)
-        return (height_range(None, depth) * torch.sigmoid(1.5 * noise)).to(torch.float32)
+        random_screen = screen(grid_of(stop), scale, rng)
+        return (height_range(None, depth) * torch.sigmoid(1.5 * random_screen)).to(torch.float32)
     lengths = _lengths(file, depth, unit, pitch)
-    own = _fits(file, grid_of(stop), lengths["pitch"], pupil_pitch)
+    file_pitch = _fits(file, grid_of(stop), lengths["pitch"], pupil_pitch)
     height = read_height_map(file, lengths["depth"], lengths["unit"])
     if problem := _wrong(file, height):
         raise ValueError(problem)
-    return height if own is None else resampled(height, own, grid_of(stop), between)
+    return height if file_pitch is None else resampled(height, file_pitch, grid_of(stop), between)
 
 
 def height_map(
@@ -114,10 +114,10 @@ def _lengths(
         if value is None:
             continue
         if name in stated and abs(stated[name] / value - 1) > 1e-6:
-            here, stated_text = (f"{x * 1e6:.6g} um" for x in (value, stated[name]))
+            text, stated_text = (f"{x * 1e6:.6g} um" for x in (value, stated[name]))
             raise ParameterError(
                 name,
-                f"{here}, but the header of {file.name} says {stated_text}: leave one of them out",
+                f"{text}, but the header of {file.name} says {stated_text}: leave one of them out",
             )
         lengths[name] = value
     return lengths
@@ -132,10 +132,10 @@ def _fits(
     Raises ParameterError for another size than the pupil needs, and for a size that nothing states.
     """
     samples, shape = grid.samples, map_header(file).shape
-    same = shape == (samples, samples)
-    if same and pitch is None:
+    has_pupil_samples = shape == (samples, samples)
+    if has_pupil_samples and pitch is None:
         _refuse_unknown_size(file, grid, pupil_pitch)
-    if same and (pitch is None or abs(pitch / grid.pitch - 1) <= _SAME):
+    if has_pupil_samples and (pitch is None or abs(pitch / grid.pitch - 1) <= _SAME):
         return None
     if len(shape) != 2 or min(shape) < 2:
         raise ParameterError(
@@ -169,20 +169,20 @@ def _(
         return []
     _refuse_unused(file, depth, unit)
     lengths = _lengths(file, depth, unit, pitch)
-    own = None if stop is None else _fits(file, grid_of(stop), lengths["pitch"], pupil_pitch)
+    file_pitch = None if stop is None else _fits(file, grid_of(stop), lengths["pitch"], pupil_pitch)
     if problem := _wrong_heights(file, lengths["depth"], lengths["unit"]):
         raise ParameterError("file", problem)
     notes = _white_note(file, depth) + _size_note(file, stop, lengths["pitch"], pupil_pitch)
-    if own is None or stop is None:
+    if file_pitch is None or stop is None:
         return notes
     if between == "linear" and (
-        step := _jump(file, lengths["depth"], lengths["unit"], own, grid_of(stop))
+        step := _jump(file, lengths["depth"], lengths["unit"], file_pitch, grid_of(stop))
     ):
         fix = "unwrap a wrapped map, or set between: nearest to keep the steps"
         raise ParameterError(
             "file", f"{file.name}: {step}, which linear interpolation makes a ramp: {fix}"
         )
-    note = coarser(own, grid_of(stop))
+    note = coarser(file_pitch, grid_of(stop))
     return [*notes, *([f"{file.name}: {note}"] if note else [])]
 
 
@@ -192,10 +192,10 @@ def _refuse_unknown_size(file: Path, grid: PupilGrid, pupil_pitch: float | None)
     """
     if pupil_pitch is None or abs(pupil_pitch / grid.pitch - 1) <= _ROUNDED:
         return
-    written = f"written as {pupil_pitch * 1e6:.4g} um"
-    apart = f"the samples of the pupil are {grid.pitch * 1e6:.4g} um apart and {written}"
+    setting_text = f"written as {pupil_pitch * 1e6:.4g} um"
+    pitch_text = f"the samples of the pupil are {grid.pitch * 1e6:.4g} um apart and {setting_text}"
     fix = f"give pitch, {grid.pitch * 1e6:.6g} um for a map as wide as the pupil"
-    raise ParameterError("pitch", f"{file.name} states no pitch, and {apart}: {fix}")
+    raise ParameterError("pitch", f"{file.name} states no pitch, and {pitch_text}: {fix}")
 
 
 def _size(grid: PupilGrid) -> str:
@@ -246,11 +246,11 @@ def _wrong(file: Path, height: Tensor) -> str:
     """Return a message for heights that are not finite, negative, or higher than any mask, else
     an empty text.
     """
-    finite = torch.isfinite(height)
-    if not bool(finite.all()):
-        row, column = (int(i) for i in (~finite).nonzero()[0])
+    is_finite = torch.isfinite(height)
+    if not bool(is_finite.all()):
+        row, column = (int(i) for i in (~is_finite).nonzero()[0])
         bad_heights = (
-            f"{int((~finite).sum())} heights are NaN or infinite, the first in row {row}, column"
+            f"{int((~is_finite).sum())} heights are NaN or infinite, the first in row {row}, column"
             f" {column}"
         )
         return f"{file.name}: {bad_heights}, but every height must be finite and at least 0"
@@ -270,6 +270,7 @@ def _wrong(file: Path, height: Tensor) -> str:
 
 @once_per_version
 def _jump(file: Path, depth: float, unit: float, pitch: float, grid: PupilGrid) -> str:
+    """Return where a file has a step that interpolation would make a ramp, or an empty text."""
     return jump(read_height_map(file, depth, unit), pitch, grid)
 
 

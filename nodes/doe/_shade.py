@@ -53,9 +53,12 @@ def shade(
     """
     grid = grid_of(stop)
     v, u = axes(grid)
-    open_ = (v.square() + u.square() <= diameter**2).float()
+    is_open = (v.square() + u.square() <= diameter**2).float()
     rows = [(centre, width, depth) for centre in notches]
-    return Shade(open_ * transmittance**0.5, torch.tensor(rows, dtype=torch.float64).reshape(-1, 3))
+    # the amplitude is the root of the transmittance
+    return Shade(
+        is_open * transmittance**0.5, torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
+    )
 
 
 @shade.preflight
@@ -118,9 +121,14 @@ def _(light: ErrorBound, *others: ErrorBound | None, result: TensorStats, **para
     if light.stats is None or (ratio is not None and ratio.rms and ratio.stats is None):
         return math.inf
     largest = max(abs(result.min), abs(result.max))
-    passed = largest / light.top if light.top > 0 else 1.0
-    off = ratio.rms * math.sqrt(math.prod(ratio.stats.shape)) if ratio and ratio.stats else 0.0
-    return light.rms * (passed + off) + off * light.top
+    filter_transmittance = largest / light.top if light.top > 0 else 1.0
+    # all of the rms error may be in one band
+    largest_ratio_error = (
+        ratio.rms * math.sqrt(math.prod(ratio.stats.shape)) if ratio and ratio.stats else 0.0
+    )
+    return (
+        light.rms * (filter_transmittance + largest_ratio_error) + largest_ratio_error * light.top
+    )
 
 
 @equal_filter.check
@@ -140,8 +148,9 @@ def transmittance(lsr: Tensor, bands: Bands, lines: list[Bands] | None) -> Tenso
         )
     ratios = lsr
     if lines:
-        middles = torch.stack(
+        line_wavelengths = torch.stack(
             [(line.centres * line.weights).sum() / line.weights.sum() for line in lines]
         )
-        ratios = lsr[(middles[:, None] - bands.centres).abs().argmin(-1).to(lsr.device)]
+        # the ratio of the band nearest to each line
+        ratios = lsr[(line_wavelengths[:, None] - bands.centres).abs().argmin(-1).to(lsr.device)]
     return ratios.amax().clamp(max=1.0)

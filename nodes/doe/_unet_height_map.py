@@ -31,6 +31,9 @@ class HeightNet(nn.Module):
     """
 
     def __init__(self, width: int = 32) -> None:
+        """Build the network with ``width`` channels after its first layer, doubled at each of three
+        halvings.
+        """
         super().__init__()
         sizes = [2, width, 2 * width, 4 * width, 8 * width]
         pairs = zip(pairwise(sizes), [1, 2, 2, 2], strict=True)
@@ -40,15 +43,19 @@ class HeightNet(nn.Module):
 
     def forward(self, coordinates: Tensor) -> Tensor:
         """Return the logits (y, x) at the coordinates (2, y, x)."""
-        passed = [torch.sin(PITCH * self.down[0](_edged(coordinates[None])))]
+        level_outputs = [torch.sin(PITCH * self.down[0](_edged(coordinates[None])))]
         for layer in self.down[1:]:
-            passed.append(F.silu(layer(_edged(passed[-1]))))
-        x = passed[-1]
-        for layer, skip in zip(self.up, passed[-2::-1], strict=True):
-            x = F.silu(
-                layer(_edged(torch.cat([enlarge(x, skip.shape[-2], skip.shape[-1]), skip], dim=1)))
+            level_outputs.append(F.silu(layer(_edged(level_outputs[-1]))))
+        features = level_outputs[-1]
+        for layer, skip in zip(self.up, level_outputs[-2::-1], strict=True):
+            features = F.silu(
+                layer(
+                    _edged(
+                        torch.cat([enlarge(features, skip.shape[-2], skip.shape[-1]), skip], dim=1)
+                    )
+                )
             )
-        logits: Tensor = self.last(_edged(x))[0, 0]
+        logits: Tensor = self.last(_edged(features))[0, 0]
         return logits
 
 
@@ -92,9 +99,9 @@ def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
             else:
                 nn.init.orthogonal_(parameter, gain=2**0.5, generator=rng)
         logits = net(coordinates(grid, rng.device))
-        spread = logits.std(correction=0).clamp(min=1e-12)
-        net.last.weight.div_(spread)
-        net.last.bias = nn.Parameter((-logits.mean() / spread)[None])
+        logit_deviation = logits.std(correction=0).clamp(min=1e-12)
+        net.last.weight.div_(logit_deviation)
+        net.last.bias = nn.Parameter((-logits.mean() / logit_deviation)[None])
     return net
 
 

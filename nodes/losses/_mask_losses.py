@@ -42,12 +42,13 @@ def suppression_loss(
     Source: NeuSee, section Two-Stage Training (L_DOE); p-norm for the maximum is ours.
     """
     ratio = single(psf.intensity) / psf.clear_peak.to(single(psf.intensity))[:, None, None]
-    top = ratio.detach().amax((-2, -1), keepdim=True)
-    dark = top <= _DARK  # false for NaN, so that NaN reaches the result
-    scale = top.where(~dark, 1.0)
+    largest_ratio = ratio.detach().amax((-2, -1), keepdim=True)
+    is_dark = largest_ratio <= _DARK  # false for NaN, so that NaN reaches the result
+    scale = largest_ratio.where(~is_dark, 1.0)
     # the root has no gradient at 0
-    sums = (ratio / scale).pow(power).sum((-2, -1)).where(~dark[:, 0, 0], 1.0)
-    norm = sums.pow(1.0 / power).where(~dark[:, 0, 0], 0.0)
+    power_sums = (ratio / scale).pow(power).sum((-2, -1)).where(~is_dark[:, 0, 0], 1.0)
+    # a p-norm is at least the maximum, and near it for a large power
+    norm = power_sums.pow(1.0 / power).where(~is_dark[:, 0, 0], 0.0)
     peaks = scale[:, 0, 0] * norm
     loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
     return loss
@@ -56,9 +57,9 @@ def suppression_loss(
 @suppression_loss.reference
 def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
     ratio = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten(1)
-    dark = ratio.detach().amax(1, keepdim=True) <= _DARK
-    logs = ratio.where(~dark, 1.0).clamp_min(1e-300).log()
-    peaks = ((power * logs).logsumexp(1) / power).exp().where(~dark[:, 0], 0.0)
+    is_dark = ratio.detach().amax(1, keepdim=True) <= _DARK
+    log_ratios = ratio.where(~is_dark, 1.0).clamp_min(1e-300).log()
+    peaks = ((power * log_ratios).logsumexp(1) / power).exp().where(~is_dark[:, 0], 0.0)
     loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
     return loss
 
@@ -79,8 +80,8 @@ def background_loss(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     Source: NeuSee, section Two-Stage Training (L_DOE), as a ratio of energies.
     """
     share = bsr(psf, radiance)
-    dark = share <= _DARK  # false for NaN, so that NaN reaches the result
-    ratios: Tensor = torch.where(dark, 1.0, 1.0 / share.where(~dark, 1.0))
+    is_dark = share <= _DARK  # false for NaN, so that NaN reaches the result
+    ratios: Tensor = torch.where(is_dark, 1.0, 1.0 / share.where(~is_dark, 1.0))
     return ratios.sum().to(single(psf.intensity).dtype)
 
 
@@ -118,23 +119,31 @@ def contrast(
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF, cut-off); the mean of
             logarithms is ours.
     """
-    bands = zip(single(psf.intensity), cut_off(psf).tolist(), strict=True)
-    return torch.stack([_lost(kernel, cut, floor, up_to) for kernel, cut in bands]).sum()
+    kernels_and_cut_offs = zip(single(psf.intensity), cut_off(psf).tolist(), strict=True)
+    return torch.stack(
+        [
+            _lost(kernel, cut_off_frequency, floor, up_to)
+            for kernel, cut_off_frequency in kernels_and_cut_offs
+        ]
+    ).sum()
 
 
 def _lost(kernel: Tensor, passed: float, floor: float, up_to: float | None) -> Tensor:
+    """Return -mean(ln sqrt(MTF^2 + floor^2)) of one band, over the frequencies that the lens passes
+    and that are at most ``up_to``, in cycles per pixel.
+    """
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
-    cut = min(passed, up_to or math.inf)  # cycles per pixel
-    inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
+    highest = min(passed, up_to or math.inf)  # cycles per pixel
+    in_band = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= highest
     light = kernel.sum()
-    dark = light.detach() <= _DARK  # false for NaN, so that NaN reaches the result
+    is_dark = light.detach() <= _DARK  # false for NaN, so that NaN reaches the result
     # in float32, the round-off of the transform turns the gradient where the contrast is near the
     # floor
-    otf = torch.fft.rfft2(kernel.double() / light.double().where(~dark, 1.0))[inside]
-    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0)
-    lost: Tensor = -0.5 * (square + floor**2).log().mean()
-    return lost.to(kernel)
+    otf = torch.fft.rfft2(kernel.double() / light.double().where(~is_dark, 1.0))[in_band]
+    squared_mtf = (otf.real.square() + otf.imag.square()).where(~is_dark, 0.0)
+    contrast_loss: Tensor = -0.5 * (squared_mtf + floor**2).log().mean()
+    return contrast_loss.to(kernel)
 
 
 @contrast.reference
@@ -147,13 +156,15 @@ def _(psf: Psf, *, floor: float = 1e-4, up_to: float | None = None) -> Tensor:
             torch.fft.fftfreq(y, dtype=torch.float64),
             torch.fft.rfftfreq(x, dtype=torch.float64),
         )
-        inside = fy[:, None].square() + fx.square() <= cut**2
+        in_band = fy[:, None].square() + fx.square() <= cut**2
         if up_to is not None:
-            inside &= fy[:, None].square() + fx.square() <= up_to**2
+            in_band &= fy[:, None].square() + fx.square() <= up_to**2
         passed_light = otf[0, 0].real
-        dark = bool(passed_light.detach() <= _DARK)
-        passed = (
-            torch.zeros(int(inside.sum())) if dark else otf[inside].abs().square() / passed_light**2
+        is_dark = bool(passed_light.detach() <= _DARK)
+        squared_mtf = (
+            torch.zeros(int(in_band.sum()))
+            if is_dark
+            else otf[in_band].abs().square() / passed_light**2
         )
-        total = total - (passed + floor**2).sqrt().log().mean()
+        total = total - (squared_mtf + floor**2).sqrt().log().mean()
     return total

@@ -62,18 +62,19 @@ def quanta(passed: Tensor, exposure: Exposure, filtered: Tensor) -> Tensor:
 
     ``passed`` is the squared modulus of the OTF, 1 at frequency 0 if all light reaches the window.
     """
-    counts = filtered * exposure.light
-    noise = counts * exposure.passed + filtered * exposure.veil + exposure.read**2
-    return counts.square() * passed / noise.clamp_min(_DARK)
+    filtered_light = filtered * exposure.light
+    # shot noise of scene and veil, and read noise, in e-^2
+    noise = filtered_light * exposure.passed + filtered * exposure.veil + exposure.read**2
+    return filtered_light.square() * passed / noise.clamp_min(_DARK)
 
 
 def mean_of(values: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
     """Return the mean of half a spectrum over the whole spectrum, at the frequencies
     ``counted``.
     """
-    weights = counted * times(size, values)
-    total: Tensor = (values * weights).sum((-2, -1)) / weights.sum()
-    return total
+    frequency_counts = counted * times(size, values)
+    mean: Tensor = (values * frequency_counts).sum((-2, -1)) / frequency_counts.sum()
+    return mean
 
 
 def error_share(snr: Tensor, spectrum: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
@@ -93,15 +94,17 @@ def peak_share(intensity: Tensor, clear_peak: Tensor, power: float | None) -> Te
     stands for the maximum.
     """
     ratio = intensity.double() / clear_peak.to(intensity.device).double()[:, None, None]
-    top = ratio.detach().amax()
+    largest_ratio = ratio.detach().amax()
     if power is None:
         return ratio.amax()
-    scale = torch.where(top > _DARK, top, 1.0)  # without light, the peak is 0 and has no gradient
-    sums = (ratio / scale).pow(power).sum()
-    norm: Tensor = torch.where(top > _DARK, sums, 1.0).pow(1 / power) * torch.where(
-        top > _DARK, top, 0.0
-    )
-    return norm
+    # a p-norm of ratios to the largest one, so that no power overflows
+    # without light, the peak is 0 and has no gradient
+    scale = torch.where(largest_ratio > _DARK, largest_ratio, 1.0)
+    power_sums = (ratio / scale).pow(power).sum()
+    smooth_peak: Tensor = torch.where(largest_ratio > _DARK, power_sums, 1.0).pow(
+        1 / power
+    ) * torch.where(largest_ratio > _DARK, largest_ratio, 0.0)
+    return smooth_peak
 
 
 def filter_of(peak: Tensor, limit: float | None) -> Tensor:
@@ -120,13 +123,20 @@ def round_mtf(frequency: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
     ``shares`` (channel, band) are those of the bands in the channels. Between radii of a fine table
     it is linear.
     """
+    # 0.75 is beyond the corner of the spectrum, sqrt(1/2) cycles per pixel
     radii = torch.linspace(0.0, 0.75, _RADII, dtype=torch.float64)
-    share = (radii / cuts[:, None]).clamp_max(1.0)
-    table = shares @ ((torch.acos(share) - share * (1 - share.square()).sqrt()) * (2 / math.pi))
-    place = frequency * ((_RADII - 1) / 0.75)
-    below = place.long().clamp_max(_RADII - 2)
+    share_of_cut = (radii / cuts[:, None]).clamp_max(1.0)
+    # transfer function of a round pupil without aberrations, summed over bands
+    table = shares @ (
+        (torch.acos(share_of_cut) - share_of_cut * (1 - share_of_cut.square()).sqrt())
+        * (2 / math.pi)
+    )
+    table_place = frequency * ((_RADII - 1) / 0.75)
+    row_below = table_place.long().clamp_max(_RADII - 2)
     return torch.lerp(
-        table[:, below], table[:, below + 1], (place - below).expand(len(shares), *frequency.shape)
+        table[:, row_below],
+        table[:, row_below + 1],
+        (table_place - row_below).expand(len(shares), *frequency.shape),
     )
 
 
@@ -187,8 +197,8 @@ def filtered_error(
     snr, spectrum, counted = _behind(
         psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to)
     )
-    lost = error_share(snr, spectrum, _size(psf), counted)
-    return lost.clamp_min(1e-30).log().mean().to(single(psf.intensity))
+    error_variance = error_share(snr, spectrum, _size(psf), counted)
+    return error_variance.clamp_min(1e-30).log().mean().to(single(psf.intensity))
 
 
 @node()
@@ -235,22 +245,30 @@ def _behind(
     exposure: Exposure,
     settings: tuple[float | None, float | None, float, float | None],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return NEQ x S of each channel behind mask and filter, S, and which frequencies count."""
+    """Return NEQ x S of each channel behind mask and filter, S, and which frequencies count.
+
+    ``grey`` is illuminant, responses and bands, ``settings`` limit, power of the norm, contrast and
+    highest frequency.
+    """
     limit, power, contrast, up_to = settings
     size, kernels = _size(psf), effective_psf(psf, *grey, torch.float64).double()
     otf = torch.fft.rfft2(kernels)
     spectrum = natural_spectrum(size, contrast, kernels)
-    filtered = filter_of(peak_share(psf.intensity, psf.clear_peak, power), limit)
-    neq = quanta(otf.real.square() + otf.imag.square(), exposure, filtered)
-    return neq * spectrum, spectrum, _counted(size, up_to, kernels)
+    transmittance = filter_of(peak_share(psf.intensity, psf.clear_peak, power), limit)
+    noise_quanta = quanta(otf.real.square() + otf.imag.square(), exposure, transmittance)
+    return noise_quanta * spectrum, spectrum, _counted(size, up_to, kernels)
 
 
 def _counted(size: tuple[int, int], up_to: float | None, like: Tensor) -> Tensor:
+    """Return True for the frequencies of half a spectrum above 0 and up to ``up_to``, None for
+    all.
+    """
     frequency = frequencies(size, like)
     return (frequency > 0) & (frequency <= (1.0 if up_to is None else up_to))
 
 
 def _size(psf: Psf) -> tuple[int, int]:
+    """Return the size (y, x) of a PSF."""
     return psf.intensity.shape[-2], psf.intensity.shape[-1]
 
 
@@ -289,22 +307,28 @@ def _by_definition(
     """Yield NEQ x S, S and the counted frequencies of each channel, on the whole spectrum."""
     y, x = psf.intensity.shape[-2:]
     fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.fftfreq(x, dtype=torch.float64)
-    square = fy[:, None].square() + fx.square()
-    spectrum = torch.where(square > 0, 1 / square, 0.0)
+    squared_frequency = fy[:, None].square() + fx.square()
+    spectrum = torch.where(squared_frequency > 0, 1 / squared_frequency, 0.0)
     spectrum = spectrum * (contrast * x * y / spectrum.sum().clamp_min(1e-300))
     lsr = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten()
-    worst = (
+    peak = (
         lsr.max()
         if power is None
         else (power * lsr.clamp_min(1e-300).log()).logsumexp(0).div(power).exp()
     )
-    passed = torch.minimum(torch.ones(()), limit / worst) if limit is not None else torch.ones(())
+    transmittance_of_filter = (
+        torch.minimum(torch.ones(()), limit / peak) if limit is not None else torch.ones(())
+    )
     sensitivity = responses.double() * (illuminant.double() * bands.centres)
     for share in sensitivity / sensitivity.sum(-1, keepdim=True):
-        mtf = torch.fft.fft2(torch.tensordot(share, psf.intensity.double(), 1)).abs()
-        noise = passed * (light * transmittance + veil) + read_noise**2
-        counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
-        yield (passed * light * mtf).square() / noise * spectrum, spectrum, counted
+        transfer = torch.fft.fft2(torch.tensordot(share, psf.intensity.double(), 1)).abs()
+        noise = transmittance_of_filter * (light * transmittance + veil) + read_noise**2
+        counted = (squared_frequency > 0) & (squared_frequency <= (up_to or 1.0) ** 2)
+        yield (
+            (transmittance_of_filter * light * transfer).square() / noise * spectrum,
+            spectrum,
+            counted,
+        )
 
 
 def best_stop(
@@ -330,32 +354,37 @@ def best_stop(
     ``information``.
     """
     size, grey = _size(plain), grey_shares(illuminant, responses, bands)
-    cuts, sides = cut_off(plain).cpu(), averaging(plain).cpu()
-    blur = _pixel_contrast(size, float(sides.max()))
-    spectrum = natural_spectrum(size, contrast, cuts)
-    counted, frequency = _counted(size, up_to, cuts), frequencies(size, cuts)
+    cut_offs, sides = cut_off(plain).cpu(), averaging(plain).cpu()
+    pixel_contrast = _pixel_contrast(size, float(sides.max()))
+    spectrum = natural_spectrum(size, contrast, cut_offs)
+    counted, frequency = _counted(size, up_to, cut_offs), frequencies(size, cut_offs)
 
     def loss_of(width: float) -> tuple[float, float, float]:
-        filtered = filter_of(_stop_peak(width, cuts, sides), limit)
+        filtered = filter_of(_stop_peak(width, cut_offs, sides), limit)
         exposure = Exposure(light, read_noise, veil, width**2)
         snr = (
             quanta(
-                (width**2 * blur * round_mtf(frequency, width * cuts, grey)).square(),
+                (width**2 * pixel_contrast * round_mtf(frequency, width * cut_offs, grey)).square(),
                 exposure,
                 filtered,
             )
             * spectrum
         )
-        lost = error_share(snr, spectrum, size, counted).clamp_min(1e-30).log()
-        loss = lost if measure == "filtered_error" else -bits(snr, size, counted)
+        log_error = error_share(snr, spectrum, size, counted).clamp_min(1e-30).log()
+        loss = log_error if measure == "filtered_error" else -bits(snr, size, counted)
         return float(loss.mean()), width, float(filtered)
 
     # a narrower stop loses light and contrast, and protects more than is asked
-    narrowest = float(stop_width(torch.full_like(cuts, limit or 1.0), cuts, sides).min())
-    coarse = min(loss_of(1.0 + i / (_STOPS - 1) * (narrowest - 1.0)) for i in range(_STOPS))
-    step = (1.0 - narrowest) / (_STOPS - 1)
-    near = (coarse[1] + i / (_STOPS - 1) * step for i in range(1 - _STOPS, _STOPS))
-    return min([coarse, *(loss_of(width) for width in near if narrowest <= width <= 1.0)])
+    narrowest = float(stop_width(torch.full_like(cut_offs, limit or 1.0), cut_offs, sides).min())
+    # evenly spaced widths, then finer ones on each side of the best
+    coarse_best = min(loss_of(1.0 + i / (_STOPS - 1) * (narrowest - 1.0)) for i in range(_STOPS))
+    width_step = (1.0 - narrowest) / (_STOPS - 1)
+    finer_widths = (
+        coarse_best[1] + i / (_STOPS - 1) * width_step for i in range(1 - _STOPS, _STOPS)
+    )
+    return min(
+        [coarse_best, *(loss_of(width) for width in finer_widths if narrowest <= width <= 1.0)]
+    )
 
 
 def _stop_peak(width: float, cuts: Tensor, sides: Tensor) -> Tensor:

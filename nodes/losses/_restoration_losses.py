@@ -89,16 +89,17 @@ def log_error(estimate: Tensor, truth: Tensor) -> Tensor:
     Source: ours; sRGB as IEC 61966-2-1.
     """
     require_same_shape(estimate, truth)
-    square = (_encoded(single(estimate)) - _encoded(single(truth))).square().mean((-3, -2, -1))
-    return (square + _NEAR).log().mean()
+    mean_square = (_encoded(single(estimate)) - _encoded(single(truth))).square().mean((-3, -2, -1))
+    return (mean_square + _NEAR).log().mean()
 
 
 def _encoded(picture: Tensor) -> Tensor:
+    """Return a picture as a display encodes it; values that no display shows keep a small slope."""
     from kornia.color import linear_rgb_to_rgb
 
-    inside = picture.clamp(0, 1)
-    encoded: Tensor = linear_rgb_to_rgb(inside)
-    return encoded + _BEYOND * (picture - inside)
+    displayable = picture.clamp(0, 1)
+    encoded: Tensor = linear_rgb_to_rgb(displayable)
+    return encoded + _BEYOND * (picture - displayable)
 
 
 def _reduced(errors: Tensor, reduction: Reduction) -> Tensor:
@@ -137,10 +138,10 @@ def mrae(
 @mrae.reference
 def _(estimate: Tensor, truth: Tensor, *, floor: float = 0.02) -> Tensor:
     truth = truth.double()
-    share = (estimate.double() - truth).abs() / torch.maximum(
+    relative_error = (estimate.double() - truth).abs() / torch.maximum(
         truth.abs(), torch.tensor(floor, dtype=torch.float64)
     )
-    return share.sum() / share.numel()
+    return relative_error.sum() / relative_error.numel()
 
 
 # --- gradient penalty -----------------------------------------------------------------------------
@@ -162,11 +163,11 @@ def gradient_penalty(slopes: Tensor) -> Tensor:
             no direction.
     Source: Gulrajani et al., Improved Training of Wasserstein GANs, NeurIPS 2017 (WGAN-GP).
     """
-    flat = single(slopes).flatten(1)
-    top = flat.detach().abs().amax(1, keepdim=True)
-    still = top == 0
+    flat_slopes = single(slopes).flatten(1)
+    largest_slope = flat_slopes.detach().abs().amax(1, keepdim=True)
+    is_zero = largest_slope == 0
     # squares of gradients below 1e-19 underflow, and sqrt has no gradient at 0
-    scale = top.where(~still, 1.0)
-    squares = (flat / scale).square().sum(1, keepdim=True)
-    norm = squares.where(~still, 1.0).sqrt().where(~still, 0.0) * scale
+    scale = largest_slope.where(~is_zero, 1.0)
+    scaled_squares = (flat_slopes / scale).square().sum(1, keepdim=True)
+    norm = scaled_squares.where(~is_zero, 1.0).sqrt().where(~is_zero, 0.0) * scale
     return (norm - 1).square().mean()

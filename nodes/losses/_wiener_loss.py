@@ -50,22 +50,27 @@ def wiener(
     """
     y, x = psf.intensity.shape[-2:]
     intensity = single(psf.intensity)
-    effective = effective_psf(psf, illuminant, responses, bands).to(intensity)
+    channel_psfs = effective_psf(psf, illuminant, responses, bands).to(intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity)
     signal = (fall((y, x)) / noise).to(intensity)  # signal over noise, by frequency
     counted_signal = signal * _counted((y, x), up_to).to(signal)
-    bands_otf, lost = torch.fft.rfft2(intensity), list[Tensor]()
-    for channel, share in zip(torch.fft.rfft2(effective), shares, strict=True):
-        passed = signal * _square(channel)
-        filtered = signal * passed / (passed + 1).square()  # signal times the square of the filter
-        apart = torch.tensordot(share, _square(bands_otf - channel), 1)
-        wrong = 1 / (passed + 1) + colour * filtered * apart
-        lost.append(variance(wrong * counted_signal, (y, x)) / variance(counted_signal, (y, x)))
-    result: Tensor = torch.stack(lost).clamp_min(1e-30).log().mean()
+    bands_otf, error_shares = torch.fft.rfft2(intensity), list[Tensor]()
+    for channel_otf, share in zip(torch.fft.rfft2(channel_psfs), shares, strict=True):
+        signal_behind = signal * _square(channel_otf)
+        # signal times the square of the filter
+        signal_filtered = signal * signal_behind / (signal_behind + 1).square()
+        band_difference = torch.tensordot(share, _square(bands_otf - channel_otf), 1)
+        error_variance = 1 / (signal_behind + 1) + colour * signal_filtered * band_difference
+        # relative to the variance of the picture, at the frequencies that count
+        error_shares.append(
+            variance(error_variance * counted_signal, (y, x)) / variance(counted_signal, (y, x))
+        )
+    result: Tensor = torch.stack(error_shares).clamp_min(1e-30).log().mean()
     return result
 
 
 def _square(spectrum: Tensor) -> Tensor:
+    """Return |spectrum|^2."""
     return spectrum.real.square() + spectrum.imag.square()
 
 
@@ -77,9 +82,11 @@ def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
         torch.fft.fftfreq(size[0], dtype=torch.float64),
         torch.fft.rfftfreq(size[1], dtype=torch.float64),
     )
-    square = fy[:, None].square() + fx.square()
-    inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))
-    return inside
+    squared_frequency = fy[:, None].square() + fx.square()
+    counted: Tensor = (squared_frequency > 0) & (
+        squared_frequency <= (1.0 if up_to is None else up_to**2)
+    )
+    return counted
 
 
 @wiener.reference
@@ -95,18 +102,24 @@ def _(
 ) -> Tensor:
     y, x = psf.intensity.shape[-2:]
     fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.fftfreq(x, dtype=torch.float64)
-    square = fy[:, None].square() + fx.square()
-    power = (square + 1 / (x * y)) ** -1.5
+    squared_frequency = fy[:, None].square() + fx.square()
+    power = (squared_frequency + 1 / (x * y)) ** -1.5
     signal = power / power.mean() / noise
-    counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
+    counted = (squared_frequency > 0) & (squared_frequency <= (up_to or 1.0) ** 2)
     bands_otf = torch.fft.fft2(psf.intensity.double())
     sensitivity = responses.double() * (illuminant.double() * bands.centres)
     logs = []
     for share in sensitivity / sensitivity.sum(-1, keepdim=True):
-        channel = (share[:, None, None] * bands_otf).sum(0)
-        filtered = signal * channel.conj() / (signal * channel.abs().square() + 1)
-        wrong = signal * (1 - filtered * channel).abs().square() + filtered.abs().square()
+        channel_otf = (share[:, None, None] * bands_otf).sum(0)
+        filter_transfer = signal * channel_otf.conj() / (signal * channel_otf.abs().square() + 1)
+        error_variance = (
+            signal * (1 - filter_transfer * channel_otf).abs().square()
+            + filter_transfer.abs().square()
+        )
         for weight, band in zip(share, bands_otf, strict=True):
-            wrong = wrong + colour * weight * signal * (filtered * (band - channel)).abs().square()
-        logs.append((wrong[counted].sum() / signal[counted].sum()).clamp_min(1e-30).log())
+            error_variance = (
+                error_variance
+                + colour * weight * signal * (filter_transfer * (band - channel_otf)).abs().square()
+            )
+        logs.append((error_variance[counted].sum() / signal[counted].sum()).clamp_min(1e-30).log())
     return torch.stack(logs).mean()

@@ -27,35 +27,47 @@ def detail_targets(size: float) -> dict[str, Tensor]:
     bright on one half. text: the word "STOP" in letters of five by seven dots in place of an even
     grey line.
     """
-    drawn: Mapping[str, Callable[[float], Tensor]] = {
+    draw_target: Mapping[str, Callable[[float], Tensor]] = {
         "tri-bar": _bars,
         "edge": _edge,
         "text": _text,
     }
-    return {name: _in_pixels(drawn[name](size)) for name in TARGETS}
+    return {name: _in_pixels(draw_target[name](size)) for name in TARGETS}
 
 
 def _bars(size: float) -> Tensor:
-    fine = round(size * _FINE)
-    across = torch.arange(fine, dtype=torch.float64)
-    light = (torch.floor(5 * across / fine) % 2 == 0).double()
-    return light.expand(fine, fine) - light.mean()
+    """Return three bright bars with two gaps as wide, in a square of ``size`` pixels, in fine
+    samples.
+
+    The mean is subtracted: an even grey square of the same light would not be detected.
+    """
+    sample_count = round(size * _FINE)
+    columns = torch.arange(sample_count, dtype=torch.float64)
+    is_bright = (torch.floor(5 * columns / sample_count) % 2 == 0).double()
+    return is_bright.expand(sample_count, sample_count) - is_bright.mean()
 
 
 def _edge(size: float) -> Tensor:
-    fine = round(size * _FINE)
-    side = torch.where(torch.arange(fine) < fine // 2, -0.5, 0.5).double()
-    return side.expand(fine, fine) - side.mean()
+    """Return a dark and a bright half of a square of ``size`` pixels, in fine samples, of mean
+    0.
+    """
+    sample_count = round(size * _FINE)
+    step = torch.where(torch.arange(sample_count) < sample_count // 2, -0.5, 0.5).double()
+    return step.expand(sample_count, sample_count) - step.mean()
 
 
 def _text(size: float) -> Tensor:
+    """Return the line of text with letters ``size`` pixels high, in fine samples, of mean 0."""
     columns = [[[int(dot) for dot in row] + [0] for row in _LETTERS[letter]] for letter in TEXT]
+    # a column of space after each letter but the last
     dots = torch.cat([torch.tensor(rows, dtype=torch.float64) for rows in columns], 1)[:, :-1]
-    tall = round(size * _FINE)
-    wide = round(size * _FINE * dots.shape[1] / 7)
-    rows, across = (torch.arange(n) * k // n for n, k in ((tall, 7), (wide, dots.shape[1])))
-    drawn = dots[rows][:, across]
-    return drawn - drawn.mean()
+    row_count = round(size * _FINE)
+    column_count = round(size * _FINE * dots.shape[1] / 7)
+    rows, dot_columns = (
+        torch.arange(n) * k // n for n, k in ((row_count, 7), (column_count, dots.shape[1]))
+    )
+    dots_in_samples = dots[rows][:, dot_columns]
+    return dots_in_samples - dots_in_samples.mean()
 
 
 def _in_pixels(fine: Tensor) -> Tensor:

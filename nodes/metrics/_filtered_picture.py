@@ -72,13 +72,14 @@ def filtered_picture(
     Source: Barrett and Myers, Foundations of Image Science, section 13.2 (NEQ); Goodman,
         Introduction to Fourier Optics, 4th ed., ch. 8 (Wiener filter).
     """
-    spectra = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands))
-    light = spectra[:, 0, 0].real
-    level = noise_variance(electrons * light, glare, read_noise, prnu, residual_glare)
-    neq = (electrons * spectra.abs()).square() / level[:, None, None]
+    otf = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands))
+    light = otf[:, 0, 0].real
+    noise_variances = noise_variance(electrons * light, glare, read_noise, prnu, residual_glare)
+    neq = (electrons * otf.abs()).square() / noise_variances[:, None, None]
     power, counted = _on(
         neq, natural_power(tuple(neq.shape[-2:]), variance), low_frequencies(neq.shape[-2:], up_to)
     )
+    # the Wiener filter leaves S / (1 + NEQ S) of the scene's power S
     error = (power / (1 + neq * power)).sum((-2, -1)) / power.sum()
     information = 0.5 * torch.log2(1 + neq * power).mean((-2, -1))
     logs = neq[:, counted].clamp_min(_LEAST).log().mean(-1)
@@ -107,31 +108,34 @@ def _(
     photons = illuminant.double() * bands.centres
     rows = []
     for response in responses.double():
-        share = response * photons / (response * photons).sum()
+        band_shares = response * photons / (response * photons).sum()
         otf = sum(
-            w * torch.fft.fft2(band_psf.double())
-            for w, band_psf in zip(share, psf.intensity, strict=True)
+            band_share * torch.fft.fft2(band_psf.double())
+            for band_share, band_psf in zip(band_shares, psf.intensity, strict=True)
         )
-        passed = float(abs(otf[0, 0]))
+        light_share = float(abs(otf[0, 0]))
         noise = (
-            electrons * passed + glare + read_noise**2 + (prnu * (electrons * passed + glare)) ** 2
+            electrons * light_share
+            + glare
+            + read_noise**2
+            + (prnu * (electrons * light_share + glare)) ** 2
         )
         noise += (residual_glare * glare) ** 2
         fy, fx = (
             torch.fft.fftfreq(y, dtype=torch.float64),
             torch.fft.fftfreq(x, dtype=torch.float64),
         )
-        square = fy[:, None] ** 2 + fx**2
-        power = torch.where(square > 0, 1 / square, 0.0)
+        squared_frequency = fy[:, None] ** 2 + fx**2
+        power = torch.where(squared_frequency > 0, 1 / squared_frequency, 0.0)
         power = power * (variance / power.mean())
         neq = electrons**2 * abs(otf) ** 2 / noise
-        low = (square > 0) & (square <= up_to**2)
+        counted = (squared_frequency > 0) & (squared_frequency <= up_to**2)
         rows.append(
             (
                 float((power / (1 + neq * power)).sum() / power.sum()),
                 float(torch.log2(1 + neq * power).mean() / 2),
-                float(torch.log(neq[low].clamp_min(_LEAST)).mean()),
-                passed,
+                float(torch.log(neq[counted].clamp_min(_LEAST)).mean()),
+                light_share,
             )
         )
     return Filtered(*torch.tensor(rows, dtype=torch.float64).T)
@@ -149,6 +153,7 @@ def _(result: Filtered, *inputs: Any, electrons: float, **params: Any) -> list[C
 
 
 def _on(like: Tensor, *tensors: Tensor) -> list[Tensor]:
+    """Return tensors on the device of the first one."""
     return [x.to(like.device) for x in tensors]
 
 
@@ -187,8 +192,10 @@ def natural_power(shape: tuple[int, ...], variance: float) -> Tensor:
     The power falls with the square of the frequency, is 0 at frequency 0, and its mean over all
     frequencies is ``variance``.
     """
-    square = _square_frequency(shape)
-    power = torch.where(square > 0, 1.0 / square.where(square > 0, 1.0), 0.0)
+    squared_frequency = _square_frequency(shape)
+    power = torch.where(
+        squared_frequency > 0, 1.0 / squared_frequency.where(squared_frequency > 0, 1.0), 0.0
+    )
     scaled: Tensor = power * (variance / power.mean())
     return scaled
 
@@ -197,15 +204,16 @@ def low_frequencies(shape: tuple[int, ...], up_to: float) -> Tensor:
     """Return True at the frequencies above 0 and up to ``up_to`` cycles per pixel, in the layout
     of an FFT: (y, x).
     """
-    square = _square_frequency(shape)
-    inside: Tensor = (square > 0) & (square <= up_to**2)
-    return inside
+    squared_frequency = _square_frequency(shape)
+    low: Tensor = (squared_frequency > 0) & (squared_frequency <= up_to**2)
+    return low
 
 
 def _square_frequency(shape: tuple[int, ...]) -> Tensor:
+    """Return the squared frequencies (y, x) of an FFT, in cycles per pixel."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in shape)
-    square: Tensor = fy[:, None].square() + fx.square()
-    return square
+    squared: Tensor = fy[:, None].square() + fx.square()
+    return squared
 
 
 def decibels(ratio: float) -> float:
@@ -255,24 +263,29 @@ def picture_spectrum(
     """Sort the frequencies of a picture by their power; ``assumed`` is the PSF that the filter
     takes for the true one.
     """
-    otf, guess = (
+    otf, assumed_otf = (
         torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)) for psf in (true, assumed)
     )
     scene = natural_power(tuple(otf.shape[-2:]), variance)
-    low = low_frequencies(tuple(otf.shape[-2:]), up_to)
+    is_low = low_frequencies(tuple(otf.shape[-2:]), up_to)
     share = scene / scene.sum()
-    rows = []
-    for channel_otf, other in zip(otf, guess, strict=True):
-        square = other.abs().square()
-        ratio = torch.where(square > 0, channel_otf * other.conj() / square.clamp_min(1e-300), 0.0)
+    channel_rows = []
+    for channel_otf, assumed_channel_otf in zip(otf, assumed_otf, strict=True):
+        assumed_power = assumed_channel_otf.abs().square()
+        # true over assumed OTF, by which the filter's answer is off
+        ratio = torch.where(
+            assumed_power > 0,
+            channel_otf * assumed_channel_otf.conj() / assumed_power.clamp_min(1e-300),
+            0.0,
+        )
         weights = (share, share * ratio.real, share * ratio.abs().square())
-        power, *sums = _binned(scene * square, *weights)
+        power, *sums = _binned(scene * assumed_power, *weights)
         strength, count = _binned(
             scene * channel_otf.abs().square(), torch.full_like(scene, 1.0 / scene.numel())
         )
-        contrast = channel_otf.abs().square()[low].clamp_min(1e-30).log().mean()
-        rows.append((power, *sums, strength, count, contrast, channel_otf[0, 0].real))
-    return PictureSpectrum(*(torch.stack(column) for column in zip(*rows, strict=True)))
+        contrast = channel_otf.abs().square()[is_low].clamp_min(1e-30).log().mean()
+        channel_rows.append((power, *sums, strength, count, contrast, channel_otf[0, 0].real))
+    return PictureSpectrum(*(torch.stack(column) for column in zip(*channel_rows, strict=True)))
 
 
 def _binned(value: Tensor, *weights: Tensor) -> list[Tensor]:
@@ -285,10 +298,13 @@ def _binned(value: Tensor, *weights: Tensor) -> list[Tensor]:
         .clamp(0, (_MOST - _LEAST_FREQUENCY) * _EACH - 1)
         .flatten()
     )
-    empty = torch.zeros((_MOST - _LEAST_FREQUENCY) * _EACH, dtype=torch.float64)
-    sums = [empty.index_add(0, bin_index, weight.flatten()) for weight in weights]
-    weighted_sum = empty.index_add(0, bin_index, (value * weights[0]).flatten())
-    return [torch.where(sums[0] > 0, weighted_sum / sums[0].clamp_min(1e-300), 0.0), *sums]
+    zero_bins = torch.zeros((_MOST - _LEAST_FREQUENCY) * _EACH, dtype=torch.float64)
+    weight_sums = [zero_bins.index_add(0, bin_index, weight.flatten()) for weight in weights]
+    weighted_sum = zero_bins.index_add(0, bin_index, (value * weights[0]).flatten())
+    return [
+        torch.where(weight_sums[0] > 0, weighted_sum / weight_sums[0].clamp_min(1e-300), 0.0),
+        *weight_sums,
+    ]
 
 
 def remaining_error(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
@@ -299,13 +315,14 @@ def remaining_error(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) 
     the filter passes u ratio of the scene; the ratio is true / known. The error is the sum of
     signal |1 - u ratio|**2 and of the filtered noise, signal u (1 - u).
     """
-    strength = amplitude**2 * spectrum.power
-    u = strength / (strength + noise[:, :, None])
+    signal_power = amplitude**2 * spectrum.power
+    wiener_gain = signal_power / (signal_power + noise[:, :, None])
+    # |1 - u ratio|^2 for the scene, and u (1 - u) for the noise, by bin
     error = (
         spectrum.signal
-        - 2 * u * spectrum.real
-        + u.square() * spectrum.square
-        + u * (1 - u) * spectrum.signal
+        - 2 * wiener_gain * spectrum.real
+        + wiener_gain.square() * spectrum.square
+        + wiener_gain * (1 - wiener_gain) * spectrum.signal
     )
     return error.sum(-1)
 
@@ -314,8 +331,8 @@ def information_bits(spectrum: PictureSpectrum, amplitude: float, noise: Tensor)
     """Return the bits a pixel, mean of log2(1 + NEQ S) / 2 over all frequencies, (noise,
     channel).
     """
-    ratio = amplitude**2 * spectrum.strength / noise[:, :, None]
-    return (spectrum.rate * torch.log2(1 + ratio)).sum(-1) / 2
+    signal_to_noise = amplitude**2 * spectrum.strength / noise[:, :, None]
+    return (spectrum.rate * torch.log2(1 + signal_to_noise)).sum(-1) / 2
 
 
 def mean_log_neq(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
@@ -331,15 +348,19 @@ def radial_contrast(
 
     The mean is over directions and channels, and the square of the light that passes is included.
     """
-    square = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)).abs().square().mean(0)
-    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in square.shape)
+    mean_square_otf = (
+        torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)).abs().square().mean(0)
+    )
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in mean_square_otf.shape)
     radius = torch.hypot(fy[:, None], fx)
-    inside = (radius > 0) & (radius < 0.5)
-    ring = (radius[inside] * 2 * rings).long()
-    empty = torch.zeros(rings, dtype=torch.float64)
-    count = empty.index_add(0, ring, torch.ones_like(radius[inside])).clamp_min(1)
+    in_rings = (radius > 0) & (radius < 0.5)
+    ring_number = (radius[in_rings] * 2 * rings).long()
+    zero_rings = torch.zeros(rings, dtype=torch.float64)
+    ring_count = zero_rings.index_add(0, ring_number, torch.ones_like(radius[in_rings])).clamp_min(
+        1
+    )
     middle = (torch.arange(rings, dtype=torch.float64) + 0.5) / (2 * rings)
-    return middle, empty.index_add(0, ring, square[inside]) / count
+    return middle, zero_rings.index_add(0, ring_number, mean_square_otf[in_rings]) / ring_count
 
 
 # --- attacked picture -----------------------------------------------------------------------------
@@ -391,14 +412,14 @@ def glare_levels(light: Tensor, clear_peak: float) -> GlareLevels:
         .long()
         .clamp(0, (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH - 1)
     )
-    empty = torch.zeros(
+    zero_bins = torch.zeros(
         (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH,
         dtype=torch.float64,
     )
-    count = empty.index_add(0, bin_index, torch.ones_like(relative))
-    mean = empty.index_add(0, bin_index, relative) / count.clamp_min(1)
-    held = count > 0
-    return GlareLevels(mean[held], count[held] / len(relative))
+    count = zero_bins.index_add(0, bin_index, torch.ones_like(relative))
+    mean = zero_bins.index_add(0, bin_index, relative) / count.clamp_min(1)
+    has_pixels = count > 0
+    return GlareLevels(mean[has_pixels], count[has_pixels] / len(relative))
 
 
 def attacked_picture(
@@ -421,33 +442,41 @@ def attacked_picture(
     """
     amplitude = electrons * transmittance
     light = amplitude * spectrum.light
-    full = noise.full_well * strengths[:, None, None] * transmittance
-    laser_light = full * glare.level[:, None] * colour  # (strength, bin, channel)
-    free = (laser_light + light) < noise.full_well
-    quiet = noise_variance(light, 0.0, noise.read_noise, noise.prnu, noise.residual_glare)
-    loudest = noise_variance(
+    # strengths count in full wells at the peak of the clear lens
+    peak_light = noise.full_well * strengths[:, None, None] * transmittance
+    laser_light = peak_light * glare.level[:, None] * colour  # (strength, bin, channel)
+    not_full = (laser_light + light) < noise.full_well
+    noise_without_glare = noise_variance(
+        light, 0.0, noise.read_noise, noise.prnu, noise.residual_glare
+    )
+    noise_at_full_well = noise_variance(
         light, noise.full_well, noise.read_noise, noise.prnu, noise.residual_glare
     )
-    steps = torch.linspace(0, 1, _NOISES, dtype=torch.float64)[:, None]
-    table = quiet.log() + steps * (loudest / quiet).log()  # (noise, channel)
-    here = noise_variance(
+    noise_steps = torch.linspace(0, 1, _NOISES, dtype=torch.float64)[:, None]
+    # the error depends on the noise alone: a table over its logarithm, (noise, channel)
+    log_noise_table = (
+        noise_without_glare.log() + noise_steps * (noise_at_full_well / noise_without_glare).log()
+    )
+    log_noise = noise_variance(
         light, laser_light, noise.read_noise, noise.prnu, noise.residual_glare
     ).log()
-    place = ((here - quiet.log()) / (loudest / quiet).log() * (_NOISES - 1)).clamp(
-        0, _NOISES - 1 - 1e-9
-    )
+    table_place = (
+        (log_noise - noise_without_glare.log())
+        / (noise_at_full_well / noise_without_glare).log()
+        * (_NOISES - 1)
+    ).clamp(0, _NOISES - 1 - 1e-9)
     error, bits = (
-        _between(f(spectrum, amplitude, table.exp()), place)
+        _between(f(spectrum, amplitude, log_noise_table.exp()), table_place)
         for f in (remaining_error, information_bits)
     )
     weights = glare.share[:, None]
-    means = (torch.where(free, error, 1.0), torch.where(free, bits, 0.0), free.double())
+    means = (torch.where(not_full, error, 1.0), torch.where(not_full, bits, 0.0), not_full.double())
     return Attacked(*((weights * mean).sum(1).mean(-1) for mean in means))
 
 
 def _between(table: Tensor, place: Tensor) -> Tensor:
     """Interpolate a table (noise, channel) at real rows ``place`` (strength, bin, channel)."""
-    low = place.floor().long()
+    row_below = place.floor().long()
     channel = torch.arange(table.shape[1])
-    below, above = table[low, channel], table[low + 1, channel]
-    return below + (place - low) * (above - below)
+    below, above = table[row_below, channel], table[row_below + 1, channel]
+    return below + (place - row_below) * (above - below)

@@ -57,10 +57,10 @@ def quality(
             f"SSIM needs {size} pixels, not {tuple(a.shape[-2:])} inside the border: give a larger"
             " picture"
         )
-    absolute, square, alike = _sums(a, b, domain)
-    psnr = -10.0 * (square / a.numel()).clamp_min(1e-20).log10()
-    windows = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
-    return Quality(absolute / a.numel(), psnr, alike / windows)
+    absolute_sum, square_sum, ssim_sum = _sums(a, b, domain)
+    psnr = -10.0 * (square_sum / a.numel()).clamp_min(1e-20).log10()
+    window_count = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
+    return Quality(absolute_sum / a.numel(), psnr, ssim_sum / window_count)
 
 
 @quality.check
@@ -81,38 +81,45 @@ def require_same_shape(
 
 
 def _inside(picture: Tensor, border: int) -> Tensor:
+    """Return a picture without a border of so many pixels, at least float32."""
     y, x = picture.shape[-2:]
     return single(picture)[..., border : max(y - border, border), border : max(x - border, border)]
 
 
 def _shown(picture: Tensor, domain: str) -> Tensor:
+    """Return a picture as a display shows it, clipped to [0, 1] and encoded in sRGB unless
+    ``domain`` is linear.
+    """
     from kornia.color import linear_rgb_to_rgb
 
-    inside = picture.clamp(0, 1)
+    displayable = picture.clamp(0, 1)
     if domain == "linear":
-        return inside
-    encoded: Tensor = linear_rgb_to_rgb(inside)
+        return displayable
+    encoded: Tensor = linear_rgb_to_rgb(displayable)
     # float32 rounds 1.055 - 0.055 to less than 1
-    return encoded.where(inside < 1, encoded - encoded.detach() + 1)
+    return encoded.where(displayable < 1, encoded - encoded.detach() + 1)
 
 
 def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum the absolute difference, squared difference and SSIM over all pixels, in stripes that
-    fit the CPU cache.
+    """Return the sums of absolute difference, squared difference and SSIM over all pixels, in
+    stripes that fit the CPU cache.
     """
-    absolute, square, alike = (
+    absolute_sum, square_sum, ssim_sum = (
         torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3)
     )
     rows = a.shape[-2] - _WINDOW + 1
     for first in range(0, rows, _STRIPE):
         last = min(first + _STRIPE, rows)
-        p, q = (_shown(x[..., first : last + _WINDOW - 1, :], domain) for x in (a, b))
-        own = None if last == rows else last - first  # the next stripe counts the remaining rows
-        difference = (p - q)[..., :own, :]
-        absolute = absolute + difference.abs().sum(-1).sum(dtype=torch.float64)
-        square = square + difference.square().sum(-1).sum(dtype=torch.float64)
-        alike = alike + _ssim(p, q).sum(-1).sum(dtype=torch.float64)
-    return absolute, square, alike
+        estimate_stripe, truth_stripe = (
+            _shown(picture[..., first : last + _WINDOW - 1, :], domain) for picture in (a, b)
+        )
+        # the next stripe counts the remaining rows
+        counted_rows = None if last == rows else last - first
+        difference = (estimate_stripe - truth_stripe)[..., :counted_rows, :]
+        absolute_sum = absolute_sum + difference.abs().sum(-1).sum(dtype=torch.float64)
+        square_sum = square_sum + difference.square().sum(-1).sum(dtype=torch.float64)
+        ssim_sum = ssim_sum + _ssim(estimate_stripe, truth_stripe).sum(-1).sum(dtype=torch.float64)
+    return absolute_sum, square_sum, ssim_sum
 
 
 def _ssim(p: Tensor, q: Tensor) -> Tensor:
@@ -123,5 +130,5 @@ def _ssim(p: Tensor, q: Tensor) -> Tensor:
 
     pictures = (x.reshape(1, -1, *x.shape[-2:]) for x in (p, q))
     with exact_convolutions(p):
-        similar: Tensor = ssim(*pictures, _WINDOW, eps=0.0, padding="valid")
-    return similar
+        similarity: Tensor = ssim(*pictures, _WINDOW, eps=0.0, padding="valid")
+    return similarity

@@ -38,6 +38,7 @@ class ProtectionBounds(NamedTuple):
         """Return the names of the values that exceed their bounds by more than sampling and
         rounding explain.
         """
+        # the fields alternate: a value, and its bound
         pairs = [
             (name, getattr(self, name), getattr(self, f"{name}_bound"))
             for name in self._fields[::2]
@@ -77,39 +78,48 @@ def protection_bounds(
     Source: Parseval's theorem and Jensen's inequality; c by numerical integration of the MTF of a
             round pupil.
     """
-    p0 = psf.clear_peak.double().cpu()
+    clear_peak = psf.clear_peak.double().cpu()
     peak = psf.intensity.amax((-2, -1)).double().cpu()
-    cuts, sides = cut_off(psf).cpu(), averaging(psf).cpu()
-    rows = [
+    cut_offs, sides = cut_off(psf).cpu(), averaging(psf).cpu()
+    contrast_by_band = [
         _contrast(kernel.double(), float(cut))
-        for kernel, cut in zip(psf.intensity.cpu(), cuts, strict=True)
+        for kernel, cut in zip(psf.intensity.cpu(), cut_offs, strict=True)
     ]
-    power, mean_square, logs = (torch.stack(column) for column in zip(*rows, strict=True))
-    lsr, noise = peak / p0, electrons + glare + read_noise**2
-    lens = round_lens(cuts, sides)
-    clear = torch.where(sides > 0, lens.power, CLEAR / 4)
-    width = stop_width(lsr, cuts, sides)
-    narrow = torch.where(
-        sides > 0, width**6 * round_lens(width * cuts, sides).power, lsr**1.5 * CLEAR / 4
+    power, mean_square, log_contrast = (
+        torch.stack(column) for column in zip(*contrast_by_band, strict=True)
     )
-    grey = _rival(lsr**2 * clear, lsr, electrons, read_noise)
-    stop = _rival(narrow, width.square(), electrons, read_noise)
-    largest = lsr * lens.peak / 4  # mean of |OTF|**2 over the lens band, by Parseval
-    mask, mask_bound = electrons**2 * mean_square / noise, electrons**2 * largest / noise
-    better = torch.maximum(grey, stop)
-    contrast = mean_square / clear
+    lsr, noise = peak / clear_peak, electrons + glare + read_noise**2
+    clear_lens = round_lens(cut_offs, sides)
+    # for points the mean over the lens band is CLEAR over 4, the exact value
+    clear_contrast = torch.where(sides > 0, clear_lens.power, CLEAR / 4)
+    stop_width_share = stop_width(lsr, cut_offs, sides)
+    stop_contrast = torch.where(
+        sides > 0,
+        stop_width_share**6 * round_lens(stop_width_share * cut_offs, sides).power,
+        lsr**1.5 * CLEAR / 4,
+    )
+    # the filter of the same peak lowers the OTF by its transmittance, LSR
+    filter_neq = _rival(lsr**2 * clear_contrast, lsr, electrons, read_noise)
+    stop_neq = _rival(stop_contrast, stop_width_share.square(), electrons, read_noise)
+    largest_contrast = lsr * clear_lens.peak / 4  # mean of |OTF|**2 over the lens band, by Parseval
+    mask_neq, mask_bound = (
+        electrons**2 * mean_square / noise,
+        electrons**2 * largest_contrast / noise,
+    )
+    better_neq = torch.maximum(filter_neq, stop_neq)
+    contrast = mean_square / clear_contrast
     scale = math.log(electrons**2 / noise)
     indicators = (
         power,
         peak,
         contrast,
-        largest / clear,
-        mask / grey,
-        mask_bound / grey,
-        mask / better,
-        mask_bound / better,
+        largest_contrast / clear_contrast,
+        mask_neq / filter_neq,
+        mask_bound / filter_neq,
+        mask_neq / better_neq,
+        mask_bound / better_neq,
     )
-    return ProtectionBounds(*indicators, logs + scale, mask_bound.log())
+    return ProtectionBounds(*indicators, log_contrast + scale, mask_bound.log())
 
 
 def _rival(power: Tensor, passed: Tensor, electrons: float, read_noise: float) -> Tensor:
@@ -140,10 +150,14 @@ def _contrast(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean of |OTF|**2 over all frequencies and over the lens band, and the mean of
     its logarithm there.
     """
-    square = torch.fft.fft2(kernel).abs().square()
+    squared_otf = torch.fft.fft2(kernel).abs().square()
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in kernel.shape)
-    inside = torch.hypot(fy[:, None], fx) <= cut
-    return square.mean(), square[inside].mean(), square[inside].clamp_min(1e-30).log().mean()
+    in_band = torch.hypot(fy[:, None], fx) <= cut
+    return (
+        squared_otf.mean(),
+        squared_otf[in_band].mean(),
+        squared_otf[in_band].clamp_min(1e-30).log().mean(),
+    )
 
 
 def largest_glare(lsr: float, electrons: float, read_noise: float) -> float:

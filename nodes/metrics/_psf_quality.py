@@ -59,17 +59,24 @@ def mtf(psf: Psf) -> Mtf:
 
 
 def _contrast(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return root mean square, median and first percentile of the contrast of one band up to
+    ``cut`` cycles per pixel.
+    """
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
-    inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
+    in_band = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
     otf = torch.fft.rfft2(kernel.double())
     passed_light = otf[0, 0].abs()
-    dark = passed_light <= _DARK
-    passed = otf[inside].abs() / passed_light.where(~dark, 1.0)
-    contrast = passed.where(~dark, 0.0).clamp_max(1.0)
-    ordered = contrast.detach().sort().values
+    is_dark = passed_light <= _DARK
+    relative_otf = otf[in_band].abs() / passed_light.where(~is_dark, 1.0)
+    contrast = relative_otf.where(~is_dark, 0.0).clamp_max(1.0)
+    sorted_contrast = contrast.detach().sort().values
     rms: Tensor = torch.linalg.vector_norm(contrast) / math.sqrt(len(contrast))
-    return rms, ordered[(len(ordered) - 1) // 2], ordered[(len(ordered) - 1) // 100]
+    return (
+        rms,
+        sorted_contrast[(len(sorted_contrast) - 1) // 2],
+        sorted_contrast[(len(sorted_contrast) - 1) // 100],
+    )
 
 
 @mtf.check
@@ -99,8 +106,8 @@ def encircled(psf: Psf, *, pixel_pitch: PixelPitch, radius: SensorLength) -> Ten
         torch.arange(n, dtype=torch.float64, device=psf.intensity.device) - n // 2 for n in sizes
     )
     y, x = (step * pixel_pitch for step in steps)
-    inside = torch.hypot(y[:, None], x[None, :]) <= radius
-    return (psf.intensity * inside).sum(-1).sum(-1, dtype=torch.float64)
+    in_radius = torch.hypot(y[:, None], x[None, :]) <= radius
+    return (psf.intensity * in_radius).sum(-1).sum(-1, dtype=torch.float64)
 
 
 @encircled.check
@@ -118,8 +125,8 @@ def encircled_curve(light: Tensor) -> Tensor:
     """
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in light.shape)
     radius = torch.hypot(y[:, None], x[None, :]).ceil().long().flatten()
-    rings = torch.zeros(int(radius.max()) + 1, dtype=torch.float64)
-    return rings.index_add_(0, radius, light.detach().double().cpu().flatten()).cumsum(0)
+    light_by_radius = torch.zeros(int(radius.max()) + 1, dtype=torch.float64)
+    return light_by_radius.index_add_(0, radius, light.detach().double().cpu().flatten()).cumsum(0)
 
 
 def over_clear_peak(psf: Psf, band: int) -> Tensor:
@@ -177,17 +184,26 @@ def spectral_error(
             f"pupil, bands and weights have {counts} bands: compute all from the same `bands` step"
         )
     finer_wavelengths, difference = _finer(bands, weights)
-    few = _in_double(_thinned(pupil))
-    index = torch.cat([few.index, _interpolated(pupil.wavelengths, pupil.index, finer_wavelengths)])
-    few = few._replace(index=index, wavelengths=torch.cat([few.wavelengths, finer_wavelengths]))
-    limit = float(few.wavelengths.min()) * focal_length / (2 * float(few.pitch) * pixel_pitch)
-    side = max(1, min(_SIDE, math.floor(2 * limit)))
+    thinned = _in_double(_thinned(pupil))
+    # the bands in use first, then those between them
+    index = torch.cat(
+        [thinned.index, _interpolated(pupil.wavelengths, pupil.index, finer_wavelengths)]
+    )
+    thinned = thinned._replace(
+        index=index, wavelengths=torch.cat([thinned.wavelengths, finer_wavelengths])
+    )
+    alias_free_pixels = (
+        float(thinned.wavelengths.min()) * focal_length / (2 * float(thinned.pitch) * pixel_pitch)
+    )
+    side = max(1, min(_SIDE, math.floor(2 * alias_free_pixels)))
     lens = {"focal_length": focal_length, "pixel_pitch": pixel_pitch, "sensor": sensor}
-    band_psf: Psf = focus(few, **lens, shape=(side, side), precision="double")
+    band_psf: Psf = focus(thinned, **lens, shape=(side, side), precision="double")
     light = band_psf.intensity.flatten(1)
-    white, off = (_norms(w.to(light) @ light[: w.shape[1]]) for w in (weights, difference))
-    dark = white <= _DARK
-    share: Tensor = torch.where(dark, 0.0, off / white.where(~dark, 1.0))
+    white_norm, error_norm = (
+        _norms(w.to(light) @ light[: w.shape[1]]) for w in (weights, difference)
+    )
+    is_dark = white_norm <= _DARK
+    share: Tensor = torch.where(is_dark, 0.0, error_norm / white_norm.where(~is_dark, 1.0))
     return share
 
 
@@ -208,11 +224,13 @@ def _finer(bands: Bands, weights: Tensor) -> tuple[Tensor, Tensor]:
     bands first.
     """
     steps = bands.centres.diff()
+    # adjoining bands of equal width: compare with twice as many, midpoints included
     if len(steps) and bool(((steps - bands.widths[1:]).abs() <= 0.01 * steps.abs()).all()):
-        middle = (bands.centres[1:] + bands.centres[:-1]) / 2
+        middles = (bands.centres[1:] + bands.centres[:-1]) / 2
         ends = torch.ones_like(bands.centres)
         ends[0] = ends[-1] = 0.5
-        return middle, torch.cat([weights * ends, -(weights[:, 1:] + weights[:, :-1]) / 2], 1) / 2
+        return middles, torch.cat([weights * ends, -(weights[:, 1:] + weights[:, :-1]) / 2], 1) / 2
+    # else halve each band by itself
     halves = torch.cat([bands.centres - bands.widths / 4, bands.centres + bands.widths / 4])
     return halves, torch.cat([weights, -weights / 2, -weights / 2], 1)
 
@@ -221,12 +239,17 @@ def _interpolated(points: Tensor, values: Tensor, where: Tensor) -> Tensor:
     """Interpolate by the polynomial through the four nearest points, or through all points if
     there are fewer.
     """
-    near = (where[:, None] - points).abs().argsort(1)[:, : min(4, len(points))]
-    x, y = points[near], values[near]
-    apart = x[:, :, None] - x[:, None, :] + torch.eye(x.shape[1], dtype=x.dtype)
-    ratio = (where[:, None, None] - x[:, None, :]) / apart
-    own = torch.eye(x.shape[1], dtype=torch.bool)
-    value: Tensor = (ratio.where(~own, 1.0).prod(2) * y).sum(1)
+    nearest = (where[:, None] - points).abs().argsort(1)[:, : min(4, len(points))]
+    point_places, point_values = points[nearest], values[nearest]
+    distances = (
+        point_places[:, :, None]
+        - point_places[:, None, :]
+        + torch.eye(point_places.shape[1], dtype=point_places.dtype)
+    )
+    # Lagrange's polynomials: the product over all other points
+    ratio = (where[:, None, None] - point_places[:, None, :]) / distances
+    is_same_point = torch.eye(point_places.shape[1], dtype=torch.bool)
+    value: Tensor = (ratio.where(~is_same_point, 1.0).prod(2) * point_values).sum(1)
     return value
 
 
@@ -241,6 +264,7 @@ def _thinned(pupil: Pupil) -> Pupil:
 
 
 def _every(pupil: Pupil, step: int) -> Pupil:
+    """Return every ``step``-th sample of a pupil along both axes."""
     return pupil._replace(
         **{name: getattr(pupil, name)[::step, ::step] for name in _SCREENS},
         pitch=pupil.pitch * step,

@@ -67,6 +67,7 @@ def _(psf: Psf, radiance: Tensor | None = None) -> Tensor:
 
 @bsr.work
 def _(result: Tensor, psf: Psf, radiance: Tensor | None = None) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     return 0.0, float((psf.intensity if radiance is None else radiance).numel())
 
 
@@ -93,8 +94,9 @@ def _(
 def _(
     result: Tensor, pupil: Pupil, bands: Bands, *others: Any, **params: Any
 ) -> tuple[float, float]:
-    count, across = len(bands.centres), max(pupil.height.shape)
-    values = 2.0 * count * _SIDE**2
-    thinned = -(-across // max(1, across // _SAMPLES))
+    # bytes of memory during the run, beside inputs and result, and number of operations
+    count, pupil_side = len(bands.centres), max(pupil.height.shape)
+    psf_pixels = 2.0 * count * _SIDE**2
+    thinned_side = -(-pupil_side // max(1, pupil_side // _SAMPLES))
     wavelengths = 2 * count - 1 if count > 1 else 3
-    return 8.0 * values, 0.5 * pupil.height.numel() + wavelengths * (thinned**2 + _SIDE**2)
+    return 8.0 * psf_pixels, 0.5 * pupil.height.numel() + wavelengths * (thinned_side**2 + _SIDE**2)

@@ -38,9 +38,9 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> S
             NaN.
     Source: NeuSee, Eq. (SensorImage).
     """
-    full = is_clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
-    pixels = full.sum().double()
-    return Saturated(pixels, pixels / full.numel())
+    is_full = is_clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
+    pixels = is_full.sum().double()
+    return Saturated(pixels, pixels / is_full.numel())
 
 
 @saturated.preflight
@@ -118,12 +118,17 @@ def peak_irradiance(
         "pixel_pitch": pixel_pitch,
         "exposure": exposure,
     }
-    total = _in_wells(image, saturation(bands, **sensor) / level)
+    # the irradiance of each pixel over what saturates it, summed over all light
+    wells = _in_wells(image, saturation(bands, **sensor) / level)
     for spot, line in zip(spots, lines, strict=True):
-        total = total + _in_wells(spot, saturation(line, **sensor))
-    brightest = total.flatten().argmax()
-    top = total.flatten().take(brightest).double()
-    return Peak(top, _above(top, multiple), _of_lasers(spots, brightest, top))
+        wells = wells + _in_wells(spot, saturation(line, **sensor))
+    brightest = wells.flatten().argmax()
+    brightest_wells = wells.flatten().take(brightest).double()
+    return Peak(
+        brightest_wells,
+        _above(brightest_wells, multiple),
+        _of_lasers(spots, brightest, brightest_wells),
+    )
 
 
 def _refuse_unpaired(spots: Sequence[Tensor], lines: Sequence[Bands]) -> None:
@@ -221,25 +226,29 @@ def heat_ratio(
             " `bands` step"
         )
     y, x = psf.intensity.shape[-2:]
-    kernel = _kernel((2 * y, 2 * x), pixel_pitch, math.sqrt(4 * diffusivity * dwell)).to(
+    # twice the window, so that no heat wraps around; width sqrt(4 D t)
+    heat_kernel = _kernel((2 * y, 2 * x), pixel_pitch, math.sqrt(4 * diffusivity * dwell)).to(
         psf.intensity.device
     )
-    spectrum = torch.fft.rfft2(kernel)
-    hottest = [
+    spectrum = torch.fft.rfft2(heat_kernel)
+    hottest_pixels = [
         torch.stack(
             [_warmed(band_light, spectrum).amax() for band_light in light.intensity.double()]
         )
         for light in (psf, plain_psf)
     ]
-    return hottest[0] / hottest[1]
+    return hottest_pixels[0] / hottest_pixels[1]
 
 
 def _warmed(light: Tensor, spectrum: Tensor) -> Tensor:
+    """Return the heat (y, x) of light, but for a factor, by a convolution with the kernel of
+    ``spectrum``.
+    """
     y, x = light.shape
-    padded: Tensor = torch.fft.irfft2(
+    convolved: Tensor = torch.fft.irfft2(
         torch.fft.rfft2(light, s=(2 * y, 2 * x)) * spectrum, s=(2 * y, 2 * x)
     )
-    return padded[:y, :x]
+    return convolved[:y, :x]
 
 
 def _kernel(shape: tuple[int, int], pitch: float, reach: float) -> Tensor:
@@ -247,13 +256,14 @@ def _kernel(shape: tuple[int, int], pitch: float, reach: float) -> Tensor:
     area in the middle.
     """
     fy, fx = (torch.fft.fftfreq(n, 1 / n, dtype=torch.float64) * pitch for n in shape)
-    r = torch.hypot(fy[:, None], fx)
-    kernel = torch.erfc(r / reach) / r.where(r > 0, 1.0)
-    disc = pitch / math.sqrt(math.pi)
-    inner = disc * math.erfc(disc / reach) + reach * (
-        1 - math.exp(-((disc / reach) ** 2))
+    distance = torch.hypot(fy[:, None], fx)
+    kernel = torch.erfc(distance / reach) / distance.where(distance > 0, 1.0)
+    disc_radius = pitch / math.sqrt(math.pi)
+    # integral of erfc(r / w) from 0 to the radius of the disc
+    disc_integral = disc_radius * math.erfc(disc_radius / reach) + reach * (
+        1 - math.exp(-((disc_radius / reach) ** 2))
     ) / math.sqrt(math.pi)
-    kernel[0, 0] = 2 * math.pi * inner / pitch**2
+    kernel[0, 0] = 2 * math.pi * disc_integral / pitch**2
     return kernel
 
 
@@ -263,18 +273,22 @@ def _(
 ) -> Tensor:
     """Sum the heat of every pixel at every pixel, row by row of the window."""
     reach = math.sqrt(4 * diffusivity * dwell)
-    disc = pixel_pitch / math.sqrt(math.pi)
-    fine = (torch.arange(20000, dtype=torch.float64) + 0.5) * (disc / 20000)
+    disc_radius = pixel_pitch / math.sqrt(math.pi)
+    fine_radii = (torch.arange(20000, dtype=torch.float64) + 0.5) * (disc_radius / 20000)
     # 2 pi r erfc / r over the area of the disc
-    middle = float(2 * torch.special.erfc(fine / reach).mean() / disc)
+    middle_kernel = float(2 * torch.special.erfc(fine_radii / reach).mean() / disc_radius)
     y, x = psf.intensity.shape[-2:]
     position = torch.cartesian_prod(torch.arange(y), torch.arange(x)).double() * pixel_pitch
-    apart = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
+    distance = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
     heat = torch.where(
-        apart > 0, torch.special.erfc(apart / reach) / apart.where(apart > 0, 1.0), middle
+        distance > 0,
+        torch.special.erfc(distance / reach) / distance.where(distance > 0, 1.0),
+        middle_kernel,
     )
-    hottest = [(light.intensity.double().flatten(1) @ heat).amax(1) for light in (psf, plain_psf)]
-    return hottest[0] / hottest[1]
+    hottest_pixels = [
+        (light.intensity.double().flatten(1) @ heat).amax(1) for light in (psf, plain_psf)
+    ]
+    return hottest_pixels[0] / hottest_pixels[1]
 
 
 @heat_ratio.check

@@ -54,32 +54,40 @@ def limits(psf: Psf) -> Limits:
             Without light (1e-30) all five bounds are 0.
     Source: Parseval's theorem; the cut-off of the clear aperture as in `metrics.mtf`.
     """
-    rows = [_contrast_bound(kernel.double()) for kernel in psf.intensity]
-    light, rms, bound = (torch.stack(column) for column in zip(*rows, strict=True))
-    passed = bound / shares(psf).to(bound).sqrt()
-    return Limits(light * least_lsr(psf).to(light), rms, bound, passed, math.sqrt(2.0) * passed)
+    bounds_by_band = [_contrast_bound(kernel.double()) for kernel in psf.intensity]
+    light, rms, bound = (torch.stack(column) for column in zip(*bounds_by_band, strict=True))
+    # all the contrast may lie within the band of the lens
+    lens_band_bound = bound / shares(psf).to(bound).sqrt()
+    return Limits(
+        light * least_lsr(psf).to(light),
+        rms,
+        bound,
+        lens_band_bound,
+        math.sqrt(2.0) * lens_band_bound,
+    )
 
 
 def _contrast_bound(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the light in the PSF of one band, the rms contrast of this PSF, and an upper bound
     of the contrast.
     """
-    dark = kernel.sum() <= _DARK  # false for NaN, so that NaN reaches the result
-    kernel = kernel.where(~dark, 1.0)  # a root has no gradient at 0
+    is_dark = kernel.sum() <= _DARK  # false for NaN, so that NaN reaches the result
+    kernel = kernel.where(~is_dark, 1.0)  # a root has no gradient at 0
     light, peak = kernel.sum(), kernel.amax()
+    # Parseval: mean of |OTF|^2 = sum of PSF^2, at most peak x light
     rms, bound = kernel.square().sum().sqrt() / light, (peak / light).sqrt()
-    return light.where(~dark, 0.0), rms.where(~dark, 0.0), bound.where(~dark, 0.0)
+    return light.where(~is_dark, 0.0), rms.where(~is_dark, 0.0), bound.where(~is_dark, 0.0)
 
 
 @limits.check
 def _(result: Limits, psf: Psf) -> list[Check]:
-    low, high = float(result.floor.min()), float(result.floor.max())
-    bounded = bool((result.rms <= result.bound * (1 + 1e-6)).all())
+    lowest, highest = float(result.floor.min()), float(result.floor.max())
+    is_within_bound = bool((result.rms <= result.bound * (1 + 1e-6)).all())
     return [
         Check(
-            f"LSR {low:.3g} to {high:.3g} for even light; rms contrast"
+            f"LSR {lowest:.3g} to {highest:.3g} for even light; rms contrast"
             f" {float(result.rms.mean()):.3g}, upper bound {float(result.bound.mean()):.3g}",
-            bounded,
+            is_within_bound,
         )
     ]
 
@@ -186,9 +194,9 @@ def bsr(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     """
     if radiance is None:
         return single(psf.intensity).sum(-1).sum(-1, dtype=torch.float64)
-    passed, scene_light = light_in_field(psf.intensity, radiance)
-    dark = scene_light <= _DARK  # false for NaN, so that NaN reaches the result
-    ratio: Tensor = torch.where(dark, 1.0, passed / scene_light.where(~dark, 1.0))
+    light_kept, scene_light = light_in_field(psf.intensity, radiance)
+    is_dark = scene_light <= _DARK  # false for NaN, so that NaN reaches the result
+    ratio: Tensor = torch.where(is_dark, 1.0, light_kept / scene_light.where(~is_dark, 1.0))
     return ratio
 
 
@@ -203,14 +211,17 @@ def _(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     cube = radiance.double()
     scene = cube.reshape(-1, *cube.shape[-3:])
     (m, n), (y, x) = kernel.shape[-2:], scene.shape[-2:]
-    around = (n - 1, n - 1, m - 1, m - 1)
-    full = conv2d(pad(scene, around), kernel.flip(-1, -2)[:, None], groups=len(kernel))
-    passed, scene_light = (
-        full[..., m // 2 : m // 2 + y, n // 2 : n // 2 + x].sum((-2, -1)),
+    padding = (n - 1, n - 1, m - 1, m - 1)
+    full_image = conv2d(pad(scene, padding), kernel.flip(-1, -2)[:, None], groups=len(kernel))
+    light_kept, scene_light = (
+        # the field of the scene within the image with margin
+        full_image[..., m // 2 : m // 2 + y, n // 2 : n // 2 + x].sum((-2, -1)),
         scene.sum((-2, -1)),
     )
-    dark = scene_light <= _DARK
-    return torch.where(dark, 1.0, passed / scene_light.where(~dark, 1.0)).reshape(cube.shape[:-2])
+    is_dark = scene_light <= _DARK
+    return torch.where(is_dark, 1.0, light_kept / scene_light.where(~is_dark, 1.0)).reshape(
+        cube.shape[:-2]
+    )
 
 
 @bsr.check
@@ -242,9 +253,9 @@ def peak_bsr(image: Tensor, plain_image: Tensor) -> Tensor:
     if image.shape != plain_image.shape:
         shapes = f"{tuple(image.shape)} with and {tuple(plain_image.shape)} without mask"
         raise ValueError(f"image {shapes} differ in shape: use one scene for both")
-    masked, plain = (single(x).amax((-2, -1)).double() for x in (image, plain_image))
-    dark = plain <= _DARK  # false for NaN, so that NaN reaches the result
-    ratio: Tensor = torch.where(dark, 1.0, masked / plain.where(~dark, 1.0))
+    masked_peak, plain_peak = (single(x).amax((-2, -1)).double() for x in (image, plain_image))
+    is_dark = plain_peak <= _DARK  # false for NaN, so that NaN reaches the result
+    ratio: Tensor = torch.where(is_dark, 1.0, masked_peak / plain_peak.where(~is_dark, 1.0))
     return ratio
 
 
@@ -264,13 +275,17 @@ def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
     Source: conservation of energy: Goodman, Introduction to Fourier Optics, 3rd ed., section 2.1.5
             (Parseval).
     """
-    passed, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))
-    through = passed / clear * passed_by_notches(pupil).to(passed.device)
+    pupil_light, clear_light = (
+        x.double().square().sum() for x in (pupil.amplitude, pupil.aperture)
+    )
+    passed_share = pupil_light / clear_light * passed_by_notches(pupil).to(pupil_light.device)
     # a copy of one band
-    inside = torch.stack([band.sum(dtype=torch.float64) for band in single(psf.intensity)])
-    dark = through <= _DARK  # false for NaN, so that NaN reaches the result
-    outside: Tensor = torch.where(dark, 0.0, 1.0 - inside / through.where(~dark, 1.0))
-    return outside
+    light_in_window = torch.stack([band.sum(dtype=torch.float64) for band in single(psf.intensity)])
+    is_dark = passed_share <= _DARK  # false for NaN, so that NaN reaches the result
+    share_outside: Tensor = torch.where(
+        is_dark, 0.0, 1.0 - light_in_window / passed_share.where(~is_dark, 1.0)
+    )
+    return share_outside
 
 
 @light_outside.check

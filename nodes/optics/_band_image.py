@@ -40,12 +40,12 @@ def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
     """
     scene, kernel, corner = _fitted(radiance, psf.intensity, border)
     size = (radiance.shape[-2], radiance.shape[-1])
-    flat = scene.reshape(-1, *scene.shape[-3:])
-    done = [_by_contrast(scene_of_batch, kernel, corner, size) for scene_of_batch in flat]
+    scenes = scene.reshape(-1, *scene.shape[-3:])
+    images = [_by_contrast(scene_of_batch, kernel, corner, size) for scene_of_batch in scenes]
     return (
-        done[0].reshape(radiance.shape)
-        if len(done) == 1
-        else torch.stack(done).reshape(radiance.shape)
+        images[0].reshape(radiance.shape)
+        if len(images) == 1
+        else torch.stack(images).reshape(radiance.shape)
     )
 
 
@@ -57,27 +57,32 @@ def _(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
     m, n = kernel.shape[-2:]
     if border == "zero":
         scene = pad(scene, (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2))
-    flat = scene.reshape(-1, *scene.shape[-3:])
-    return conv2d(flat, kernel.flip(-1, -2)[:, None], groups=len(kernel)).reshape(radiance.shape)
+    scenes = scene.reshape(-1, *scene.shape[-3:])
+    return conv2d(scenes, kernel.flip(-1, -2)[:, None], groups=len(kernel)).reshape(radiance.shape)
 
 
 @image.check
 def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
-    before, after = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (radiance, result))
-    if before <= 0:
+    scene_light, image_light = (
+        float(x.sum(-1).sum(dtype=torch.float64)) for x in (radiance, result)
+    )
+    if scene_light <= 0:
         return [Check("the scene holds no light")]
     largest_sum = float(psf.intensity.sum(-1).sum(-1, dtype=torch.float64).amax())
     return [
         Check(
-            f"flux kept in the image {after / before:.2%}",
-            ok=params.get("border") == "reflect" or after <= before * largest_sum * 1.001,
+            f"flux kept in the image {image_light / scene_light:.2%}",
+            ok=params.get("border") == "reflect"
+            or image_light <= scene_light * largest_sum * 1.001,
         )
     ]
 
 
 def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor, Tensor, Corner]:
-    """Return the padded scene, the PSF that reaches the scene, and the first image pixel within
-    their convolution.
+    """Return the scene, the part of the PSF that reaches it, and the place (y, x) of the first
+    image pixel within their full convolution.
+
+    The scene gets a mirrored border unless ``border`` is zero, for which it stays as it is.
     """
     if radiance.ndim < 3 or radiance.shape[-3] != intensity.shape[0]:
         raise ValueError(
@@ -88,10 +93,20 @@ def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor
     kernel = reach(reach(intensity, -2, radiance.shape[-2]), -1, radiance.shape[-1]).to(dtype)
     m, n = kernel.shape[-2:]
     if border == "zero":
+        # pixel (0, 0) lies half a PSF within the full convolution
         return radiance.to(dtype), kernel, (m // 2, n // 2)
-    around = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
-    flat = pad(radiance.to(dtype).reshape(-1, *radiance.shape[-3:]), around, mode="reflect")
-    return flat.reshape(*radiance.shape[:-2], *flat.shape[-2:]), kernel, (m - 1, n - 1)
+    # left, right, above, below: as far as a PSF of odd or even side reaches
+    padding = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
+    # `pad` needs a batch of pictures
+    padded_scenes = pad(
+        radiance.to(dtype).reshape(-1, *radiance.shape[-3:]), padding, mode="reflect"
+    )
+    return (
+        padded_scenes.reshape(*radiance.shape[:-2], *padded_scenes.shape[-2:]),
+        kernel,
+        # half a PSF in, as above, and another half of padding
+        (m - 1, n - 1),
+    )
 
 
 def reach(kernel: Tensor, dim: int, size: int) -> Tensor:
@@ -107,15 +122,15 @@ def _by_contrast(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) ->
     """Convolve each band of the scene with its PSF, in float64 if the contrast of the band is
     too high for float32.
     """
-    deep = _deep(scene) if scene.dtype == torch.float32 else []
-    if not any(deep):
+    needs_float64 = _deep(scene) if scene.dtype == torch.float32 else []
+    if not any(needs_float64):
         return _convolve(scene, kernel, corner, size)
-    if all(deep):
+    if all(needs_float64):
         return _convolve(scene.double(), kernel.double(), corner, size).to(scene.dtype)
-    wide = (torch.float64 if d else scene.dtype for d in deep)
+    band_types = (torch.float64 if d else scene.dtype for d in needs_float64)
     images = [
         _convolve(s[None].to(d), k[None].to(d), corner, size)
-        for s, k, d in zip(scene, kernel, wide, strict=True)
+        for s, k, d in zip(scene, kernel, band_types, strict=True)
     ]
     return torch.cat([band.to(scene.dtype) for band in images])
 
@@ -125,11 +140,12 @@ def _deep(scene: Tensor) -> list[bool]:
     its other pixels.
     """
     flat = scene.detach().flatten(1)
-    few = flat[:, :: max(1, flat.shape[1] >> 16)]
-    mostly = few.abs().sqrt().mean(1).square()
-    bright = torch.linalg.vector_norm(flat, dim=1) / math.sqrt(flat.shape[1])
-    deep: list[bool] = (bright > _DEEP * mostly).tolist()
-    return deep
+    sampled = flat[:, :: max(1, flat.shape[1] >> 16)]
+    # mean of the roots, squared: bright pixels hardly count
+    typical = sampled.abs().sqrt().mean(1).square()
+    root_mean_square = torch.linalg.vector_norm(flat, dim=1) / math.sqrt(flat.shape[1])
+    needs_float64: list[bool] = (root_mean_square > _DEEP * typical).tolist()
+    return needs_float64
 
 
 def _convolve(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Tensor:
@@ -137,6 +153,7 @@ def _convolve(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Te
     wrap-around in the window.
     """
     length = [
+        # longest of the picture, the end of the window, and what would wrap around into it
         smooth(max(s, a + w, s + k - 1 - a))
         for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], corner, size, strict=True)
     ]
@@ -158,8 +175,8 @@ class _Product(torch.autograd.Function):
     def forward(a: Tensor, b: Tensor, *settings: Any) -> Tensor:
         at_a, at_b, corner, size, conjugate, length = settings
         plane, result = _Plane(length, a), a.new_empty(len(a), *size)
-        for picture, kernel, out in zip(a, b, result, strict=True):
-            out.copy_(
+        for picture, kernel, band_result in zip(a, b, result, strict=True):
+            band_result.copy_(
                 plane.window(plane.product(picture, at_a, kernel, at_b, conjugate), corner, size)
             )
         return result
@@ -178,19 +195,20 @@ class _Product(torch.autograd.Function):
             ctx.settings,
             grads[0],
         )
-        of_a = of_b = None
+        scene_gradient = kernel_gradient = None
+        # gradient for a: correlation of grad and b, its window where a lies
         if ctx.needs_input_grad[0]:
-            of_a = _Product.apply(
+            scene_gradient = _Product.apply(
                 grad, b, corner, at_b, at_a, tuple(a.shape[1:]), not conjugate, length
             )  # type: ignore[no-untyped-call]
         if ctx.needs_input_grad[1]:
             first, second, first_corner, second_corner = (
                 (a, grad, at_a, corner) if conjugate else (grad, a, corner, at_a)
             )
-            of_b = _Product.apply(
+            kernel_gradient = _Product.apply(
                 first, second, first_corner, second_corner, at_b, tuple(b.shape[1:]), True, length
             )  # type: ignore[no-untyped-call]
-        return of_a, of_b, *(None for _ in ctx.settings)
+        return scene_gradient, kernel_gradient, *(None for _ in ctx.settings)
 
     @staticmethod
     def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
@@ -222,23 +240,23 @@ class _Plane:
 
     def product(self, a: Tensor, at_a: Corner, b: Tensor, at_b: Corner, conjugate: bool) -> Tensor:
         first, second = self._spectrum(a, at_a), self._spectrum(b, at_b)
-        both: Tensor = first.mul_(second.conj_physical_() if conjugate else second)
-        return both
+        product: Tensor = first.mul_(second.conj_physical_() if conjugate else second)
+        return product
 
     def _spectrum(self, x: Tensor, corner: Corner) -> Tensor:
         """Return the FFT of a zero-padded picture: first along the rows that hold samples, then
         along all columns.
         """
-        (y, left), (h, w) = corner, x.shape
+        (y, left), (height, width) = corner, x.shape
         for edge in (
             self.rows[:y],
-            self.rows[y + h :],
-            self.real[:h, :left],
-            self.real[:h, left + w :],
+            self.rows[y + height :],
+            self.real[:height, :left],
+            self.real[:height, left + width :],
         ):
             edge.zero_()
-        self.real[:h, left : left + w] = x
-        torch.fft.rfft(self.real[:h], out=self.rows[y : y + h])
+        self.real[:height, left : left + width] = x
+        torch.fft.rfft(self.real[:height], out=self.rows[y : y + height])
         spectrum: Tensor = torch.fft.fft(self.rows, dim=0)
         return spectrum
 
@@ -296,22 +314,27 @@ def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
     are in float64, a few rows at a time, because allocating whole float64 planes takes longer than
     the sums.
     """
-    above = torch.ones(_ROWS, _ROWS, dtype=torch.float64, device=plane.device).tril()
-    down, parts = plane.new_zeros(kernel[1], dtype=torch.float64), []
+    # the product with a lower triangle of ones is a running sum down the rows
+    lower_triangle = torch.ones(_ROWS, _ROWS, dtype=torch.float64, device=plane.device).tril()
+    sum_above, blocks = plane.new_zeros(kernel[1], dtype=torch.float64), []
     for end in range(len(plane), 0, -_ROWS):
         rows = plane[max(0, end - _ROWS) : end].flip(0, 1).cumsum(1, dtype=torch.float64)
-        sums = above[: len(rows), : len(rows)] @ _along(rows, 1, kernel[1], size[1]) + down
-        down = sums[-1]
-        parts.append(sums.to(plane.dtype))
-    return _along(torch.cat(parts), 0, kernel[0], size[0])
+        sums = (
+            lower_triangle[: len(rows), : len(rows)] @ _along(rows, 1, kernel[1], size[1])
+            + sum_above
+        )
+        sum_above = sums[-1]
+        blocks.append(sums.to(plane.dtype))
+    return _along(torch.cat(blocks), 0, kernel[0], size[0])
 
 
 def _along(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:
     """Return sums over the boxes along the axis ``dim``, each of which starts or ends at an edge
     of the scene.
     """
-    before = kernel // 2
-    first = sums.narrow(dim, size - before - 1, before + 1)
+    # boxes that start at the edge grow, those that end there shrink
+    half_kernel = kernel // 2
+    first = sums.narrow(dim, size - half_kernel - 1, half_kernel + 1)
     return torch.cat(
-        [first, sums.narrow(dim, -1, 1) - sums.narrow(dim, 0, kernel - before - 1)], dim
+        [first, sums.narrow(dim, -1, 1) - sums.narrow(dim, 0, kernel - half_kernel - 1)], dim
     )

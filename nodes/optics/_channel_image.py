@@ -49,6 +49,8 @@ def _where(facts: ImageFacts, window: tuple[int, int]) -> Where:
     the image.
     """
     (m, n), zero = window, (0, 0)
+    # first pixel of the image in the full convolution: half a PSF in, and another half where the
+    # scene is padded
     corner = (m - 1, n - 1) if facts.reflect else (m // 2, n // 2)
     return Where(zero, zero, corner, facts.size, transform(facts, window))
 
@@ -73,21 +75,24 @@ def majorant_by_cell(off: Tensor, intensity: Tensor, facts: ImageFacts) -> Tenso
     """
     window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, facts)[0]
     corner = _where(facts, window).at
-    before = [-k % _CELL for k in corner]  # so that the middle of the kernel begins a cell
-    around = [-(k + b) % _CELL for k, b in zip(window, before, strict=True)]
-    wide = pad(kernel.double(), (before[1], around[1], before[0], around[0]))
-    light = avg_pool2d(wide[None], _CELL)[0] * _CELL**2
-    worst = max_pool2d(pad(cells(bordered(off[None], facts, window))[None], (1, 1, 1, 1)), 2, 1)[
-        0, 0
-    ].to(light)
-    length = [a + b for a, b in zip(light.shape, worst.shape, strict=True)]
-    product = torch.fft.irfft2(
-        torch.fft.rfft2(light, length) * torch.fft.rfft2(worst, length), length
+    padding_before = [-k % _CELL for k in corner]  # so that the middle of the kernel begins a cell
+    padding_after = [-(k + b) % _CELL for k, b in zip(window, padding_before, strict=True)]
+    padded_kernel = pad(
+        kernel.double(), (padding_before[1], padding_after[1], padding_before[0], padding_after[0])
     )
-    first = [(k + b) // _CELL for k, b in zip(corner, before, strict=True)]
-    y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first, facts.size, strict=True))
-    inside: Tensor = product[y, x]
-    return inside.clamp_min_(0)
+    cell_light = avg_pool2d(padded_kernel[None], _CELL)[0] * _CELL**2
+    # the worst of two by two cells, because a shift by part of a cell touches both
+    cell_error = max_pool2d(
+        pad(cells(bordered(off[None], facts, window))[None], (1, 1, 1, 1)), 2, 1
+    )[0, 0].to(cell_light)
+    length = [a + b for a, b in zip(cell_light.shape, cell_error.shape, strict=True)]
+    product = torch.fft.irfft2(
+        torch.fft.rfft2(cell_light, length) * torch.fft.rfft2(cell_error, length), length
+    )
+    first_cell = [(k + b) // _CELL for k, b in zip(corner, padding_before, strict=True)]
+    y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first_cell, facts.size, strict=True))
+    image_cells: Tensor = product[y, x]
+    return image_cells.clamp_min_(0)
 
 
 def cells(planes: Tensor) -> Tensor:
@@ -112,16 +117,21 @@ def bordered(planes: Tensor, facts: ImageFacts, window: tuple[int, int]) -> Tens
     if not facts.reflect:
         return planes
     m, n = window
-    around = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
-    wide: Tensor = pad(planes, around, mode="reflect")
-    return wide
+    # left, right, above, below: as far as a PSF of odd or even side reaches
+    padding = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
+    padded: Tensor = pad(planes, padding, mode="reflect")
+    return padded
 
 
 def _kernels(intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
+    """Return the kernels (kernel, y, x) of a plan: the PSFs themselves, or weighted sums of
+    them.
+    """
     stack = centred(intensity, plan.window)
     if plan.kernels is None:
         return stack if plan.number == len(stack) else stack[plan.bands.to(stack.device)]
     weights = plan.kernels.new_zeros(len(plan.kernels), len(facts.basis))
+    # the columns of omitted bands stay 0
     weights = weights.index_copy_(1, plan.bands, plan.kernels)
     weights = weights if facts.share is None else weights @ facts.share
     return _summed_bands(weights.to(stack), stack)
@@ -149,14 +159,15 @@ def guessed(planes: Tensor, facts: ImageFacts) -> Tensor:
     The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and
     half of an upper bound of the brightest pixel with blur.
     """
-    through = facts.passed.total
-    room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(facts.rows[:, 0])
-    for i, weights in enumerate((facts.rows * through @ facts.basis).to(planes)):
-        bright = torch.mv(planes.flatten(1).T, weights, out=room)
-        sharp[i] = torch.maximum(bright.amax(), -bright.amin())
-    power = ((facts.basis @ facts.gram) * facts.basis).sum(1).clamp_min(0) * facts.copies
-    blurred = facts.rows.abs() @ (power * through * facts.passed.peak).sqrt()
-    return torch.minimum(sharp / 4, blurred / 2)
+    passed_light = facts.passed.total
+    brightness, unblurred = planes.new_empty(planes[0].numel()), torch.zeros_like(facts.rows[:, 0])
+    for i, weights in enumerate((facts.rows * passed_light @ facts.basis).to(planes)):
+        pixel_sum = torch.mv(planes.flatten(1).T, weights, out=brightness)
+        unblurred[i] = torch.maximum(pixel_sum.amax(), -pixel_sum.amin())
+    band_power = ((facts.basis @ facts.gram) * facts.basis).sum(1).clamp_min(0) * facts.copies
+    blurred = facts.rows.abs() @ (band_power * passed_light * facts.passed.peak).sqrt()
+    # a quarter and a half of two upper bounds: the estimate that the docstring names
+    return torch.minimum(unblurred / 4, blurred / 2)
 
 
 def rounding(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) -> Tensor:
@@ -167,17 +178,22 @@ def rounding(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) -> Te
     the brightest pixel for errors that are not spread: sums over the bands, planes and rows of a
     PSF, of which five roundings were measured.
     """
-    count = math.prod(transform(facts, plan.window))
-    u, x, y, _ = plan.mix
-    plane = facts.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(facts.copies)
-    kernel = (facts.passed.total * facts.passed.peak).sqrt()
+    transform_size = math.prod(transform(facts, plan.window))
+    result_of_term, term_of_plane, term_of_kernel, _ = plan.mix
+    plane_norm = facts.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(facts.copies)
+    kernel_norm = (facts.passed.total * facts.passed.peak).sqrt()
     if plan.kernels is not None:
-        kernel = plan.kernels.abs() @ kernel[plan.bands]
+        kernel_norm = plan.kernels.abs() @ kernel_norm[plan.bands]
     else:  # the band of each PSF, or the band in which a PSF has the weight 1
-        kernel = kernel[plan.bands if facts.share is None else facts.share.argmax(0)]
-    terms = (plane if x is None else x.abs() @ plane) * (kernel if y is None else y.abs() @ kernel)
-    white = terms[None].sum(1) if u is None else u.abs() @ terms
-    return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 10 * brightest)
+        kernel_norm = kernel_norm[plan.bands if facts.share is None else facts.share.argmax(0)]
+    terms = (plane_norm if term_of_plane is None else term_of_plane.abs() @ plane_norm) * (
+        kernel_norm if term_of_kernel is None else term_of_kernel.abs() @ kernel_norm
+    )
+    term_norm = terms[None].sum(1) if result_of_term is None else result_of_term.abs() @ terms
+    return eps * (
+        8 * math.sqrt(math.log2(transform_size + 1)) * term_norm / math.sqrt(transform_size)
+        + 10 * brightest
+    )
 
 
 # --- channel image --------------------------------------------------------------------------------
@@ -234,21 +250,25 @@ def image_channels(
     """
     share = (
         None
+        # every band has its PSF: no weights are needed
         if few is None or few.share.shape[0] == few.share.shape[1]
         else few.share.double().cpu()
     )
     planes, intensity = _fitted(radiance, psf, rows, share)
-    unit = rows.detach().abs().amax(1).double().cpu()
-    unit = unit.where(unit > 0, 1.0)
-    scaled = rows.detach().double().cpu() / unit[:, None]
+    largest_weight = rows.detach().abs().amax(1).double().cpu()
+    largest_weight = largest_weight.where(largest_weight > 0, 1.0)
+    scaled_rows = rows.detach().double().cpu() / largest_weight[:, None]
     facts = _given(
-        radiance, planes, scaled, border, spread(passed(intensity.detach()), share), share
+        radiance, planes, scaled_rows, border, spread(passed(intensity.detach()), share), share
     )
     result, bound, sizes = _formed(planes, intensity, facts, 0.0 if largest else within)
-    top = _top(result, radiance, intensity, facts, within * _QUICKLY) if largest else math.inf
-    brightest = torch.tensor(top, dtype=torch.float64)
-    scale = unit.to(result)[:, None, None]
-    result = result * scale if result.requires_grad else result.mul_(scale)
+    # relative error of the brightest pixel, where it is asked for
+    brightest_error = (
+        _top(result, radiance, intensity, facts, within * _QUICKLY) if largest else math.inf
+    )
+    brightest = torch.tensor(brightest_error, dtype=torch.float64)
+    row_scale = largest_weight.to(result)[:, None, None]
+    result = result * row_scale if result.requires_grad else result.mul_(row_scale)
     estimated = (
         torch.zeros(2, dtype=torch.float64)
         if few is None
@@ -278,8 +298,9 @@ def _(
 
 @image_channels.approximation_error
 def _(result: Channels) -> tuple[float, float]:
-    error, top = result.estimated.tolist()
-    return float(result.bound) + error, float(result.largest) + top
+    # relative errors, in root mean square and of the brightest pixel
+    error, brightest_error = result.estimated.tolist()
+    return float(result.bound) + error, float(result.largest) + brightest_error
 
 
 @image.propagate_error
@@ -316,6 +337,7 @@ def _(*inputs: Any, **params: Any) -> tuple[float, float]:
 
 @image_channels.check
 def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> list[Check]:
+    # as in `Plan.kept`
     planes, kernels, bands, y, x = result.kept.tolist()
     text = (
         f"{planes} planes and {kernels} kernels of {y} x {x} for {result.rows.shape[1]} bands, "
@@ -329,23 +351,28 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
 def _fitted(
     radiance: LowRankCube, psf: Psf, rows: Tensor, share: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Return the basis images of the scene, and the part of the PSF that reaches the scene, in
-    the same precision.
+    """Return the basis images of the scene (k, y, x), and the part of the PSF that reaches the
+    scene (band, y, x), in the same precision.
     """
     psf_bands = len(psf.intensity)
     if share is not None:
         psf_bands = len(share) if share.shape[1] == psf_bands else -1
-    bands = {len(radiance.basis), psf_bands, rows.shape[-1]}
-    if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
+    band_counts = {len(radiance.basis), psf_bands, rows.shape[-1]}
+    if (
+        len(band_counts) > 1
+        or radiance.planes.ndim != 3
+        or psf.intensity.ndim != 3
+        or rows.ndim != 2
+    ):
         raise ValueError(
             f"radiance of {len(radiance.basis)} bands in planes {tuple(radiance.planes.shape)}, PSF"
             f" {tuple(psf.intensity.shape)} and rows {tuple(rows.shape)} must have the same bands,"
             " without a batch: compute all three from the same `bands` step"
         )
     planes, dtype = radiance.planes, torch.promote_types(radiance.planes.dtype, psf.intensity.dtype)
-    kernel = reach(reach(psf.intensity, -2, planes.shape[-2]), -1, planes.shape[-1])
+    cropped_psf = reach(reach(psf.intensity, -2, planes.shape[-2]), -1, planes.shape[-1])
     dtype = torch.promote_types(dtype, torch.float32)
-    return planes.to(dtype), kernel.to(dtype)
+    return planes.to(dtype), cropped_psf.to(dtype)
 
 
 def _given(
@@ -356,24 +383,33 @@ def _given(
     through: Passed,
     share: Tensor | None,
 ) -> ImageFacts:
-    flat = planes.detach().flatten(1)
-    gram = (flat @ flat.T).double().cpu()
-    copies = 9 if border == "reflect" else 1
+    """Return the facts of scene, PSF and weights from which a plan is chosen, in float64 on the
+    CPU.
+    """
+    flat_planes = planes.detach().flatten(1)
+    plane_products = (flat_planes @ flat_planes.T).double().cpu()
+    # a mirrored border repeats the scene at most in 3 x 3 fields
+    copy_count = 9 if border == "reflect" else 1
+    # errors as root mean squares where the cube has them, else as largest values
     if radiance.residual_rms.numel():
-        residual = radiance.residual_rms.double().cpu() * math.sqrt(copies)
-        norm = (gram.diagonal() * (1.001 * copies / flat.shape[1])).clamp_min(0).sqrt()
+        residual = radiance.residual_rms.double().cpu() * math.sqrt(copy_count)
+        plane_norms = (
+            (plane_products.diagonal() * (1.001 * copy_count / flat_planes.shape[1]))
+            .clamp_min(0)
+            .sqrt()
+        )
     else:
-        residual, norm = (
+        residual, plane_norms = (
             radiance.residual_max.double().cpu(),
-            torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu(),
+            torch.maximum(flat_planes.amax(1), -flat_planes.amin(1)).double().cpu(),
         )
     return ImageFacts(
         rows,
         radiance.basis.detach().double().cpu(),
         residual,
-        norm,
-        gram,
-        copies,
+        plane_norms,
+        plane_products,
+        copy_count,
         through,
         (planes.shape[1], planes.shape[2]),
         border == "reflect",
@@ -384,24 +420,29 @@ def _given(
 def _formed(
     planes: Tensor, intensity: Tensor, facts: ImageFacts, within: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the summed image, its error bound, and the sizes of the first convolution plan of
-    error at most ``within``.
+    """Return the summed image, its relative error bound, and the sizes (`Plan.kept`) of the first
+    convolution plan of error at most ``within``.
     """
     eps = torch.finfo(planes.dtype).eps
-    brightest, allowed = facts.rows.new_zeros(len(facts.rows)), within / (1 + within) - 16 * eps
+    # an error relative to the true pixel is within / (1 + within) of the computed one
+    brightest, allowed_error = (
+        facts.rows.new_zeros(len(facts.rows)),
+        within / (1 + within) - 16 * eps,
+    )
     if within > 0:
         brightest = guessed(planes.detach(), facts)
-        facts = with_windows(facts, intensity.detach(), brightest, allowed)
+        facts = with_windows(facts, intensity.detach(), brightest, allowed_error)
     for attempt in range(_TRIES):
-        plan = choose(facts, brightest, allowed if attempt < _TRIES - 1 else 0.0)
+        # the last try omits nothing
+        plan = choose(facts, brightest, allowed_error if attempt < _TRIES - 1 else 0.0)
         result = convolved(planes, intensity, facts, plan)
         brightest_found = result.detach().abs().amax((1, 2)).double().cpu()
-        lost = rounding(facts, plan, brightest_found, eps)
-        bound = _share(plan.off + lost, brightest_found)
+        round_off = rounding(facts, plan, brightest_found, eps)
+        bound = _share(plan.off + round_off, brightest_found)
         if plan.whole or bound <= within:
             break
-        brightest = (brightest_found - plan.off - lost).clamp_min(0)
-        allowed = within / (1 + within) - _share(lost, brightest_found) - eps
+        brightest = (brightest_found - plan.off - round_off).clamp_min(0)
+        allowed_error = within / (1 + within) - _share(round_off, brightest_found) - eps
     return result, torch.tensor(bound, dtype=torch.float64), torch.tensor(plan.kept)
 
 
@@ -420,37 +461,45 @@ def _top(
     if not radiance.residual_map.numel():
         return math.inf
     image, residual = result.detach(), radiance.residual_map.to(result)
-    low, highest = (
+    lowest, highest = (
         torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, image), strict=True)
     )
-    lost = rounding(
+    round_off = rounding(
         facts,
         choose(facts, highest, 0.0),
-        torch.maximum(highest, -low),
+        torch.maximum(highest, -lowest),
         torch.finfo(image.dtype).eps,
     )
     if quickly > 0 and min(image.shape[1:]) >= _LARGE:
-        above = (
+        highest_possible = (
             (cells(image) + majorant_by_cell(residual, intensity.detach(), facts))
             .amax((1, 2))
             .double()
             .cpu()
         )
-        if (top := _share(above - highest + lost, highest)) <= quickly:
-            return top
-    lacks = majorant(residual, intensity.detach(), facts)
-    room = torch.empty_like(lacks)
-    above = torch.stack([torch.add(row, lacks, out=room).amax() for row in image]).double().cpu()
-    return _share(above - highest + lost, highest)
+        if (largest_error := _share(highest_possible - highest + round_off, highest)) <= quickly:
+            return largest_error
+    residual_image = majorant(residual, intensity.detach(), facts)
+    sum_buffer = torch.empty_like(residual_image)
+    highest_possible = (
+        torch.stack([torch.add(row, residual_image, out=sum_buffer).amax() for row in image])
+        .double()
+        .cpu()
+    )
+    return _share(highest_possible - highest + round_off, highest)
 
 
 def _share(off: Tensor, peak: Tensor) -> float:
     """Return the largest relative error of the brightest pixels, given computed values ``peak``
     and error bounds ``off``.
     """
-    share = torch.where(off > 0, torch.where(off < peak, off / (peak - off), math.inf), 0.0)
-    worst = float(share.amax()) if bool(torch.isfinite(off + peak).all()) else math.inf
-    return worst
+    relative_errors = torch.where(
+        off > 0, torch.where(off < peak, off / (peak - off), math.inf), 0.0
+    )
+    largest_error = (
+        float(relative_errors.amax()) if bool(torch.isfinite(off + peak).all()) else math.inf
+    )
+    return largest_error
 
 
 image.channel_sum_form = image_channels

@@ -37,14 +37,14 @@ class Passed(NamedTuple):
 def passed(intensity: Tensor) -> Passed:
     """Return the sums and maxima of PSFs (band, y, x), with the whole PSF as the only window."""
     # a maximum over several dimensions takes three times as long
-    ends = [torch.aminmax(band) for band in intensity]
-    low, high = (torch.stack(columns).double().cpu() for columns in zip(*ends, strict=True))
+    extremes = [torch.aminmax(band) for band in intensity]
+    low, high = (torch.stack(columns).double().cpu() for columns in zip(*extremes, strict=True))
     signed = not bool((low >= 0).all())  # True for NaN too
     rows = (intensity.abs() if signed else intensity).sum(2)
     total = rows.sum(1, dtype=torch.float64).cpu() * (1 + _ROUNDED)
-    nothing = torch.zeros_like(total)[None]
+    zeros = torch.zeros_like(total)[None]
     window = (intensity.shape[1], intensity.shape[2])
-    return Passed([window], total, torch.maximum(high, -low), nothing, nothing, signed)
+    return Passed([window], total, torch.maximum(high, -low), zeros, zeros, signed)
 
 
 def by_window(intensity: Tensor, signed: bool) -> Passed:
@@ -54,14 +54,18 @@ def by_window(intensity: Tensor, signed: bool) -> Passed:
     """
     m, n = intensity.shape[1:]
     windows = list(dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in _LADDER))
-    tall, wide = ([_inside(length, w[axis]) for w in windows] for axis, length in enumerate((m, n)))
-    sums, tops = _pieces(intensity.abs() if signed else intensity, _cuts(tall), _cuts(wide))
+    row_spans, column_spans = (
+        [_inside(length, w[axis]) for w in windows] for axis, length in enumerate((m, n))
+    )
+    sums, maxima = _pieces(
+        intensity.abs() if signed else intensity, _cuts(row_spans), _cuts(column_spans)
+    )
     beyond, above = torch.zeros(2, len(windows), len(intensity), dtype=torch.float64)
-    for j, (y, x) in enumerate(zip(tall, wide, strict=True)):
-        outside = ~torch.outer(_covered(y, _cuts(tall)), _covered(x, _cuts(wide)))
-        if bool(outside.any()):
-            beyond[j], above[j] = sums[:, outside].sum(1), tops[:, outside].amax(1)
-    return Passed(windows, sums.sum((1, 2)), tops.amax((1, 2)), beyond, above, signed)
+    for j, (y, x) in enumerate(zip(row_spans, column_spans, strict=True)):
+        is_outside = ~torch.outer(_covered(y, _cuts(row_spans)), _covered(x, _cuts(column_spans)))
+        if bool(is_outside.any()):
+            beyond[j], above[j] = sums[:, is_outside].sum(1), maxima[:, is_outside].amax(1)
+    return Passed(windows, sums.sum((1, 2)), maxima.amax((1, 2)), beyond, above, signed)
 
 
 def spread(of: Passed, share: Tensor | None) -> Passed:
@@ -83,11 +87,15 @@ def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
 
 
 def _inside(length: int, window: int) -> tuple[int, int]:
+    """Return the first and the last sample, exclusive, of a window about the central sample n
+    // 2.
+    """
     first = length // 2 - window // 2
     return first, first + window
 
 
 def _cuts(spans: list[tuple[int, int]]) -> list[int]:
+    """Return the edges of all spans, in rising order, once each."""
     return sorted(set(chain.from_iterable(spans)))
 
 
@@ -103,12 +111,17 @@ def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, 
     A few large calls are faster than many small calls, each of which waits for other work on the
     machine.
     """
-    along = [(size[:, a:b].sum(1), size[:, a:b].amax(1)) for a, b in pairwise(rows)]
-    sums, tops = (
-        torch.stack(row_parts, 1).double().cpu() for row_parts in zip(*along, strict=True)
+    row_sums_and_maxima = [(size[:, a:b].sum(1), size[:, a:b].amax(1)) for a, b in pairwise(rows)]
+    row_sums, row_maxima = (
+        torch.stack(row_parts, 1).double().cpu()
+        for row_parts in zip(*row_sums_and_maxima, strict=True)
     )
-    total = torch.stack([sums[..., a:b].sum(-1) for a, b in pairwise(columns)], -1) * (1 + _ROUNDED)
-    return total, torch.stack([tops[..., a:b].amax(-1) for a, b in pairwise(columns)], -1)
+    piece_sums = torch.stack([row_sums[..., a:b].sum(-1) for a, b in pairwise(columns)], -1) * (
+        1 + _ROUNDED
+    )
+    return piece_sums, torch.stack(
+        [row_maxima[..., a:b].amax(-1) for a, b in pairwise(columns)], -1
+    )
 
 
 # --- summed convolution ---------------------------------------------------------------------------
@@ -180,23 +193,29 @@ class Summed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         (a, b), (mix, where), grad = ctx.saved_tensors, ctx.how, grads[0]
+        # the transposed matrices mix the gradients
         u, x, y = (m if m is None else m.T for m in mix[:3])
-        flip = not where.conjugate
-        of_a = of_b = None
+        correlation = not where.conjugate
+        picture_gradient = kernel_gradient = None
         if ctx.needs_input_grad[0]:
-            back = where._replace(
-                at_a=where.at, at=where.at_a, size=tuple(a.shape[1:]), conjugate=flip
+            gradient_where = where._replace(
+                at_a=where.at, at=where.at_a, size=tuple(a.shape[1:]), conjugate=correlation
             )
-            of_a = summed(grad, b, Mix(x, u, mix.y), back)
+            picture_gradient = summed(grad, b, Mix(x, u, mix.y), gradient_where)
         if ctx.needs_input_grad[1]:
-            back = where._replace(at=where.at_b, size=tuple(b.shape[1:]), conjugate=True)
+            gradient_where = where._replace(at=where.at_b, size=tuple(b.shape[1:]), conjugate=True)
             if where.conjugate:
-                of_b = summed(a, grad, Mix(y, mix.x, u), back._replace(at_b=where.at))
-            else:
-                of_b = summed(
-                    grad, a, Mix(y, u, mix.x), back._replace(at_a=where.at, at_b=where.at_a)
+                kernel_gradient = summed(
+                    a, grad, Mix(y, mix.x, u), gradient_where._replace(at_b=where.at)
                 )
-        return of_a, of_b, None, None
+            else:
+                kernel_gradient = summed(
+                    grad,
+                    a,
+                    Mix(y, u, mix.x),
+                    gradient_where._replace(at_a=where.at, at_b=where.at_a),
+                )
+        return picture_gradient, kernel_gradient, None, None
 
     @staticmethod
     def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
@@ -220,21 +239,33 @@ def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
 
 
 def _summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
-    mix, (high, wide) = mix.to(a), where.length
-    columns = wide // 2 + 1
+    """Return weighted sums (result, y, x) of convolutions, a block of spectrum columns at a
+    time.
+    """
+    mix, (tall_length, wide_length) = mix.to(a), where.length
+    columns = wide_length // 2 + 1
     step = columns if a.is_cuda else min(columns, _COLUMNS)
-    pictures = _Columns(_rows(a, where.at_a[1], wide, step), where.at_a[0], high)
-    kernels = _Columns(_rows(b, where.at_b[1], wide, step), where.at_b[0], high)
+    pictures = _Columns(_rows(a, where.at_a[1], wide_length, step), where.at_a[0], tall_length)
+    kernels = _Columns(_rows(b, where.at_b[1], wide_length, step), where.at_b[0], tall_length)
     result = pictures.room.new_empty(_results(mix, a), where.size[0], columns)
-    for i, c in enumerate(range(0, columns, step)):
-        x, y = pictures.spectra(i), _times(mix.y, kernels.spectra(i))
-        block = torch.fft.ifft(_mixed(mix, x, y.conj() if where.conjugate else y))
-        block = block[:, : columns - c, where.at[0] : where.at[0] + where.size[0]]
-        result[:, :, c : c + step] = block.transpose(1, 2)
-    return _pixels(result, wide, slice(where.at[1], where.at[1] + where.size[1]))
+    for block_number, first_column in enumerate(range(0, columns, step)):
+        picture_spectra, kernel_spectra = (
+            pictures.spectra(block_number),
+            _times(mix.y, kernels.spectra(block_number)),
+        )
+        block = torch.fft.ifft(
+            _mixed(
+                mix, picture_spectra, kernel_spectra.conj() if where.conjugate else kernel_spectra
+            )
+        )
+        # only the rows of the window are kept
+        block = block[:, : columns - first_column, where.at[0] : where.at[0] + where.size[0]]
+        result[:, :, first_column : first_column + step] = block.transpose(1, 2)
+    return _pixels(result, wide_length, slice(where.at[1], where.at[1] + where.size[1]))
 
 
 def _results(mix: Mix, a: Tensor) -> int:
+    """Return the number of results, from the last matrix that is not the identity."""
     return next(len(m) for m in (mix.u, mix.x, a) if m is not None)
 
 
@@ -258,24 +289,25 @@ def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
     A block of columns is contiguous: in rows 12 kB apart, each element would lie in another memory
     page.
     """
-    count, tall, broad = x.shape
+    count, row_count, width = x.shape
     full_blocks, remainder = divmod(wide // 2 + 1, step)
-    some = _few_rows(x, tall)
-    room = x.new_zeros(some, wide)
-    blocks = room.new_empty(
-        count, full_blocks + (remainder > 0), tall, step, dtype=x.dtype.to_complex()
+    chunk = _few_rows(x, row_count)
+    zero_padded = x.new_zeros(chunk, wide)
+    blocks = zero_padded.new_empty(
+        count, full_blocks + (remainder > 0), row_count, step, dtype=x.dtype.to_complex()
     )
     if remainder:
+        # the last block is filled up with zeros
         blocks[:, full_blocks, :, remainder:] = 0.0
     for plane, block in zip(x, blocks, strict=True):
-        for y in range(0, tall, some):
-            rows = slice(y, min(y + some, tall))
-            inside = room[: rows.stop - y]
-            inside[:, left : left + broad] = plane[rows]
-            spectrum: Tensor = torch.fft.rfft(inside)
+        for y in range(0, row_count, chunk):
+            rows = slice(y, min(y + chunk, row_count))
+            padded_rows = zero_padded[: rows.stop - y]
+            padded_rows[:, left : left + width] = plane[rows]
+            spectrum: Tensor = torch.fft.rfft(padded_rows)
             block[:full_blocks, rows] = (
                 spectrum[:, : full_blocks * step]
-                .view(len(inside), full_blocks, step)
+                .view(len(padded_rows), full_blocks, step)
                 .transpose(0, 1)
             )
             block[full_blocks:, rows, :remainder] = spectrum[:, full_blocks * step :]
@@ -286,10 +318,10 @@ def _pixels(spectrum: Tensor, wide: int, columns: slice) -> Tensor:
     """Return the wanted columns of pictures, given the spectrum of each row."""
     size = spectrum.shape[1]
     pixels = spectrum.real.new_empty(*spectrum.shape[:2], columns.stop - columns.start)
-    some = _few_rows(spectrum, size)
+    chunk = _few_rows(spectrum, size)
     for plane, rows in zip(pixels, spectrum, strict=True):
-        for y in range(0, size, some):
-            plane[y : y + some] = torch.fft.irfft(rows[y : y + some], n=wide)[:, columns]
+        for y in range(0, size, chunk):
+            plane[y : y + chunk] = torch.fft.irfft(rows[y : y + chunk], n=wide)[:, columns]
     return pixels
 
 
@@ -320,9 +352,11 @@ def _times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
     """Multiply complex spectra by a real matrix."""
     if matrix is None:
         return spectra
-    pairs = torch.view_as_real(spectra)
+    real_and_imaginary = torch.view_as_real(spectra)
     return torch.view_as_complex(
-        (matrix @ pairs.reshape(len(spectra), -1)).reshape(-1, *pairs.shape[1:])
+        (matrix @ real_and_imaginary.reshape(len(spectra), -1)).reshape(
+            -1, *real_and_imaginary.shape[1:]
+        )
     )
 
 
@@ -395,12 +429,18 @@ def with_windows(
     """Return ``facts`` with the light that smaller PSF windows omit, or unchanged if these
     windows omit too much.
     """
-    few, signed = slice(_EVERY // 2, None, _EVERY), facts.passed.signed
+    # a test on few bands avoids the sums of all where no window is small enough
+    some_bands, signed = slice(_EVERY // 2, None, _EVERY), facts.passed.signed
     if facts.share is None and len(intensity) > _EVERY:
-        some = facts._replace(
-            rows=facts.rows[:, few], basis=facts.basis[few], residual=facts.residual[:, few]
+        facts_of_some = facts._replace(
+            rows=facts.rows[:, some_bands],
+            basis=facts.basis[some_bands],
+            residual=facts.residual[:, some_bands],
         )
-        if not _narrow(some._replace(passed=by_window(intensity[few], signed)), within * brightest):
+        if not _narrow(
+            facts_of_some._replace(passed=by_window(intensity[some_bands], signed)),
+            within * brightest,
+        ):
             return facts
     return facts._replace(passed=spread(by_window(intensity, signed), facts.share))
 
@@ -419,31 +459,37 @@ def choose(facts: ImageFacts, brightest: Tensor, within: float) -> Plan:
     """Return the cheapest convolution plan that omits at most ``within`` of the brightest pixel,
     or a complete plan.
     """
-    bands, lost = _strong(facts, brightest, within)
-    complete = min(_plans(facts, bands, lost, len(facts.norm), 0), key=lambda plan: plan.cost)
-    best = complete._replace(whole=True)
+    bands, omitted_light = _strong(facts, brightest, within)
+    complete = min(
+        _plans(facts, bands, omitted_light, len(facts.norm), 0), key=lambda plan: plan.cost
+    )
+    cheapest = complete._replace(whole=True)
     if within <= 0:
-        return best
-    for k in _enough(facts, bands, lost, brightest, within):
-        fewer = _fewer(facts, bands, k, brightest)
-        for j in range(len(facts.passed.windows)):
-            plans = _plans(facts, bands, lost, k, j, (within * brightest, fewer))
-            best = min([best, *plans], key=lambda plan: plan.cost)
-    return best
+        return cheapest
+    for planes in _enough(facts, bands, omitted_light, brightest, within):
+        fewer = _fewer(facts, bands, planes, brightest)
+        for window_number in range(len(facts.passed.windows)):
+            plans = _plans(
+                facts, bands, omitted_light, planes, window_number, (within * brightest, fewer)
+            )
+            cheapest = min([cheapest, *plans], key=lambda plan: plan.cost)
+    return cheapest
 
 
 def _strong(facts: ImageFacts, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
     """Return the bands to convolve, and an upper bound of the light that the omitted bands add
     to each weighted sum.
     """
-    may = facts.rows.abs() * (facts.residual[0] * facts.passed.total)
-    share = torch.where(may > 0, may / brightest.clamp_min(1e-300)[:, None], 0.0).amax(0)
-    order = share.argsort()
-    weak = order[share[order].cumsum(0) <= _SMALL * max(within, 0.0)]
-    bands = torch.ones_like(share, dtype=torch.bool).index_fill_(0, weak, False)
+    most_light = facts.rows.abs() * (facts.residual[0] * facts.passed.total)
+    share = torch.where(
+        most_light > 0, most_light / brightest.clamp_min(1e-300)[:, None], 0.0
+    ).amax(0)
+    rising_order = share.argsort()
+    omitted = rising_order[share[rising_order].cumsum(0) <= _SMALL * max(within, 0.0)]
+    bands = torch.ones_like(share, dtype=torch.bool).index_fill_(0, omitted, False)
     if not bool(bands.any()):
         bands[int(share.argmax())] = True
-    return bands.nonzero()[:, 0], may[:, ~bands].sum(1)
+    return bands.nonzero()[:, 0], most_light[:, ~bands].sum(1)
 
 
 def _enough(
@@ -452,10 +498,14 @@ def _enough(
     """Return how many basis images each picture needs for an error of at most ``within`` times
     the brightest pixel.
     """
-    off = (
+    omitted_light = (
         lost + (facts.residual[:, bands] * facts.passed.total[bands]) @ facts.rows[:, bands].abs().T
     )
-    fits = [k for k in range(1, len(facts.norm) + 1) if bool((off[k] <= within * brightest).all())]
+    fits = [
+        k
+        for k in range(1, len(facts.norm) + 1)
+        if bool((omitted_light[k] <= within * brightest).all())
+    ]
     return fits[:_FARTHER]
 
 
@@ -473,18 +523,23 @@ def _plans(
     The kernels of the three plans are one for each plane and row, one for each PSF, and fewer
     kernels to mix.
     """
-    rows, basis, through = facts.rows[:, bands], facts.basis[bands, :k], facts.passed.total[bands]
+    rows, basis, passed_light = (
+        facts.rows[:, bands],
+        facts.basis[bands, :k],
+        facts.passed.total[bands],
+    )
     off = (
         lost
-        + rows.abs() @ (facts.residual[k, bands] * through)
+        + rows.abs() @ (facts.residual[k, bands] * passed_light)
         + rows.abs() @ _tail(facts, bands, k, j)
     )
     if within is not None and not bool((off <= within[0]).all()):
         return
-    count = len(rows)
-    u = torch.eye(count, dtype=torch.float64).repeat_interleave(k, 1)
-    x = torch.eye(k, dtype=torch.float64).repeat(count, 1)
-    sums = _sums(rows, basis)
+    row_count = len(rows)
+    # terms are (row, plane): each result sums its own k terms, and each term takes its plane
+    result_of_term = torch.eye(row_count, dtype=torch.float64).repeat_interleave(k, 1)
+    plane_of_term = torch.eye(k, dtype=torch.float64).repeat(row_count, 1)
+    kernel_weights = _sums(rows, basis)
 
     def plan(kernels: Tensor | None, mix: Mix, off: Tensor) -> Plan:
         window = facts.passed.windows[j]
@@ -502,16 +557,25 @@ def _plans(
             False,
         )
 
-    yield plan(sums, Mix(u, x, None, count), off)
+    # a kernel for each plane and row
+    yield plan(kernel_weights, Mix(result_of_term, plane_of_term, None, row_count), off)
     if facts.share is None:
+        # a kernel for each band, that is, its PSF
         yield plan(None, Mix(rows, basis, None), off)
     else:
-        yield plan(None, Mix(u, x, sums @ facts.share[bands], count), off)
+        yield plan(
+            None,
+            Mix(result_of_term, plane_of_term, kernel_weights @ facts.share[bands], row_count),
+            off,
+        )
     if within is not None:
         limit, few = within
+        # the fewest mixed kernels within the limit
         for q in (few.off + off <= limit).all(1).nonzero()[:1, 0].tolist():
             yield plan(
-                few.kernels[: q + 1], Mix(u, x, few.mixed[:, : q + 1], count), off + few.off[q]
+                few.kernels[: q + 1],
+                Mix(result_of_term, plane_of_term, few.mixed[:, : q + 1], row_count),
+                off + few.off[q],
             )
 
 
@@ -519,20 +583,31 @@ def _fewer(facts: ImageFacts, bands: Tensor, k: int, brightest: Tensor) -> Fewer
     """Return a small set of kernels: singular vectors of the matrix that sums the bands of the
     PSF to kernels.
     """
-    rows, band = facts.rows[:, bands], facts.passed.total[bands]
-    plane = torch.where(brightest[:, None] > 0, facts.norm[:k] / brightest[:, None], 0.0).flatten()
-    scaled = plane[:, None] * _sums(rows, facts.basis[bands, :k]) * band
-    a, s, b = torch.linalg.svd(scaled, full_matrices=False)
-    off = [
-        (scaled - (a[:, :q] * s[:q]) @ b[:q]).abs().sum(1).reshape(len(rows), -1).sum(1)
-        for q in range(1, len(s))
+    rows, band_light = facts.rows[:, bands], facts.passed.total[bands]
+    plane_scale = torch.where(
+        brightest[:, None] > 0, facts.norm[:k] / brightest[:, None], 0.0
+    ).flatten()
+    # in units of light, so that singular values are errors of the image
+    scaled = plane_scale[:, None] * _sums(rows, facts.basis[bands, :k]) * band_light
+    left_vectors, singular_values, right_vectors = torch.linalg.svd(scaled, full_matrices=False)
+    omitted_light = [
+        (scaled - (left_vectors[:, :q] * singular_values[:q]) @ right_vectors[:q])
+        .abs()
+        .sum(1)
+        .reshape(len(rows), -1)
+        .sum(1)
+        for q in range(1, len(singular_values))
     ]
-    kernels = torch.where(band > 0, b / band, 0.0)
-    mixed = torch.where(plane[:, None] > 0, a * s / plane[:, None], 0.0)
+    kernels = torch.where(band_light > 0, right_vectors / band_light, 0.0)
+    mixed = torch.where(
+        plane_scale[:, None] > 0, left_vectors * singular_values / plane_scale[:, None], 0.0
+    )
     # a row without weight above
     unknown = torch.where((brightest == 0) & (rows != 0).any(1), math.inf, 0.0)
     return Fewer(
-        kernels, mixed, torch.stack(off) * brightest + unknown if off else brightest[None][:0]
+        kernels,
+        mixed,
+        torch.stack(omitted_light) * brightest + unknown if omitted_light else brightest[None][:0],
     )
 
 
@@ -551,9 +626,10 @@ def _tail(facts: ImageFacts, bands: Tensor, k: int, j: int) -> Tensor:
     """
     basis = facts.basis[bands, :k]
     beyond, above = facts.passed.beyond[j, bands], facts.passed.above[j, bands]
-    top = facts.residual[0, bands] + facts.residual[k, bands]
+    largest_value = facts.residual[0, bands] + facts.residual[k, bands]
     power = ((basis @ facts.gram[:k, :k]) * basis).sum(1).clamp_min(0) * facts.copies
-    return torch.minimum(top * beyond, (power * beyond * above).sqrt() * (1 + 1e-6))
+    # max |scene| x sum |PSF|, or root of (scene power x sum |PSF| x max |PSF|)
+    return torch.minimum(largest_value * beyond, (power * beyond * above).sqrt() * (1 + 1e-6))
 
 
 def _cost(
@@ -562,12 +638,16 @@ def _cost(
     """Return the seconds that a convolution plan is expected to take on two cores: FFTs,
     products and kernel sums.
     """
-    area = math.prod(transform(facts, window))
+    transform_area = math.prod(transform(facts, window))
     count = bands if kernels is None else len(kernels)
     terms = len(mix.x) if mix.x is not None else k
     products = terms * (k + len(facts.rows) + (count if mix.y is not None else 0) + 8)
-    sums = 0 if kernels is None else count * bands * math.prod(window)
-    return area * (2e-9 * (k + count + len(facts.rows)) + 3e-11 * products) + 1.4e-11 * sums
+    kernel_sums = 0 if kernels is None else count * bands * math.prod(window)
+    # seconds for each sample, measured: transforms, products, and sums of kernels
+    return (
+        transform_area * (2e-9 * (k + count + len(facts.rows)) + 3e-11 * products)
+        + 1.4e-11 * kernel_sums
+    )
 
 
 def transform(facts: ImageFacts, window: tuple[int, int]) -> tuple[int, int]:

@@ -54,8 +54,12 @@ def without_gradients(
     pupil: Pupil, radiance: LowRankCube, rows: Tensor
 ) -> tuple[Pupil, LowRankCube, Tensor]:
     """Return the inputs of a choice, which is constant for gradients."""
-    still = pupil._replace(**{name: getattr(pupil, name).detach() for name in _SCREENS})
-    return still, radiance._replace(planes=radiance.planes.detach()), rows.detach().double().cpu()
+    constant_pupil = pupil._replace(**{name: getattr(pupil, name).detach() for name in _SCREENS})
+    return (
+        constant_pupil,
+        radiance._replace(planes=radiance.planes.detach()),
+        rows.detach().double().cpu(),
+    )
 
 
 class Thumbnail(NamedTuple):
@@ -69,11 +73,12 @@ class Thumbnail(NamedTuple):
 
     def light(self, bands: Tensor) -> Tensor:
         """Return the PSFs (band, cell, cell) of some bands about the axis."""
-        some = self.pupil._replace(
+        pupil_of_bands = self.pupil._replace(
             index=self.pupil.index[bands], wavelengths=self.pupil.wavelengths[bands]
         )
         return binned(
-            focused(some, (self.pixels * SIDE, self.pixels * SIDE), self.lens), self.pixels
+            focused(pupil_of_bands, (self.pixels * SIDE, self.pixels * SIDE), self.lens),
+            self.pixels,
         )
 
 
@@ -84,23 +89,29 @@ def thumbnail(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | N
     longer.
     """
     # square pixels of a thinned pupil would be too wide
-    small, lens = _thinned(pupil), {**lens, "pixel": "point"}
-    ends = torch.tensor(sorted({0, len(pupil.wavelengths) // 2, len(pupil.wavelengths) - 1}))
-    some = small._replace(index=small.index[ends], wavelengths=small.wavelengths[ends])
-    reach = (
-        float(small.wavelengths.min())
-        * lens["focal_length"]
-        / (float(small.pitch) * lens["pixel_pitch"])
+    thinned, lens = _thinned(pupil), {**lens, "pixel": "point"}
+    # the first, the middle and the last band stand for all
+    end_bands = torch.tensor(sorted({0, len(pupil.wavelengths) // 2, len(pupil.wavelengths) - 1}))
+    pupil_of_ends = thinned._replace(
+        index=thinned.index[end_bands], wavelengths=thinned.wavelengths[end_bands]
     )
-    clear, through = small.aperture.double().square().sum(), small.amplitude.double().square().sum()
+    alias_free = (
+        float(thinned.wavelengths.min())
+        * lens["focal_length"]
+        / (float(thinned.pitch) * lens["pixel_pitch"])
+    )
+    clear_light, passed_light = (
+        thinned.aperture.double().square().sum(),
+        thinned.amplitude.double().square().sum(),
+    )
     for pixels in _BINS:
         side = pixels * SIDE
-        if side > reach or side**2 * _GAIN > shape[0] * shape[1]:
+        if side > alias_free or side**2 * _GAIN > shape[0] * shape[1]:
             return None
-        if float(focused(some, (side, side), lens).sum((1, 2)).min()) >= _HELD * float(
-            through / clear
+        if float(focused(pupil_of_ends, (side, side), lens).sum((1, 2)).min()) >= _HELD * float(
+            passed_light / clear_light
         ):
-            return Thumbnail(small, pixels, lens)
+            return Thumbnail(thinned, pixels, lens)
     return None
 
 
@@ -154,11 +165,11 @@ def share_of_bands(bands: Tensor, count: int) -> Tensor:
     band = torch.arange(count, dtype=torch.float64)
     if len(bands) == 1:
         return torch.ones(count, 1, dtype=torch.float64)
-    high = torch.searchsorted(bands.double(), band).clamp(1, len(bands) - 1)
-    low = high - 1
-    weight = ((band - bands[low]) / (bands[high] - bands[low])).clamp(0.0, 1.0)[:, None]
+    upper = torch.searchsorted(bands.double(), band).clamp(1, len(bands) - 1)
+    lower = upper - 1
+    weight = ((band - bands[lower]) / (bands[upper] - bands[lower])).clamp(0.0, 1.0)[:, None]
     share = torch.zeros(count, len(bands), dtype=torch.float64)
-    return share.scatter_(1, low[:, None], 1 - weight).scatter_(1, high[:, None], weight)
+    return share.scatter_(1, lower[:, None], 1 - weight).scatter_(1, upper[:, None], weight)
 
 
 def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) -> Parts:
@@ -167,18 +178,22 @@ def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) ->
 
     ``light`` has the PSFs (band, m, n) of all bands in cells of ``pixels`` along each side.
     """
+    # mean over each cell: `binned` returns the sum
     planes = binned(radiance.planes[:_PLANES], pixels) / pixels**2
     basis = radiance.basis[:, :_PLANES].detach().double().cpu()
-    white = torch.tensordot((rows.sum(0) @ basis).to(planes), planes, 1)[None]
-    tile = (min(_TILE, white.shape[1]), min(_TILE, white.shape[2]))
-    mean = avg_pool2d(white[None], tile)[0, 0]
-    spread = avg_pool2d(white[None].square(), tile)[0, 0] - mean.square()
-    tiles = [divmod(int(x.argmax()), x.shape[1]) for x in (mean, spread)]
-    about = [(y * tile[0] + tile[0] // 2, x * tile[1] + tile[1] // 2) for y, x in tiles]
-    middle = (white.shape[1] // 2, white.shape[2] // 2)
-    scene = torch.stack([_cut(planes, place) for place in dict.fromkeys([*about, middle])]).to(
-        light
-    )
+    picture = torch.tensordot((rows.sum(0) @ basis).to(planes), planes, 1)[None]
+    tile_size = (min(_TILE, picture.shape[1]), min(_TILE, picture.shape[2]))
+    tile_mean = avg_pool2d(picture[None], tile_size)[0, 0]
+    tile_variance = avg_pool2d(picture[None].square(), tile_size)[0, 0] - tile_mean.square()
+    tiles = [divmod(int(x.argmax()), x.shape[1]) for x in (tile_mean, tile_variance)]
+    tile_middles = [
+        (y * tile_size[0] + tile_size[0] // 2, x * tile_size[1] + tile_size[1] // 2)
+        for y, x in tiles
+    ]
+    picture_middle = (picture.shape[1] // 2, picture.shape[2] // 2)
+    scene = torch.stack(
+        [_cut(planes, place) for place in dict.fromkeys([*tile_middles, picture_middle])]
+    ).to(light)
     weights = (rows[:, None, :] * basis.T).flatten(0, 1)
     kernels = weights.to(light) @ light.flatten(1)
     spectra = torch.fft.rfft2(scene)
@@ -188,13 +203,13 @@ def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) ->
 
 def _cut(planes: Tensor, place: tuple[int, int]) -> Tensor:
     """Return a part of the scene about a pixel; a smaller scene is filled up with zeros."""
-    spans = []
+    part_spans = []
     for middle, size in zip(place, planes.shape[1:], strict=True):
         side = min(_PART, size)
         first = min(max(middle - side // 2, 0), size - side)
-        spans.append(slice(first, first + side))
-    cut = planes[:, spans[0], spans[1]]
-    return pad(cut, (0, _PART - cut.shape[2], 0, _PART - cut.shape[1]))
+        part_spans.append(slice(first, first + side))
+    part = planes[:, part_spans[0], part_spans[1]]
+    return pad(part, (0, _PART - part.shape[2], 0, _PART - part.shape[1]))
 
 
 def estimated(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]:
@@ -205,11 +220,12 @@ def estimated(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]
     brightest pixel, or a quarter of the first where that is larger; both are relative to the
     brightest pixel of all parts.
     """
-    off = (parts.weights @ share).to(light) @ light.flatten(1) - parts.kernels
-    error = _imaged(parts.scene, off, light)
+    kernel_error = (parts.weights @ share).to(light) @ light.flatten(1) - parts.kernels
+    error = _imaged(parts.scene, kernel_error, light)
     scale = parts.top.where(parts.top > 0, 1.0)
     rms = error.square().mean((2, 3)).sqrt() / scale
     change = ((parts.image + error).amax((0, 2, 3)) - parts.top).abs() / scale
+    # the error of the brightest pixel is taken as at least a quarter of the rms
     return float(rms.max()), max(float(rms.max()) / 4, float(change.max()))
 
 
@@ -217,11 +233,12 @@ def _imaged(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
     """Return the image (part, row, y, x) of parts of a scene, without the margin to which light
     comes from outside.
     """
-    rows = kernels.view(-1, spectra.shape[1], *like.shape[1:])
+    row_kernels = kernels.view(-1, spectra.shape[1], *like.shape[1:])
     size = (_PART, _PART)
-    image = torch.fft.irfft2((spectra[:, None] * torch.fft.rfft2(rows, size)).sum(2), size)
-    spans = [slice(m - 1, _PART) for m in like.shape[1:]]
-    inner: Tensor = image[..., spans[0], spans[1]]
+    image = torch.fft.irfft2((spectra[:, None] * torch.fft.rfft2(row_kernels, size)).sum(2), size)
+    # what a circular convolution wraps around lies before sample m - 1
+    valid_spans = [slice(m - 1, _PART) for m in like.shape[1:]]
+    inner: Tensor = image[..., valid_spans[0], valid_spans[1]]
     return inner
 
 
@@ -281,20 +298,21 @@ def few_bands(
         "pixel": pixel,
         "sensor": sensor,
     }
-    small = thumbnail(pupil, shape, lens)
-    if small is None:
+    thumb = thumbnail(pupil, shape, lens)
+    if thumb is None:
         return _all_bands(count)
-    half = _evenly(count // 2 + 1, count)
-    light_of_half = small.light(half)
-    light = _interpolated(light_of_half, half, count)
-    rungs_of_half = [few for few in rungs if _FINER * few <= len(half)]
+    # PSFs of half the bands decide, unless so many are needed that all must be computed
+    half_bands = _evenly(count // 2 + 1, count)
+    light_of_half = thumb.light(half_bands)
+    light = _interpolated(light_of_half, half_bands, count)
+    rungs_of_half = [few for few in rungs if _FINER * few <= len(half_bands)]
     choice = _fewest(
-        rungs_of_half, parts_of(radiance, rows, light, small.pixels), light, within, largest
+        rungs_of_half, parts_of(radiance, rows, light, thumb.pixels), light, within, largest
     )
     if choice is None:
-        light = _completed(light_of_half, half, count, small)
+        light = _completed(light_of_half, half_bands, count, thumb)
         choice = _fewest(
-            rungs, parts_of(radiance, rows, light, small.pixels), light, within, largest
+            rungs, parts_of(radiance, rows, light, thumb.pixels), light, within, largest
         )
     return choice or _all_bands(count)
 
@@ -320,9 +338,9 @@ def _interpolated(light: Tensor, some: Tensor, count: int) -> Tensor:
 
 def _completed(light: Tensor, some: Tensor, count: int, small: Thumbnail) -> Tensor:
     """Return the PSFs (band, y, x) of all bands, of which those of some bands are there already."""
-    others = torch.tensor(sorted({*range(count)} - {*some.tolist()}))
-    together = torch.cat([light, small.light(others)])
-    return together[torch.cat([some, others]).argsort()]
+    other_bands = torch.tensor(sorted({*range(count)} - {*some.tolist()}))
+    all_light = torch.cat([light, small.light(other_bands)])
+    return all_light[torch.cat([some, other_bands]).argsort()]
 
 
 def _fewest(
@@ -333,9 +351,9 @@ def _fewest(
     for few in rungs:
         computed = _evenly(few, count)
         share = share_of_bands(computed, count)
-        error, top = (_SAFETY * x for x in estimated(parts, share, light[computed]))
-        if max(error, top if largest else 0.0) <= within:
-            return FewBands(share, computed, _number(error), _number(top))
+        error, top_error = (_SAFETY * x for x in estimated(parts, share, light[computed]))
+        if max(error, top_error if largest else 0.0) <= within:
+            return FewBands(share, computed, _number(error), _number(top_error))
     return None
 
 
@@ -413,23 +431,26 @@ def few_bands_checked(
     }
     between_bands, pixels = few._replace(used=torch.tensor(between)), bins_of(psf.intensity)
     window = (pixels * SIDE, pixels * SIDE)
-    own = binned(centred(psf.intensity.detach(), window), pixels)
-    added = binned(focused(pupil_of_bands(pupil, between_bands), window, lens), pixels)
+    own_light = binned(centred(psf.intensity.detach(), window), pixels)
+    added_light = binned(focused(pupil_of_bands(pupil, between_bands), window, lens), pixels)
+    # by band, those in use and those between them
     order = sorted(range(len(computed) + len(between)), key=[*computed, *between].__getitem__)
-    light = torch.cat([own, added])[order]
-    finer = share_of_bands(torch.tensor(sorted([*computed, *between])), count).to(
+    light = torch.cat([own_light, added_light])[order]
+    finer_light = share_of_bands(torch.tensor(sorted([*computed, *between])), count).to(
         light
     ) @ light.flatten(1)
-    parts = parts_of(radiance, rows, finer.view(count, *light.shape[1:]), pixels)
-    error, top = estimated(parts, few.share.cpu(), own)
-    raised = (
-        max(float(old), _SAFETY * new) for old, new in ((few.error, error), (few.largest, top))
+    parts = parts_of(radiance, rows, finer_light.view(count, *light.shape[1:]), pixels)
+    error, top_error = estimated(parts, few.share.cpu(), own_light)
+    raised_errors = (
+        max(float(old), _SAFETY * new)
+        for old, new in ((few.error, error), (few.largest, top_error))
     )
-    return few._replace(**dict(zip(("error", "largest"), map(_number, raised), strict=True)))
+    return few._replace(**dict(zip(("error", "largest"), map(_number, raised_errors), strict=True)))
 
 
 @few_bands_checked.approximation_error
 def _(result: FewBands) -> tuple[float, float]:
+    # relative errors, in root mean square and of the brightest pixel
     return float(result.error), float(result.largest)
 
 
@@ -449,6 +470,7 @@ def _(result: FewBands, few: FewBands, *inputs: object, **params: object) -> lis
 
 
 def _all_bands(count: int) -> FewBands:
+    """Return the choice of all bands, without an error."""
     return FewBands(
         torch.eye(count, dtype=torch.float64), torch.arange(count), _number(0.0), _number(0.0)
     )

@@ -89,10 +89,10 @@ def _(
     if angle is not None:
         return angle_notes(angle)
     if rule == "focal_length_over_width":
-        wide = share * focal_length / (shape[1] * pixel_pitch)
+        tilt = share * focal_length / (shape[1] * pixel_pitch)
         raise ParameterError(
             "rule",
-            f"{share:g} f / W = {wide:.3g} rad would put the spot {wide * focal_length:.2g} m off"
+            f"{share:g} f / W = {tilt:.3g} rad would put the spot {tilt * focal_length:.2g} m off"
             " the axis: set `angle`, or set rule: width_over_focal_length",
         )
     return []
@@ -112,12 +112,12 @@ def angle_notes(angle: tuple[float, float]) -> list[str]:
             f"{degrees} off the axis is {size:.4g} rad, but the model takes an angle in rad as its"
             " direction cosine, which is below 1: give less than 57.3 deg",
         )
-    off = 1 - math.sin(size) / size if size else 0.0
+    relative_difference = 1 - math.sin(size) / size if size else 0.0
     text = (
         f"{degrees} off the axis: the model takes an angle as its direction cosine, and the two"
-        f" differ by {off:.1%}"
+        f" differ by {relative_difference:.1%}"
     )
-    return [text] if off > _SMALL else []
+    return [text] if relative_difference > _SMALL else []
 
 
 @direction.check
@@ -125,10 +125,12 @@ def _(
     result: Tensor, *, focal_length: float, pixel_pitch: float, shape: tuple[int, int], **_: Any
 ) -> list[Check]:
     y, x = (float(n) * focal_length / pixel_pitch for n in result)
-    inside = abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2
-    off = math.degrees(math.hypot(*(float(n) for n in result)))
-    beyond = "" if inside else ": beyond the sensor, where only glare reaches the picture"
-    return [Check(f"spot {y:+.1f}, {x:+.1f} px (y, x) off the axis, {off:.3g} deg{beyond}")]
+    on_sensor = abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2
+    degrees = math.degrees(math.hypot(*(float(n) for n in result)))
+    beyond_text = "" if on_sensor else ": beyond the sensor, where only glare reaches the picture"
+    return [
+        Check(f"spot {y:+.1f}, {x:+.1f} px (y, x) off the axis, {degrees:.3g} deg{beyond_text}")
+    ]
 
 
 # --- laser spot -----------------------------------------------------------------------------------
@@ -188,16 +190,20 @@ def laser_irradiance(
             "quantum_efficiency": quantum_efficiency,
             "pixel_pitch": pixel_pitch,
         }
-        wells = 1.0 / saturation(bands, **sensor, exposure=exposure)
-        energy = strength * bands.weights / unit(psf.clear_peak, bands, wells, responses, meaning)
+        wells_per_irradiance = 1.0 / saturation(bands, **sensor, exposure=exposure)
+        irradiance_by_band = (
+            strength
+            * bands.weights
+            / unit(psf.clear_peak, bands, wells_per_irradiance, responses, meaning)
+        )
     elif light is not None:
-        energy = light.flux / pixel_pitch**2 * bands.weights
+        irradiance_by_band = light.flux / pixel_pitch**2 * bands.weights
     else:
         raise ValueError(
             "a laser needs a strength, or its light in watts: give strength, or the input light"
         )
     intensity = single(psf.intensity)
-    return intensity * energy.to(intensity)[:, None, None]
+    return intensity * irradiance_by_band.to(intensity)[:, None, None]
 
 
 def unit(
@@ -245,6 +251,7 @@ def _(
 
 
 def _no_channel(bands: Bands) -> str:
+    """Return the message for a laser line that no channel of the camera sees."""
     nm = float((bands.centres * bands.weights).sum() / bands.weights.sum()) * 1e9
     text = f"no channel of the camera sees {nm:.5g} nm, so no strength can saturate one"
     return f"{text}: give power with distance and divergence, or reading.strength=irradiance"
@@ -281,9 +288,11 @@ def _(
     if meaning == "first_channel":
         response = responses.min if responses else 0.0
     # the saturation irradiance falls with wavelength
-    ends = torch.tensor([bands.min], dtype=torch.float64)
-    saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor)
-    return _LSR * strength * float(saturating) / response if response > 0 else math.inf
+    shortest_wavelength = torch.tensor([bands.min], dtype=torch.float64)
+    saturation_irradiance: Tensor = saturation(
+        Bands(shortest_wavelength, shortest_wavelength, shortest_wavelength), **sensor
+    )
+    return _LSR * strength * float(saturation_irradiance) / response if response > 0 else math.inf
 
 
 @laser_irradiance.expected_range
@@ -318,18 +327,28 @@ def _(
     meaning: Meaning = "irradiance",
     **sensor: float,
 ) -> list[Check]:
-    wells = 1.0 / saturation(bands, **sensor)
+    wells_per_irradiance = 1.0 / saturation(bands, **sensor)
     peak = float(result.sum(0).max())
-    watts, when = (
+    peak_text, exposure_text = (
         f"peak of the spot {peak:.4g} W/m2",
         f"at the nominal exposure of {sensor['exposure']:g} s",
     )
     if strength is not None:
-        return [Check(f"{watts}, strength {strength:g} {when}", math.isfinite(peak))]
+        return [Check(f"{peak_text}, strength {strength:g} {exposure_text}", math.isfinite(peak))]
     if light is None or (
         meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)
     ):
-        return [Check(watts, math.isfinite(peak))]
-    clear = light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
-    strength = float(clear * unit(psf.clear_peak, bands, wells, responses, meaning))
-    return [Check(f"{watts}, which is a strength of {strength:.4g} {when}", math.isfinite(peak))]
+        return [Check(peak_text, math.isfinite(peak))]
+    # peak of the beam over that of an even one, times the mean irradiance
+    clear_irradiance = (
+        light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
+    )
+    strength = float(
+        clear_irradiance * unit(psf.clear_peak, bands, wells_per_irradiance, responses, meaning)
+    )
+    return [
+        Check(
+            f"{peak_text}, which is a strength of {strength:.4g} {exposure_text}",
+            math.isfinite(peak),
+        )
+    ]

@@ -51,9 +51,11 @@ def passed_by_notches(pupil: Pupil) -> Tensor:
     if not len(pupil.notches):
         return torch.ones_like(pupil.wavelengths, dtype=torch.float64)
     centres, widths, depths = pupil.notches.to(pupil.wavelengths).unbind(1)
-    away = (pupil.wavelengths[:, None] - centres) / widths
-    passed: Tensor = (1.0 - depths * torch.exp(-4.0 * math.log(2.0) * away.square())).prod(1)
-    return passed
+    distance_in_widths = (pupil.wavelengths[:, None] - centres) / widths
+    transmitted: Tensor = (
+        1.0 - depths * torch.exp(-4.0 * math.log(2.0) * distance_in_widths.square())
+    ).prod(1)
+    return transmitted
 
 
 # --- lens band ------------------------------------------------------------------------------------
@@ -111,13 +113,17 @@ def round_lens(frequency: Tensor, side: Tensor) -> RoundLens:
             pupil).
     """
     nodes, weights = unit_nodes(_NODES)
+    # a quadrature over the disc of frequencies: a quarter of it, for symmetry
     radius, azimuth = (nodes + 0.5)[:, None], (nodes + 0.5) * (math.pi / 2)
-    mtf = (torch.acos(radius) - radius * (1 - radius.square()).sqrt()) * (2 / math.pi)
-    across = (side.double() * frequency.double())[..., None, None] * radius
-    pixel = torch.sinc(across * azimuth.cos()) * torch.sinc(across * azimuth.sin())
-    area = 2 * radius * weights[:, None] * weights
-    peak = (area * mtf * pixel).sum((-2, -1)) / (area * mtf).sum()
-    return RoundLens(peak, (area * (mtf * pixel).square()).sum((-2, -1)))
+    # transfer function of a round pupil without aberrations
+    transfer = (torch.acos(radius) - radius * (1 - radius.square()).sqrt()) * (2 / math.pi)
+    half_cycles = (side.double() * frequency.double())[..., None, None] * radius
+    pixel_transfer = torch.sinc(half_cycles * azimuth.cos()) * torch.sinc(
+        half_cycles * azimuth.sin()
+    )
+    area_share = 2 * radius * weights[:, None] * weights
+    peak = (area_share * transfer * pixel_transfer).sum((-2, -1)) / (area_share * transfer).sum()
+    return RoundLens(peak, (area_share * (transfer * pixel_transfer).square()).sum((-2, -1)))
 
 
 def stop_width(lsr: Tensor, frequency: Tensor, side: Tensor) -> Tensor:
@@ -128,6 +134,7 @@ def stop_width(lsr: Tensor, frequency: Tensor, side: Tensor) -> Tensor:
     away. ``frequency`` is the cut-off of the lens, and ``side`` that of the square over which a
     pixel averages, as in `round_lens`.
     """
+    # a first guess: without an average the peak is width^4
     clear_peak, width = round_lens(frequency, side).peak, lsr**0.25
     for _ in range(_STEPS):
         width = (lsr * clear_peak / round_lens(width * frequency, side).peak) ** 0.25

@@ -72,18 +72,23 @@ def fine_axis(pixels: int, bandwidth: float, error: float) -> FineAxis:
 
 
 def _samples_per_pixel(lowest: float) -> list[float]:
+    """Return samples per pixel above ``lowest``, from the least on, that are tried for a grid."""
     step = _STEP if lowest < _WHOLE else 1.0
-    first = max(math.floor(lowest / step) + 1, math.ceil(1 / step))
+    first_multiple = max(math.floor(lowest / step) + 1, math.ceil(1 / step))
     count = 8 + math.ceil(0.5 * lowest / step)
-    return [step * (first + i) for i in range(count)]
+    return [step * (first_multiple + i) for i in range(count)]
 
 
 def _grid(pixels: int, bandwidth: float, per_pixel: float, error: float) -> FineAxis:
+    """Return the grid of a window with a given number of samples per pixel; ``bandwidth`` is in
+    cycles a pixel, ``error`` that of the filter.
+    """
     taps = math.ceil(per_pixel * (1 + _width(per_pixel - 2 * bandwidth, error))) + 1
     return FineAxis(pixels, bandwidth, per_pixel, error, taps)
 
 
 def _decibels(error: float) -> float:
+    """Return an error as the attenuation of a filter in decibels."""
     return -20 * math.log10(error)
 
 
@@ -99,16 +104,18 @@ def _width(gap: float, error: float) -> float:
 
 def _weights(grid: FineAxis, away: Tensor) -> Tensor:
     """Return the weights of samples at distances ``away`` in pixels from the middle of a pixel."""
-    nodes, shares = unit_nodes(12 + math.ceil(2 * grid.per_pixel))
+    places, place_shares = unit_nodes(12 + math.ceil(2 * grid.per_pixel))
     width = _width(grid.per_pixel - 2 * grid.bandwidth, grid.error)
+    # Kaiser's parameter for this attenuation
     beta = 0.1102 * (_decibels(grid.error) - 8.7)
-    distance = away[..., None] + nodes
+    distance = away[..., None] + places
     window = torch.special.i0(beta * (1 - (2 * distance / width).square()).clamp_min(0).sqrt())
+    # ideal low-pass filter times Kaiser's window, then averaged over the pixel
     low_pass = torch.sinc(grid.per_pixel * distance) * window.where(
         distance.abs() <= width / 2, 0.0
     )
     weights: Tensor = (
-        low_pass @ shares / float(torch.special.i0(torch.tensor(beta, dtype=torch.float64)))
+        low_pass @ place_shares / float(torch.special.i0(torch.tensor(beta, dtype=torch.float64)))
     )
     return weights
 
@@ -122,10 +129,13 @@ def unit_nodes(count: int) -> tuple[Tensor, Tensor]:
 
 @functools.lru_cache(maxsize=64)
 def _nodes(count: int) -> tuple[list[float], list[float]]:
+    """Return Gauss-Legendre nodes between -1/2 and 1/2, and weights of sum one, as lists of
+    numbers.
+    """
     import numpy as np
 
-    x, w = np.polynomial.legendre.leggauss(count)
-    return (x / 2).tolist(), (w / 2).tolist()
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return (nodes / 2).tolist(), (weights / 2).tolist()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,14 +165,15 @@ class _AxisFilter:
 
 @functools.lru_cache(maxsize=256)
 def _axis_filter(grid: FineAxis, dtype: torch.dtype, device: torch.device) -> _AxisFilter:
-    pixels = torch.arange(_ROWS, dtype=torch.float64) - (grid.pixels - 1) / 2
-    middles = (grid.samples - 1) / 2 + grid.per_pixel * pixels
-    firsts = (middles - grid.taps / 2).ceil()
-    samples = firsts[:, None] + torch.arange(grid.taps, dtype=torch.float64)
+    """Return the weights of a fine grid in blocks of pixels, in a type and on a device."""
+    pixel_offsets = torch.arange(_ROWS, dtype=torch.float64) - (grid.pixels - 1) / 2
+    middles = (grid.samples - 1) / 2 + grid.per_pixel * pixel_offsets
+    first_samples = (middles - grid.taps / 2).ceil()
+    samples = first_samples[:, None] + torch.arange(grid.taps, dtype=torch.float64)
     weights = _weights(grid, (samples[:_PERIOD] - middles[:_PERIOD, None]) / grid.per_pixel)
-    first = int(firsts[0])
-    block = torch.zeros(_ROWS, int(firsts[-1]) - first + grid.taps, dtype=torch.float64)
-    for row, start in enumerate(firsts.int().tolist()):
+    first = int(first_samples[0])
+    block = torch.zeros(_ROWS, int(first_samples[-1]) - first + grid.taps, dtype=torch.float64)
+    for row, start in enumerate(first_samples.int().tolist()):
         block[row, start - first : start - first + grid.taps] = weights[row % _PERIOD]
     stride = round(_ROWS * grid.per_pixel)
     return _AxisFilter(block.to(device, dtype), first, stride, grid.pixels, grid.samples)
@@ -183,23 +194,29 @@ class PixelFilter:
 
     def average(self, fine: Tensor) -> Tensor:
         """Return the average (y, x) over each pixel of an intensity on the fine grid."""
-        y, x = self.rows, self.columns
-        half, out = fine.new_empty(y.pixels, x.samples), fine.new_empty(y.pixels, x.pixels)
-        for pixels, samples, weights in y.spans():
-            torch.mm(weights, fine[samples], out=half[pixels])
-        for pixels, samples, weights in x.spans():
-            torch.mm(half[:, samples], weights.T, out=out[:, pixels])
-        return out
+        row_filter, column_filter = self.rows, self.columns
+        rows_averaged, averaged = (
+            fine.new_empty(row_filter.pixels, column_filter.samples),
+            fine.new_empty(row_filter.pixels, column_filter.pixels),
+        )
+        for pixels, samples, weights in row_filter.spans():
+            torch.mm(weights, fine[samples], out=rows_averaged[pixels])
+        for pixels, samples, weights in column_filter.spans():
+            torch.mm(rows_averaged[:, samples], weights.T, out=averaged[:, pixels])
+        return averaged
 
     def spread(self, light: Tensor) -> Tensor:
         """Return the adjoint of `average`, on the fine grid."""
-        y, x = self.rows, self.columns
-        half, out = light.new_zeros(y.pixels, x.samples), light.new_zeros(y.samples, x.samples)
-        for pixels, samples, weights in x.spans():
-            half[:, samples].addmm_(light[:, pixels], weights)
-        for pixels, samples, weights in y.spans():
-            out[samples].addmm_(weights.T, half[pixels])
-        return out
+        row_filter, column_filter = self.rows, self.columns
+        columns_spread, spread = (
+            light.new_zeros(row_filter.pixels, column_filter.samples),
+            light.new_zeros(row_filter.samples, column_filter.samples),
+        )
+        for pixels, samples, weights in column_filter.spans():
+            columns_spread[:, samples].addmm_(light[:, pixels], weights)
+        for pixels, samples, weights in row_filter.spans():
+            spread[samples].addmm_(weights.T, columns_spread[pixels])
+        return spread
 
 
 def averaged(fine: Tensor, rows: FineAxis, columns: FineAxis) -> Tensor:
@@ -217,8 +234,8 @@ class _Averaged(torch.autograd.Function):
 
     @staticmethod
     def forward(light: Tensor, rows: FineAxis, columns: FineAxis, adjoint: bool) -> Tensor:
-        over = PixelFilter(rows, columns, light)
-        return over.spread(light) if adjoint else over.average(light)
+        pixel_filter = PixelFilter(rows, columns, light)
+        return pixel_filter.spread(light) if adjoint else pixel_filter.average(light)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -317,7 +334,7 @@ def _envelopes(
     grid: tuple[GridAxis, GridAxis], alpha: float, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """Return the diffraction envelope of square pupil samples along both axes."""
-    y, x = (
+    row_envelope, column_envelope = (
         plain(
             torch.sinc((centred(axis.samples, device) / axis.per_pixel + axis.middle) * alpha)
             .square()
@@ -325,7 +342,7 @@ def _envelopes(
         )
         for axis in grid
     )
-    return y, x
+    return row_envelope, column_envelope
 
 
 def fine_grid(
@@ -352,8 +369,8 @@ def strips(rows: FineAxis, columns: FineAxis) -> list[tuple[int, int]]:
     """Return the first and the last row, exclusive, of each strip of pixels whose fine grid is
     computed at a time.
     """
-    room = FINE_SAMPLES // columns.samples - rows.taps
-    height = max(1, math.floor(room / rows.per_pixel))
+    rows_of_samples = FINE_SAMPLES // columns.samples - rows.taps
+    height = max(1, math.floor(rows_of_samples / rows.per_pixel))
     count = -(-rows.pixels // height)
     ends = [rows.pixels * i // count for i in range(count + 1)]
     return list(pairwise(ends))
@@ -374,17 +391,18 @@ def band_average(
 ) -> list[Tensor]:
     """Return the share of the light in each pixel of one band, in strips of rows (y, x)."""
     rows, columns = fine_grid(pupil, camera, band, optics.dtype)
+    # pixels from the spot to the middle of the window, along both axes
     middles = [(n - 1) / 2 - place for n, place in zip(camera.shape, spot(camera), strict=True)]
-    across = GridAxis(columns.samples, columns.per_pixel, middles[1])
+    column_axis = GridAxis(columns.samples, columns.per_pixel, middles[1])
     averages = []
     for start, stop in strips(rows, columns):
         strip = rows.part(stop - start)
-        below = (start + stop - camera.shape[0]) / 2
-        along = GridAxis(strip.samples, strip.per_pixel, middles[0] + below)
-        view = view_of(pupil, camera, band, (along, across), light, optics.dtype)
+        offset_of_strip = (start + stop - camera.shape[0]) / 2
+        row_axis = GridAxis(strip.samples, strip.per_pixel, middles[0] + offset_of_strip)
+        view = view_of(pupil, camera, band, (row_axis, column_axis), light, optics.dtype)
         sampling = Sampling((replace(view, band=0),), optics.dtype, optics.method, optics.keep)
-        fine = intensity_of(pupil.amplitude, pupil.height, pupil.path, sampling)[0]
-        averages.append(averaged(fine, strip, columns))
+        fine_intensity = intensity_of(pupil.amplitude, pupil.height, pupil.path, sampling)[0]
+        averages.append(averaged(fine_intensity, strip, columns))
     return averages
 
 
@@ -428,6 +446,7 @@ def _degrees(samples: int, alpha: float) -> int:
     """
     # of phase, from the middle of pupil and pixel to their edges
     radians = math.pi * alpha * samples / 2
+    # a plane wave of phase r needs r + O(r^(1/3)) polynomials
     return min(samples, 8 * math.ceil((radians + 5 * math.cbrt(radians) + 10) / 8))
 
 
@@ -435,15 +454,18 @@ def _polynomials(samples: int, degrees: int, device: torch.device) -> Tensor:
     """Return orthonormal polynomials (sample, degree) on the samples of the pupil."""
     import numpy as np
 
-    place = (np.arange(samples) - (samples - 1) / 2) * (2 / samples)
-    polynomials: Tensor = torch.from_numpy(np.polynomial.legendre.legvander(place, degrees - 1)).to(
-        device
-    )
+    positions = (np.arange(samples) - (samples - 1) / 2) * (2 / samples)
+    polynomials: Tensor = torch.from_numpy(
+        np.polynomial.legendre.legvander(positions, degrees - 1)
+    ).to(device)
     orthonormal: Tensor = torch.linalg.qr(polynomials).Q
     return orthonormal
 
 
 def _projected(aperture: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Return the moments (row degree, column degree) of an aperture in orthonormal polynomials, by
+    stripes of rows in float64.
+    """
     step = max(1, _STRIPE // aperture.shape[1])
     moments = rows.new_zeros(rows.shape[1], columns.shape[1])
     for start in range(0, len(aperture), step):
@@ -455,13 +477,16 @@ def _projected(aperture: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
 def _axis_average(
     moments: Tensor, bases: list[Tensor], alpha: float, square_samples: bool
 ) -> float:
-    waves, weights = [], []
+    """Return the average of |U|^2 alpha^2 over the pixel on the axis, from the moments of the
+    pupil.
+    """
+    wave_by_degree, weights = [], []
     for basis in bases:
-        nodes, shares = unit_nodes(10 + math.ceil(2 * alpha * len(basis)))
+        nodes, node_shares = unit_nodes(10 + math.ceil(2 * alpha * len(basis)))
         turns = torch.outer(centred(len(basis), basis.device), nodes.to(basis.device) * alpha)
         phases = torch.complex(torch.cos(2 * math.pi * turns), -torch.sin(2 * math.pi * turns))
-        waves.append(basis.T.to(phases.dtype) @ phases)
+        wave_by_degree.append(basis.T.to(phases.dtype) @ phases)
         envelope = torch.sinc(nodes * alpha).square() if square_samples else 1.0
-        weights.append((shares * envelope).to(basis.device))
-    field = waves[0].T @ moments.to(waves[0].dtype) @ waves[1]
-    return float(weights[0] @ field.abs().square() @ weights[1]) * alpha**2
+        weights.append((node_shares * envelope).to(basis.device))
+    focal_field = wave_by_degree[0].T @ moments.to(wave_by_degree[0].dtype) @ wave_by_degree[1]
+    return float(weights[0] @ focal_field.abs().square() @ weights[1]) * alpha**2

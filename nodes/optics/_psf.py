@@ -50,8 +50,8 @@ def refuse_aliases(pupil: Pupil, camera: Geometry) -> None:
         return
     shortest, pitch = float(pupil.wavelengths.min()), float(pupil.pitch)
     limit = shortest * camera.focal_length / (2 * pitch)
-    for axis, n, place in zip("yx", camera.shape, spot(camera), strict=True):
-        reach = max(abs(0 - place), abs(n - 1 - place)) * camera.pixel_pitch
+    for axis, n, spot_place in zip("yx", camera.shape, spot(camera), strict=True):
+        reach = max(abs(0 - spot_place), abs(n - 1 - spot_place)) * camera.pixel_pitch
         if reach > limit * (1 + 1e-9):
             raise ValueError(
                 f"the window reaches {reach * 1e3:.3g} mm from the spot along {axis}, but at"
@@ -83,13 +83,14 @@ def refuse_coarse_points(pupil: Pupil, camera: Geometry) -> None:
     shortest = float(pupil.wavelengths.min())
     widest = float(pupil.pitch) * max(pupil.height.shape)
     if _coarse(camera, shortest, widest):
+        # the pupil may be narrower than its grid: look again, because this takes longer
         diameter = min(_diameter(pupil, widest), widest)
         if _coarse(camera, shortest, diameter):
-            number = camera.focal_length / diameter
+            f_number = camera.focal_length / diameter
             raise ValueError(
                 f"points {camera.pixel_pitch * 1e6:.3g} um apart miss or repeat the light of a spot"
-                f" at {shortest * 1e9:.4g} nm and f/{number:.3g}, where wavelength x f-number is"
-                f" {shortest * number * 1e6:.3g} um: write sensor.sampling=integrated to average"
+                f" at {shortest * 1e9:.4g} nm and f/{f_number:.3g}, where wavelength x f-number is"
+                f" {shortest * f_number * 1e6:.3g} um: write sensor.sampling=integrated to average"
                 " over each pixel, or choose a finer pitch"
             )
 
@@ -105,18 +106,20 @@ def spread_points_notes(pupil: Pupil, camera: Geometry) -> list[str]:
     fringe = float(pupil.wavelengths.min()) * camera.focal_length / float(pupil.diameter)
     if camera.pixel_pitch <= fringe / 2 * (1 + 1e-9):
         return []
-    away = torch.tensor(
+    # half the diagonal of a pixel, in the Airy pattern (2 J1(x) / x)^2; 1.22 is its first zero
+    airy_argument = torch.tensor(
         math.pi * min(camera.pixel_pitch / math.sqrt(2) / fringe, 1.22), dtype=torch.float64
     )
-    lost = 1 - float((2 * torch.special.bessel_j1(away) / away).square())
+    missed = 1 - float((2 * torch.special.bessel_j1(airy_argument) / airy_argument).square())
     return [
         f"points {camera.pixel_pitch * 1e6:.3g} um apart are further apart than half of wavelength"
-        f" x f-number, {fringe / 2 * 1e6:.3g} um: a peak between them shows up to {lost:.0%}"
+        f" x f-number, {fringe / 2 * 1e6:.3g} um: a peak between them shows up to {missed:.0%}"
         " too low"
     ]
 
 
 def _coarse(camera: Geometry, wavelength: float, diameter: float) -> bool:
+    """Return True if pixels are further apart than wavelength x f-number, for lengths in metres."""
     return camera.pixel_pitch * diameter > wavelength * camera.focal_length * (1 + 1e-9)
 
 
@@ -124,17 +127,18 @@ def _diameter(pupil: Pupil, widest: float) -> float:
     """Return the diameter of the clear aperture, or its larger side where the pupil does not
     name the diameter.
     """
-    named = pupil.diameter
-    if not named.is_meta and float(named) > 0:
-        return float(named)
+    stated_diameter = pupil.diameter
+    if not stated_diameter.is_meta and float(stated_diameter) > 0:
+        return float(stated_diameter)
     if pupil.aperture.is_meta:
         return 0.0
-    open_ = pupil.aperture.detach() != 0
-    sides = [_extent(open_.any(axis)) for axis in (0, 1)]
+    is_open = pupil.aperture.detach() != 0
+    sides = [_extent(is_open.any(axis)) for axis in (0, 1)]
     return float(pupil.pitch) * max(sides)
 
 
 def _extent(open_: Tensor) -> int:
+    """Return the number of samples from the first to the last open one, for a line of a stop."""
     open_places = open_.nonzero()
     return int(open_places[-1] - open_places[0]) + 1 if len(open_places) else 0
 
@@ -142,11 +146,11 @@ def _extent(open_: Tensor) -> int:
 def fast_lens_notes(pupil: Pupil, camera: Geometry) -> list[str]:
     """Return a note for a lens of f/1.2 or faster, whose light is too oblique for this model."""
     diameter = 0.0 if pupil.diameter.is_meta else float(pupil.diameter)
-    number = camera.focal_length / diameter if diameter else math.inf
-    if number > _FAST * (1 + 1e-9):
+    f_number = camera.focal_length / diameter if diameter else math.inf
+    if f_number > _FAST * (1 + 1e-9):
         return []
     return [
-        f"f/{number:.3g}: the PSF is that of scalar theory, and the acceptance of microlenses is"
+        f"f/{f_number:.3g}: the PSF is that of scalar theory, and the acceptance of microlenses is"
         " ignored; a real sensor loses part of this oblique light"
     ]
 
@@ -274,58 +278,74 @@ def _(*, pupil: Pupil | None = None, direction: Tensor | None = None, **params: 
 def _(result: Psf, *inputs: object, **params: object) -> list[Check]:
     rows = result.intensity.detach().sum(-1)  # a float64 copy of the whole stack would take 1 GB
     shares = 100 * rows.sum(-1, dtype=torch.float64)
-    low, high = float(shares.min()), float(shares.max())
-    energy = f"energy in window {low:.1f} %" + (f" to {high:.1f} %" if high - low >= 0.05 else "")
-    return [Check(energy, low >= 0.0)]
+    lowest, highest = float(shares.min()), float(shares.max())
+    energy = f"energy in window {lowest:.1f} %" + (
+        f" to {highest:.1f} %" if highest - lowest >= 0.05 else ""
+    )
+    return [Check(energy, lowest >= 0.0)]
 
 
 def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) -> Psf:
+    """Return the PSF of a pupil in the type ``dtype``, by the named method of the transform."""
     _agree(pupil)
     refuse_aliases(pupil, camera)
     refuse_coarse_points(pupil, camera)
-    area, total = _area(pupil.aperture)
-    refuse_not_finite("the PSF cannot be normalised", aperture=area)
-    if not area > 0:
+    clear_light, clear_field = _area(pupil.aperture)
+    refuse_not_finite("the PSF cannot be normalised", aperture=clear_light)
+    if not clear_light > 0:
         raise ValueError(
             "the aperture is closed everywhere: there is no light to normalise the PSF by"
         )
-    lights = (passed_by_notches(pupil) / area).tolist()
+    lights = (passed_by_notches(pupil) / clear_light).tolist()
     focused = _averages if camera.sensor == "integrated" else _points
     intensity = focused(pupil, camera, lights, dtype, method)
     if not transformed():
-        passed = area if pupil.amplitude is pupil.aperture else _area(pupil.amplitude)[0]
-        refuse_gained_light(intensity, [light * passed for light in lights], pupil.wavelengths)
+        passed_light = (
+            clear_light if pupil.amplitude is pupil.aperture else _area(pupil.amplitude)[0]
+        )
+        refuse_gained_light(
+            intensity, [light * passed_light for light in lights], pupil.wavelengths
+        )
     return Psf(
         intensity,
-        *(values.to(intensity.device) for values in _clear_lens(pupil, camera, area, total)),
+        *(
+            values.to(intensity.device)
+            for values in _clear_lens(pupil, camera, clear_light, clear_field)
+        ),
     )
 
 
 def _clear_lens(
     pupil: Pupil, camera: _Camera, area: float, total: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return peak and cut-off of the lens without mask, dirt and aberrations, and over what a
-    pixel averages.
+    """Return three values by band of the lens without mask, dirt and aberrations: the peak of its
+    PSF, its cut-off in cycles per pixel, and the side of the square over which a pixel averages, 0
+    for points.
     """
     alphas = [turns_per_pixel(pupil, camera, band) for band in range(pupil.wavelengths.numel())]
-    points = torch.tensor(alphas, dtype=torch.float64).square() * (total**2 / area)
-    cut_off = (points * (4 / math.pi)).sqrt()
+    # |sum of the field|^2 alpha^2 over the light: the peak of a lens without phase
+    point_peaks = torch.tensor(alphas, dtype=torch.float64).square() * (total**2 / area)
+    cut_off = (point_peaks * (4 / math.pi)).sqrt()
     if camera.sensor != "integrated":
-        return points, cut_off, torch.zeros_like(points)
-    peaks = torch.tensor(
+        return point_peaks, cut_off, torch.zeros_like(point_peaks)
+    averaged_peaks = torch.tensor(
         clear_averages(pupil.aperture, alphas, camera.pixel == "zoh"), dtype=torch.float64
     )
-    return peaks / area, cut_off, torch.ones_like(points)
+    return averaged_peaks / area, cut_off, torch.ones_like(point_peaks)
 
 
 def _points(
     pupil: Pupil, camera: _Camera, lights: list[float], dtype: torch.dtype, method: Method
 ) -> Tensor:
     """Return the intensity (band, y, x) at the middle of each pixel, times the area of a pixel."""
+    # pixels from the spot to the middle of the window, along both axes
     middles = [(n - 1) / 2 - place for n, place in zip(camera.shape, spot(camera), strict=True)]
-    y, x = (GridAxis(n, 1.0, middle) for n, middle in zip(camera.shape, middles, strict=True))
+    row_axis, column_axis = (
+        GridAxis(n, 1.0, middle) for n, middle in zip(camera.shape, middles, strict=True)
+    )
     views = (
-        view_of(pupil, camera, band, (y, x), light, dtype) for band, light in enumerate(lights)
+        view_of(pupil, camera, band, (row_axis, column_axis), light, dtype)
+        for band, light in enumerate(lights)
     )
     return intensity_of(
         pupil.amplitude, pupil.height, pupil.path, Sampling(tuple(views), dtype, method)
@@ -339,6 +359,7 @@ def _averages(
     field_bytes = 2 * fine_samples(pupil, camera, dtype) * dtype.itemsize
     optics = Optics(dtype, method, field_bytes <= KEPT_FIELD_BYTES)
     factors = (pupil.amplitude, pupil.height, pupil.path)
+    # with gradients every band is a tensor of its own; else all are written into one
     if transformed() or (torch.is_grad_enabled() and any(x.requires_grad for x in factors)):
         bands = [
             torch.cat(band_average(pupil, camera, band, light, optics))
@@ -352,9 +373,7 @@ def _averages(
 
 
 def _area(amplitude: Tensor) -> tuple[float, float]:
-    """Return the sum of the light and the sum of the field over all samples of an amplitude in
-    the pupil.
-    """
+    """Return the sum of the squares and the sum of all samples of an amplitude in the pupil."""
     parts = torch.split(amplitude.detach().flatten(), _PART)  # read from memory once for both sums
     light, field = zip(*((torch.dot(x, x), x.sum()) for x in parts), strict=True)
     total_light, total_field = (
@@ -364,6 +383,9 @@ def _area(amplitude: Tensor) -> tuple[float, float]:
 
 
 def _agree(pupil: Pupil) -> None:
+    """Raise ValueError for factors of a pupil that differ in shape or type, or that cannot have
+    gradients.
+    """
     shapes = {
         name: tuple(getattr(pupil, name).shape)
         for name in ("aperture", "amplitude", "height", "path")

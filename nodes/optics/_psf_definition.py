@@ -30,15 +30,22 @@ class Geometry(NamedTuple):
 def by_definition(pupil: Pupil, camera: Geometry) -> Psf:
     """Return the PSF of a pupil in float64, by one matrix of phases for each axis, band by band."""
     screens = {"height": pupil.height.new_zeros(()), "path": pupil.path.new_zeros(())}
-    clear = pupil._replace(amplitude=pupil.aperture.detach(), notches=pupil.notches[:0], **screens)
-    centre = camera._replace(shape=(1, 1), angle=(0.0, 0.0))
-    count = range(len(pupil.wavelengths))
-    peaks = [_intensity(clear, centre, band)[0, 0] for band in count]
-    points = [_intensity(clear, centre._replace(sensor="point"), band)[0, 0] for band in count]
-    cut_off = (torch.stack(points) * (4 / math.pi)).sqrt()
+    clear_pupil = pupil._replace(
+        amplitude=pupil.aperture.detach(), notches=pupil.notches[:0], **screens
+    )
+    on_axis = camera._replace(shape=(1, 1), angle=(0.0, 0.0))
+    band_numbers = range(len(pupil.wavelengths))
+    peaks = [_intensity(clear_pupil, on_axis, band)[0, 0] for band in band_numbers]
+    point_peaks = [
+        _intensity(clear_pupil, on_axis._replace(sensor="point"), band)[0, 0]
+        for band in band_numbers
+    ]
+    # peak at a point = area of the pupil in units of (wavelength x f / pixel)^2 = pi / 4 x the
+    # square of the cut-off
+    cut_off = (torch.stack(point_peaks) * (4 / math.pi)).sqrt()
     sides = torch.full_like(cut_off, 1.0 if camera.sensor == "integrated" else 0.0)
     return Psf(
-        torch.stack([_intensity(pupil, camera, band) for band in count]),
+        torch.stack([_intensity(pupil, camera, band) for band in band_numbers]),
         torch.stack(peaks),
         cut_off,
         sides,
@@ -56,17 +63,21 @@ def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:
     )
     field = amplitude * torch.exp(2j * math.pi * _reduced(turns))
     # turns per sample and pixel
-    reach = float(pupil.pitch) * camera.pixel_pitch / (wavelength * camera.focal_length)
+    turns_per_sample = float(pupil.pitch) * camera.pixel_pitch / (wavelength * camera.focal_length)
     total = amplitude.new_zeros(camera.shape)
-    points = _points(reach * max(field.shape)) if camera.sensor == "integrated" else [(0.0, 1.0)]
+    points = (
+        _points(turns_per_sample * max(field.shape))
+        if camera.sensor == "integrated"
+        else [(0.0, 1.0)]
+    )
     for y, weight_y in points:
         for x, weight_x in points:
             rows, columns = (
-                _axis(camera, axis, shift, field.shape[axis], reach)
+                _axis(camera, axis, shift, field.shape[axis], turns_per_sample)
                 for axis, shift in ((0, y), (1, x))
             )
             total = total + weight_y * weight_x * (rows @ field @ columns.T).abs().square()
-    light: Tensor = total * (reach**2 / pupil.aperture.detach().double().square().sum())
+    light: Tensor = total * (turns_per_sample**2 / pupil.aperture.detach().double().square().sum())
     for centre, width, depth in pupil.notches.tolist():
         light = light * (1.0 - depth * 2.0 ** (-((2.0 * (wavelength - centre) / width) ** 2)))
     return light
@@ -98,5 +109,5 @@ def _points(fringes: float) -> list[tuple[float, float]]:
     """
     import numpy as np
 
-    x, w = np.polynomial.legendre.leggauss(10 + math.ceil(4 * fringes))
-    return list(zip((x / 2).tolist(), (w / 2).tolist(), strict=True))
+    nodes, weights = np.polynomial.legendre.leggauss(10 + math.ceil(4 * fringes))
+    return list(zip((nodes / 2).tolist(), (weights / 2).tolist(), strict=True))

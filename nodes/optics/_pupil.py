@@ -40,16 +40,22 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
     edges by design, so a few large steps mean nothing. Many large steps mean that the samples
     cannot follow the phase.
     """
-    worst = int((pupil.index / pupil.wavelengths).argmax())
-    every = max(1, len(pupil.height) // _ROWS)
-    here, below = (
-        [x[k::every] for x in (pupil.height, pupil.path, pupil.aperture > 0)] for k in (0, 1)
+    steepest_band = int((pupil.index / pupil.wavelengths).argmax())
+    row_step = max(1, len(pupil.height) // _ROWS)
+    # height, path and whether the stop is open, each row and the next one
+    sampled_rows, rows_below = (
+        [x[k::row_step] for x in (pupil.height, pupil.path, pupil.aperture > 0)] for k in (0, 1)
     )
-    pairs = len(below[0])
+    pairs = len(rows_below[0])
     steps = torch.cat(
         [
-            _steps(pupil, worst, [x[:pairs] for x in here], below),
-            _steps(pupil, worst, [x[:, :-1] for x in here], [x[:, 1:] for x in here]),
+            _steps(pupil, steepest_band, [x[:pairs] for x in sampled_rows], rows_below),
+            _steps(
+                pupil,
+                steepest_band,
+                [x[:, :-1] for x in sampled_rows],
+                [x[:, 1:] for x in sampled_rows],
+            ),
         ]
     )
     return (
@@ -204,17 +210,18 @@ def _lens_path(
     """Return the optical path of defocus and aberrations, or None for a lens without both;
     ``defocus`` is in m.
     """
-    bent = any(aberrations.values())
-    if not bool(defocus) and not bent:
+    has_aberrations = any(aberrations.values())
+    if not bool(defocus) and not has_aberrations:
         return None
     path = torch.empty_like(like)
     v, u = axes(grid, like.device)
     for rows in stripes(grid):
-        square = v[rows].square() + u.square()
-        surface = defocus * square
-        if bent:
+        squared_radius = v[rows].square() + u.square()
+        # defocus is a paraboloid, of this path at the rim
+        surface = defocus * squared_radius
+        if has_aberrations:
             surface = surface + combine(aberrations, v[rows], u)
-        path[rows] = surface.masked_fill_(square > 1, 0.0)
+        path[rows] = surface.masked_fill_(squared_radius > 1, 0.0)
     return path
 
 
@@ -226,6 +233,7 @@ def _shapes(
     dirt: Dirt | None,
     shade: Shade | None,
 ) -> None:
+    """Raise ValueError unless height, index, dirt and shade have the pupil grid and the bands."""
     refuse_half(height=height)
     refuse_other_grid(height, grid)
     if index.shape != bands.centres.shape:
@@ -246,14 +254,14 @@ def _(
     result: Pupil, height: Tensor, index: Tensor, bands: Bands, stop: Stop, *_: Any, **__: Any
 ) -> list[Check]:
     samples, pitch, diameter = grid_of(stop)
-    passed = _light(result.amplitude) / _light(result.aperture)
+    throughput = _light(result.amplitude) / _light(result.aperture)
     median, share = phase_steps(result)
     text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
     return [
         Check(
-            f"throughput {passed:.4f} of the clear pupil"
+            f"throughput {throughput:.4f} of the clear pupil"
             f" {min(samples * pitch, diameter) * 1e3:#.3g} mm",
-            passed > 0,
+            throughput > 0,
         ),
         Check(
             text if share <= LARGE_STEPS else f"{text}: aliased, use a finer pupil pitch",
@@ -263,4 +271,5 @@ def _(
 
 
 def _light(amplitude: Tensor) -> float:
+    """Return the sum of the squared amplitude, by rows, so that float32 sums stay short."""
     return float(torch.bmm(amplitude[:, None, :], amplitude[:, :, None]).sum(dtype=torch.float64))

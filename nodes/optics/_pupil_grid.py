@@ -58,26 +58,31 @@ def pupil_grid(
         aperture == "stretched" and not math.isclose(samples * pitch, diameter, rel_tol=_SAME)
     ):
         return PupilGrid(samples, diameter / samples, diameter)
-    span = samples * pitch
-    nearest = 0.0 if samples % 2 else pitch * math.sqrt(0.5)
-    if diameter < 2 * nearest:
-        needed = f"{2 * nearest * 1e6:.3g} um"
+    grid_width = samples * pitch
+    # an odd grid has a sample on the axis; an even one half a diagonal away
+    nearest_sample = 0.0 if samples % 2 else pitch * math.sqrt(0.5)
+    if diameter < 2 * nearest_sample:
+        needed = f"{2 * nearest_sample * 1e6:.3g} um"
         raise ParameterError(
             "diameter",
             f"{diameter * 1e6:.3g} um holds no pupil sample: give {needed} or more, or a finer"
             " pitch",
         )
-    if aperture == "held" and is_wider(diameter, span):
+    if aperture == "held" and is_wider(diameter, grid_width):
         text = (
             f"{millimetres(diameter)} is wider than the pupil grid of {samples} x"
             f" {pitch * 1e6:.4g} um"
         )
-        fix = (
+        remedy = (
             f"give samples: {math.ceil(diameter / pitch * (1 - _SAME))}, leave the pitch out, or"
             " choose"
         )
-        raise ParameterError("diameter", f"{text} = {millimetres(span)}: {fix} aperture: stretched")
-    return PupilGrid(samples, pitch, diameter if aperture == "clipped" else min(diameter, span))
+        raise ParameterError(
+            "diameter", f"{text} = {millimetres(grid_width)}: {remedy} aperture: stretched"
+        )
+    return PupilGrid(
+        samples, pitch, diameter if aperture == "clipped" else min(diameter, grid_width)
+    )
 
 
 def is_wider(diameter: float, span: float) -> bool:
@@ -101,13 +106,17 @@ def clear_area(stop: Stop) -> float:
     """Return the area of the clear pupil in m2: a disc, cut by the square of the grid where the
     disc is wider.
     """
-    radius, half = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
-    if half >= radius:
+    radius, half_width = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
+    if half_width >= radius:
         return math.pi * radius**2
-    if half <= radius * math.sqrt(0.5):
-        return 4 * half**2
-    angle = math.acos(half / radius)
-    return math.pi * radius**2 - 4 * (radius**2 * angle - half * math.sqrt(radius**2 - half**2))
+    # the disc covers the whole square
+    if half_width <= radius * math.sqrt(0.5):
+        return 4 * half_width**2
+    segment_half_angle = math.acos(half_width / radius)
+    # the disc without the four segments beyond the sides
+    return math.pi * radius**2 - 4 * (
+        radius**2 * segment_half_angle - half_width * math.sqrt(radius**2 - half_width**2)
+    )
 
 
 def gaussian_over(stop: Stop, width: Number) -> Number:
@@ -117,17 +126,21 @@ def gaussian_over(stop: Stop, width: Number) -> Number:
     Integrated over r in closed form, and over one eighth of the azimuth by Gauss and Legendre, to
     1e-13. A tensor receives its gradient.
     """
-    radius, half = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
-    if half >= radius:
+    radius, half_width = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
+    if half_width >= radius:
         return math.pi * width**2 * _share_within(radius, width)
-    corner = min(math.acos(half / radius), math.pi / 4)
-    straight = (
-        corner
+    # in an eighth of the pupil: up to this angle the side of the square is nearer than the disc
+    half_side_angle = min(math.acos(half_width / radius), math.pi / 4)
+    straight_part = (
+        half_side_angle
         / 2
-        * sum(weight * _share_within(edge, width) for edge, weight in _edges(half, corner))
+        * sum(
+            weight * _share_within(edge, width)
+            for edge, weight in _edges(half_width, half_side_angle)
+        )
     )
-    curved = (math.pi / 4 - corner) * _share_within(radius, width)
-    integral: Number = 4 * width**2 * (straight + curved)
+    curved_part = (math.pi / 4 - half_side_angle) * _share_within(radius, width)
+    integral: Number = 4 * width**2 * (straight_part + curved_part)
     return integral
 
 
@@ -146,6 +159,7 @@ def _edges(half: float, corner: float) -> list[tuple[float, float]]:
 
     nodes, weights = np.polynomial.legendre.leggauss(40)
     return list(
+        # the side lies at half / cos(angle), for angles from 0 to the corner
         zip((half / np.cos(corner * (nodes + 1) / 2)).tolist(), weights.tolist(), strict=True)
     )
 
@@ -258,22 +272,22 @@ def _(
     grid = pupil_grid(samples, pitch, diameter, aperture)
     if pitch is None or math.isclose(samples * pitch, diameter, rel_tol=_ROUNDED):
         return []
-    span = samples * pitch
-    written = f"{samples} x {pitch * 1e6:.4g} um = {millimetres(span)}"
+    grid_width = samples * pitch
+    grid_text = f"{samples} x {pitch * 1e6:.4g} um = {millimetres(grid_width)}"
     if aperture == "stretched":
-        fit = (
+        fit_text = (
             f"the pitch becomes {grid.pitch * 1e6:.4g} um, so that {samples} samples span the"
             " aperture"
         )
-        return [f"aperture {millimetres(diameter)}, pupil grid {written}: {fit}"]
-    if is_wider(diameter, span):
-        left = (
-            f"a disc of {millimetres(span)}"
+        return [f"aperture {millimetres(diameter)}, pupil grid {grid_text}: {fit_text}"]
+    if is_wider(diameter, grid_width):
+        clear = (
+            f"a disc of {millimetres(grid_width)}"
             if aperture == "inscribed"
             else "a disc cut by the square grid"
         )
         return [
-            f"aperture {millimetres(diameter)} > pupil grid {written}: {aperture}, {left}; see"
+            f"aperture {millimetres(diameter)} > pupil grid {grid_text}: {aperture}, {clear}; see"
             " reading.aperture"
         ]
     return []
@@ -282,12 +296,14 @@ def _(
 @stop.check
 def _(result: Stop, *, diameter: float, aperture: Aperture = "held", **_: Any) -> list[Check]:
     samples, pitch, clear = grid_of(result)
-    span = samples * pitch
+    grid_width = samples * pitch
     narrowed = (
         f", {aperture} instead of the requested {millimetres(diameter)}"
-        if is_wider(diameter, span)
+        if is_wider(diameter, grid_width)
         else ""
     )
     return [
-        Check(f"clear pupil {millimetres(min(span, clear))}{narrowed}, {samples} samples across")
+        Check(
+            f"clear pupil {millimetres(min(grid_width, clear))}{narrowed}, {samples} samples across"
+        )
     ]

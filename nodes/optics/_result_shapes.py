@@ -35,13 +35,21 @@ def _(
     **params: Any,
 ) -> Pupil:
     side, dtype = int(stop.samples), torch.float32 if height is None else height.dtype
-    clear, amplitude, relief, path = (blank(side, side, dtype=dtype) for _ in range(4))
+    aperture, amplitude, relief, path = (blank(side, side, dtype=dtype) for _ in range(4))
     wave = double(len(bands.centres))
-    even = wavefront is None or (known(wavefront.taper) and not float(wavefront.taper))
-    open_ = clear if dirt is None and shade is None and even else amplitude
+    is_even = wavefront is None or (known(wavefront.taper) and not float(wavefront.taper))
+    transmission = aperture if dirt is None and shade is None and is_even else amplitude
     notches = double(0, 3) if shade is None else shade.notches
     return Pupil(
-        clear, open_, relief, path, wave, bands.centres, stop.pitch, notches, clear_diameter(stop)
+        aperture,
+        transmission,
+        relief,
+        path,
+        wave,
+        bands.centres,
+        stop.pitch,
+        notches,
+        clear_diameter(stop),
     )
 
 
@@ -74,16 +82,22 @@ def _(
     points = [Axis(n, k, alpha) for n, k in zip(samples, size, strict=True)]
     if params.get("sensor") != "integrated":
         return _field_bytes(points), bands * 1e9 * expected_seconds(*points)
-    fine = fine_axes(samples, (size[0], size[1]), alpha, result.intensity.dtype)
+    fine_grids = fine_axes(samples, (size[0], size[1]), alpha, result.intensity.dtype)
     axes = [
-        Axis(n, grid.samples, alpha / grid.per_pixel) for n, grid in zip(samples, fine, strict=True)
+        Axis(n, grid.samples, alpha / grid.per_pixel)
+        for n, grid in zip(samples, fine_grids, strict=True)
     ]
-    average = _FILTER_SECONDS * axes[0].n_out * axes[1].n_out
-    strip = 8.0 * min(FINE_SAMPLES, axes[0].n_out * axes[1].n_out)
-    return _field_bytes(axes) + strip, bands * 1e9 * (expected_seconds(*axes) + average)
+    average_seconds = _FILTER_SECONDS * axes[0].n_out * axes[1].n_out
+    strip_bytes = 8.0 * min(FINE_SAMPLES, axes[0].n_out * axes[1].n_out)
+    return _field_bytes(axes) + strip_bytes, bands * 1e9 * (
+        expected_seconds(*axes) + average_seconds
+    )
 
 
 def _field_bytes(axes: list[Axis]) -> float:
+    """Return the bytes of the field in the pupil and behind the transform along one axis, in single
+    precision.
+    """
     return 8.0 * axes[0].n_in * (axes[1].n_in + axes[1].n_out)
 
 
@@ -94,13 +108,14 @@ def _(radiance: Tensor, psf: Psf, **params: Any) -> Tensor:
 
 @image.work
 def _(result: Tensor, radiance: Tensor, psf: Psf, *, border: str = "zero", **params: Any) -> Any:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     size = _padded(radiance, psf, border)
-    around = (
+    border_bytes = (
         result.nbytes if border == "zero" else result[..., 0, 0].numel() * 4.0 * size[0] * size[1]
     )
-    return 8.0 * size[0] * size[1] + around, result[..., 0, 0].numel() * 3 * transform_operations(
-        *size
-    )
+    return 8.0 * size[0] * size[1] + border_bytes, result[
+        ..., 0, 0
+    ].numel() * 3 * transform_operations(*size)
 
 
 @few_bands.shape
@@ -153,18 +168,29 @@ def _(
     border: str = "zero",
     **params: Any,
 ) -> tuple[float, float]:
-    (high, wide), (k, y, x), r = (
+    # bytes of memory during the run, beside inputs and result, and number of operations
+    (transform_height, transform_width), (planes_count, y, x), row_count = (
         _padded(radiance.planes, psf, border),
         radiance.planes.shape,
         len(rows),
     )
+    # the part of the PSF that reaches the scene
     m, n = (min(a, 2 * b - 1) for a, b in zip(psf.intensity.shape[-2:], (y, x), strict=True))
-    tall = y if border == "zero" else y + m
-    rows_of_spectra = 4.0 * wide * (k * tall + r * k * m + r * y)
-    around = 4.0 * k * m * n + (0.0 if border == "zero" else 4.0 * k * tall * (x + n))
-    transforms = k + r * (k + 1)
-    operations = transforms * transform_operations(high, wide) + psf.intensity.numel()
-    return rows_of_spectra + 4.0 * r * y * wide + around, operations
+    scene_height = y if border == "zero" else y + m
+    rows_of_spectra = (
+        4.0
+        * transform_width
+        * (planes_count * scene_height + row_count * planes_count * m + row_count * y)
+    )
+    kernel_bytes = 4.0 * planes_count * m * n + (
+        0.0 if border == "zero" else 4.0 * planes_count * scene_height * (x + n)
+    )
+    # planes, a kernel for each row and plane, and the rows back
+    transforms = planes_count + row_count * (planes_count + 1)
+    operations = (
+        transforms * transform_operations(transform_height, transform_width) + psf.intensity.numel()
+    )
+    return rows_of_spectra + 4.0 * row_count * y * transform_width + kernel_bytes, operations
 
 
 @laser_irradiance.shape

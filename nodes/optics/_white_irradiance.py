@@ -53,11 +53,12 @@ def white_irradiance(
     """
     if illuminance is None and luminance is None:
         return torch.zeros((), dtype=torch.float64)
-    candela = 0.0 if luminance is None else luminance
+    luminance_of_white = 0.0 if luminance is None else luminance
     if illuminance is not None:
-        candela = illuminance / math.pi
+        # a white surface that scatters evenly: luminance = illuminance / pi
+        luminance_of_white = illuminance / math.pi
     widths = bands.widths.detach().cpu().double()
-    radiance = candela * luminous_share(bands, kind, temperature)
+    radiance = luminance_of_white * luminous_share(bands, kind, temperature)
     if float(widths.max() / widths.min()) > 1 + _EQUAL:
         raise ParameterError("illuminance", _WIDTHS)
     return torch.as_tensor(
@@ -108,6 +109,6 @@ def _(
 ) -> list[Check]:
     if not float(result) > 0:
         return [Check("no brightness in lux or cd/m2")]
-    number = focal_length / (2 * math.sqrt(clear_area(stop) / math.pi))
+    f_number = focal_length / (2 * math.sqrt(clear_area(stop) / math.pi))
     total = float(result) * len(bands.centres)
-    return [Check(f"white: {total:.4g} W/m2 on the sensor in all bands, at f/{number:.3g}")]
+    return [Check(f"white: {total:.4g} W/m2 on the sensor in all bands, at f/{f_number:.3g}")]

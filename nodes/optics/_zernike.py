@@ -22,6 +22,7 @@ def noll(index: int) -> tuple[int, int]:
     """
     if index < 1:
         raise ValueError(f"Zernike index {index}: Noll numbers begin at 1 (piston)")
+    # order n begins after n (n + 1) / 2 smaller numbers
     n = (math.isqrt(8 * index - 7) - 1) // 2
     position = index - n * (n + 1) // 2 - 1
     m = 2 * ((position + (n + 1) % 2) // 2) + n % 2
@@ -32,14 +33,14 @@ def _radial(n: int, m: int) -> list[float]:
     """Return the coefficients of the orthonormal radial polynomial R(n, m)(r) / r**m in rising
     powers of r squared.
     """
-    low, high, factorial = (n - m) // 2, (n + m) // 2, math.factorial
+    lower, upper, factorial = (n - m) // 2, (n + m) // 2, math.factorial
     norm = math.sqrt((n + 1) * (1 if m == 0 else 2))
-    terms = reversed(range(low + 1))
+    terms = reversed(range(lower + 1))
     return [
         norm
         * (-1) ** k
         * factorial(n - k)
-        / (factorial(k) * factorial(high - k) * factorial(low - k))
+        / (factorial(k) * factorial(upper - k) * factorial(lower - k))
         for k in terms
     ]
 
@@ -51,14 +52,15 @@ def _by_azimuth(coefficients: Mapping[int, float]) -> dict[int, list[float]]:
     sums: dict[int, list[float]] = {}
     for index, rms in coefficients.items():
         n, m = noll(index)
-        new, old = _radial(n, abs(m)), sums.get(m, [])
-        width = max(len(new), len(old))
-        padded = [row + [0.0] * (width - len(row)) for row in (new, old)]
+        new_terms, earlier_terms = _radial(n, abs(m)), sums.get(m, [])
+        term_count = max(len(new_terms), len(earlier_terms))
+        padded = [row + [0.0] * (term_count - len(row)) for row in (new_terms, earlier_terms)]
         sums[m] = [rms * a + b for a, b in zip(*padded, strict=True)]
     return sums
 
 
 def _horner(coefficients: list[float], x: Tensor) -> Tensor:
+    """Return the polynomial with coefficients in rising powers at x, by Horner's rule."""
     value = torch.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value.mul_(x).add_(coefficient)
@@ -75,12 +77,17 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
     """
     sums = _by_azimuth(coefficients)
     square = v.square() + u.square()
-    total, real, imag = torch.zeros_like(square), torch.ones_like(square), torch.zeros_like(square)
+    total, cosine, sine = (
+        torch.zeros_like(square),
+        torch.ones_like(square),
+        torch.zeros_like(square),
+    )
     for order in range(max(map(abs, sums), default=-1) + 1):
-        for m, wave in ((order, real), (-order, imag)):
-            if m in sums and (order or wave is real):
+        for m, wave in ((order, cosine), (-order, sine)):
+            if m in sums and (order or wave is cosine):
                 total.addcmul_(_horner(sums[m], square), wave)
-        real, imag = real * u - imag * v, real * v + imag * u
+        # (u + i v)^m = r^m exp(i m phi), a power more each time
+        cosine, sine = cosine * u - sine * v, cosine * v + sine * u
     return total
 
 
@@ -122,12 +129,16 @@ def factors(
     lattice. The lattice does not depend on the sampling of the pupil, so the screen does not depend
     on the sampling either.
     """
-    width = scale / 2
-    half = max(0.5, grid.samples * grid.pitch / (2 * grid.diameter)) + 4 * width
-    count = 2 * math.ceil(half / width) + 1
-    white = torch.randn(count, count, generator=rng, device=rng.device, dtype=torch.float64)
-    line = axes(grid, device)[0] / 2
-    centres = (torch.arange(count, dtype=torch.float64, device=line.device) - count // 2) * width
-    spread = torch.exp(-((line - centres) ** 2) / (2 * width**2))
-    spread = spread / spread.square().sum(1, keepdim=True).sqrt()
-    return spread @ white.to(line.device), spread.T
+    # noise of spots exp(-x^2 / (2 w^2)) has the correlation exp(-d^2 / (4 w^2)): w = scale / 2
+    spot_width = scale / 2
+    half_width = max(0.5, grid.samples * grid.pitch / (2 * grid.diameter)) + 4 * spot_width
+    count = 2 * math.ceil(half_width / spot_width) + 1
+    white_noise = torch.randn(count, count, generator=rng, device=rng.device, dtype=torch.float64)
+    positions = axes(grid, device)[0] / 2
+    centres = (
+        torch.arange(count, dtype=torch.float64, device=positions.device) - count // 2
+    ) * spot_width
+    spot_weights = torch.exp(-((positions - centres) ** 2) / (2 * spot_width**2))
+    # each sample has variance 1
+    spot_weights = spot_weights / spot_weights.square().sum(1, keepdim=True).sqrt()
+    return spot_weights @ white_noise.to(positions.device), spot_weights.T

@@ -206,15 +206,17 @@ def colour_matrix(
             colour-science.
     """
     spectra = _paints(bands.centres)
-    second = spectra.T @ spectra / len(spectra)
+    # least squares over paints: counts = C s, colour = R s, with the mean of s s'
+    spectra_products = spectra.T @ spectra / len(spectra)
     pixel = {"pixel_pitch": pixel_pitch, "exposure": exposure}
     counts = _counts(bands, illuminant, responses, level, quantum_efficiency, **pixel)
     rgb = _target(bands.centres, len(counts))
-    moments = counts @ second @ counts.T
-    ridge = (1e-12 * moments.diagonal().mean()).clamp_min(1e-200) * torch.eye(
-        len(moments), dtype=torch.float64
+    count_products = counts @ spectra_products @ counts.T
+    # so that channels that see the same have a solution
+    ridge = (1e-12 * count_products.diagonal().mean()).clamp_min(1e-200) * torch.eye(
+        len(count_products), dtype=torch.float64
     )
-    matrix: Tensor = torch.linalg.solve(moments + ridge, counts @ second @ rgb.T).T
+    matrix: Tensor = torch.linalg.solve(count_products + ridge, counts @ spectra_products @ rgb.T).T
     return matrix
 
 
@@ -223,14 +225,18 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
     bands, illuminant, responses, level = inputs
     spectra = _paints(bands.centres)
     counts = _counts(bands, illuminant, responses, level, **params)
-    off = (
+    rms_error = (
         (spectra @ counts.T @ result.T - spectra @ _target(bands.centres, len(result[0])).T)
         .square()
         .mean()
         .sqrt()
     )
     quantity = "colour" if len(result[0]) > 1 else "luminance"
-    return [Check(f"rms {quantity} error {float(off):.3f} on colour charts", float(off) < 0.1)]
+    return [
+        Check(
+            f"rms {quantity} error {float(rms_error):.3f} on colour charts", float(rms_error) < 0.1
+        )
+    ]
 
 
 @colour_matrix.propagate_error
@@ -279,8 +285,8 @@ def _counts(
     **pixel: float,
 ) -> Tensor:
     """Return the electrons in each channel for one unit of reflectance in each band, on the CPU."""
-    lit = level.cpu().double() * illuminant.cpu().double()
-    weights = channel_weights(bands, responses.cpu(), lit, **pixel)
+    band_light = level.cpu().double() * illuminant.cpu().double()
+    weights = channel_weights(bands, responses.cpu(), band_light, **pixel)
     return weights * quantum_efficiency
 
 
@@ -338,13 +344,15 @@ def white_level(
             for the maximum.
     """
     equal_energy = torch.ones(len(bands.centres), dtype=torch.float64)
-    lit = equal_energy * illuminant.cpu().double()
+    equal_light = equal_energy * illuminant.cpu().double()
     weights = channel_weights(
-        bands, responses.cpu(), lit, pixel_pitch=pixel_pitch, exposure=exposure
+        bands, responses.cpu(), equal_light, pixel_pitch=pixel_pitch, exposure=exposure
     )
-    counts = weights.sum(-1) * quantum_efficiency
+    electrons_of_white = weights.sum(-1) * quantum_efficiency
+    # stated: so many full wells of the channel that sees white best
     if white is not None:
-        return equal_energy * (white * full_well / float(counts.max()))
+        return equal_energy * (white * full_well / float(electrons_of_white.max()))
+    # by the colours of a restored picture; without one, by what each channel sees of white
     if restored is not None:
         light_of = {
             "pixel_pitch": pixel_pitch,
@@ -354,8 +362,8 @@ def white_level(
         matrix = colour_matrix(bands, illuminant, responses, equal_energy, **light_of)
         brightness = (matrix.to(restored.device) @ single(restored).double().flatten(-2)).amax(-2)
         return equal_energy * _bright_quantile(brightness.reshape(restored.shape[-2:]), clipped)
-    passed = _passed(psf, bands, illuminant, responses)
-    white_counts = (counts * passed).clamp_min(1e-300).to(signal.device)
+    psf_sum = _passed(psf, bands, illuminant, responses)
+    white_counts = (electrons_of_white * psf_sum).clamp_min(1e-300).to(signal.device)
     return equal_energy * _bright_quantile(
         (single(signal).double() / white_counts[:, None, None]).amax(-3), clipped
     )

@@ -72,35 +72,44 @@ def fitted(pixels: Seen, layout: Layout, count: int, rng: Generator) -> Fit:
     """
     share = node_weights(pixels.middle, layout.shape, layout.zones)
     state, weight = _start(pixels, share, layout.window)
-    hold = _hold(linear(pixels, state, share), state.kernels, weight)
+    unchanged_ways = _hold(linear(pixels, state, share), state.kernels, weight)
     _refuse_unseen(linear(pixels, state, share), weight)
     for _ in range(_STEPS):
-        near = linear(pixels, state, share)
-        residual = pixels.light - near.model(state.background)
-        step = _solved(near, hold, weight, _slope(near, state, weight, residual))
-        before = state.offset
+        linear_model = linear(pixels, state, share)
+        residual = pixels.light - linear_model.model(state.background)
+        step = _solved(
+            linear_model, unchanged_ways, weight, _slope(linear_model, state, weight, residual)
+        )
+        offset_before = state.offset
         state = _ahead(
             pixels, state, share, weight, step._replace(offset=step.offset.clamp(-_MOST, _MOST))
         )
         weight = _weight(pixels, linear(pixels, state, share).model(state.background))
-        if float((state.offset - before).abs().max()) < _ENOUGH:
+        if float((state.offset - offset_before).abs().max()) < _ENOUGH:
             break
-    near = linear(pixels, state, share)
-    residual = pixels.light - near.model(state.background)
-    _refuse_unseen(near, weight)
+    linear_model = linear(pixels, state, share)
+    residual = pixels.light - linear_model.model(state.background)
+    _refuse_unseen(linear_model, weight)
     kernels = gauged(state.kernels)
-    local = _misfit(near, weight, residual)
+    local_misfit = _misfit(linear_model, weight, residual)
     draws = []
     for _ in range(count):
+        # noise of the frames, weighted, gives the slope of a drawn error
         noise = _normal(weight, rng) * weight.sqrt()
-        slope = near.slope(noise)
+        slope = linear_model.slope(noise)
         slope = slope._replace(
             background=slope.background + _normal(pixels.doubt, rng) / pixels.doubt.sqrt()
         )
-        other = gauged(state.plus(_solved(near, hold, weight, slope)).kernels)
-        draws.append((kernels + local * (other - kernels)).float())
+        drawn_kernels = gauged(
+            state.plus(_solved(linear_model, unchanged_ways, weight, slope)).kernels
+        )
+        draws.append((kernels + local_misfit * (drawn_kernels - kernels)).float())
     return Fit(
-        kernels, torch.stack(draws), state, _chi(weight, residual, near), *_support(near, weight)
+        kernels,
+        torch.stack(draws),
+        state,
+        _chi(weight, residual, linear_model),
+        *_support(linear_model, weight),
     )
 
 
@@ -132,7 +141,9 @@ def centre(kernels: Tensor) -> Tensor:
 
 
 def _start(pixels: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State, Tensor]:
-    """Return a first guess: one PSF for all nodes, from the points that are not saturated."""
+    """Return a first guess, one PSF for all nodes from the points that are not saturated, and the
+    weight (channel, pixel) of each pixel.
+    """
     points, channels, nodes = len(pixels.owner), len(pixels.light), share.shape[1]
     kernels = pixels.light.new_zeros(nodes, channels, *window)
     state = State(
@@ -141,15 +152,19 @@ def _start(pixels: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State,
         pixels.light.new_zeros(points, 2),
         pixels.background,
     )
-    near = linear(pixels, state, share)
-    stamps = near.stamps_of(pixels.light - pixels.background.T[:, pixels.frame])
+    linear_model = linear(pixels, state, share)
+    stamps = linear_model.stamps_of(pixels.light - pixels.background.T[:, pixels.frame])
     weight = _weight(pixels, pixels.light)
-    weights = near.stamps_of(weight)
-    good = (near.stamps_of(pixels.clipped.double()) == 0).all(1).flatten(1).all(1)
-    valid = (weights[good] > 0).double()
-    guess = (stamps[good] * valid).sum(0) / (valid * stamps[good].sum((-2, -1), keepdim=True)).sum(
-        0
-    ).clamp_min(1e-9)
+    weights = linear_model.stamps_of(weight)
+    # points of which no pixel is clipped in any channel
+    unclipped_points = (
+        (linear_model.stamps_of(pixels.clipped.double()) == 0).all(1).flatten(1).all(1)
+    )
+    valid = (weights[unclipped_points] > 0).double()
+    # mean of these points, each over its own light, at the pixels that count
+    guess = (stamps[unclipped_points] * valid).sum(0) / (
+        valid * stamps[unclipped_points].sum((-2, -1), keepdim=True)
+    ).sum(0).clamp_min(1e-9)
     guess = guess.clamp_min(0.0)
     guess = guess / guess.sum((-2, -1), keepdim=True).clamp_min(1e-9)
     for _ in range(2):
@@ -161,15 +176,20 @@ def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor,
     """Return the whole-pixel offset of each point at which the guess explains most, and the
     signal of each channel.
     """
-    channels, wide = len(guess), (_SEARCH,) * 4
-    product = conv2d(pad(weights * stamps, wide), guess[:, None], groups=channels)
-    norm = conv2d(pad(weights, wide), guess.square()[:, None], groups=channels).clamp_min(1e-30)
-    best = (product.clamp_min(0.0).square() / norm).sum(1).flatten(1).argmax(1)
+    channels, search_padding = len(guess), (_SEARCH,) * 4
+    product = conv2d(pad(weights * stamps, search_padding), guess[:, None], groups=channels)
+    norm = conv2d(pad(weights, search_padding), guess.square()[:, None], groups=channels).clamp_min(
+        1e-30
+    )
+    # largest product^2 / norm, summed over channels: the gain of a least-squares signal
+    best_place = (product.clamp_min(0.0).square() / norm).sum(1).flatten(1).argmax(1)
     signal = (
-        (product / norm).flatten(2).gather(2, best[:, None, None].expand(-1, channels, 1))[..., 0]
+        (product / norm)
+        .flatten(2)
+        .gather(2, best_place[:, None, None].expand(-1, channels, 1))[..., 0]
     )
     side = 2 * _SEARCH + 1
-    offset = torch.stack([best // side, best % side], 1).double() - _SEARCH
+    offset = torch.stack([best_place // side, best_place % side], 1).double() - _SEARCH
     return offset, signal.clamp_min(1e-3)
 
 
@@ -178,13 +198,16 @@ def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor,
 
 def _weight(pixels: Seen, expected: Tensor) -> Tensor:
     """Return 1 / variance of each pixel; 0 where it is clipped, or may be clipped by chance."""
-    ground = pixels.background.T[:, pixels.frame]
-    variance = pixels.floor.T[:, pixels.frame] + (expected - ground).clamp_min(0.0)
-    censored = pixels.clipped | (expected > pixels.level - _SURE * variance.sqrt())
-    return torch.where(censored, 0.0, 1.0 / variance)
+    background = pixels.background.T[:, pixels.frame]
+    variance = pixels.floor.T[:, pixels.frame] + (expected - background).clamp_min(0.0)
+    unusable = pixels.clipped | (expected > pixels.level - _SURE * variance.sqrt())
+    return torch.where(unusable, 0.0, 1.0 / variance)
 
 
 def _slope(near: Linear, state: State, weight: Tensor, residual: Tensor) -> State:
+    """Return the slope of the log likelihood with respect to a state, that of the backgrounds
+    included.
+    """
     slope = near.slope(weight * residual)
     pull_to_background = (near.seen.background - state.background) / near.seen.doubt
     return slope._replace(background=slope.background + pull_to_background)
@@ -194,11 +217,13 @@ def _ahead(pixels: Seen, state: State, share: Tensor, weight: Tensor, step: Stat
     """Return the state after a step, halved until the frames fit better; the state itself if
     none does.
     """
-    worst = _square(pixels, state, linear(pixels, state, share), weight)
+    square_before = _square(pixels, state, linear(pixels, state, share), weight)
     for _ in range(_HALVED):
-        ahead = state.plus(step)
-        if float(_square(pixels, ahead, linear(pixels, ahead, share), weight)) < float(worst):
-            return ahead
+        next_state = state.plus(step)
+        if float(_square(pixels, next_state, linear(pixels, next_state, share), weight)) < float(
+            square_before
+        ):
+            return next_state
         step = State(*(0.5 * entry for entry in step))
     return state
 
@@ -236,24 +261,27 @@ def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
     ``hold`` decides.
     """
     diagonal = _curvature(near, weight)
-    inverse = State(*(1.0 / x for x in diagonal))
-    calm = State(*(_CALM * x.amax() * torch.ones_like(x) for x in diagonal))
+    inverse_diagonal = State(*(1.0 / x for x in diagonal))
+    damping = State(*(_CALM * x.amax() * torch.ones_like(x) for x in diagonal))
     x = State(*(torch.zeros_like(entry) for entry in right))
     residual = _free(right, hold)
-    way = _free(residual.times(inverse), hold)
-    size = residual.dot(way)
-    first = size
+    # the iteration stays among changes that the frames can tell
+    direction = _free(residual.times(inverse_diagonal), hold)
+    residual_norm = residual.dot(direction)
+    first_norm = residual_norm
     for _ in range(_ITERATIONS):
-        if float(size) <= _RESIDUAL * float(first):
+        if float(residual_norm) <= _RESIDUAL * float(first_norm):
             break
-        image = near.slope(weight * near.change(way)).plus(way.times(calm))
-        image = image._replace(background=image.background + way.background / near.seen.doubt)
-        image = _free(image, hold)
-        step = size / way.dot(image)
-        x, residual = x.plus(way, step), residual.plus(image, -step)
-        turned = _free(residual.times(inverse), hold)
-        size, before = residual.dot(turned), size
-        way = turned.plus(way, size / before)
+        product = near.slope(weight * near.change(direction)).plus(direction.times(damping))
+        product = product._replace(
+            background=product.background + direction.background / near.seen.doubt
+        )
+        product = _free(product, hold)
+        step = residual_norm / direction.dot(product)
+        x, residual = x.plus(direction, step), residual.plus(product, -step)
+        preconditioned = _free(residual.times(inverse_diagonal), hold)
+        residual_norm, norm_before = residual.dot(preconditioned), residual_norm
+        direction = preconditioned.plus(direction, residual_norm / norm_before)
     return x
 
 
@@ -280,8 +308,8 @@ def _hold(near: Linear, kernels: Tensor, weight: Tensor) -> Hold:
 def _free(change: State, hold: Hold) -> State:
     """Return a change without the part that does not change the frames, which would have no end."""
     kernels = change.kernels - change.kernels.mean((-2, -1), keepdim=True)
-    for way in () if hold.ways is None else hold.ways:
-        kernels = kernels - (way * kernels).sum((-3, -2, -1), keepdim=True) * way
+    for direction in () if hold.ways is None else hold.ways:
+        kernels = kernels - (direction * kernels).sum((-3, -2, -1), keepdim=True) * direction
     return change._replace(kernels=kernels, offset=change.offset - hold.points @ change.offset)
 
 
@@ -290,12 +318,13 @@ def _ways(kernels: Tensor) -> Tensor:
     and to the right.
     """
     directions = list[Tensor]()
-    for way in torch.gradient(kernels, dim=(-2, -1)):
-        way = way - way.mean((-2, -1), keepdim=True)
+    for direction in torch.gradient(kernels, dim=(-2, -1)):
+        direction = direction - direction.mean((-2, -1), keepdim=True)
+        # orthogonal to the first, by Gram and Schmidt
         for other in directions:
-            way = way - (way * other).sum((-3, -2, -1), keepdim=True) * other
+            direction = direction - (direction * other).sum((-3, -2, -1), keepdim=True) * other
         directions.append(
-            way / way.square().sum((-3, -2, -1), keepdim=True).sqrt().clamp_min(1e-30)
+            direction / direction.square().sum((-3, -2, -1), keepdim=True).sqrt().clamp_min(1e-30)
         )
     return torch.stack(directions)
 
@@ -318,39 +347,48 @@ def _refuse_unseen(near: Linear, weight: Tensor) -> None:
 
 def _misfit(near: Linear, weight: Tensor, residual: Tensor) -> Tensor:
     """Return the root of chi-square around each pixel of the window (y, x), at least 1."""
-    square, count = (
+    squares, count = (
         near.stamps_of(x).sum((0, 1)) for x in (weight * residual.square(), (weight > 0).double())
     )
-    mean = [
+    local_means = [
         avg_pool2d(x[None, None], _LOCAL, 1, _LOCAL // 2, count_include_pad=False)[0, 0]
-        for x in (square, count)
+        # sums of squares and numbers of pixels around each pixel of the window
+        for x in (squares, count)
     ]
-    free = 1.0 - _unknowns(near) / float((weight > 0).sum())
-    return (mean[0] / (free * mean[1]).clamp_min(1e-9)).clamp_min(1.0).sqrt()
+    free_share = 1.0 - _unknowns(near) / float((weight > 0).sum())
+    return (local_means[0] / (free_share * local_means[1]).clamp_min(1e-9)).clamp_min(1.0).sqrt()
 
 
 def _chi(weight: Tensor, residual: Tensor, near: Linear) -> Tensor:
-    free = 1.0 - _unknowns(near) / float((weight > 0).sum())
-    return (weight * residual.square()).sum(1) / ((weight > 0).sum(1) * free).clamp_min(1.0)
+    """Return chi-square per degree of freedom (channel,)."""
+    free_share = 1.0 - _unknowns(near) / float((weight > 0).sum())
+    return (weight * residual.square()).sum(1) / ((weight > 0).sum(1) * free_share).clamp_min(1.0)
 
 
 def _support(near: Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how many points at each node would tell its PSF as well, and the inflation of its
-    variance.
+    """Return for each node how many points would tell its PSF as well if they lay in the middle of
+    its zone, and the inflation of its variance because points tell several PSFs at once.
 
     The worst of the pixels in the middle. With A the bilinear weights of the points that show a
     pixel, the number is 1 over the diagonal of the inverse of A^T A, and the inflation the product
     of this diagonal and that of A^T A (Kutner et al., Applied Linear Statistical Models, 5th ed.,
     2005, sec. 10.5): 1 for points in the middles of zones.
     """
-    shown = near.stamps_of(weight) > 0
-    y, x = (n // 2 for n in shown.shape[-2:])
-    core = shown[..., y - _CORE : y + _CORE + 1, x - _CORE : x + _CORE + 1].flatten(1).double()
-    patterns = torch.unique(core, dim=1).T
-    normal = near.share.T @ (patterns[:, :, None] * near.share)
-    sizes, ways = torch.linalg.eigh(normal)
-    inverse = (ways.square() / sizes.clamp_min(_ALONE)[:, None]).sum(-1)
-    return (1.0 / inverse).amin(0), (inverse * normal.diagonal(dim1=-2, dim2=-1)).amax(0)
+    pixel_shown = near.stamps_of(weight) > 0
+    middle_y, middle_x = (n // 2 for n in pixel_shown.shape[-2:])
+    core_shown = (
+        pixel_shown[
+            ..., middle_y - _CORE : middle_y + _CORE + 1, middle_x - _CORE : middle_x + _CORE + 1
+        ]
+        .flatten(1)
+        .double()
+    )
+    # each set of points that shows some pixel, once
+    patterns = torch.unique(core_shown, dim=1).T
+    weight_products = near.share.T @ (patterns[:, :, None] * near.share)
+    eigenvalues, eigenvectors = torch.linalg.eigh(weight_products)
+    inverse = (eigenvectors.square() / eigenvalues.clamp_min(_ALONE)[:, None]).sum(-1)
+    return (1.0 / inverse).amin(0), (inverse * weight_products.diagonal(dim1=-2, dim2=-1)).amax(0)
 
 
 def _unknowns(near: Linear) -> float:
@@ -440,15 +478,21 @@ def measured_psf(
     pixels = read_points(files or (), layout.window, camera)
     fit = fitted(pixels, layout, draws, rng)
     kernels = fit.kernels.reshape(*zones, *fit.kernels.shape[1:])
-    drawn = fit.draws.reshape(-1, *kernels.shape)
-    deviation = (drawn.double() - kernels).square().mean(0).sqrt()
+    drawn_kernels = fit.draws.reshape(-1, *kernels.shape)
+    deviation = (drawn_kernels.double() - kernels).square().mean(0).sqrt()
     places = pixels.middle + fit.state.offset
     points = torch.cat(
         [pixels.owner[:, None].double(), places, fit.state.signal.sum(1, keepdim=True)], 1
     )
-    counts = (x.reshape(*zones) for x in (fit.support, fit.inflation))
+    support_and_inflation = (x.reshape(*zones) for x in (fit.support, fit.inflation))
     return MeasuredPsf(
-        kernels, deviation, drawn, points, fit.chi, _outside(kernels, drawn.double()), *counts
+        kernels,
+        deviation,
+        drawn_kernels,
+        points,
+        fit.chi,
+        _outside(kernels, drawn_kernels.double()),
+        *support_and_inflation,
     )
 
 
@@ -498,20 +542,20 @@ def _counted(result: MeasuredPsf) -> Check:
     """Return how many points tell each PSF, and the zone in which they tell several PSFs at
     once.
     """
-    fewest, worst = float(result.support.min()), float(result.inflation.max())
+    fewest, largest_inflation = float(result.support.min()), float(result.inflation.max())
     row, column = divmod(int(result.inflation.argmax()), result.inflation.shape[1])
     text = (
         f"each zone has {fewest:.2g} points or more in effect, inflation of variance at most"
-        f" {worst:.3g}"
+        f" {largest_inflation:.3g}"
     )
-    if worst <= _INFLATED:
+    if largest_inflation <= _INFLATED:
         return Check(text)
-    why = (
+    reason = (
         f" in zone ({row + 1}, {column + 1}), more than {_INFLATED:g}: its points lie far from the"
         " middle of the zone and tell several PSFs at once, so that the deviation may be too"
         " small; take frames with points near the middles of the zones, or choose fewer zones"
     )
-    return Check(text + why, False)
+    return Check(text + reason, False)
 
 
 def _two(numbers: Sequence[int]) -> tuple[int, int]:
@@ -524,11 +568,13 @@ def _outside(kernels: Tensor, draws: Tensor) -> Tensor:
     for each channel.
     """
     y, x = kernels.shape[-2:]
-    rim = torch.ones(y, x, dtype=torch.bool)
-    rim[2:-2, 2:-2] = False
+    in_rim = torch.ones(y, x, dtype=torch.bool)
+    in_rim[2:-2, 2:-2] = False
     rim_level, spread = (
-        kernels[..., rim].mean(-1),
-        (draws - kernels)[..., rim].mean(-1).square().mean(0).sqrt(),
+        kernels[..., in_rim].mean(-1),
+        (draws - kernels)[..., in_rim].mean(-1).square().mean(0).sqrt(),
     )
+    # light that falls as 1 / r^3 from r = R on: integral of level (R / r)^3 2 pi r dr = 2 pi R^2
+    # level
     bound = 2.0 * math.pi * (min(y, x) / 2.0) ** 2 * (rim_level.clamp_min(0.0) + 2.0 * spread)
     return bound.amax((0, 1))

@@ -95,8 +95,10 @@ def _refuse_problems(files: Sequence[Path], problems: Sequence[str]) -> None:
     """Raise ParameterError with the problems of all frames that have one."""
     stated = [problem for problem in problems if problem]
     if stated:
-        head = f"{len(stated)} of {len(files)} frames cannot be used: " if len(files) > 1 else ""
-        raise ParameterError("files", head + "; ".join(stated))
+        beginning = (
+            f"{len(stated)} of {len(files)} frames cannot be used: " if len(files) > 1 else ""
+        )
+        raise ParameterError("files", beginning + "; ".join(stated))
 
 
 def _empty_zones(
@@ -105,11 +107,13 @@ def _empty_zones(
     zones: tuple[int, int],
 ) -> list[tuple[int, int]]:
     """Return the zones without a sharp point, (row, column) from 1."""
-    full = set()
+    zones_with_points = set()
     for points in points_by_file:
-        full |= {_zone(place, shape, zones) for place, sharp in points if sharp}
-    every = itertools.product(range(zones[0]), range(zones[1]))
-    return [(row + 1, column + 1) for row, column in every if (row, column) not in full]
+        zones_with_points |= {_zone(place, shape, zones) for place, sharp in points if sharp}
+    all_zones = itertools.product(range(zones[0]), range(zones[1]))
+    return [
+        (row + 1, column + 1) for row, column in all_zones if (row, column) not in zones_with_points
+    ]
 
 
 def points_in(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> int:
@@ -123,35 +127,48 @@ def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) 
     """
     gain, offset, full_well, bits, read_noise = camera
     lit, dark = lit_and_dark(files)
-    base = (
+    dark_level = (
         sum((read_frame(file).values / gain for file in dark), np.zeros(1)) / len(dark)
         if dark
         else offset
     )
-    parts, first = [], 0
+    frame_pixels, first_pixel = [], 0
     for number, file in enumerate(lit):
         raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
-        ends = is_clipped(raw, full_well=full_well, gain=gain, bits=bits)
-        light = raw / gain - torch.as_tensor(base)
+        clipped_pixels = is_clipped(raw, full_well=full_well, gain=gain, bits=bits)
+        light = raw / gain - torch.as_tensor(dark_level)
         places = [place for place, _ in _found(file, window, camera)]
-        parts.append(_kept(light, ends, places, window, number, first))
-        first += parts[-1][0].shape[-1]
-    lights, cut, frames, indices, middle, owner, background, doubt, spread = zip(
-        *parts, strict=True
-    )
-    index, ground = torch.cat(indices), torch.stack(background)
-    level = min(full_well, (2.0**bits - 1) / gain) - float(np.mean(base))
+        frame_pixels.append(_kept(light, clipped_pixels, places, window, number, first_pixel))
+        first_pixel += frame_pixels[-1][0].shape[-1]
+    (
+        # in the order that `_kept` returns
+        light_by_frame,
+        clipped_by_frame,
+        frame_by_frame,
+        pixels_by_frame,
+        middle_by_frame,
+        owner_by_frame,
+        background_by_frame,
+        doubt_by_frame,
+        variance_by_frame,
+    ) = zip(*frame_pixels, strict=True)
+    pixel_index, background_level = torch.cat(pixels_by_frame), torch.stack(background_by_frame)
+    level = min(full_well, (2.0**bits - 1) / gain) - float(np.mean(dark_level))
+    # a mean of dark frames adds its own noise; 1 / 12 of a digital number squared is its rounding
     read_variance = read_noise**2 * (1 + (1 / len(dark) if dark else 0)) + 1 / (12 * gain**2)
-    floor = torch.maximum(torch.stack(spread), read_variance + ground.clamp_min(0.0))
+    floor = torch.maximum(
+        torch.stack(variance_by_frame), read_variance + background_level.clamp_min(0.0)
+    )
     return Seen(
-        torch.cat(lights, 1),
-        torch.cat(cut, 1),
-        torch.cat(frames),
-        torch.where(index < 0, first, index),
-        torch.cat(owner),
-        torch.cat(middle),
-        ground,
-        torch.stack(doubt),
+        torch.cat(light_by_frame, 1),
+        torch.cat(clipped_by_frame, 1),
+        torch.cat(frame_by_frame),
+        # places beyond the frame: one after the last pixel
+        torch.where(pixel_index < 0, first_pixel, pixel_index),
+        torch.cat(owner_by_frame),
+        torch.cat(middle_by_frame),
+        background_level,
+        torch.stack(doubt_by_frame),
         floor,
         level,
     )
@@ -165,34 +182,46 @@ def _kept(
     number: int,
     first: int,
 ) -> tuple[Tensor, ...]:
-    """Return the pixels of one frame in the windows of its points, and the background of the
-    frame beyond them.
+    """Return of one frame the pixels in the windows of its points: light and clipped (channel,
+    pixel), frame of each, pixels of each window, middle and frame of each point; and the background
+    beyond the windows: its mean, the variance of this mean, and that of a pixel, for each channel.
+
+    ``ends`` are the clipped pixels, ``number`` that of the frame, ``first`` that of its first
+    pixel.
     """
     y, x = light.shape[-2:]
     middle = torch.tensor(places, dtype=torch.int64).reshape(-1, 2)
     rows = middle[:, :1] + torch.arange(window[0]) - window[0] // 2
     columns = middle[:, 1:] + torch.arange(window[1]) - window[1] // 2
-    inside = ((rows >= 0) & (rows < y))[:, :, None] & ((columns >= 0) & (columns < x))[:, None]
-    flat = rows.clamp(0, y - 1)[:, :, None] * x + columns.clamp(0, x - 1)[:, None]
+    in_frame = ((rows >= 0) & (rows < y))[:, :, None] & ((columns >= 0) & (columns < x))[:, None]
+    flat_place = rows.clamp(0, y - 1)[:, :, None] * x + columns.clamp(0, x - 1)[:, None]
     covered = _covered((y, x), places, window).flatten()
-    wide = _covered((y, x), places, (2 * window[0], 2 * window[1])).flatten()
-    lit = wide if int((~wide).sum()) >= _AROUND else covered
-    order = covered.cumsum(0) - 1 + first
-    index = torch.where(inside, order[flat], -1).flatten(1)
-    pairs = zip(light.flatten(1), ends.flatten(1), strict=True)
-    level, doubt, spread = map(
-        torch.stack, zip(*(_average(c[~lit & ~e]) for c, e in pairs), strict=True)
+    widely_covered = _covered((y, x), places, (2 * window[0], 2 * window[1])).flatten()
+    # windows twice as wide leave a better background, if enough pixels remain
+    near_points = widely_covered if int((~widely_covered).sum()) >= _AROUND else covered
+    pixel_number = covered.cumsum(0) - 1 + first
+    window_pixels = torch.where(in_frame, pixel_number[flat_place], -1).flatten(1)
+    channels = zip(light.flatten(1), ends.flatten(1), strict=True)
+    mean_background, mean_variance, pixel_variance = map(
+        torch.stack,
+        zip(
+            *(
+                _average(channel_light[~near_points & ~channel_clipped])
+                for channel_light, channel_clipped in channels
+            ),
+            strict=True,
+        ),
     )
     return (
         light.flatten(1)[:, covered],
         ends.flatten(1)[:, covered],
         torch.full((int(covered.sum()),), number),
-        index,
+        window_pixels,
         middle,
         torch.full((len(places),), number),
-        level,
-        doubt,
-        spread,
+        mean_background,
+        mean_variance,
+        pixel_variance,
     )
 
 
@@ -200,9 +229,15 @@ def _covered(
     shape: tuple[int, int], places: list[tuple[int, int]], window: tuple[int, int]
 ) -> Tensor:
     """Return True for the pixels (y, x) in windows around places."""
-    covered, (down, right) = torch.zeros(shape, dtype=torch.bool), (n // 2 for n in window)
+    covered, (half_rows, half_columns) = (
+        torch.zeros(shape, dtype=torch.bool),
+        (n // 2 for n in window),
+    )
     for y, x in places:
-        covered[max(y - down, 0) : y + down + 1, max(x - right, 0) : x + right + 1] = True
+        covered[
+            max(y - half_rows, 0) : y + half_rows + 1,
+            max(x - half_columns, 0) : x + half_columns + 1,
+        ] = True
     return covered
 
 
@@ -226,21 +261,23 @@ def _found(
     """
     gain, _, full_well, bits, read_noise = camera
     raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
-    ends = is_clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0)
+    clipped_pixels = is_clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0)
     light = (raw / gain).sum(0)
-    calm = _median(light)
-    ground = calm.median()
+    median_picture = _median(light)
+    background = median_picture.median()
+    # standard deviation of a normal law over its median absolute deviation
     noise = 1.4826 * float((light - light.median()).abs().median())
     noise = max(noise, read_noise * math.sqrt(len(raw)), 1e-6)
-    above = calm - ground
-    high = above > max(_SIGNIFICANT * noise, _FAINTEST * float(above.max()))
-    top = high & (above >= max_pool2d(above[None], 7, 1, 3)[0])
-    above = torch.where(top, above, 0.0)
+    above = median_picture - background
+    is_significant = above > max(_SIGNIFICANT * noise, _FAINTEST * float(above.max()))
+    is_peak = is_significant & (above >= max_pool2d(above[None], 7, 1, 3)[0])
+    above = torch.where(is_peak, above, 0.0)
     points = list[tuple[tuple[int, int], bool]]()
     while len(points) < _MOST and float(above.max()) > 0:
         y, x = divmod(int(above.argmax()), above.shape[1])
-        near = ends[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
-        points.append(((y, x), not bool(near.any())))
+        clipped_near = clipped_pixels[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+        points.append(((y, x), not bool(clipped_near.any())))
+        # no other point within the window of this one
         above[
             max(y - window[0] // 2, 0) : y + window[0] // 2 + 1,
             max(x - window[1] // 2, 0) : x + window[1] // 2 + 1,
@@ -257,8 +294,8 @@ def _is_inner(place: tuple[int, int], height: int, width: int) -> bool:
 
 def _median(picture: Tensor) -> Tensor:
     """Return the median of three by three pixels, in which a single hot pixel does not show."""
-    wide = pad(picture[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    return wide.unfold(0, 3, 1).unfold(1, 3, 1).flatten(-2).median(-1).values
+    padded = pad(picture[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    return padded.unfold(0, 3, 1).unfold(1, 3, 1).flatten(-2).median(-1).values
 
 
 def _unusable(
@@ -285,11 +322,13 @@ def _unusable(
 def _zone(
     place: tuple[int, int], shape: tuple[int, int], zones: tuple[int, int]
 ) -> tuple[int, int]:
+    """Return the zone (row, column) in which a pixel (y, x) of a frame lies."""
     row, column = (c * z // n for c, z, n in zip(place, zones, shape, strict=True))
     return row, column
 
 
 def _without_point(empty: list[tuple[int, int]], zones: tuple[int, int]) -> str:
+    """Return the message for zones (row, column) without a sharp point."""
     names = ", ".join(f"({i}, {j})" for i, j in empty)
     return (
         f"{len(empty)} of {zones[0]} x {zones[1]} zones have no point with an unsaturated core,"
@@ -341,8 +380,10 @@ def hats(position: Tensor, size: int, count: int) -> Tensor:
     """Return the linear weights (place, node) of ``count`` nodes in the middles of equal parts
     of ``size`` pixels.
     """
-    along = ((position.double() + 0.5) * count / size - 0.5).clamp(0, count - 1)
-    return (1.0 - (along[:, None] - torch.arange(count, dtype=torch.float64)).abs()).clamp_min(0.0)
+    position_in_nodes = ((position.double() + 0.5) * count / size - 0.5).clamp(0, count - 1)
+    return (
+        1.0 - (position_in_nodes[:, None] - torch.arange(count, dtype=torch.float64)).abs()
+    ).clamp_min(0.0)
 
 
 def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -352,25 +393,30 @@ def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
     The interpolation is a sinc with a Kaiser window: its error is below 1e-4 for up to 0.4 periods
     in a pixel. The slope of the samples is continued beyond their ends.
     """
-    apart = torch.arange(size)[:, None] - torch.arange(size + 2 * _REACH) + _REACH
-    distance = apart.double() - offset[:, None, None]
-    inside = (1.0 - (distance / (_REACH + 1.0)).square()).clamp_min(0.0)
-    root = inside.sqrt()
+    distance_in_samples = torch.arange(size)[:, None] - torch.arange(size + 2 * _REACH) + _REACH
+    distance = distance_in_samples.double() - offset[:, None, None]
+    inside_square = (1.0 - (distance / (_REACH + 1.0)).square()).clamp_min(0.0)
+    # Kaiser's window, i0(beta sqrt(1 - t^2)) / i0(beta), and below its derivative
+    root = inside_square.sqrt()
     taper = torch.special.i0(_BETA * root) / torch.special.i0(
         torch.tensor(_BETA, dtype=torch.float64)
     )
-    bent = torch.special.i1(_BETA * root) / torch.special.i0(
+    taper_slope = torch.special.i1(_BETA * root) / torch.special.i0(
         torch.tensor(_BETA, dtype=torch.float64)
     )
-    wave, x = torch.sinc(distance), math.pi * distance
-    small = distance.abs() < 1e-4
-    rise = torch.where(
-        small, -math.pi * x / 3.0, (torch.cos(x) - wave) / torch.where(small, 1.0, distance)
+    sinc, x = torch.sinc(distance), math.pi * distance
+    near_zero = distance.abs() < 1e-4
+    sinc_slope = torch.where(
+        # near 0 the first term of the series of the derivative
+        near_zero,
+        -math.pi * x / 3.0,
+        (torch.cos(x) - sinc) / torch.where(near_zero, 1.0, distance),
     )
-    fall = -_BETA * distance / (_REACH + 1.0) ** 2 * bent / root.clamp_min(1e-6)
-    outside = inside <= 0
-    value = (wave * taper).masked_fill(outside, 0.0)
-    slope = -(rise * taper + wave * fall).masked_fill(outside, 0.0)
+    taper_change = -_BETA * distance / (_REACH + 1.0) ** 2 * taper_slope / root.clamp_min(1e-6)
+    is_outside = inside_square <= 0
+    value = (sinc * taper).masked_fill(is_outside, 0.0)
+    # by the shift: the distance falls as the shift grows
+    slope = -(sinc_slope * taper + sinc * taper_change).masked_fill(is_outside, 0.0)
     return _folded(value), _folded(slope)
 
 
@@ -380,22 +426,23 @@ def _folded(matrix: Tensor) -> Tensor:
     """
     inner = matrix[..., _REACH:-_REACH].clone()
     reach = min(_REACH, inner.shape[-1] - 1)
-    left, right = (
+    left_columns, right_columns = (
         matrix[..., _REACH - reach : _REACH],
         matrix[..., -_REACH : matrix.shape[-1] - _REACH + reach],
     )
-    inner[..., 0] += 2.0 * left.sum(-1)
-    inner[..., 1 : reach + 1] -= left.flip(-1)
-    inner[..., -1] += 2.0 * right.sum(-1)
-    inner[..., -1 - reach : -1] -= right.flip(-1)
+    # beyond the end the samples are 2 x end - mirror image
+    inner[..., 0] += 2.0 * left_columns.sum(-1)
+    inner[..., 1 : reach + 1] -= left_columns.flip(-1)
+    inner[..., -1] += 2.0 * right_columns.sum(-1)
+    inner[..., -1 - reach : -1] -= right_columns.flip(-1)
     return inner
 
 
 def moved(kernels: Tensor, offset: Tensor) -> Tensor:
     """Return kernels (kernel, channel, y, x), shifted by ``offset`` (kernel, 2)."""
-    down, _ = shifting(offset[:, 0], kernels.shape[-2])
-    right, _ = shifting(offset[:, 1], kernels.shape[-1])
-    return _applied(down, kernels, right)
+    row_matrix, _ = shifting(offset[:, 0], kernels.shape[-2])
+    column_matrix, _ = shifting(offset[:, 1], kernels.shape[-1])
+    return _applied(row_matrix, kernels, column_matrix)
 
 
 class Linear(NamedTuple):
@@ -423,8 +470,10 @@ class Linear(NamedTuple):
         stamps = self.stamps_of(pixels)
         signal = (stamps * self.patterns[0]).sum((-2, -1))
         offset = (stamps * self.patterns[1:]).sum((-3, -2, -1)).T
-        back = self.down.mT[:, None] @ (self.signal[..., None, None] * stamps) @ self.right[:, None]
-        kernels = torch.tensordot(self.share, back, ([0], [0]))
+        kernel_slope = (
+            self.down.mT[:, None] @ (self.signal[..., None, None] * stamps) @ self.right[:, None]
+        )
+        kernels = torch.tensordot(self.share, kernel_slope, ([0], [0]))
         background = pixels.new_zeros(len(self.seen.background), len(pixels)).index_add(
             0, self.seen.frame, pixels.T
         )
@@ -432,16 +481,18 @@ class Linear(NamedTuple):
 
     def stamps_of(self, pixels: Tensor) -> Tensor:
         """Return pixels (channel, pixel) as windows (point, channel, y, x); 0 beyond the frame."""
-        held = torch.cat([pixels, pixels.new_zeros(len(pixels), 1)], 1)[
+        # one more pixel of 0 for places beyond the frame
+        with_outside = torch.cat([pixels, pixels.new_zeros(len(pixels), 1)], 1)[
             :, self.seen.pixels
         ].transpose(0, 1)
-        return held.reshape(*held.shape[:2], *self.patterns.shape[-2:])
+        return with_outside.reshape(*with_outside.shape[:2], *self.patterns.shape[-2:])
 
     def _scattered(self, stamps: Tensor) -> Tensor:
-        flat = stamps.transpose(0, 1).flatten(1)
+        """Return frames (channel, pixel) that are sums of windows (point, channel, y, x)."""
+        flat_stamps = stamps.transpose(0, 1).flatten(1)
         count = self.seen.light.shape[-1]
-        with_outside = flat.new_zeros(len(flat), count + 1).index_add(
-            1, self.seen.pixels.flatten(), flat
+        with_outside = flat_stamps.new_zeros(len(flat_stamps), count + 1).index_add(
+            1, self.seen.pixels.flatten(), flat_stamps
         )
         return with_outside[:, :count]
 
@@ -456,14 +507,19 @@ class Linear(NamedTuple):
 def linear(pixels: Seen, state: State, share: Tensor) -> Linear:
     """Return the frames near a state."""
     y, x = state.kernels.shape[-2:]
-    (down, steep), (right, steep_x) = (
+    (row_matrix, row_slope), (column_matrix, column_slope) = (
         shifting(state.offset[:, 0], y),
         shifting(state.offset[:, 1], x),
     )
-    kernels, size = torch.tensordot(share, state.kernels, 1), state.signal[..., None, None]
-    patterns = _applied(down, kernels, right)
-    slopes = size * _applied(steep, kernels, right), size * _applied(down, kernels, steep_x)
-    return Linear(pixels, share, state.signal, down, right, torch.stack([patterns, *slopes]))
+    kernels, signal = torch.tensordot(share, state.kernels, 1), state.signal[..., None, None]
+    patterns = _applied(row_matrix, kernels, column_matrix)
+    slopes = (
+        signal * _applied(row_slope, kernels, column_matrix),
+        signal * _applied(row_matrix, kernels, column_slope),
+    )
+    return Linear(
+        pixels, share, state.signal, row_matrix, column_matrix, torch.stack([patterns, *slopes])
+    )
 
 
 def _applied(down: Tensor, kernels: Tensor, right: Tensor) -> Tensor:

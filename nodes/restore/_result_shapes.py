@@ -122,40 +122,57 @@ def _(glare: Tensor, *inputs: Any, patterns: int = 12, **params: Any) -> Tensor:
 def _(
     result: Tensor, glare: Tensor, pupil: Pupil, *others: Any, **params: Any
 ) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
+    # the transform of a PSF has the size of pupil and window together
     y, x = (n + k for n, k in zip(glare.shape[-2:], pupil.height.shape, strict=True))
-    times = (len(result) + 1) * len(pupil.wavelengths)
-    return 16.0 * (pupil.height.numel() + y * x), _FOCUS * times * transform_operations(y, x)
+    psf_count = (len(result) + 1) * len(pupil.wavelengths)
+    return 16.0 * (pupil.height.numel() + y * x), _FOCUS * psf_count * transform_operations(y, x)
 
 
 @find_lasers.shape
 def _(electrons: Tensor, *inputs: Any, most: int = 3, **params: Any) -> FoundLasers:
     channels = len(electrons)
+    # in the order of the fields of `FoundLasers`
     shapes = ((2,), (), (), (channels,), (2, 2), (2,), (channels, 2))
     values = [double(most, *shape) for shape in shapes]
-    certain, spread = blank(most, 2, dtype=torch.bool), double(most, 3 + channels, 3 + channels)
-    places, wave, width, size, ends, wave_ends, size_ends = values
+    identifiable, correlation = (
+        blank(most, 2, dtype=torch.bool),
+        double(most, 3 + channels, 3 + channels),
+    )
+    (
+        directions,
+        wavelengths,
+        widths,
+        strengths,
+        direction_intervals,
+        wavelength_intervals,
+        strength_intervals,
+    ) = values
     number, gain = blank(dtype=torch.int64), double(most, 2)
     straight = (double(most, channels), double(most, channels))
     return FoundLasers(
         number,
-        places,
-        wave,
-        width,
-        size,
-        ends,
-        wave_ends,
-        size_ends,
-        certain,
+        directions,
+        wavelengths,
+        widths,
+        strengths,
+        direction_intervals,
+        wavelength_intervals,
+        strength_intervals,
+        identifiable,
         gain,
-        spread,
+        correlation,
         *straight,
     )
 
 
 @find_lasers.work
 def _(result: FoundLasers, electrons: Tensor, *others: Any, **params: Any) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     y, x = electrons.shape[-2:]
+    # a search for each laser, and one that finds no more
     rounds = 1 + len(result.direction)
+    # five transforms for each line in each round
     return _SEARCHED * y * x, 5.0 * _LINES * rounds * transform_operations(2 * y, 2 * x)
 
 
@@ -172,10 +189,14 @@ def _(found: Any, pupil: Any, electrons: Tensor, *, patterns: int = 12, **params
 def _summed(
     result: Tensor, lasers: Any, pupil: Pupil, electrons: Tensor, **params: Any
 ) -> tuple[float, float]:
-    """Return the work of sums over all samples of the pupil, for each row and column of pixels."""
-    side, (y, x) = max(pupil.height.shape), electrons.shape[-2:]
-    count = len(result) if result.ndim > electrons.ndim else 1
-    return 64.0 * (side**2 + side * (y + x)), count * float(side * side * y + side * y * x)
+    """Return peak memory in bytes and operations of sums over all samples of the pupil, for each
+    row and column of pixels.
+    """
+    pupil_side, (y, x) = max(pupil.height.shape), electrons.shape[-2:]
+    pattern_count = len(result) if result.ndim > electrons.ndim else 1
+    return 64.0 * (pupil_side**2 + pupil_side * (y + x)), pattern_count * float(
+        pupil_side * pupil_side * y + pupil_side * y * x
+    )
 
 
 for node in (found_glare, found_nearby):
@@ -186,21 +207,31 @@ for node in (found_glare, found_nearby):
 def _(
     result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any
 ) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     border = params.get("border", 1.0)
     y, x = _torus(electrons, psf, border)
-    coarse = max(electrons.shape[-2:]) / 2 ** halvings((electrons.shape[-2], electrons.shape[-1]))
-    unknowns = len(electrons) * coarse**2  # of the coarsest grid, which is solved as a dense system
-    steps, side = _descent(electrons, psf, border)
-    operations = steps + _FILLED * unknowns**2
-    largest = max(unknowns, _WHITENED * side)
-    nearby = (
+    # the frame is halved until it is small enough for a dense solution
+    coarsest_side = max(electrons.shape[-2:]) / 2 ** halvings(
+        (electrons.shape[-2], electrons.shape[-1])
+    )
+    # of the coarsest grid, which is solved as a dense system
+    unknowns = len(electrons) * coarsest_side**2
+    step_operations, lowest_side = _descent(electrons, psf, border)
+    operations = step_operations + _FILLED * unknowns**2
+    largest_system = max(unknowns, _WHITENED * lowest_side)
+    nearby_memory = (
         _MODE
         * sum(
-            len(patterns_drawn) for patterns_drawn in (others[5] if len(others) > 5 else None) or ()
+            # others[5] is `nearby`, after illuminant, responses, bands, clipped and glare
+            len(patterns_drawn)
+            for patterns_drawn in (others[5] if len(others) > 5 else None) or ()
         )
         * electrons.numel()
     )
-    return max(31.0 * len(electrons) * y * x, _SYSTEM * largest**2) + nearby, operations
+    # 31 bytes for each pixel of the transforms, or those of the dense system
+    return max(
+        31.0 * len(electrons) * y * x, _SYSTEM * largest_system**2
+    ) + nearby_memory, operations
 
 
 @wiener_spread.shape
@@ -229,8 +260,10 @@ def _(
 def _(
     result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any
 ) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     inputs_of_filter = (*others[:4], *others[5:])  # without the matrix
     memory, operations = wiener.hooks.work(result, electrons, psf, *inputs_of_filter, **params)  # type: ignore[misc]
+    # half as much memory again for draws and details; each draw is a deconvolution
     return 1.5 * memory, draws * operations
 
 
@@ -247,33 +280,37 @@ def _(
     ghosts: Any = None,
     **params: Any,
 ) -> WienerProblem:
-    fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
-    doubts = sum(len(other) for other in nearby or ())
+    kind = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
+    mode_count = sum(len(other) for other in nearby or ())
     count, frame, by_channel = len(electrons), tuple(electrons.shape), (len(electrons), 1, 1)
     kernels = (count, *psf.intensity.shape[-2:])
-    patterns = [(number, *frame) for number in (len(glare or ()) + len(ghosts or ()), doubts)]
+    patterns = [(number, *frame) for number in (len(glare or ()) + len(ghosts or ()), mode_count)]
+    # in the order of the fields of `WienerProblem`
     shapes = (frame, frame, kernels, *patterns, frame, frame, by_channel, by_channel)
-    return WienerProblem._make(blank(*shape, dtype=fine) for shape in shapes)
+    return WienerProblem._make(blank(*shape, dtype=kind) for shape in shapes)
 
 
 @wiener_problem.work
 def _(result: WienerProblem, *inputs: Any, **params: Any) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     work: tuple[float, float] = wiener.hooks.work(result.picture, *inputs)  # type: ignore[misc]
     return work
 
 
 @filter_facts.shape
 def _(electrons: Tensor, *inputs: Any, **params: Any) -> FilterFacts:
-    fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
+    kind = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
     frame, by_channel = tuple(electrons.shape), (len(electrons), 1, 1)
+    # `MAPS` is for three channels: each further channel has `EACH` more
     maps = (MAPS + EACH * (len(electrons) - 3), *frame[1:])
     return FilterFacts._make(
-        blank(*shape, dtype=fine) for shape in (frame, frame, maps, by_channel, by_channel)
+        blank(*shape, dtype=kind) for shape in (frame, frame, maps, by_channel, by_channel)
     )
 
 
 @filter_facts.work
 def _(result: FilterFacts, *inputs: Any, **params: Any) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     work: tuple[float, float] = wiener.hooks.work(result.answer, *inputs)  # type: ignore[misc]
     return work
 
@@ -282,7 +319,9 @@ def _(result: FilterFacts, *inputs: Any, **params: Any) -> tuple[float, float]:
 def _(
     result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, **params: Any
 ) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
+    # bytes and operations of the network behind the filter
     of_layers, layers = _layers(result, width=width)
     return memory + of_layers, operations + layers
 
@@ -297,8 +336,11 @@ def _(
     steps: int = 2,
     **params: Any,
 ) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
+    # bytes and operations of one network
     of_layers, layers = _layers(result, width=width)
+    # the answer and each step deconvolve; each step has its own layers
     return memory + of_layers, (1 + steps) * operations + steps * layers
 
 
@@ -308,31 +350,33 @@ def _(signal: Any, clipped: Any, psf: Any, bands: Bands, *others: Any, **params:
 
 
 def _descent(electrons: Tensor, psf: Psf, border: float) -> tuple[float, float]:
-    """Return the operations of the steps on all grids but the coarsest, and the largest matrix
-    that speeds them up.
+    """Return the operations of the steps on all grids but the coarsest, and the side of the largest
+    matrix that speeds them up.
     """
     channels, *picture = electrons.shape
-    rims = [
+    psf_radii = [
         min(k // 2, max(256, n // 2), n)
         for n, k in zip(picture, psf.intensity.shape[-2:], strict=True)
     ]
-    size = torus((picture[0], picture[1]), bordered((rims[0], rims[1]), border))
-    total, largest, steps = 0.0, 0.0, STEPS
+    size = torus((picture[0], picture[1]), bordered((psf_radii[0], psf_radii[1]), border))
+    operations, largest, steps = 0.0, 0.0, STEPS
     for level in range(halvings((picture[0], picture[1]))):
         y, x = (n >> level for n in size)
-        total += steps * channels * transform_operations(y, x)
+        operations += steps * channels * transform_operations(y, x)
         if max(picture) / 2**level <= LOWEST:
-            side = float(min(channels * MODES, 3 * MODES, channels * y * x / SHARE))
-            total, largest = total + _INVERTED * side**3, max(largest, side)
+            unknowns = float(min(channels * MODES, 3 * MODES, channels * y * x / SHARE))
+            operations, largest = operations + _INVERTED * unknowns**3, max(largest, unknowns)
         steps = min(4 * steps, MOST)
-    return total, largest
+    return operations, largest
 
 
 @richardson_lucy.work
 def _(
     result: Tensor, electrons: Tensor, psf: Psf, *others: Any, iterations: int = 40, **params: Any
 ) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     y, x = _torus(electrons, psf)
+    # bytes, and four transforms of each channel in each iteration
     return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(
         electrons
     ) * transform_operations(y, x)
@@ -348,6 +392,7 @@ def _torus(picture: Tensor, psf: Psf, border: float = 1.0) -> tuple[int, int]:
 
 
 def _layers(result: Tensor, *inputs: Any, width: int = 32, **params: Any) -> tuple[float, float]:
+    """Return peak memory in bytes and operations of a network with layers of ``width`` channels."""
     pixels = float(result[0].numel())
     return 4.0 * width * pixels, width**2 * pixels
 
@@ -368,8 +413,10 @@ def _(
     reduce: int = 1,
     **params: Any,
 ) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     if architecture is None:
         return _layers(result)
+    # what one call on a small picture showed, for each pixel
     trial, pixels = tried(architecture, parameters, multiple), result[0].numel() / reduce**2
     return _KEPT * trial.memory * min(
         pixels, tile**2 if tile else math.inf
@@ -406,6 +453,7 @@ def _(
     kernels = rows, columns, channels, y, x
     points = points_in(files, (y, x), (gain, offset, full_well, bits, read_noise))
     per_zone = [double(rows, columns) for _ in range(2)]
+    # in the order of its fields
     return MeasuredPsf(
         double(*kernels),
         double(*kernels),
@@ -460,12 +508,14 @@ def _(
     psf, memory, operations = Psf(measured.kernels[0, 0], measured.fit), 0.0, 0.0
     for y in rows:
         for x in columns:
-            window = blank(len(electrons), y, x)
-            doubts = [blank(len(patterns_drawn), *window.shape) for patterns_drawn in nearby or ()]
-            held, taken = wiener.hooks.work(
-                window, window, psf, None, None, None, None, None, doubts
+            part_frame = blank(len(electrons), y, x)
+            doubts = [
+                blank(len(patterns_drawn), *part_frame.shape) for patterns_drawn in nearby or ()
+            ]
+            part_memory, part_operations = wiener.hooks.work(
+                part_frame, part_frame, psf, None, None, None, None, None, doubts
             )  # type: ignore[misc]
-            memory, operations = max(memory, held), operations + taken
+            memory, operations = max(memory, part_memory), operations + part_operations
     return memory, operations
 
 
@@ -480,6 +530,7 @@ def _(
     draws: int = 8,
     **params: Any,
 ) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     memory, operations = wiener_by_field.hooks.work(  # type: ignore[misc]
         result, electrons, measured, clipped, *others[:2]
     )
@@ -492,6 +543,6 @@ def _sides(size: int, count: int, window: int) -> list[int]:
     """
     if count == 1:
         return [size]
-    ends = math.ceil(1.5 * size / count) + window // 2
-    inner = math.ceil(2.0 * size / count) + 2 * (window // 2)
-    return [min(side, size) for side in (ends, *[inner] * (count - 2), ends)]
+    end_side = math.ceil(1.5 * size / count) + window // 2
+    inner_side = math.ceil(2.0 * size / count) + 2 * (window // 2)
+    return [min(side, size) for side in (end_side, *[inner_side] * (count - 2), end_side)]

@@ -50,15 +50,17 @@ class MeasuringSensor:
         """Return the clip level, the least number of electrons without offset that
         `restore.clipped` marks, in e-.
         """
-        top: int = max(1, min(2**self.bits - 1, int(self.well * self.gain - 0.5)))
-        return (top - 0.5) / self.gain - self.offset
+        largest_number: int = max(1, min(2**self.bits - 1, int(self.well * self.gain - 0.5)))
+        # rounding sends all from half a number below it to the largest number
+        return (largest_number - 0.5) / self.gain - self.offset
 
     def variance(self, expected: Tensor, floor: float = 0.0) -> Tensor:
         """Return the variance of the measured electrons; expectations below ``floor`` count as
         ``floor``.
         """
-        still = self.read_noise**2 + 1.0 / (12.0 * self.gain**2)
-        return self.spread**2 * expected.clamp_min(floor) + still
+        # read noise, and 1 / 12 of a digital number squared for its rounding
+        constant_variance = self.read_noise**2 + 1.0 / (12.0 * self.gain**2)
+        return self.spread**2 * expected.clamp_min(floor) + constant_variance
 
     def surprise(
         self, expected: Tensor, measured: Tensor, unsaturated: Tensor, floor: float = 0.0
@@ -86,12 +88,12 @@ class MeasuringSensor:
         """
         variance = self.variance(expected, floor)
         # of the variance, relative
-        growth = self.spread**2 * (expected > floor).to(expected) / variance
+        relative_growth = self.spread**2 * (expected > floor).to(expected) / variance
         error = measured - expected
-        normal = -error / variance + 0.5 * growth * (1.0 - error.square() / variance)
+        normal = -error / variance + 0.5 * relative_growth * (1.0 - error.square() / variance)
         distance = self._distance(expected, variance)
-        approach = -variance.rsqrt() - 0.5 * distance * growth
-        return torch.where(unsaturated > 0, normal, _hazard(distance) * approach)
+        distance_slope = -variance.rsqrt() - 0.5 * distance * relative_growth
+        return torch.where(unsaturated > 0, normal, _hazard(distance) * distance_slope)
 
     def measured(self, expected: Tensor, rng: Generator) -> Tensor:
         """Return one measurement of expected electrons without dark electrons, in e- without the
@@ -144,14 +146,14 @@ def measuring_sensor(
         "rounding": (digital["rounding"], "nearest"),
         "offset_subtracted": (signal["offset_subtracted"], True),
     }
-    wrong = [
+    bad_settings = [
         f"{name} {setting!r} (must be {right!r})"
         for name, (setting, right) in settings.items()
         if setting != right
     ]
-    if wrong:
+    if bad_settings:
         raise ValueError(
-            f"the likelihood is not that of a sensor with {', '.join(wrong)}: use `reading:"
+            f"the likelihood is not that of a sensor with {', '.join(bad_settings)}: use `reading:"
             " coherent`"
         )
     return MeasuringSensor(

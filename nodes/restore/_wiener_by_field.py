@@ -163,17 +163,24 @@ class _Part(NamedTuple):
 
 
 def _parts(electrons: Tensor, measured: MeasuredPsf) -> Iterator[_Part]:
+    """Yield the part of a frame around each node of the measured PSF, row by row.
+
+    A part holds the pixels where the node's weight is not 0, and the reach of its PSF around them.
+    """
     size = (electrons.shape[-2], electrons.shape[-1])
-    down, right = (
+    row_weights, column_weights = (
         hats(torch.arange(n), n, count)
         for n, count in zip(size, measured.kernels.shape[:2], strict=True)
     )
-    for i in range(down.shape[1]):
-        for j in range(right.shape[1]):
+    for i in range(row_weights.shape[1]):
+        for j in range(column_weights.shape[1]):
             kernels = measured.kernels[i, j]
-            reach = edge(kernels, size)
-            rows, columns = _around(down[:, i], reach[0]), _around(right[:, j], reach[1])
-            weight = down[rows, i, None] * right[columns, j]
+            psf_radii = edge(kernels, size)
+            rows, columns = (
+                _around(row_weights[:, i], psf_radii[0]),
+                _around(column_weights[:, j], psf_radii[1]),
+            )
+            weight = row_weights[rows, i, None] * column_weights[columns, j]
             yield _Part(rows, columns, weight, kernels, measured.draws[:, i, j])
 
 
@@ -187,6 +194,7 @@ def _glare(
 ) -> Glare:
     """Return the glare of the whole frame, with what a doubt and ``scatter`` need of it."""
     kernel = _channelwise(measured.kernels[0, 0])
+    # kernel[0] is a PSF with a band per channel, kernel[2] its responses
     light = known_and_light(kernel[0], kernel[2], single(electrons), clipped, lights)[2]
     light = light if doubt == 0 else with_light_around(light)
     return with_smooth(light) if scatter else light
@@ -196,24 +204,25 @@ def _problem(
     electrons: Tensor, clipped: Tensor, zone: _Part, light: Glare, settings: Settings
 ) -> Scaled:
     """Return the deconvolution of a part of a frame."""
-    inside = (slice(None), zone.rows, zone.columns)
-    fine = single(electrons)[inside]
-    fine = fine.double() if max(fine.shape[-2:]) <= PRECISE else fine
-    unclipped, kernels = (~clipped[inside]).to(fine), zone.kernels.to(fine)
+    channels_and_part = (slice(None), zone.rows, zone.columns)
+    picture = single(electrons)[channels_and_part]
+    picture = picture.double() if max(picture.shape[-2:]) <= PRECISE else picture
+    unclipped, kernels = (~clipped[channels_and_part]).to(picture), zone.kernels.to(picture)
 
     def cut(pictures: list[Tensor]) -> list[Tensor]:
-        return [x[..., zone.rows, zone.columns].to(fine) for x in pictures]
+        return [x[..., zone.rows, zone.columns].to(picture) for x in pictures]
 
     nearby = [None if x is None else cut([x])[0] for x in light.nearby]
-    around, smooth = (
+    light_around, spread_patterns = (
         light.around and cut(light.around),
         light.smooth and [cut(patterns) for patterns in light.smooth],
     )
-    here = Glare(cut(light.patterns), nearby, around, light.peaks, smooth)
-    return posed(fine, unclipped, kernels, here, settings)
+    glare_in_part = Glare(cut(light.patterns), nearby, light_around, light.peaks, spread_patterns)
+    return posed(picture, unclipped, kernels, glare_in_part, settings)
 
 
 def _around(weight: Tensor, reach: int) -> slice:
+    """Return the slice of an axis where a weight is not 0, ``reach`` pixels wider on both sides."""
     inside = weight.nonzero()[:, 0]
     return slice(max(int(inside[0]) - reach, 0), min(int(inside[-1]) + reach + 1, len(weight)))
 
@@ -232,6 +241,7 @@ def _channelwise(kernels: Tensor) -> tuple[Psf, Tensor, Tensor, Bands]:
 
 
 def _refuse_other(electrons: Tensor, measured: MeasuredPsf) -> None:
+    """Raise ValueError unless the picture and the measured PSF have the same number of channels."""
     if (channels := measured.kernels.shape[2]) != electrons.shape[-3]:
         raise ValueError(
             f"the measured PSF has {channels} channels and the picture {electrons.shape[-3]}: use"

@@ -156,8 +156,9 @@ def line(
         return _points(wavelength, sigma, count, floor)
     width = (3 * fwhm if span is None else span) / count
     edges = width * (torch.arange(count + 1, dtype=torch.float64) - count / 2)
-    inside = torch.erf(edges / (sigma * math.sqrt(2))).diff() / 2
-    weights = inside + floor * width / (sigma * math.sqrt(2 * math.pi))
+    line_share = torch.erf(edges / (sigma * math.sqrt(2))).diff() / 2
+    # the floor is relative to the peak of the line's density
+    weights = line_share + floor * width / (sigma * math.sqrt(2 * math.pi))
     centres = wavelength + (edges[1:] + edges[:-1]) / 2
     return Samples(centres, torch.full_like(centres, width), weights / weights.sum())
 
@@ -202,10 +203,13 @@ def _(result: Samples, *, wavelength: float, **params: Any) -> list[Check]:
 
 
 def _points(wavelength: float, sigma: float, count: int, floor: float) -> Samples:
-    first = math.floor(wavelength / _GRID - count / 2 + 1 + 1e-9)
-    centres = _GRID * (first + torch.arange(count, dtype=torch.float64))
-    shape: Tensor = torch.exp(-(((centres - wavelength) / sigma) ** 2) / 2) + floor
-    weights = shape * _GRID / (sigma * math.sqrt(2 * math.pi))
+    """Return ``count`` points of the 10 nm grid around a line, each with the power density there
+    times 10 nm.
+    """
+    first_multiple = math.floor(wavelength / _GRID - count / 2 + 1 + 1e-9)
+    centres = _GRID * (first_multiple + torch.arange(count, dtype=torch.float64))
+    relative_power: Tensor = torch.exp(-(((centres - wavelength) / sigma) ** 2) / 2) + floor
+    weights = relative_power * _GRID / (sigma * math.sqrt(2 * math.pi))
     return Samples(centres, torch.full_like(centres, _GRID), weights)
 
 
@@ -273,12 +277,12 @@ def _(result: Bands, *, file: Path, count: int = 5) -> list[Check]:
     table = laser.power.table()
     lines = Bands(table.wavelengths, table.wavelengths, table.values[0])
     own = _mean(table) if laser.widths is None else mean_wavelength(lines)
-    mean, range_ = mean_wavelength(result), float(result.centres.max() - result.centres.min())
+    mean, band_range = mean_wavelength(result), float(result.centres.max() - result.centres.min())
     text = (
         f"{file.name} in {len(result.centres)} bands: mean {mean * 1e9:.6g} nm, {own * 1e9:.6g} nm"
         " in the table"
     )
-    return [Check(text, abs(mean - own) <= 0.1 * range_ + 1e-13)]
+    return [Check(text, abs(mean - own) <= 0.1 * band_range + 1e-13)]
 
 
 class LaserTable(NamedTuple):
@@ -298,11 +302,13 @@ def laser_table(file: Path) -> LaserTable:
 
 @once_per_version
 def _laser_table(file: Path) -> LaserTable:
+    """Read and check the spectrum of a laser; raise ValueError for a wrong table."""
     table = curves(file, None, fewest=1)
     power, *others = table.columns
     if not power.unit:
         raise ValueError(f"{file.name}: column 2, {power.quantity}, has no unit")
     spectrum = _PER_LENGTH.search(power.unit) is not None
+    # separate lines may have widths in a third column
     if len(others) > (0 if spectrum else 1):
         raise ValueError(
             f"{file.name} has {len(table.columns) + 1} columns in place of"
@@ -313,8 +319,8 @@ def _laser_table(file: Path) -> LaserTable:
         raise ValueError(f"{file.name} has no power at any wavelength")
     if spectrum and len(table.wavelengths) < 2:
         raise ValueError(f"{file.name} holds one wavelength: a spectrum needs at least two")
-    alone = table._replace(columns=(power,), values=table.values[:1])
-    return LaserTable(alone, None if spectrum else _widths(table))
+    power_curve = table._replace(columns=(power,), values=table.values[:1])
+    return LaserTable(power_curve, None if spectrum else _widths(table))
 
 
 def _widths(table: Curves) -> Numbers:
@@ -331,9 +337,9 @@ def _widths(table: Curves) -> Numbers:
 
 def _divided(table: Table, count: int) -> Bands:
     """Divide a spectrum into equal bands that hold all but `_LEFT` of its energy."""
-    low, high = _reached(table, _LEFT / 2), _reached(table, 1 - _LEFT / 2)
-    edges = torch.linspace(low, high, count + 1, dtype=torch.float64)
-    centres, width = (edges[1:] + edges[:-1]) / 2, (high - low) / count
+    lowest, highest = _reached(table, _LEFT / 2), _reached(table, 1 - _LEFT / 2)
+    edges = torch.linspace(lowest, highest, count + 1, dtype=torch.float64)
+    centres, width = (edges[1:] + edges[:-1]) / 2, (highest - lowest) / count
     widths = torch.full_like(centres, width)
     energy = table.over(Bands(centres, widths, torch.ones_like(centres)))[0]
     return Bands(centres, widths, energy / energy.sum())
@@ -343,6 +349,7 @@ def _reached(table: Table, share: float) -> float:
     """Return the wavelength up to which a spectrum has a share of its energy, by bisection."""
     first, low, high = (float(table.wavelengths[i]) for i in (0, 0, -1))
     total = _energy(table, first, high)
+    # bisection to the last digit of float64
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (
@@ -361,8 +368,16 @@ def _mean(table: Table) -> float:
     """Return the mean wavelength of a spectrum that is linear between its samples, weighted by
     energy.
     """
-    x, y = table.wavelengths, table.values[0]
-    steps = x.diff()
-    areas = (y[1:] + y[:-1]) / 2 * steps
-    moments = steps * (x[1:] * (2 * y[1:] + y[:-1]) + x[:-1] * (2 * y[:-1] + y[1:])) / 6
-    return float(moments.sum() / areas.sum())
+    wavelengths, power = table.wavelengths, table.values[0]
+    steps = wavelengths.diff()
+    areas = (power[1:] + power[:-1]) / 2 * steps
+    # integral of x y over a step in which both are linear
+    first_moments = (
+        steps
+        * (
+            wavelengths[1:] * (2 * power[1:] + power[:-1])
+            + wavelengths[:-1] * (2 * power[:-1] + power[1:])
+        )
+        / 6
+    )
+    return float(first_moments.sum() / areas.sum())

@@ -83,27 +83,27 @@ def _(
     camera: Camera | Path = "CIE 1931",
     quantum_efficiency: float | None = None,
 ) -> list[str]:
-    low, high = seen_range(camera)
+    shortest_nm, longest_nm = seen_range(camera)
     notes = _peak_note(camera, quantum_efficiency) if isinstance(camera, Path) else []
     if bands is None or bands.centres.is_meta:
         return notes
     centres = bands.centres * 1e9
-    if low <= float(centres.min()) and float(centres.max()) <= high:
+    if shortest_nm <= float(centres.min()) and float(centres.max()) <= longest_nm:
         return notes  # most recipes: colour-science, whose import takes a second, is not needed
     strongest = responses(bands, camera=camera).amax(0)
     unseen = centres[strongest < _UNSEEN]
     if not len(unseen):
         return notes
-    which = f"{float(unseen.min()):.5g} nm" + (
+    range_nm = f"{float(unseen.min()):.5g} nm" + (
         f" to {float(unseen.max()):.5g} nm" if len(unseen) > 1 else ""
     )
     largest = float(strongest[strongest < _UNSEEN].max())
     return [
         *notes,
         (
-            f"no channel of {_name(camera)} sees {len(unseen)} of {len(centres)} bands, {which}:"
+            f"no channel of {_name(camera)} sees {len(unseen)} of {len(centres)} bands, {range_nm}:"
             f" the largest relative response is {largest:.2g}, below {_UNSEEN:g}, so their light is"
-            f" missing from the picture; choose {low:g} to {high:g} nm"
+            f" missing from the picture; choose {shortest_nm:g} to {longest_nm:g} nm"
         ),
     ]
 
@@ -113,12 +113,12 @@ def _(
     result: Tensor, bands: Bands, *, camera: Camera | Path = "CIE 1931", **params: object
 ) -> list[Check]:
     peaks = [float(bands.centres[int(row.argmax())]) * 1e9 for row in result]
-    lit = bool((result.amax(1) > 0).all())
+    all_respond = bool((result.amax(1) > 0).all())
     text = (
         f"{_name(camera)}: peak{'s' * (len(peaks) > 1)} at"
         f" {', '.join(f'{peak:.4g}' for peak in peaks)} nm"
     )
-    return [Check(text, lit or len(bands.centres) < 10)]
+    return [Check(text, all_respond or len(bands.centres) < 10)]
 
 
 def channel_count(camera: str | Path) -> int:
@@ -139,11 +139,16 @@ def camera_curves(file: Path) -> tuple[Curves, bool]:
 
 
 def _camera_curves(file: Path) -> tuple[Curves, bool]:
+    """Read and check the curves of a camera; return them, and True if they are absolute quantum
+    efficiencies.
+
+    Raises ValueError for a wrong table. Responsivities in A/W become quantum efficiencies.
+    """
     table = curves(file, None, assumed="nm")
     if len(table.values) not in (1, 3):
-        count = f"{len(table.values) + 1} columns in place of 4"
+        column_text = f"{len(table.values) + 1} columns in place of 4"
         raise ValueError(
-            f"{file.name}: the file has {count} for red, green and blue, or 2 for one channel"
+            f"{file.name}: the file has {column_text} for red, green and blue, or 2 for one channel"
         )
     unit = _only_unit(table)
     absolute = unit == "A/W" or any(_is_efficiency(column.quantity) for column in table.columns)
@@ -153,6 +158,7 @@ def _camera_curves(file: Path) -> tuple[Curves, bool]:
             f"{file.name}: {table.columns[0].heading} needs the unit (1), (%) or (A/W)"
         )
     factor = 0.01 if unit == "%" else 1
+    # QE = responsivity x h c / (e wavelength)
     shares = table.values * (_ELECTRON_VOLT_METRES / table.wavelengths if unit == "A/W" else factor)
     if absolute:
         table.refuse(shares > 1, lambda value: _above_one(value, unit))
@@ -172,9 +178,9 @@ def _only_unit(table: Curves) -> str:
 
 def _refuse_no_sensitivity(table: Curves) -> None:
     """Raise ValueError for a channel without sensitivity, or with a negative one."""
-    dark = table.values.max(1) <= 0
-    if dark.any():
-        name = table.columns[int(dark.argmax())].heading
+    is_blind = table.values.max(1) <= 0
+    if is_blind.any():
+        name = table.columns[int(is_blind.argmax())].heading
         raise ValueError(
             f"{table.file.name}: a channel has no sensitivity at any wavelength, {name}"
         )
@@ -207,17 +213,17 @@ def _peak_note(file: Path, quantum_efficiency: float | None) -> list[str]:
         return []
     largest = table.values.max()
     peak_nm = table.wavelengths[table.values.max(0).argmax()] * 1e9
-    peak = f"{file.name}: the largest QE is {largest:.4g}, at {peak_nm:g} nm"
+    peak_text = f"{file.name}: the largest QE is {largest:.4g}, at {peak_nm:g} nm"
     if quantum_efficiency is not None:
-        stated = f"sensor.quantum_efficiency={quantum_efficiency:.4g}"
-        same = abs(quantum_efficiency / largest - 1) < 1e-3
+        setting = f"sensor.quantum_efficiency={quantum_efficiency:.4g}"
+        is_same = abs(quantum_efficiency / largest - 1) < 1e-3
         return (
-            [f"{peak}, as {stated}"]
-            if same
-            else [f"{peak}, and the QE of the table counts for electrons, not {stated}"]
+            [f"{peak_text}, as {setting}"]
+            if is_same
+            else [f"{peak_text}, and the QE of the table counts for electrons, not {setting}"]
         )
     return [
-        f"{peak}, and responses are relative to it: electrons are right with"
+        f"{peak_text}, and responses are relative to it: electrons are right with"
         f" sensor.quantum_efficiency={largest:.4g}"
     ]
 

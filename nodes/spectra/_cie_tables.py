@@ -28,11 +28,15 @@ class Table(NamedTuple):
         The result is (spectrum, band), on the CPU. The spectra are constant beyond the first and
         last sample.
         """
-        x = centres.detach().cpu().double()
-        right = torch.searchsorted(self.wavelengths, x).clamp(1, len(self.wavelengths) - 1)
-        low, high = self.wavelengths[right - 1], self.wavelengths[right]
-        share = ((x - low) / (high - low)).clamp(0, 1)
-        return self.values[:, right - 1] * (1 - share) + self.values[:, right] * share
+        wavelengths = centres.detach().cpu().double()
+        upper = torch.searchsorted(self.wavelengths, wavelengths).clamp(
+            1, len(self.wavelengths) - 1
+        )
+        lower_wavelength, upper_wavelength = self.wavelengths[upper - 1], self.wavelengths[upper]
+        share = ((wavelengths - lower_wavelength) / (upper_wavelength - lower_wavelength)).clamp(
+            0, 1
+        )
+        return self.values[:, upper - 1] * (1 - share) + self.values[:, upper] * share
 
     def over(self, bands: Bands) -> Tensor:
         """Average each linearly interpolated spectrum of the table over each spectral band.
@@ -41,16 +45,16 @@ class Table(NamedTuple):
         Colour-science samples spectra at points, which changes the energy of the lines of a lamp by
         10 %.
         """
-        centres, half = (
+        centres, half_width = (
             bands.centres.detach().cpu().double(),
             bands.widths.detach().cpu().double() / 2,
         )
-        thin = half <= 1e-13
-        mean = (self._below(centres + half) - self._below(centres - half)) / (2 * half).where(
-            ~thin, 1.0
-        )
+        is_point = half_width <= 1e-13
+        band_mean = (self._below(centres + half_width) - self._below(centres - half_width)) / (
+            2 * half_width
+        ).where(~is_point, 1.0)
         inside = (centres >= self.wavelengths[0]) & (centres <= self.wavelengths[-1])
-        return torch.where(thin, self.at(centres) * inside, mean)
+        return torch.where(is_point, self.at(centres) * inside, band_mean)
 
     def _below(self, limits: Tensor) -> Tensor:
         """Return the exact integral of each linearly interpolated spectrum from the first sample
@@ -59,10 +63,14 @@ class Table(NamedTuple):
         steps = self.wavelengths.diff()
         areas = ((self.values[:, 1:] + self.values[:, :-1]) / 2 * steps).cumsum(1)
         full_steps = torch.cat([torch.zeros_like(areas[:, :1]), areas], 1)
-        x = limits.clamp(self.wavelengths[0], self.wavelengths[-1])
-        left = (torch.searchsorted(self.wavelengths, x) - 1).clamp(0, len(steps) - 1)
-        last_step = (self.values[:, left] + self.at(x)) / 2 * (x - self.wavelengths[left])
-        return full_steps[:, left] + last_step
+        limits_in_range = limits.clamp(self.wavelengths[0], self.wavelengths[-1])
+        step = (torch.searchsorted(self.wavelengths, limits_in_range) - 1).clamp(0, len(steps) - 1)
+        last_step = (
+            (self.values[:, step] + self.at(limits_in_range))
+            / 2
+            * (limits_in_range - self.wavelengths[step])
+        )
+        return full_steps[:, step] + last_step
 
 
 @functools.cache
@@ -168,17 +176,18 @@ def require_range(
 
     ``covered`` has the range in m. ``source`` starts the message, such as "D65 is tabulated from".
     """
-    low, high, first, last = (
+    low, high, first_nm, last_nm = (
         float(x) * 1e9 for x in (wavelengths.min(), wavelengths.max(), covered[0], covered[-1])
     )
-    if low < first - _ROUNDING or high > last + _ROUNDING:
+    if low < first_nm - _ROUNDING or high > last_nm + _ROUNDING:
         raise ValueError(
-            f"the bands reach from {low:.4g} to {high:.4g} nm, but {source} {first:.4g} to"
-            f" {last:.4g} nm: {fix}"
+            f"the bands reach from {low:.4g} to {high:.4g} nm, but {source} {first_nm:.4g} to"
+            f" {last_nm:.4g} nm: {fix}"
         )
 
 
 def _table(spectra: object) -> Table:
+    """Return the spectra of an object of colour-science as a table."""
     import numpy as np
 
     values = np.atleast_2d(np.asarray(spectra.values).T)  # type: ignore[attr-defined]

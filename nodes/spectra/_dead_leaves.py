@@ -51,14 +51,21 @@ def leaves(
             f"spectra have shape {tuple(spectra.shape)}, not (leaf, band) with {len(bands.centres)}"
             " bands: compute spectra and bands from the same `bands` step"
         )
-    fine = (_FINE * shape[0], _FINE * shape[1])
-    top = _topmost(len(spectra), fine, _FINE * smallest, rng)
-    other = torch.randint(len(spectra), (len(spectra),), generator=rng, device=rng.device)
-    bright = darkest ** _even(rng, len(spectra))
-    mixed, dimmed = texture * _smooth(fine, rng), 1.0 - shade * _smooth(fine, rng)
-    lit = (spectra.double() * _lights(bands, daylights, rng)).float().T
-    cube = lit[:, top] * (1.0 - mixed) + lit[:, other[top]] * mixed
-    cube = cube * (bright[top] * dimmed)
+    sample_shape = (_FINE * shape[0], _FINE * shape[1])
+    topmost = _topmost(len(spectra), sample_shape, _FINE * smallest, rng)
+    second_leaf = torch.randint(len(spectra), (len(spectra),), generator=rng, device=rng.device)
+    # log-uniform from ``darkest`` to 1
+    leaf_brightness = darkest ** _even(rng, len(spectra))
+    texture_share, shading = (
+        texture * _smooth(sample_shape, rng),
+        1.0 - shade * _smooth(sample_shape, rng),
+    )
+    leaf_spectra = (spectra.double() * _lights(bands, daylights, rng)).float().T
+    cube = (
+        leaf_spectra[:, topmost] * (1.0 - texture_share)
+        + leaf_spectra[:, second_leaf[topmost]] * texture_share
+    )
+    cube = cube * (leaf_brightness[topmost] * shading)
     return F.avg_pool2d(cube[None], _FINE)[0].clamp(0.0, 1.0)
 
 
@@ -75,21 +82,29 @@ def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Gene
     sample (y, x).
     """
     largest = max(min(size) / 2, smallest)
-    share = _even(rng, count)
-    radius = (smallest**-2 * (1 - share) + largest**-2 * share) ** -0.5
-    long, angle = radius * (1 + _even(rng, count)), torch.pi * _even(rng, count)
-    y, x = (torch.arange(n, device=rng.device) - (n * _even(rng, count))[:, None] for n in size)
-    cos, sin = angle.cos()[:, None, None], angle.sin()[:, None, None]
-    along, across = cos * x[:, None] + sin * y[:, :, None], cos * y[:, :, None] - sin * x[:, None]
-    inside = (along / long[:, None, None]) ** 2 + (across / radius[:, None, None]) ** 2 < 1
+    uniform = _even(rng, count)
+    # the number of leaves falls as 1 / radius^3, between the smallest and the largest
+    radius = (smallest**-2 * (1 - uniform) + largest**-2 * uniform) ** -0.5
+    long_radius, angle = radius * (1 + _even(rng, count)), torch.pi * _even(rng, count)
+    y_from_centre, x_from_centre = (
+        torch.arange(n, device=rng.device) - (n * _even(rng, count))[:, None] for n in size
+    )
+    cosine, sine = angle.cos()[:, None, None], angle.sin()[:, None, None]
+    long_axis, short_axis = (
+        cosine * x_from_centre[:, None] + sine * y_from_centre[:, :, None],
+        cosine * y_from_centre[:, :, None] - sine * x_from_centre[:, None],
+    )
+    inside = (long_axis / long_radius[:, None, None]) ** 2 + (
+        short_axis / radius[:, None, None]
+    ) ** 2 < 1
     number = torch.arange(count, device=rng.device)[:, None, None]
     return (inside * number).amax(0)
 
 
 def _smooth(size: tuple[int, int], rng: torch.Generator) -> Tensor:
     """Draw a random field (y, x) of numbers from 0 to 1 that vary slowly over the picture."""
-    coarse = (max(2, size[0] // (_FINE * _COARSE)), max(2, size[1] // (_FINE * _COARSE)))
-    grid = torch.rand(1, 1, *coarse, generator=rng, device=rng.device)
+    grid_shape = (max(2, size[0] // (_FINE * _COARSE)), max(2, size[1] // (_FINE * _COARSE)))
+    grid = torch.rand(1, 1, *grid_shape, generator=rng, device=rng.device)
     return F.interpolate(grid, size, mode="bilinear", align_corners=True)[0, 0]
 
 
@@ -97,14 +112,18 @@ def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
     """Return the ratio of a random daylight spectrum to D65 in each band, scaled to a maximum of
     1.
     """
-    chance, which = torch.rand(2, generator=rng, device=rng.device).tolist()
+    chance, light_fraction = torch.rand(2, generator=rng, device=rng.device).tolist()
     centres = bands.centres
     if chance >= share:
         return torch.ones_like(centres)
-    per_kelvin = 1 / _WARMEST + (1 / _COOLEST - 1 / _WARMEST) * int(which * _LIGHTS) / (_LIGHTS - 1)
+    # evenly in 1 / temperature, as eyes see it
+    per_kelvin = 1 / _WARMEST + (1 / _COOLEST - 1 / _WARMEST) * int(light_fraction * _LIGHTS) / (
+        _LIGHTS - 1
+    )
     ratio = daylight(1 / per_kelvin).at(centres)[0] / light("D65").at(centres)[0]
     return (ratio / ratio.max()).to(centres)
 
 
 def _even(rng: torch.Generator, count: int) -> Tensor:
+    """Return ``count`` random numbers from 0 to 1, uniform."""
     return torch.rand(count, generator=rng, device=rng.device)

@@ -99,12 +99,13 @@ def luminous_share(bands: Bands | None, kind: str | Path, temperature: float) ->
     Raises ParameterError for a table of light that does not hold 99 % of the luminous efficiency,
     and 0 for no bands.
     """
-    table, eye = _light(kind, temperature), observer()
-    in_table = (eye.wavelengths >= table.wavelengths[0]) & (
-        eye.wavelengths <= table.wavelengths[-1]
+    table, observer_table = _light(kind, temperature), observer()
+    in_range = (observer_table.wavelengths >= table.wavelengths[0]) & (
+        observer_table.wavelengths <= table.wavelengths[-1]
     )
-    curve = eye.values[1] * in_table
-    if float(curve.sum() / eye.values[1].sum()) < _VISIBLE:
+    # the second function of the observer is the luminous efficiency
+    efficiency = observer_table.values[1] * in_range
+    if float(efficiency.sum() / observer_table.values[1].sum()) < _VISIBLE:
         low, high = float(table.wavelengths[0]) * 1e9, float(table.wavelengths[-1]) * 1e9
         text = (
             f"{_name(kind)} is tabulated from {low:.4g} to {high:.4g} nm, which does not reach over"
@@ -114,14 +115,18 @@ def luminous_share(bands: Bands | None, kind: str | Path, temperature: float) ->
             "kind", f"{text} wavelengths: lux and cd/m2 need light from 430 to 680 nm"
         )
     lumens = _LUMENS_PER_WATT * float(
-        torch.trapezoid(curve * table.at(eye.wavelengths)[0], eye.wavelengths)
+        torch.trapezoid(
+            efficiency * table.at(observer_table.wavelengths)[0], observer_table.wavelengths
+        )
     )
+    # before the run only the checks above count
     if bands is None or bands.centres.is_meta:
         return 0.0
     if not lumens > 0:
         raise ParameterError(
             "kind", f"{_name(kind)} gives no visible light: state sensor.background in place of lux"
         )
+    # mean W in a band over the lumens of the same light
     return float((table.over(bands)[0] * bands.widths.cpu()).mean()) / lumens
 
 
@@ -135,6 +140,7 @@ def light_curve(file: Path) -> Curves:
 
 @once_per_version
 def _light_curve(file: Path) -> Curves:
+    """Read and check the spectral power of a light; raise ValueError for another quantity."""
     table = curves(file, None)
     if len(table.values) != 1:
         raise ValueError(f"{file.name} has {len(table.values) + 1} columns in place of 2")
@@ -154,6 +160,7 @@ def _light_curve(file: Path) -> Curves:
 
 
 def _light(kind: str | Path, temperature: float) -> Table:
+    """Return the spectral power of a kind of light, or of a file."""
     if isinstance(kind, Path):
         return light_curve(kind).table()
     return daylight(temperature) if kind == "daylight" else light(kind)
@@ -164,6 +171,7 @@ def _name(kind: str | Path) -> str:
 
 
 def _edges(bands: Bands) -> Tensor:
+    """Return the lower edges of all bands, then the upper ones, in m."""
     return torch.cat([bands.centres - bands.widths / 2, bands.centres + bands.widths / 2])
 
 
@@ -190,19 +198,22 @@ def illuminate(
     power = illuminant if times == "once" else illuminant.square()
     if isinstance(reflectance, LowRankCube):
         basis = reflectance.basis * power.to(reflectance.basis)[:, None]
-        by = power.detach().abs().to(reflectance.residual_max)
+        band_power = power.detach().abs().to(reflectance.residual_max)
         rms = (
-            reflectance.residual_rms * by
+            reflectance.residual_rms * band_power
             if reflectance.residual_rms.numel()
             else reflectance.residual_rms
         )
-        largest = reflectance.residual_map * float(by.max())
-        return LowRankCube(reflectance.planes, basis, reflectance.residual_max * by, rms, largest)
+        largest = reflectance.residual_map * float(band_power.max())
+        return LowRankCube(
+            reflectance.planes, basis, reflectance.residual_max * band_power, rms, largest
+        )
     reflectance = single(reflectance)
     return reflectance * power.to(reflectance)[:, None, None]
 
 
 def _same_bands(reflectance: Tensor | LowRankCube, illuminant: Tensor) -> None:
+    """Raise ValueError unless reflectance and illuminant have the same bands."""
     if isinstance(reflectance, LowRankCube):
         shape: tuple[int, ...] = (len(reflectance.basis), *reflectance.planes.shape[1:])
     else:

@@ -132,24 +132,27 @@ def lift_checks(
 
     A large picture is sampled at some 100 000 pixels.
     """
+    # a sample of the pixels is enough
     step = max(1, rgb[0].numel() // 65536)
     colours, spectra = (t.detach().flatten(1)[:, ::step].double().cpu() for t in (rgb, result))
     scale = max(float(colours.abs().max()), 1e-30)
-    off = float((to_srgb(bands.centres) @ spectra - colours).abs().max()) / scale
+    error = float((to_srgb(bands.centres) @ spectra - colours).abs().max()) / scale
     checks = [
         Check(
-            f"colours of the estimated spectra differ from the RGB input by {off:.2g} of the"
+            f"colours of the estimated spectra differ from the RGB input by {error:.2g} of the"
             " largest RGB value",
             float(result.min()) >= 0,
         )
     ]
     if matrix is not None:
-        raw = matrix.cpu() @ colours
-        below = float(raw.clamp_max(0).abs().sum()) / max(float(raw.abs().sum()), 1e-30)
+        unclipped = matrix.cpu() @ colours
+        negative_share = float(unclipped.clamp_max(0).abs().sum()) / max(
+            float(unclipped.abs().sum()), 1e-30
+        )
         checks.append(
             Check(
-                f"{below:.2%} of the reconstructed light was negative and is clipped to 0",
-                below < 0.05,
+                f"{negative_share:.2%} of the reconstructed light was negative and is clipped to 0",
+                negative_share < 0.05,
             )
         )
     return checks
@@ -180,14 +183,14 @@ def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
     the picture.
     """
     needs_rgb(rgb)
-    flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
-    if (cube := linear_planes(flat, exact, within)) is not None:
+    flat_picture, matrix_float64 = rgb.detach().flatten(1), matrix.to(rgb.device)
+    if (cube := linear_planes(flat_picture, matrix_float64, within)) is not None:
         return as_low_rank_cube(cube, _lifted(rgb, matrix) if rgb.requires_grad else rgb)
     dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
     source = Source(
-        lambda pixels: (exact @ flat[:, pixels].double()).clamp_min_(0),
-        len(exact),
-        flat.shape[1],
+        lambda pixels: (matrix_float64 @ flat_picture[:, pixels].double()).clamp_min_(0),
+        len(matrix_float64),
+        flat_picture.shape[1],
         dtype,
     )
     return as_low_rank_cube(
@@ -196,11 +199,13 @@ def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
 
 
 def _basis(bands: Bands) -> Tensor:
+    """Return the matrix (band, 3) of the basis reflectances of Mallett and Yuksel."""
     inside_charts(bands)
     return mallett().at(bands.centres).T
 
 
 def _estimator(bands: Bands) -> Tensor:
+    """Return the matrix (band, 3) of the estimator for bands."""
     inside_charts(bands)
     return _solved(tuple(float(c) for c in bands.centres))
 
@@ -220,9 +225,9 @@ def lift_matrix(measured: Tensor, centres: Tensor) -> Tensor:
 
     Shapes: known (spectrum, band) -> (band, 3) float64.
     """
-    second, rgb = measured.T @ measured / len(measured), to_srgb(centres)
-    second_of_rgb = rgb @ second @ rgb.T
-    if len(centres) < 3 or not float(torch.linalg.cond(second_of_rgb)) < 1e10:
+    spectra_products, rgb_of_spectra = measured.T @ measured / len(measured), to_srgb(centres)
+    rgb_products = rgb_of_spectra @ spectra_products @ rgb_of_spectra.T
+    if len(centres) < 3 or not float(torch.linalg.cond(rgb_products)) < 1e10:
         ends = (
             f"{len(centres)} bands from {float(centres[0]) * 1e9:.4g} to"
             f" {float(centres[-1]) * 1e9:.4g} nm"
@@ -231,7 +236,8 @@ def lift_matrix(measured: Tensor, centres: Tensor) -> Tensor:
             f"{ends} cannot distinguish three colours: use more bands, such as 31 from 400 to"
             " 700 nm"
         )
-    weights: Tensor = torch.linalg.solve(second_of_rgb, rgb @ second).T
+    # least mean square error: E[s c'] E[c c']^-1 for colours c of spectra s
+    weights: Tensor = torch.linalg.solve(rgb_products, rgb_of_spectra @ spectra_products).T
     return weights
 
 

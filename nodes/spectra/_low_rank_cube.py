@@ -42,23 +42,30 @@ def few_planes(source: Source, within: float) -> LowRankCube:
     The bound ``within`` is relative to the largest element. The planes and the map of errors are
     flat, with all pixels in one row. Raises ValueError for NaN.
     """
-    largest, gram = _largest_and_products(source)
+    largest, band_products = _largest_and_products(source)
     scale = float(largest.max())
-    scaled = scale > 0 and not 1e-280 < float(gram.amax()) < 1e280
+    # products near the ends of float64 are computed anew from the cube over its largest element
+    scaled = scale > 0 and not 1e-280 < float(band_products.amax()) < 1e280
     if scaled:
-        gram = _largest_and_products(source, scale)[1]
-    axes = torch.linalg.eigh(gram).eigenvectors.flip(1)
-    eps = torch.finfo(source.dtype).eps
-    target = max(within, _FLOOR * eps, _ROOT) * scale
-    spread = _spread(gram / source.pixels, axes, source.bands, eps) * (scale if scaled else 1.0)
-    count = max(
-        1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands)
+        band_products = _largest_and_products(source, scale)[1]
+    axes = torch.linalg.eigh(band_products).eigenvectors.flip(1)
+    round_off = torch.finfo(source.dtype).eps
+    target = max(within, _FLOOR * round_off, _ROOT) * scale
+    spread = _spread(band_products / source.pixels, axes, source.bands, round_off) * (
+        scale if scaled else 1.0
     )
-    planes, last, off = _projected(source, axes[:, :count])
-    residual = bound_by_planes(largest, planes, axes[:, :count], last)
+    count = max(
+        1,
+        next(
+            (k for k, band_errors in enumerate(spread) if float(band_errors.max()) <= target),
+            source.bands,
+        ),
+    )
+    planes, largest_by_band, largest_by_pixel = _projected(source, axes[:, :count])
+    residual = bound_by_planes(largest, planes, axes[:, :count], largest_by_band)
     # no more than was measured
     spread = torch.cat([spread[:count], torch.minimum(spread[count], residual[count])[None]])
-    return LowRankCube(planes, axes[:, :count], residual, spread, off)
+    return LowRankCube(planes, axes[:, :count], residual, spread, largest_by_pixel)
 
 
 def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -68,35 +75,41 @@ def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, T
     """
     if not source.pixels or not source.bands:
         raise ValueError("the cube has no pixels: give a scene with pixels")
-    tops, gram = [], None
+    band_maxima, band_products = [], None
     for piece in source.pieces():
-        x = source.part(piece).div_(scale) if scale != 1.0 else source.part(piece)
-        gram = x @ x.T if gram is None else gram.addmm_(x, x.T)
-        tops.append(x.abs_().amax(1))
-    largest = torch.stack(tops).amax(0) * scale
-    if gram is None or not bool(torch.isfinite(largest).all()):
+        block = source.part(piece).div_(scale) if scale != 1.0 else source.part(piece)
+        band_products = (
+            block @ block.T if band_products is None else band_products.addmm_(block, block.T)
+        )
+        band_maxima.append(block.abs_().amax(1))
+    largest = torch.stack(band_maxima).amax(0) * scale
+    if band_products is None or not bool(torch.isfinite(largest).all()):
         raise ValueError(
             "the cube holds NaN or infinite values: replace these values, or do not compress the"
             " cube"
         )
-    return largest, gram
+    return largest, band_products
 
 
 def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Project a spectral cube on the axes of principal components, and return the largest error by
-    band and by pixel.
+    """Project a spectral cube on the axes (band, k) of principal components, block by block.
 
-    The first returned value holds the basis images, in the precision of the source.
+    Return the basis images (k, pixel) in the precision of the source, and the largest error of what
+    they leave out, by band and by pixel.
     """
     planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
-    last, off = axes.new_zeros(source.bands), planes.new_empty(source.pixels)
+    largest_by_band, largest_by_pixel = (
+        axes.new_zeros(source.bands),
+        planes.new_empty(source.pixels),
+    )
     for piece in source.pieces():
-        x = source.part(piece)
-        planes[:, piece] = axes.T @ x
-        left = x.sub_(axes @ planes[:, piece].double()).abs_()
-        last = torch.maximum(last, left.amax(1))
-        off[piece] = left.amax(0)
-    return planes, last, off.mul_(1 + 2 * torch.finfo(source.dtype).eps)
+        block = source.part(piece)
+        planes[:, piece] = axes.T @ block
+        block_errors = block.sub_(axes @ planes[:, piece].double()).abs_()
+        largest_by_band = torch.maximum(largest_by_band, block_errors.amax(1))
+        largest_by_pixel[piece] = block_errors.amax(0)
+    # errors by pixel are rounded up, because they are bounds
+    return planes, largest_by_band, largest_by_pixel.mul_(1 + 2 * torch.finfo(source.dtype).eps)
 
 
 def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
@@ -108,13 +121,14 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
     bands. The round-off of these products counts as part of the error.
     """
     powers = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
-    after = torch.cat([powers.flip(1).cumsum(1).flip(1), torch.zeros_like(powers[:, :1])], 1)[
+    # power of the components from the k-th on, for k = 0, 1, 2 ...
+    omitted = torch.cat([powers.flip(1).cumsum(1).flip(1), torch.zeros_like(powers[:, :1])], 1)[
         :, : count + 1
     ].T
-    total = power.diagonal()
-    double = 64 * torch.finfo(torch.float64).eps * total.sum()
-    planes = torch.arange(count + 1, dtype=total.dtype, device=total.device)[:, None]
-    return (after + double).sqrt() + eps * (planes * total).sqrt()
+    band_power = power.diagonal()
+    product_round_off = 64 * torch.finfo(torch.float64).eps * band_power.sum()
+    plane_count = torch.arange(count + 1, dtype=band_power.dtype, device=band_power.device)[:, None]
+    return (omitted + product_round_off).sqrt() + eps * (plane_count * band_power).sqrt()
 
 
 def bound_by_planes(largest: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
@@ -128,8 +142,9 @@ def bound_by_planes(largest: Tensor, planes: Tensor, basis: Tensor, last: Tensor
     by_plane = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
     # round-off of the measurement
     last = last + 4 * torch.finfo(torch.float64).eps * (largest + by_plane.sum(1))
-    after = by_plane.flip(1).cumsum(1).flip(1).T
-    return torch.cat([largest[None], last + after[1:], last[None]])
+    # row k: at most the sum of the planes from the k-th on
+    plane_bounds = by_plane.flip(1).cumsum(1).flip(1).T
+    return torch.cat([largest[None], last + plane_bounds[1:], last[None]])
 
 
 # --- low rank cube --------------------------------------------------------------------------------
@@ -165,10 +180,13 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
         raise ValueError(
             f"cube has shape {tuple(cube.shape)}, not (band, y, x): compress one scene at a time"
         )
-    flat = cube.detach().flatten(1)
+    flat_cube = cube.detach().flatten(1)
     dtype = cube.dtype if cube.dtype == torch.float64 else torch.float32
     source = Source(
-        lambda pixels: flat[:, pixels].to(torch.float64, copy=True), len(flat), flat.shape[1], dtype
+        lambda pixels: flat_cube[:, pixels].to(torch.float64, copy=True),
+        len(flat_cube),
+        flat_cube.shape[1],
+        dtype,
     )
     return as_low_rank_cube(few_planes(source, within), cube)
 
@@ -187,18 +205,31 @@ def as_low_rank_cube(flat: LowRankCube, cube: Tensor) -> LowRankCube:
 
 @compress.reference
 def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
-    flat = cube.double().flatten(1)
-    axes = torch.linalg.svd(flat, full_matrices=False)[0]
-    errors = [flat - axes[:, :r] @ (axes[:, :r].T @ flat) for r in range(axes.shape[1] + 1)]
-    spread = torch.stack([error.square().mean(1).sqrt() for error in errors])
-    limit = within * float(flat.abs().max())
+    flat_cube = cube.double().flatten(1)
+    axes = torch.linalg.svd(flat_cube, full_matrices=False)[0]
+    errors = [
+        flat_cube - axes[:, :plane_count] @ (axes[:, :plane_count].T @ flat_cube)
+        for plane_count in range(axes.shape[1] + 1)
+    ]
+    rms_errors = torch.stack([error.square().mean(1).sqrt() for error in errors])
+    allowed_error = within * float(flat_cube.abs().max())
     count = max(
-        1, next((r for r, x in enumerate(spread) if float(x.max()) <= limit), axes.shape[1])
+        1,
+        next(
+            (
+                plane_count
+                for plane_count, x in enumerate(rms_errors)
+                if float(x.max()) <= allowed_error
+            ),
+            axes.shape[1],
+        ),
     )
-    planes = (axes[:, :count].T @ flat).reshape(-1, *cube.shape[1:])
+    planes = (axes[:, :count].T @ flat_cube).reshape(-1, *cube.shape[1:])
     residual = torch.stack([error.abs().amax(1) for error in errors])
-    off = errors[count].abs().amax(0).reshape(cube.shape[1:])
-    return LowRankCube(planes, axes[:, :count], residual[: count + 1], spread[: count + 1], off)
+    largest_by_pixel = errors[count].abs().amax(0).reshape(cube.shape[1:])
+    return LowRankCube(
+        planes, axes[:, :count], residual[: count + 1], rms_errors[: count + 1], largest_by_pixel
+    )
 
 
 @compress.check
@@ -260,12 +291,18 @@ def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube
     ):
         return None
     axes = _axes(picture, matrix)
-    some = matrix @ picture[:, :: max(1, picture.shape[1] // _SAMPLE)].double()
-    target = within * float(some.amax())
+    sampled_cube = matrix @ picture[:, :: max(1, picture.shape[1] // _SAMPLE)].double()
+    allowed_error = within * float(sampled_cube.amax())
     count = next(
-        (k for k in range(1, len(axes.power) + 1) if float(_omitted(axes, k).max()) <= target), 0
+        (
+            k
+            for k in range(1, len(axes.power) + 1)
+            if float(_omitted(axes, k).max()) <= allowed_error
+        ),
+        0,
     )
-    if not count or float(some.clamp_max(0).square().mean(1).max()) >= target**2:
+    # clipped light alone would exceed the error
+    if not count or float(sampled_cube.clamp_max(0).square().mean(1).max()) >= allowed_error**2:
         return None
     cube = _measured(picture, matrix, axes, count)
     return (
@@ -276,13 +313,15 @@ def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube
 
 
 def _axes(picture: Tensor, matrix: Tensor) -> _Axes:
-    gram = matrix.new_zeros(len(picture), len(picture))
+    """Return the principal components of the cube ``matrix @ picture`` before it is clipped."""
+    channel_products = matrix.new_zeros(len(picture), len(picture))
     for start in range(0, picture.shape[1], _PLANES_PIECE):
-        x = picture[:, start : start + _PLANES_PIECE].double()
-        gram.addmm_(x, x.T)
-    values, vectors = torch.linalg.eigh(gram / picture.shape[1])
-    root = vectors * values.clamp_min(0).sqrt()  # root @ root.T is the mean product of the channels
-    basis, strength, _ = torch.linalg.svd(matrix @ root, full_matrices=False)
+        block = picture[:, start : start + _PLANES_PIECE].double()
+        channel_products.addmm_(block, block.T)
+    values, vectors = torch.linalg.eigh(channel_products / picture.shape[1])
+    # root @ root.T is the mean product of the channels
+    product_root = vectors * values.clamp_min(0).sqrt()
+    basis, strength, _ = torch.linalg.svd(matrix @ product_root, full_matrices=False)
     return _Axes(basis, basis.T @ matrix, strength.square())
 
 
@@ -294,34 +333,41 @@ def _omitted(axes: _Axes, count: int) -> Tensor:
 
 
 def _measured(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> LowRankCube:
-    """Return the first components of a cube, and the errors that omitted components and clipping
-    leave.
+    """Return the low-rank cube of the first ``count`` components of ``matrix @ picture``, clipped
+    at 0, with the errors that omitted components and clipping leave, measured on every pixel.
     """
     basis, weights = axes.basis[:, :count], axes.weights[:count]
-    light, reduced = (
+    matrix_of_all, matrix_of_components = (
         matrix.to(picture),
         None if count == len(axes.power) else (basis @ weights).to(picture),
     )
-    planes, off = picture.new_empty(count, picture.shape[1]), picture.new_empty(picture.shape[1])
-    tops, lasts, squares = [], [], matrix.new_zeros(len(matrix))
+    planes, largest_by_pixel = (
+        picture.new_empty(count, picture.shape[1]),
+        picture.new_empty(picture.shape[1]),
+    )
+    block_maxima, block_errors, square_sums = [], [], matrix.new_zeros(len(matrix))
     for start in range(0, picture.shape[1], _PLANES_PIECE):
         columns = slice(start, start + _PLANES_PIECE)
-        x = picture[:, columns]
-        planes[:, columns] = weights @ x.double()
-        bands = light @ x
-        tops.append(bands.amax(1))
-        if reduced is None:  # what is clipped is all that is lost
-            lost = bands.amin(0).neg_().clamp_min_(0)
-            off[columns], at_loss = lost, lost.nonzero()[:, 0]
-            left = bands[:, at_loss].clamp_max_(0)
+        block = picture[:, columns]
+        planes[:, columns] = weights @ block.double()
+        bands = matrix_of_all @ block
+        block_maxima.append(bands.amax(1))
+        # with all components the unclipped cube is exact: errors are where it was negative
+        if matrix_of_components is None:  # what is clipped is all that is lost
+            clipped_light = bands.amin(0).neg_().clamp_min_(0)
+            largest_by_pixel[columns], clipped_pixels = clipped_light, clipped_light.nonzero()[:, 0]
+            errors = bands[:, clipped_pixels].clamp_max_(0)
         else:
-            left = bands.clamp_min_(0).sub_(reduced @ x)
-            off[columns] = left.abs().amax(0)
-        if left.shape[1]:
-            lasts.append(left.abs().amax(1))
-            squares += left.square().sum(1)
-    rms = (squares / picture.shape[1]).sqrt()
-    return _bounded(planes, basis, axes, off, (torch.stack(tops), lasts, rms))
+            # the clipped cube less its components
+            errors = bands.clamp_min_(0).sub_(matrix_of_components @ block)
+            largest_by_pixel[columns] = errors.abs().amax(0)
+        if errors.shape[1]:
+            block_errors.append(errors.abs().amax(1))
+            square_sums += errors.square().sum(1)
+    rms = (square_sums / picture.shape[1]).sqrt()
+    return _bounded(
+        planes, basis, axes, largest_by_pixel, (torch.stack(block_maxima), block_errors, rms)
+    )
 
 
 def _bounded(
@@ -331,16 +377,25 @@ def _bounded(
     off: Tensor,
     measured: tuple[Tensor, list[Tensor], Tensor],
 ) -> LowRankCube:
-    """Return the low-rank cube with the bounds of its errors, to which the rounding of float32
-    is added.
+    """Return the low-rank cube with the bounds of its errors, to which the rounding of float32 is
+    added.
+
+    ``off`` is the largest error by pixel; ``measured`` holds the largest elements of each block
+    (block, band), the largest errors of each block with any, and the rms error of each band.
     """
-    tops, lasts, rms = measured
-    largest = tops.amax(0).double().clamp_min(0)
-    sizes = torch.maximum(planes.amax(1), -planes.amin(1)).double()
-    rounding = 4 * torch.finfo(planes.dtype).eps * float((basis.abs() @ sizes).max())
-    last = (torch.stack(lasts).amax(0).double() if lasts else torch.zeros_like(largest)) + rounding
-    before = [_omitted(axes, k) + rms for k in range(planes.shape[0])]
-    spread = torch.stack([*before, rms]) + rounding
+    block_maxima, block_errors, rms = measured
+    largest = block_maxima.amax(0).double().clamp_min(0)
+    plane_maxima = torch.maximum(planes.amax(1), -planes.amin(1)).double()
+    rounding = 4 * torch.finfo(planes.dtype).eps * float((basis.abs() @ plane_maxima).max())
+    largest_by_band = (
+        torch.stack(block_errors).amax(0).double() if block_errors else torch.zeros_like(largest)
+    ) + rounding
+    earlier_errors = [_omitted(axes, k) + rms for k in range(planes.shape[0])]
+    rms_errors = torch.stack([*earlier_errors, rms]) + rounding
     return LowRankCube(
-        planes, basis, bound_by_planes(largest, planes, basis, last), spread, off.add_(rounding)
+        planes,
+        basis,
+        bound_by_planes(largest, planes, basis, largest_by_band),
+        rms_errors,
+        off.add_(rounding),
     )

@@ -54,6 +54,7 @@ def wrong_wavelengths(wavelengths: Numbers, values: Numbers) -> str:
 
 
 def _number(cell: str, file: Path, line: int) -> float:
+    """Return the number in a cell; raise ValueError with file and line for another text."""
     try:
         return float(cell)
     except ValueError:
@@ -155,9 +156,9 @@ def _read(file: Path) -> Table:
         raise ParameterError(
             "files", f"{file.name} cannot be read as reflectances ({error}): {_FILES}"
         ) from None
-    wrong = _wrong(wavelengths, values)
-    if wrong:
-        raise ParameterError("files", f"{file.name}: {wrong}")
+    problem = _wrong(wavelengths, values)
+    if problem:
+        raise ParameterError("files", f"{file.name}: {problem}")
     return Table(
         torch.from_numpy(wavelengths) * 1e-9, torch.from_numpy(np.ascontiguousarray(values))
     )
@@ -188,19 +189,24 @@ def _wrong(wavelengths: Numbers, values: Numbers) -> str:
 
 
 def _npz(file: Path) -> tuple[Numbers, Numbers]:
+    """Read wavelengths in nm and reflectances (spectrum, wavelength) from a .npz file."""
     npz_needs(file, 1.0, 8.0, "files")
     with np.load(file, allow_pickle=False) as arrays:
         return _real(arrays["wavelengths"]), _real(arrays["reflectances"])
 
 
 def _mat(file: Path) -> tuple[Numbers, Numbers]:
+    """Read wavelengths in nm and reflectances (spectrum, wavelength) from a .mat file."""
     from scipy.io import loadmat
 
     mat_needs(file, 2.0, together=True, parameter="files")
     try:
         variables = loadmat(file)
-    except Exception as why:  # scipy raises many kinds of errors for foreign bytes
-        raise ValueError(f"the file is not a .mat file of version 7 or older: {why}") from None
+    except Exception as read_error:  # scipy raises many kinds of errors for foreign bytes
+        raise ValueError(
+            f"the file is not a .mat file of version 7 or older: {read_error}"
+        ) from None
+    # variables S_name (start, step, count) and sur_name, as the Psychtoolbox has them
     name = next(
         name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_")
     )

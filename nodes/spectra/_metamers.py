@@ -60,7 +60,7 @@ def metamers(
             " `bands` step"
         )
     measured = reflectances.double()
-    base = _mixtures(measured, count, mixed, thickness, rng)
+    mixture = _mixtures(measured, count, mixed, thickness, rng)
     black = metameric_blacks(
         measured[_drawn(len(measured), (count,), rng)]
         - measured[_drawn(len(measured), (count,), rng)],
@@ -68,9 +68,10 @@ def metamers(
         bands,
     )
     normal = torch.randn(count, 1, generator=rng, device=rng.device, dtype=torch.float64)
-    share = blacks * normal * base.mean(1, keepdim=True) / measured.mean()
-    low, high = _limits(base, black)
-    return (base + share.maximum(low).minimum(high) * black).clamp(0.0, 1.0)
+    # in proportion to the brightness of each mixture
+    share = blacks * normal * mixture.mean(1, keepdim=True) / measured.mean()
+    least_share, greatest_share = _limits(mixture, black)
+    return (mixture + share.maximum(least_share).minimum(greatest_share) * black).clamp(0.0, 1.0)
 
 
 @metamers.preflight
@@ -117,16 +118,19 @@ def _mixtures(
     """
     options = {"generator": rng, "device": rng.device, "dtype": torch.float64}
     weights = -torch.rand(count, mixed, **options).clamp_min(1e-12).log()  # type: ignore[call-overload]
+    # squares of exponential numbers differ widely: one dominates
     weights = weights.square()
     weights = weights / weights.sum(1, keepdim=True)
-    sums = (weights[..., None] * measured[_drawn(len(measured), (count, mixed), rng)]).sum(1)
-    even: Tensor = torch.rand(count, 1, **options)  # type: ignore[call-overload]
-    power: Tensor = thickness[0] * (thickness[1] / thickness[0]) ** even
-    layers: Tensor = sums.clamp(_DARKEST, 1.0) ** power
+    mixtures = (weights[..., None] * measured[_drawn(len(measured), (count, mixed), rng)]).sum(1)
+    uniform: Tensor = torch.rand(count, 1, **options)  # type: ignore[call-overload]
+    layer_thickness: Tensor = thickness[0] * (thickness[1] / thickness[0]) ** uniform
+    # Beer and Lambert: the transmission of a layer to the power of its thickness
+    layers: Tensor = mixtures.clamp(_DARKEST, 1.0) ** layer_thickness
     return layers
 
 
 def _drawn(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
+    """Return random indices below ``of``."""
     return torch.randint(of, shape, generator=rng, device=rng.device)
 
 
@@ -134,7 +138,11 @@ def _limits(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
     """Return the smallest and the largest factor that keep each spectrum ``base + factor *
     black`` in [0, 1].
     """
-    to_white, to_dark = (1.0 - base) / black, -base / black
-    high = torch.where(black > 0, to_white, torch.where(black < 0, to_dark, torch.inf))
-    low = torch.where(black > 0, to_dark, torch.where(black < 0, to_white, -torch.inf))
-    return low.amax(1, keepdim=True), high.amin(1, keepdim=True)
+    factor_to_white, factor_to_dark = (1.0 - base) / black, -base / black
+    greatest_by_band = torch.where(
+        black > 0, factor_to_white, torch.where(black < 0, factor_to_dark, torch.inf)
+    )
+    least_by_band = torch.where(
+        black > 0, factor_to_dark, torch.where(black < 0, factor_to_white, -torch.inf)
+    )
+    return least_by_band.amax(1, keepdim=True), greatest_by_band.amin(1, keepdim=True)

@@ -52,6 +52,7 @@ class Stage(nn.Module):
     """
 
     def __init__(self, dim: int) -> None:
+        """Build a stage for ``dim`` channels, which each of two halvings of the size doubles."""
         super().__init__()
         self.embedding = _conv(dim, dim)
         self.encoder_layers = nn.ModuleList(
@@ -68,16 +69,16 @@ class Stage(nn.Module):
         self.mapping = _conv(dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        inner, skips = self.embedding(x), []
+        features, skips = self.embedding(x), []
         for attend, shrink in _parts(self.encoder_layers):
-            skips.append(attend(inner))
-            inner = shrink(skips[-1])
-        inner = self.bottleneck(inner)
+            skips.append(attend(features))
+            features = shrink(skips[-1])
+        features = self.bottleneck(features)
         for (grow, fuse, attend), skip in zip(
             _parts(self.decoder_layers), reversed(skips), strict=True
         ):
-            inner = attend(fuse(torch.cat([grow(inner), skip], 1)))
-        result: Tensor = self.mapping(inner) + x
+            features = attend(fuse(torch.cat([grow(features), skip], 1)))
+        result: Tensor = self.mapping(features) + x
         return result
 
 
@@ -103,6 +104,7 @@ class SpectralAttention(nn.Module):
     """
 
     def __init__(self, dim: int) -> None:
+        """Build the attention of ``dim`` channels, as one head for each 31 of them."""
         super().__init__()
         self.heads = dim // BANDS
         self.to_q, self.to_k, self.to_v = (nn.Linear(dim, dim, bias=False) for _ in range(3))
@@ -114,12 +116,12 @@ class SpectralAttention(nn.Module):
         shape = x.shape
         pixels = x.flatten(2).transpose(1, 2)
         value = self.to_v(pixels).transpose(1, 2)
-        query, key, heads = (
+        query, key, value_heads = (
             t.unflatten(1, (self.heads, -1)) for t in (*self._across(pixels), value)
         )
         scores = (key @ query.transpose(-1, -2)) * self.rescale
-        mixed = (scores.softmax(-1) @ heads).flatten(1, 2).transpose(1, 2)
-        result: Tensor = self.proj(mixed).transpose(1, 2).reshape(shape) + self.pos_emb(
+        attended = (scores.softmax(-1) @ value_heads).flatten(1, 2).transpose(1, 2)
+        result: Tensor = self.proj(attended).transpose(1, 2).reshape(shape) + self.pos_emb(
             value.reshape(shape)
         )
         return result
@@ -129,7 +131,8 @@ class SpectralAttention(nn.Module):
         over all pixels.
         """
         query, key = (
-            F.normalize(to(pixels).transpose(1, 2), dim=-1) for to in (self.to_q, self.to_k)
+            F.normalize(projection(pixels).transpose(1, 2), dim=-1)
+            for projection in (self.to_q, self.to_k)
         )
         return query, key
 
@@ -153,9 +156,13 @@ class FeedForward(nn.Module):
     """
 
     def __init__(self, dim: int) -> None:
+        """Build the network for ``dim`` channels."""
         super().__init__()
-        wide, thin = nn.Conv2d(dim, 4 * dim, 1, bias=False), nn.Conv2d(4 * dim, dim, 1, bias=False)
-        self.net = nn.Sequential(wide, nn.GELU(), _depthwise(4 * dim), nn.GELU(), thin)
+        widening, narrowing = (
+            nn.Conv2d(dim, 4 * dim, 1, bias=False),
+            nn.Conv2d(4 * dim, dim, 1, bias=False),
+        )
+        self.net = nn.Sequential(widening, nn.GELU(), _depthwise(4 * dim), nn.GELU(), narrowing)
 
     def forward(self, x: Tensor) -> Tensor:
         result: Tensor = self.net(x)
@@ -255,10 +262,10 @@ def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
 
     Each picture is stretched to [0, 1], and the result is scaled back. Negative values are kept.
     """
-    low, high = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True)
-    span = high - low
-    cube: Tensor = network((rgb - low) / span.where(span > 0, 1.0))
-    return cube * span + low
+    darkest, brightest = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True)
+    span = brightest - darkest
+    cube: Tensor = network((rgb - darkest) / span.where(span > 0, 1.0))
+    return cube * span + darkest
 
 
 def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
@@ -300,12 +307,16 @@ def _loaded(weights: Path) -> nn.Module:
 
 
 def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
+    """Return an MST++ network with random orthogonal weights; raise ValueError unless that is
+    allowed.
+    """
     if untrained != "allow":
         raise ValueError(
             "MST++ has no weights: give a checkpoint file in weights, or set untrained: allow"
         )
     network = _empty().to_empty(device=rng.device)
     for name, tensor in network.named_parameters():
+        # scales begin at 1, biases at 0
         if name.endswith(("rescale", "norm.weight")):
             nn.init.ones_(tensor)
         elif tensor.ndim == 1:
@@ -335,10 +346,10 @@ def _fitting(weights: Path) -> dict[str, Tensor]:
 
 def _not_fitting(tensors: Mapping[str, Tensor]) -> list[str]:
     """Return the names of tensors that MST++ needs in another shape, or does not have."""
-    network = _empty().state_dict()
+    expected = _empty().state_dict()
     shapes = {name: tensor.shape for name, tensor in tensors.items()}
-    wrong = [name for name in network if shapes.get(name) != network[name].shape]
-    return wrong + [name for name in tensors if name not in network]
+    wrong_shape = [name for name in expected if shapes.get(name) != expected[name].shape]
+    return wrong_shape + [name for name in tensors if name not in expected]
 
 
 def _read(weights: Path) -> dict[str, Tensor]:
@@ -358,9 +369,9 @@ def _read(weights: Path) -> dict[str, Tensor]:
 
             return load_file(weights)
         content = torch.load(weights, map_location="cpu", weights_only=True)
-    except Exception as why:  # each library raises its own errors for a broken file
+    except Exception as read_error:  # each library raises its own errors for a broken file
         raise ParameterError(
-            "weights", f"{weights} holds no tensors that can be read safely: {why}"
+            "weights", f"{weights} holds no tensors that can be read safely: {read_error}"
         ) from None
     state = content.get("state_dict", content) if isinstance(content, dict) else content
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):

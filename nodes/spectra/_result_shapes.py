@@ -45,8 +45,11 @@ def _beyond(bands: Bands, camera: str | Path) -> bool:
     """Return True for the few bands of a laser if some channel may not see them; no table is
     read for others.
     """
-    low, high = seen_range(camera)
-    return len(bands.centres) < _FEW and not low <= float(bands.centres.mean()) * 1e9 <= high
+    shortest_nm, longest_nm = seen_range(camera)
+    return (
+        len(bands.centres) < _FEW
+        and not shortest_nm <= float(bands.centres.mean()) * 1e9 <= longest_nm
+    )
 
 
 @rows.shape
@@ -71,12 +74,15 @@ def _mixture(rgb: Tensor, bands: Bands, **params: Any) -> LowRankCube:
 
 
 def _low_rank(planes: int, bands: int, like: Tensor) -> LowRankCube:
+    """Return the low-rank form of a cube without values, in the size of the picture ``like``."""
     dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
-    planes_of_cube, off = (
+    planes_of_cube, residual_map = (
         blank(*shape, *like.shape[-2:], dtype=dtype) for shape in ((planes,), ())
     )
-    largest, spread = (double(planes + 1, bands) for _ in range(2))
-    return LowRankCube(planes_of_cube, double(bands, planes), largest, spread, off)
+    residual_max, residual_rms = (double(planes + 1, bands) for _ in range(2))
+    return LowRankCube(
+        planes_of_cube, double(bands, planes), residual_max, residual_rms, residual_map
+    )
 
 
 for node in (lift_lmmse, lift_mallett, lift_mst_plus_plus):
@@ -95,6 +101,7 @@ def _(cube: Tensor, **params: Any) -> LowRankCube:
 
 @compress.work
 def _(result: LowRankCube, cube: Tensor, **params: Any) -> tuple[float, float]:
+    # bytes of memory during the run, beside inputs and result, and number of operations
     return 8.0 * cube[0].numel(), float(cube.numel() * len(cube))
 
 
@@ -111,8 +118,8 @@ def _(spectra: Tensor, bands: Bands, *, shape: tuple[int, int], **params: Any) -
 @leaves.work
 def _(result: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
     """Return the work of a picture that is drawn several times as fine, in all bands at once."""
-    fine = float(_FINE**2 * result.numel())
-    return 4.0 * fine, fine
+    sample_count = float(_FINE**2 * result.numel())
+    return 4.0 * sample_count, sample_count
 
 
 @render.shape

@@ -90,8 +90,8 @@ def table_rows(file: Path) -> Rows:
     rows = list(csv_rows(file))
     if not rows:
         raise ValueError(f"{file.name} has no columns of numbers below a header")
-    (first, header), body = rows[0], rows[1:]
-    _refuse_only_numbers(file, first, header)
+    (first_line, header), body = rows[0], rows[1:]
+    _refuse_only_numbers(file, first_line, header)
     columns = tuple(_column(cell) for cell in header)
     if not body or len(columns) < 2:
         raise ValueError(f"{file.name} has no columns of numbers below a header")
@@ -134,12 +134,12 @@ def curves(file: Path, units: Sequence[str] | None, assumed: str = "", fewest: i
     wavelengths that do not rise or lie outside 100 nm to 20 um.
     """
     rows = table_rows(file)
-    first, *others = rows.columns
-    bare = assumed and not any(column.unit for column in rows.columns)
-    unit = assumed if bare else first.unit
+    first_column, *others = rows.columns
+    without_units = assumed and not any(column.unit for column in rows.columns)
+    unit = assumed if without_units else first_column.unit
     if unit not in LENGTHS:
-        _refuse_first(file, first)
-    if units is not None and not bare:
+        _refuse_first(file, first_column)
+    if units is not None and not without_units:
         for number, column in enumerate(others, 1):
             _refuse_unit(file, number, column, units)
     nm = rows.values[:, 0] * (LENGTHS[unit] / 1e-9)
@@ -164,6 +164,7 @@ def refused(parameter: str, form: str, error: Exception) -> ParameterError:
 
 
 def _column(cell: str) -> Column:
+    """Return the quantity and the unit that a cell of a header names."""
     match = _HEADING.fullmatch(cell.strip())
     if match is None:
         return Column(cell.strip(), "")
@@ -171,6 +172,7 @@ def _column(cell: str) -> Column:
 
 
 def _is_number(cell: str) -> bool:
+    """Return True for a cell that is a number, with point and exponent as in other tables."""
     try:
         float(cell)
     except ValueError:
@@ -179,11 +181,14 @@ def _is_number(cell: str) -> bool:
 
 
 def _number(file: Path, line: int, index: int, column: Column, cell: str) -> float:
-    where = f" (column {index + 1}, {column.heading})"
+    """Return the finite number in a cell; raise ValueError with line and column for another
+    text.
+    """
+    place_text = f" (column {index + 1}, {column.heading})"
     if not _is_number(cell):
-        raise ValueError(f"{file.name}:{line}: {cell.strip()!r} is not a number{where}")
+        raise ValueError(f"{file.name}:{line}: {cell.strip()!r} is not a number{place_text}")
     if not math.isfinite(float(cell)):
-        raise ValueError(f"{file.name}:{line}: {cell.strip()} is NaN or infinite{where}")
+        raise ValueError(f"{file.name}:{line}: {cell.strip()} is NaN or infinite{place_text}")
     return float(cell)
 
 
@@ -198,6 +203,7 @@ def _refuse_first(file: Path, first: Column) -> None:
 
 
 def _refuse_unit(file: Path, number: int, column: Column, units: Sequence[str]) -> None:
+    """Raise ValueError for a column whose unit is none of ``units``; columns count from 0."""
     if column.unit not in units:
         fault = f"has the unit {column.unit}" if column.unit else "has no unit"
         fix = f"write one of {', '.join(f'({unit})' for unit in units)}"
@@ -206,15 +212,15 @@ def _refuse_unit(file: Path, number: int, column: Column, units: Sequence[str]) 
 
 def _wrong_order(file: Path, lines: Sequence[int], nm: Numbers) -> Iterator[str]:
     """Yield what is wrong with the wavelengths of a file, in nm."""
-    for line, before, here in zip(lines[1:], nm, nm[1:], strict=False):
-        if here == before:
+    for line, previous, here in zip(lines[1:], nm, nm[1:], strict=False):
+        if here == previous:
             yield (
                 f"{file.name}:{line}: {here:g} nm stands there again: keep one row for each"
                 " wavelength"
             )
-        elif here < before:
+        elif here < previous:
             yield (
-                f"{file.name}:{line}: {here:g} nm follows {before:g} nm: list the wavelengths in"
+                f"{file.name}:{line}: {here:g} nm follows {previous:g} nm: list the wavelengths in"
                 " rising order"
             )
     for line, here in zip(lines, nm, strict=True):

@@ -39,17 +39,20 @@ class _Chirps(NamedTuple):
 
 @functools.lru_cache(maxsize=32)
 def _chirps(axis: Axis, dtype: torch.dtype, device: torch.device) -> _Chirps:
-    a = axis.sign * axis.alpha / 2
-    j, k = centred(axis.n_in, device), centred(axis.n_out, device)
-    span = axis.n_in + axis.n_out - 1
-    length = smooth(span)
-    lag = torch.arange(span, dtype=torch.float64, device=device) + (k[0] - j[-1])
+    """Return the phase factors and the transformed kernel of the chirp transform along an axis."""
+    half_signed_alpha = axis.sign * axis.alpha / 2
+    input_samples, output_samples = centred(axis.n_in, device), centred(axis.n_out, device)
+    lag_count = axis.n_in + axis.n_out - 1
+    length = smooth(lag_count)
+    lag = torch.arange(lag_count, dtype=torch.float64, device=device) + (
+        output_samples[0] - input_samples[-1]
+    )
     kernel = torch.zeros(length, dtype=torch.complex128, device=device)
-    kernel[:span] = unit_phasor(lag.square_().mul_(-a), torch.float64)
+    kernel[:lag_count] = unit_phasor(lag.square_().mul_(-half_signed_alpha), torch.float64)
     spectrum = torch.fft.fft(kernel).to(dtype.to_complex())
     before, behind = (
-        unit_phasor(j.square_().mul_(a), dtype),
-        unit_phasor(k.square_().mul_(a), dtype),
+        unit_phasor(input_samples.square_().mul_(half_signed_alpha), dtype),
+        unit_phasor(output_samples.square_().mul_(half_signed_alpha), dtype),
     )
     return _Chirps(before, spectrum, behind, length)
 
@@ -58,18 +61,20 @@ def bluestein(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Works
     """Compute the scaled Fourier transform of a field by chirps, along rows and then along
     columns, in small chunks.
     """
-    kind = work.dtype.to_complex()
-    along_x, along_y = (_chirps(axis, work.dtype, work.device) for axis in (columns, rows))
-    half = work.take("half", columns.n_out, rows.n_in, dtype=kind)
-    for start, stop in row_chunks(rows.n_in, along_x.length):
+    complex_type = work.dtype.to_complex()
+    column_chirps, row_chirps = (_chirps(axis, work.dtype, work.device) for axis in (columns, rows))
+    columns_transformed = work.take("half", columns.n_out, rows.n_in, dtype=complex_type)
+    for start, stop in row_chunks(rows.n_in, column_chirps.length):
         planes = work.take("planes", 2, stop - start, columns.n_in)
         source(start, stop, planes)
         line = torch.complex(
-            planes[0], planes[1], out=work.take("field", stop - start, columns.n_in, dtype=kind)
+            planes[0],
+            planes[1],
+            out=work.take("field", stop - start, columns.n_in, dtype=complex_type),
         )
-        half[:, start:stop] = _convolve(line, along_x, columns, work).T
-    for start, stop in row_chunks(columns.n_out, along_y.length):
-        patch = _convolve(half[start:stop], along_y, rows, work)
+        columns_transformed[:, start:stop] = _convolve(line, column_chirps, columns, work).T
+    for start, stop in row_chunks(columns.n_out, row_chirps.length):
+        patch = _convolve(columns_transformed[start:stop], row_chirps, rows, work)
         sink(slice(0, rows.n_out), slice(start, stop), torch.view_as_real(patch).permute(2, 1, 0))
 
 
@@ -77,10 +82,10 @@ def _convolve(lines: Tensor, chirps: _Chirps, axis: Axis, work: Workspace) -> Te
     """Return the chirp transform along the last dimension, in a buffer that the next call
     overwrites.
     """
-    padded = work.take("padded", lines.shape[0], chirps.length, dtype=lines.dtype)
-    torch.mul(lines, chirps.before, out=padded[:, : axis.n_in])
-    padded[:, axis.n_in :] = 0
-    product = torch.fft.fft(padded, dim=1).mul_(chirps.spectrum)
+    zero_padded = work.take("padded", lines.shape[0], chirps.length, dtype=lines.dtype)
+    torch.mul(lines, chirps.before, out=zero_padded[:, : axis.n_in])
+    zero_padded[:, axis.n_in :] = 0
+    product = torch.fft.fft(zero_padded, dim=1).mul_(chirps.spectrum)
     window: Tensor = torch.fft.ifft(product, dim=1)[:, axis.n_in - 1 : axis.n_in - 1 + axis.n_out]
     return window.mul_(chirps.behind)
 
@@ -97,9 +102,10 @@ def smooth(n: int, even: bool = False) -> int:
 
 
 def _rough(n: int) -> bool:
-    for p in (2, 3, 5):
-        while n % p == 0:
-            n //= p
+    """Return True for a number with prime factors above 5."""
+    for prime in (2, 3, 5):
+        while n % prime == 0:
+            n //= prime
     return n > 1
 
 
@@ -139,20 +145,31 @@ class Banded:
     def __init__(
         self, n_rows: int, n_columns: int, origin: float, step: float, reach: float, block: int
     ) -> None:
+        """Lay out a matrix of ``n_rows`` x ``n_columns`` in blocks of about ``block`` rows, without
+        its weights.
+        """
         self.n_columns, self.reach = n_columns, reach
         self.count = -(-n_rows // block)
         self.block = -(-n_rows // self.count)
         self.n_rows = self.count * self.block
         self.origin, self.step = origin, step
-        first = [math.ceil(self._at(b * self.block) - reach) for b in range(self.count)]
-        last = [math.floor(self._at((b + 1) * self.block - 1) + reach) for b in range(self.count)]
-        self.width = max(z - a for a, z in zip(first, last, strict=True)) + 1 + _SLACK
-        self.runs = _runs([z + 1 - self.width for z in last], first, step * self.block)
-        starts = list(chain.from_iterable(run.starts for run in self.runs))
-        self.margin = max(0, -min(starts), max(starts) + self.width - n_columns)
+        first_columns = [math.ceil(self._at(b * self.block) - reach) for b in range(self.count)]
+        last_columns = [
+            math.floor(self._at((b + 1) * self.block - 1) + reach) for b in range(self.count)
+        ]
+        self.width = (
+            max(z - a for a, z in zip(first_columns, last_columns, strict=True)) + 1 + _SLACK
+        )
+        self.runs = _runs(
+            [z + 1 - self.width for z in last_columns], first_columns, step * self.block
+        )
+        block_starts = list(chain.from_iterable(run.starts for run in self.runs))
+        # columns beyond the ends that blocks of equal width reach
+        self.margin = max(0, -min(block_starts), max(block_starts) + self.width - n_columns)
         self.weights = torch.empty(0)
 
     def _at(self, row: int) -> float:
+        """Return the column in the middle of the band of a row."""
         return self.origin + self.step * row
 
     def fill(self, weigh: Callable[[Tensor, Tensor], Tensor]) -> "Banded":
@@ -164,8 +181,8 @@ class Banded:
             self.width
         )
         rows = torch.arange(self.n_rows, dtype=torch.float64).view(self.count, self.block, 1)
-        near = (columns - (self.origin + self.step * rows)).abs_() <= self.reach
-        self.weights = torch.where(near, weigh(rows, columns), 0.0)
+        in_band = (columns - (self.origin + self.step * rows)).abs_() <= self.reach
+        self.weights = torch.where(in_band, weigh(rows, columns), 0.0)
         return self
 
     def to(self, dtype: torch.dtype, device: torch.device) -> "Banded":
@@ -177,38 +194,52 @@ class Banded:
         """Return the part of the banded matrix from block ``first`` up to, but without, block
         ``last``.
         """
-        cut = copy.copy(self)
-        cut.count, cut.n_rows = last - first, (last - first) * self.block
-        cut.weights, cut.runs = self.weights[first:last], []
+        part = copy.copy(self)
+        part.count, part.n_rows = last - first, (last - first) * self.block
+        part.weights, part.runs = self.weights[first:last], []
         for run in self.runs:
-            a, z = max(run.first, first), min(run.first + run.blocks, last)
-            if a < z:
-                cut.runs.append(
-                    _Run(a - first, z - a, run.start + (a - run.first) * run.stride, run.stride)
+            first_block, last_block = max(run.first, first), min(run.first + run.blocks, last)
+            if first_block < last_block:
+                part.runs.append(
+                    _Run(
+                        first_block - first,
+                        last_block - first_block,
+                        run.start + (first_block - run.first) * run.stride,
+                        run.stride,
+                    )
                 )
-        return cut
+        return part
 
     def left(self, x: Tensor, out: Tensor) -> None:
         """Write ``matrix @ x[margin + n_columns + margin, c]`` to ``out[n_rows, c]``; ``x`` may
         have a row stride.
         """
-        wide, pitch = x.shape[1], x.stride(0)
-        blocks = out.view(self.count, self.block, wide)
+        column_count, row_stride = x.shape[1], x.stride(0)
+        output_blocks = out.view(self.count, self.block, column_count)
         for first, count, start, stride in self.runs:
-            offset = (start + self.margin) * pitch + x.storage_offset()
-            view = x.as_strided((count, self.width, wide), (stride * pitch, pitch, 1), offset)
-            _multiply(self.weights[first : first + count], view, blocks[first : first + count])
+            offset = (start + self.margin) * row_stride + x.storage_offset()
+            # overlapping windows of x, one for each block, without a copy
+            overlapping_rows = x.as_strided(
+                (count, self.width, column_count), (stride * row_stride, row_stride, 1), offset
+            )
+            _multiply(
+                self.weights[first : first + count],
+                overlapping_rows,
+                output_blocks[first : first + count],
+            )
 
     def right(self, x: Tensor, out: Tensor) -> None:
         """Write ``x[r, margin + n_columns + margin] @ matrix^T`` to ``out[block, r, i]``, in
         blocks of matrix rows.
         """
-        tall, wide = x.shape
+        row_count, row_stride = x.shape
         for first, count, start, stride in self.runs:
             offset = start + self.margin + x.storage_offset()
-            view = x.as_strided((count, tall, self.width), (stride, wide, 1), offset)
+            overlapping_columns = x.as_strided(
+                (count, row_count, self.width), (stride, row_stride, 1), offset
+            )
             _multiply(
-                view,
+                overlapping_columns,
                 self.weights[first : first + count].transpose(1, 2),
                 out[first : first + count],
             )
@@ -242,16 +273,19 @@ def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
 
 
 def _longest(low: list[int], high: list[int], first: int, stride: int) -> _Run:
-    a, z, count = low[first], high[first], 0
+    """Return the longest run from block ``first`` on with a stride, whose columns stay from ``low``
+    to ``high``.
+    """
+    least_start, greatest_start, count = low[first], high[first], 0
     while first + count < len(low):
-        lower, upper = (
-            max(a, low[first + count] - stride * count),
-            min(z, high[first + count] - stride * count),
+        least_next, greatest_next = (
+            max(least_start, low[first + count] - stride * count),
+            min(greatest_start, high[first + count] - stride * count),
         )
-        if lower > upper:
+        if least_next > greatest_next:
             break
-        a, z, count = lower, upper, count + 1
-    return _Run(first, count, z, stride)
+        least_start, greatest_start, count = least_next, greatest_next, count + 1
+    return _Run(first, count, greatest_start, stride)
 
 
 # --- kaiser bessel transform ----------------------------------------------------------------------
@@ -335,31 +369,41 @@ def plan(
     The field is interpolated to the grid of the FFT in the type ``kind``, by default ``dtype``.
     """
     kernel = SINGLE if dtype == torch.float32 else DOUBLE
-    pitch = min(
+    point_pitch = min(
         1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST
     )
-    points = odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
-    length = smooth(math.ceil(max(points, 2 * _BLOCK) * kernel.oversampling), even=True)
-    spread = _spread(axis, kernel, pitch, length)
+    point_count = odd(math.ceil((axis.n_in - 1) / point_pitch) + kernel.width)
+    length = smooth(math.ceil(max(point_count, 2 * _BLOCK) * kernel.oversampling), even=True)
+    spread = _spread(axis, kernel, point_pitch, length)
+    # the output must lie within the frequencies of the FFT, margins included
     while spread.n_columns + 2 * spread.margin > length:
         length = smooth(length + length // 4, even=True)
-        spread = _spread(axis, kernel, pitch, length)
-    gather = _gather(axis, kernel, pitch, points, length).to(kind or dtype, device)
-    frequencies = spread.n_columns + 2 * spread.margin
-    return Plan(gather, spread.to(dtype, device), points, length, frequencies, axis.sign)
+        spread = _spread(axis, kernel, point_pitch, length)
+    gather = _gather(axis, kernel, point_pitch, point_count, length).to(kind or dtype, device)
+    frequency_count = spread.n_columns + 2 * spread.margin
+    return Plan(gather, spread.to(dtype, device), point_count, length, frequency_count, axis.sign)
 
 
 def _gather(axis: Axis, kernel: Kernel, pitch: float, points: int, length: int) -> Banded:
     """Return the matrix that interpolates the field to the grid of the FFT, corrected for the
     interpolation after the FFT.
     """
-    j0, l0 = (axis.n_in - 1) / 2, (points - 1) // 2
-    band = Banded(points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, _BLOCK)
+    middle_sample, middle_point = (axis.n_in - 1) / 2, (points - 1) // 2
+    band = Banded(
+        points,
+        axis.n_in,
+        middle_sample - pitch * middle_point,
+        pitch,
+        pitch * kernel.width / 2,
+        _BLOCK,
+    )
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
-        place = (row - l0).clamp_(max=l0)
-        scale = alternating(place + length // 2) * (kernel.peak / kernel.transform(place / length))
-        return kernel((column - j0) / pitch - place) / kernel.peak * scale
+        distance_from_middle = (row - middle_point).clamp_(max=middle_point)
+        scale = alternating(distance_from_middle + length // 2) * (
+            kernel.peak / kernel.transform(distance_from_middle / length)
+        )
+        return kernel((column - middle_sample) / pitch - distance_from_middle) / kernel.peak * scale
 
     return band.fill(weigh)
 
@@ -368,17 +412,24 @@ def _spread(axis: Axis, kernel: Kernel, pitch: float, length: int) -> Banded:
     """Return the matrix that interpolates the FFT to the output samples, corrected for the
     interpolation before the FFT.
     """
-    k0, fine = (axis.n_out - 1) / 2, axis.alpha * pitch * length
-    frequencies = odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
-    q0 = (frequencies - 1) // 2
-    band = Banded(axis.n_out, frequencies, q0 - fine * k0, fine, kernel.width / 2, 2 * _BLOCK)
+    middle_output, frequencies_per_output = (axis.n_out - 1) / 2, axis.alpha * pitch * length
+    frequency_count = odd(math.ceil((axis.n_out - 1) * frequencies_per_output) + kernel.width)
+    middle_frequency = (frequency_count - 1) // 2
+    band = Banded(
+        axis.n_out,
+        frequency_count,
+        middle_frequency - frequencies_per_output * middle_output,
+        frequencies_per_output,
+        kernel.width / 2,
+        2 * _BLOCK,
+    )
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
-        place = (row - k0).clamp_(max=k0)
+        distance_from_middle = (row - middle_output).clamp_(max=middle_output)
         return (
-            alternating(column - q0)
-            * kernel(fine * place - (column - q0))
-            / kernel.transform(axis.alpha * pitch * place)
+            alternating(column - middle_frequency)
+            * kernel(frequencies_per_output * distance_from_middle - (column - middle_frequency))
+            / kernel.transform(axis.alpha * pitch * distance_from_middle)
         )
 
     return band.fill(weigh)
@@ -397,14 +448,16 @@ def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: W
     """Compute the scaled Fourier transform by interpolation, a short FFT and interpolation, in
     chunks that fit in a cache.
     """
-    last = last_type(*last_work(rows, columns), work.dtype)
-    along_x, along_y = (
+    last_kind = last_type(*last_work(rows, columns), work.dtype)
+    column_plan, row_plan = (
         plan(columns, work.dtype, work.device),
-        plan(rows, work.dtype, work.device, last),
+        plan(rows, work.dtype, work.device, last_kind),
     )
-    half = _rows_to_frequencies(along_x, along_y.gather.margin, rows.n_in, source, work)
-    spectrum = _columns_to_frequencies(along_y, half, work)
-    _interpolate(along_x, along_y, (rows.n_out, columns.n_out), spectrum, sink, work)
+    row_frequencies = _rows_to_frequencies(
+        column_plan, row_plan.gather.margin, rows.n_in, source, work
+    )
+    spectrum = _columns_to_frequencies(row_plan, row_frequencies, work)
+    _interpolate(column_plan, row_plan, (rows.n_out, columns.n_out), spectrum, sink, work)
 
 
 def last_work(rows: Axis, columns: Axis) -> tuple[float, float]:
@@ -418,23 +471,30 @@ def _rows_to_frequencies(
     x: Plan, margin: int, n_rows: int, source: Source, work: Workspace
 ) -> Tensor:
     """Return the cropped FFT of every pupil row, with ``margin`` rows of zeros above and below."""
-    kind, wide = work.dtype.to_complex(), x.gather.n_columns
-    half = _zero_margins(work.take("half", n_rows + 2 * margin, x.kept, dtype=kind), 0, margin)
-    for start, stop in row_chunks(n_rows, wide):
-        n = stop - start
+    complex_type, column_count = work.dtype.to_complex(), x.gather.n_columns
+    frequencies = _zero_margins(
+        work.take("half", n_rows + 2 * margin, x.kept, dtype=complex_type), 0, margin
+    )
+    for start, stop in row_chunks(n_rows, column_count):
+        chunk_rows = stop - start
         planes = _zero_margins(
-            work.take("planes", 2, n, wide + 2 * x.gather.margin), 2, x.gather.margin
+            work.take("planes", 2, chunk_rows, column_count + 2 * x.gather.margin),
+            2,
+            x.gather.margin,
         )
-        source(start, stop, planes.narrow(2, x.gather.margin, wide))
-        blocks = work.take("blocks", x.gather.count, 2 * n, x.gather.block)
+        source(start, stop, planes.narrow(2, x.gather.margin, column_count))
+        blocks = work.take("blocks", x.gather.count, 2 * chunk_rows, x.gather.block)
         x.gather.right(planes.flatten(0, 1), blocks)
-        line = work.take("line", n, x.length, dtype=kind)
-        _place(blocks, line, x)
-        half[margin + start : margin + stop] = _fft(line, x.sign)[:, x.cropped : x.cropped + x.kept]
-    return half
+        fft_input = work.take("line", chunk_rows, x.length, dtype=complex_type)
+        _place(blocks, fft_input, x)
+        frequencies[margin + start : margin + stop] = _fft(fft_input, x.sign)[
+            :, x.cropped : x.cropped + x.kept
+        ]
+    return frequencies
 
 
 def _zero_margins(x: Tensor, dim: int, margin: int) -> Tensor:
+    """Write zeros to the first and last ``margin`` places of an axis, and return ``x``."""
     x.narrow(dim, 0, margin).zero_()
     x.narrow(dim, x.shape[dim] - margin, margin).zero_()
     return x
@@ -444,11 +504,11 @@ def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
     """Copy blocks of interpolated (re, im) samples to the middle of the complex FFT input, and
     set the rest to zero.
     """
-    count, block, n = x.gather.count, x.gather.block, line.shape[0]
+    count, block, row_count = x.gather.count, x.gather.block, line.shape[0]
     line[:, : x.padded] = 0
-    parts = blocks.view(count, 2, n, block).permute(1, 2, 0, 3)
-    into = line[:, x.padded : x.padded + count * block]
-    torch.complex(parts[0], parts[1], out=into.view(n, count, block))
+    block_parts = blocks.view(count, 2, row_count, block).permute(1, 2, 0, 3)
+    target = line[:, x.padded : x.padded + count * block]
+    torch.complex(block_parts[0], block_parts[1], out=target.view(row_count, count, block))
     line[:, x.padded + x.points :] = 0
 
 
@@ -456,15 +516,19 @@ def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
     """Interpolate all columns to the grid of the FFT, transform the columns, and return the
     cropped FFT transposed.
     """
-    wide, kind = half.shape[1], y.gather.weights.dtype.to_complex()
-    field = half if kind == half.dtype else work.take("given", *half.shape, dtype=kind).copy_(half)
-    columns = work.take("columns", y.length, wide, dtype=kind)
+    column_count, complex_type = half.shape[1], y.gather.weights.dtype.to_complex()
+    field = (
+        half
+        if complex_type == half.dtype
+        else work.take("given", *half.shape, dtype=complex_type).copy_(half)
+    )
+    columns = work.take("columns", y.length, column_count, dtype=complex_type)
     y.gather.left(_flat(field), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
     columns[: y.padded] = 0
     columns[y.padded + y.points :] = 0
-    spectrum = work.take("spectrum", wide, y.kept, dtype=half.dtype)
+    spectrum = work.take("spectrum", column_count, y.kept, dtype=half.dtype)
     # small chunks keep the memory that the FFT allocates small
-    for start, stop in row_chunks(wide, y.length):
+    for start, stop in row_chunks(column_count, y.length):
         lines = _fft(columns[:, start:stop].T, y.sign)
         spectrum[start:stop] = lines[:, y.cropped : y.cropped + y.kept]
     return spectrum
@@ -487,6 +551,7 @@ def _interpolate(
             first * stripe.block,
             min(first * stripe.block + stripe.n_rows, shape[1]),
         )
+        # (re and im, block, row in the block, column)
         tiles = blocks.view(y.spread.count, 2, stripe.n_rows, y.spread.block).permute(1, 0, 3, 2)
         _deliver(tiles[..., : stop - start], slice(start, stop), shape[0], sink)
 
@@ -515,6 +580,7 @@ def _flat(x: Tensor) -> Tensor:
 
 
 def _fft(x: Tensor, sign: int) -> Tensor:
+    """Return the FFT along rows with exp(sign 2 pi i ...), never divided by its length."""
     result: Tensor = (
         torch.fft.fft(x, dim=1) if sign < 0 else torch.fft.ifft(x, dim=1, norm="forward")
     )

@@ -67,39 +67,64 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
     The weights in front of the FFT are of the type ``gathered``, all else of the type ``kind``.
     """
     kernel = SINGLE if dtype == torch.float32 else DOUBLE
-    pitch, points, length, fine, frequencies = _grids(axis, kernel)
-    j0, k0, l0, q0 = (
+    point_pitch, point_count, length, frequencies_per_output, frequency_count = _grids(axis, kernel)
+    middle_sample, middle_output, middle_point, middle_frequency = (
         (axis.n_in - 1) / 2,
         (axis.n_out - 1) / 2,
-        (points - 1) // 2,
-        (frequencies - 1) // 2,
+        (point_count - 1) // 2,
+        (frequency_count - 1) // 2,
     )
 
     def gather(row: Tensor, column: Tensor) -> Tensor:
-        place = row - l0
-        scale = alternating(place + length // 2) * (kernel.peak / kernel.transform(place / length))
-        return kernel((column - j0) / pitch - place) / kernel.peak * scale
+        distance_from_middle = row - middle_point
+        scale = alternating(distance_from_middle + length // 2) * (
+            kernel.peak / kernel.transform(distance_from_middle / length)
+        )
+        return (
+            kernel((column - middle_sample) / point_pitch - distance_from_middle)
+            / kernel.peak
+            * scale
+        )
 
     def spread(row: Tensor, column: Tensor) -> Tensor:
-        place, near = row - k0, column - q0
+        distance_from_middle, frequency_from_middle = row - middle_output, column - middle_frequency
         return (
-            alternating(near)
-            * kernel(fine * place - near)
-            / kernel.transform(axis.alpha * pitch * place)
+            alternating(frequency_from_middle)
+            * kernel(frequencies_per_output * distance_from_middle - frequency_from_middle)
+            / kernel.transform(axis.alpha * point_pitch * distance_from_middle)
         )
 
     gather_first, gather_weights = _band(
-        points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, gather
+        point_count,
+        axis.n_in,
+        middle_sample - point_pitch * middle_point,
+        point_pitch,
+        point_pitch * kernel.width / 2,
+        gather,
     )
     spread_first, spread_weights = _band(
-        axis.n_out, frequencies, q0 - fine * k0, fine, kernel.width / 2, spread
+        axis.n_out,
+        frequency_count,
+        middle_frequency - frequencies_per_output * middle_output,
+        frequencies_per_output,
+        kernel.width / 2,
+        spread,
     )
     turns = torch.view_as_real(
         unit_phasor(torch.arange(length, dtype=torch.float64) / -length, kind)
     )
     arrays = (torch.tensor(_factors(length)), gather_first, spread_first)
     held = (*arrays, gather_weights.to(gathered), spread_weights.to(kind), turns.contiguous())
-    sizes = (axis.n_in, axis.n_out, points, length, length // 2 - l0, length // 2 - q0, frequencies)
+    # in the order of the fields of `CAxis`
+    sizes = (
+        axis.n_in,
+        axis.n_out,
+        point_count,
+        length,
+        length // 2 - middle_point,
+        length // 2 - middle_frequency,
+        frequency_count,
+    )
     widths = (gather_weights.shape[1], spread_weights.shape[1], len(held[0]))
     plan = CAxis(*sizes, *widths, *(x.data_ptr() for x in held))
     plan.held = held
@@ -115,17 +140,26 @@ def expected_seconds(rows: Axis, columns: Axis) -> float:
     the FFTs.
     """
     transforms = columns.n_in * _fft_steps(rows) + rows.n_out * _fft_steps(columns)
-    behind = rows.n_out * (columns.n_in + columns.n_out)
-    return 0.11e-3 + 2.3e-9 * rows.n_in * columns.n_in + 0.108e-9 * transforms + 0.41e-9 * behind
+    last_products = rows.n_out * (columns.n_in + columns.n_out)
+    # seconds for each sample, measured: phase and gathering, FFTs, last interpolation
+    return (
+        0.11e-3
+        + 2.3e-9 * rows.n_in * columns.n_in
+        + 0.108e-9 * transforms
+        + 0.41e-9 * last_products
+    )
 
 
 def _fft_steps(axis: Axis) -> float:
+    """Return the operations of one FFT along an axis, but for a factor."""
     length = _grids(axis, SINGLE)[2]
     return length * math.log2(length)
 
 
 def _grids(axis: Axis, kernel: Kernel) -> tuple[float, int, int, float, int]:
-    """Return the pitch and the number of the points before the FFT, and what `_length` returns."""
+    """Return pitch and number of the points before the FFT, the length of the FFT, its samples for
+    each output sample, and the number of frequencies that are kept of it.
+    """
     pitch = min(
         1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST
     )
@@ -139,10 +173,10 @@ def _length(axis: Axis, kernel: Kernel, pitch: float, shortest: int) -> tuple[in
     """
     length = smooth(max(shortest, _SHORTEST), even=True)
     while True:
-        fine = axis.alpha * pitch * length
-        frequencies = odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
-        if frequencies <= length:
-            return length, fine, frequencies
+        frequencies_per_output = axis.alpha * pitch * length
+        frequency_count = odd(math.ceil((axis.n_out - 1) * frequencies_per_output) + kernel.width)
+        if frequency_count <= length:
+            return length, frequencies_per_output, frequency_count
         length = smooth(length + length // 4, even=True)
 
 
@@ -167,6 +201,7 @@ def _band(
 
 
 def _factors(length: int) -> list[int]:
+    """Return the factors of an FFT length, in the order of the passes."""
     factors = []
     for factor in _FACTORS:
         while length % factor == 0:
@@ -261,11 +296,13 @@ class FusedPupil:
     """
 
     def __init__(self, screens: Screens, dtype: torch.dtype, work: Workspace) -> None:
-        wide = dtype == torch.float64 or any(x.dtype == torch.float64 for x in screens[:3])
-        self.kind = torch.float64 if wide else torch.float32
-        factors = [x.detach().to(self.kind).contiguous() for x in screens[:3]]
-        self.amplitude, self.height = factors[:2]
-        self.path = factors[2] if screens.longest > 0 else None
+        """Convert the factors of the pupil to one type; ``dtype`` is that of the intensity."""
+        double = dtype == torch.float64 or any(x.dtype == torch.float64 for x in screens[:3])
+        self.kind = torch.float64 if double else torch.float32
+        screens_of_kind = [x.detach().to(self.kind).contiguous() for x in screens[:3]]
+        self.amplitude, self.height = screens_of_kind[:2]
+        # null where there is no path, which the C++ then does not read
+        self.path = screens_of_kind[2] if screens.longest > 0 else None
         self.dtype, self.work = dtype, work
 
     def forward(
@@ -289,14 +326,18 @@ class FusedPupil:
         A focal field that was not stored is computed again.
         """
         sums = [None if grad is None else torch.zeros_like(self.height) for grad in grads]
-        gain, band = weight, -1
-        for view, stored in zip(views, fields, strict=True):
+        band_weight, band = weight, -1
+        for view, stored_field in zip(views, fields, strict=True):
             if view.band != band:
-                gain, band = weight[view.band].contiguous(), view.band
-            field = self.work.take("focal", 2, *gain.shape) if stored is None else stored
-            if stored is None:
+                band_weight, band = weight[view.band].contiguous(), view.band
+            field = (
+                self.work.take("focal", 2, *band_weight.shape)
+                if stored_field is None
+                else stored_field
+            )
+            if stored_field is None:
                 self.forward(view, None, False, field)
-            self._adjoint(view, field, gain, sums)
+            self._adjoint(view, field, band_weight, sums)
         for grad, added in zip(grads, sums, strict=True):
             if grad is not None and added is not None:
                 grad.copy_(added)
@@ -311,30 +352,38 @@ class FusedPupil:
         self._call("adjoint", *axes, focal.structure, pointer(gain), pupil.structure, added)
 
     def _pupil(self, view: View) -> "_Held":
+        """Return the structure of the pupil in one view, with the tilts that it points to."""
         v, u = (
-            centred(n, torch.device("cpu")).mul_(t)
-            for n, t in zip(self.height.shape, view.tilt, strict=True)
+            centred(n, torch.device("cpu")).mul_(tilt)
+            for n, tilt in zip(self.height.shape, view.tilt, strict=True)
         )
-        arrays = [pointer(x) for x in (self.amplitude, self.height, self.path)]
-        turns = view.turns_height, view.turns_path
+        pointers = [pointer(x) for x in (self.amplitude, self.height, self.path)]
+        turns_per_metre = view.turns_height, view.turns_path
         return _Held(
-            _Pupil(self.kind == torch.float64, *arrays, *turns, pointer(v), pointer(u)), (v, u)
+            _Pupil(self.kind == torch.float64, *pointers, *turns_per_metre, pointer(v), pointer(u)),
+            (v, u),
         )
 
     def _call(self, name: str, rows: Axis, columns: Axis, *arguments: Any) -> None:
-        kind = last_type(*last_work(rows, columns), self.dtype, _LITTLE)
-        y, x = (
-            fused_axis(rows, self.dtype, self.dtype, kind),
-            fused_axis(columns, self.dtype, kind, kind),
+        """Call the C++ function ``name`` for the types of this pupil, with axes, threads, memory
+        and arguments.
+        """
+        last_type_used = last_type(*last_work(rows, columns), self.dtype, _LITTLE)
+        row_axis, column_axis = (
+            fused_axis(rows, self.dtype, self.dtype, last_type_used),
+            fused_axis(columns, self.dtype, last_type_used, last_type_used),
         )
-        operator = getattr(operators(), f"neusee_psf_{name}_{_NAMES[self.dtype, kind]}")
+        operator = getattr(operators(), f"neusee_psf_{name}_{_NAMES[self.dtype, last_type_used]}")
         tiles = [
-            self._tiles(label, y, n, kind) for label, n in (("before", x.n_in), ("behind", x.n_out))
+            self._tiles(label, row_axis, n, last_type_used)
+            for label, n in (("before", column_axis.n_in), ("behind", column_axis.n_out))
         ]
         structures = [
-            ctypes.byref(s) if isinstance(s, ctypes.Structure) else s for s in (y, x, *arguments)
+            ctypes.byref(s) if isinstance(s, ctypes.Structure) else s
+            for s in (row_axis, column_axis, *arguments)
         ]
         samples = rows.n_in * columns.n_in + rows.n_out * columns.n_out
+        # one thread alone for few samples
         threads = min(torch.get_num_threads(), 1 + samples // _ALONE)
         operator(*structures[:2], ctypes.c_int64(threads), *tiles, *structures[2:])
 
@@ -343,10 +392,14 @@ class FusedPupil:
         vectors.
         """
         vector = operators().neusee_psf_vector_bytes()
-        lanes, wide = vector // kind.itemsize, vector // self.dtype.itemsize
-        size = 2 * _up(y.kept, lanes) * _up(n, wide)
-        flat = self.work.take(label, size + lanes, dtype=kind)
-        return ctypes.c_void_p(_up(flat.data_ptr(), vector))
+        numbers_per_vector, columns_per_vector = (
+            vector // kind.itemsize,
+            vector // self.dtype.itemsize,
+        )
+        size = 2 * _up(y.kept, numbers_per_vector) * _up(n, columns_per_vector)
+        # one vector more than needed, to align its start
+        memory = self.work.take(label, size + numbers_per_vector, dtype=kind)
+        return ctypes.c_void_p(_up(memory.data_ptr(), vector))
 
 
 class _Held:
@@ -357,9 +410,11 @@ class _Held:
 
 
 def _focal(view: View, intensity: Tensor | None, field: Tensor | None, add: bool) -> _Held:
+    """Return the structure of the focal plane of a view, with the tensors that it points to."""
     arrays = (*(view.envelope or (None, None)), intensity, field)
     return _Held(_Focal(view.weight, *(pointer(x) for x in arrays), add), arrays)
 
 
 def _up(n: int, step: int) -> int:
+    """Return a whole number, rounded up to a multiple of ``step``."""
     return -(-n // step) * step

@@ -171,27 +171,34 @@ def _computed(
     """
     refuse_too_many_turns(screens, sampling.views)
     views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
-    device, fields, done = screens.height.device, list[Tensor | None](), -1
+    device, fields, last_band = screens.height.device, list[Tensor | None](), -1
     intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=device)
+    # re and im of each view: twice the bytes of its intensity
     keep = keep and sampling.keep and 2 * len(views) * intensity[0].nbytes <= KEPT_FIELD_BYTES
     fused = sampling.fused(device)
     with borrowed(sampling.dtype, device) as work:
         pupil = FusedPupil(screens, sampling.dtype, work) if fused else None
         for view in views:
-            focal = (
+            focal_field = (
+                # torch keeps the field transposed, the C++ does not
                 torch.empty(2, *shape[:: 1 if fused else -1], dtype=sampling.dtype, device=device)
                 if keep
                 else None
             )
             if pupil is not None:
-                pupil.forward(view, intensity[view.band], view.band == done, focal)
+                pupil.forward(view, intensity[view.band], view.band == last_band, focal_field)
             else:
                 field = Field(screens, view, sampling.dtype)
                 _power(
-                    field, intensity[view.band], view.band == done, focal, sampling.by_torch, work
+                    field,
+                    intensity[view.band],
+                    view.band == last_band,
+                    focal_field,
+                    sampling.by_torch,
+                    work,
                 )
-            fields.append(focal)
-            done = view.band
+            fields.append(focal_field)
+            last_band = view.band
     return intensity, fields
 
 
@@ -252,19 +259,20 @@ def _add_change(
     """
 
     def source(start: int, stop: int, out: Tensor) -> None:
-        rows, everywhere = slice(start, stop), slice(0, out.shape[2])
-        unit = work.take("unit", *out.shape)
-        field.phasor(rows, everywhere, unit, work)
+        rows, all_columns = slice(start, stop), slice(0, out.shape[2])
+        phasor = work.take("unit", *out.shape)
+        field.phasor(rows, all_columns, phasor, work)
         amplitude, height, path = (x[rows].to(out.dtype) for x in tangents)
-        turning = field.view.turns_height * height + field.view.turns_path * path
-        turning = turning.mul_(2 * math.pi).mul_(field.screens.amplitude[rows])
-        torch.mul(unit[0], amplitude, out=out[0]).addcmul_(unit[1], turning, value=-1)
-        torch.mul(unit[1], amplitude, out=out[1]).addcmul_(unit[0], turning)
+        phase_change = field.view.turns_height * height + field.view.turns_path * path
+        phase_change = phase_change.mul_(2 * math.pi).mul_(field.screens.amplitude[rows])
+        # d(a e^(i t)) = e^(i t) (da + i a dt), in real and imaginary parts
+        torch.mul(phasor[0], amplitude, out=out[0]).addcmul_(phasor[1], phase_change, value=-1)
+        torch.mul(phasor[1], amplitude, out=out[1]).addcmul_(phasor[0], phase_change)
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        focal = patch_of(planes.transpose(1, 2), rows, columns, patch)
+        focal_patch = patch_of(planes.transpose(1, 2), rows, columns, patch)
         patch_of(change, rows, columns, patch).add_(
-            _scaled(field.view, (2 * focal * patch).sum(0), rows, columns)
+            _scaled(field.view, (2 * focal_patch * patch).sum(0), rows, columns)
         )
 
     propagate(field.view.rows, field.view.columns, source, sink, work, method)
@@ -276,8 +284,12 @@ def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
     """
     if view.envelope is None:
         return values.mul_(view.weight)
-    y, x = view.envelope
-    return values.mul_(y[rows].view(*values.shape[:-1], 1)).mul_(x[columns]).mul_(view.weight)
+    row_envelope, column_envelope = view.envelope
+    return (
+        values.mul_(row_envelope[rows].view(*values.shape[:-1], 1))
+        .mul_(column_envelope[columns])
+        .mul_(view.weight)
+    )
 
 
 def _power(
@@ -290,9 +302,11 @@ def _power(
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         if focal is not None:
             _keep(focal, rows, columns, patch)
-        power = _scaled(field.view, patch[0].square().addcmul_(patch[1], patch[1]), rows, columns)
-        into = patch_of(out, rows, columns, patch)
-        into.add_(power) if add else into.copy_(power)
+        intensity = _scaled(
+            field.view, patch[0].square().addcmul_(patch[1], patch[1]), rows, columns
+        )
+        target = patch_of(out, rows, columns, patch)
+        target.add_(intensity) if add else target.copy_(intensity)
 
     propagate(field.view.rows, field.view.columns, field.rows(work), sink, work, method)
 
@@ -332,18 +346,18 @@ def _add_gradient(
     The transform runs on the transposed problem, so that its result comes back in rows of the
     pupil.
     """
-    view, everywhere = field.view, slice(0, planes.shape[2])
+    view, all_rows = field.view, slice(0, planes.shape[2])
     # one copy; by slabs of a power of two it is slow
-    gain = work.take("gain", *planes.shape[1:]).copy_(weight.T)
+    transposed_weight = work.take("gain", *planes.shape[1:]).copy_(weight.T)
 
     def source(start: int, stop: int, out: Tensor) -> None:
-        _scaled(view, gain[start:stop].mul_(2).T, everywhere, slice(start, stop))
-        torch.mul(planes[:, start:stop], gain[start:stop], out=out)
+        _scaled(view, transposed_weight[start:stop].mul_(2).T, all_rows, slice(start, stop))
+        torch.mul(planes[:, start:stop], transposed_weight[start:stop], out=out)
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        flat = work.take("flat", 2, columns.stop - columns.start, rows.stop - rows.start)
-        patch_of(flat.transpose(1, 2), slice(None), slice(None), patch).copy_(patch)
-        _chain(field, columns, rows, flat, grads, work)
+        pupil_patch = work.take("flat", 2, columns.stop - columns.start, rows.stop - rows.start)
+        patch_of(pupil_patch.transpose(1, 2), slice(None), slice(None), patch).copy_(patch)
+        _chain(field, columns, rows, pupil_patch, grads, work)
 
     propagate(view.columns.adjoint(), view.rows.adjoint(), source, sink, work, method)
 
@@ -359,14 +373,17 @@ def _chain(
     """Add the gradients of amplitude, height and path by the chain rule, given the gradient
     ``patch`` of the field.
     """
-    unit = work.take("unit", *patch.shape)
-    field.phasor(rows, columns, unit, work)
+    phasor = work.take("unit", *patch.shape)
+    field.phasor(rows, columns, phasor, work)
     if grads[0] is not None:
-        grads[0][rows, columns].addcmul_(unit[0], patch[0]).addcmul_(unit[1], patch[1])
+        grads[0][rows, columns].addcmul_(phasor[0], patch[0]).addcmul_(phasor[1], patch[1])
     if grads[1] is None and grads[2] is None:
         return
-    turning = torch.mul(unit[0], patch[1], out=work.take("turning", *patch.shape[1:]))
-    turning.addcmul_(unit[1], patch[0], value=-1).mul_(field.screens.amplitude[rows, columns])
+    phase_gradient = torch.mul(phasor[0], patch[1], out=work.take("turning", *patch.shape[1:]))
+    # gradient of the phase: amplitude x Im(conj(phasor) x gradient of the field)
+    phase_gradient.addcmul_(phasor[1], patch[0], value=-1).mul_(
+        field.screens.amplitude[rows, columns]
+    )
     for grad, turns in ((grads[1], field.view.turns_height), (grads[2], field.view.turns_path)):
         if grad is not None:
-            grad[rows, columns].add_(turning, alpha=2 * math.pi * turns)
+            grad[rows, columns].add_(phase_gradient, alpha=2 * math.pi * turns)

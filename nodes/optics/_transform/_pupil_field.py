@@ -75,13 +75,14 @@ class Field:
     """
 
     def __init__(self, screens: Screens, view: View, dtype: torch.dtype) -> None:
+        """Prepare the field of ``screens`` for one view, with values of ``dtype``."""
         self.screens, self.view = screens, view
         tilts = zip(screens.height.shape, view.tilt, strict=True)
         v, u = (centred(n, screens.height.device).mul_(tilt) for n, tilt in tilts)
         turns = screens.highest * abs(view.turns_height) + screens.longest * view.turns_path
         self.few = dtype == torch.float32 and turns + float(v[-1].abs() + u[-1].abs()) < _FEW_TURNS
-        kind = torch.float32 if self.few else torch.float64
-        self.tilt_v, self.tilt_u = v.to(kind)[:, None], u.to(kind)
+        phase_type = torch.float32 if self.few else torch.float64
+        self.tilt_v, self.tilt_u = v.to(phase_type)[:, None], u.to(phase_type)
 
     def phasor(self, rows: slice, columns: slice, planes: Tensor, work: Workspace) -> None:
         """Write the cosine and sine of the pupil phase in one patch, in float64 if the phase
@@ -102,10 +103,10 @@ class Field:
         """Return a function that writes the requested rows of the pupil field to a buffer for
         the transform.
         """
-        everywhere = slice(0, self.screens.height.shape[1])
+        all_columns = slice(0, self.screens.height.shape[1])
 
         def fill(start: int, stop: int, planes: Tensor) -> None:
-            self.phasor(slice(start, stop), everywhere, planes, work)
+            self.phasor(slice(start, stop), all_columns, planes, work)
             planes.mul_(self.screens.amplitude[start:stop])
 
         return fill

@@ -36,20 +36,20 @@ class Workspace:
         overwritten.
         """
         key = (name, dtype or self.dtype)
-        flat, size = self._flat.get(key), prod(shape)
-        if flat is None or flat.numel() < size:
+        buffer, size = self._flat.get(key), prod(shape)
+        if buffer is None or buffer.numel() < size:
             self._flat.pop(key, None)
-            flat = self._flat[key] = torch.empty(size, dtype=key[1], device=self.device)
-        return flat[:size].view(shape)
+            buffer = self._flat[key] = torch.empty(size, dtype=key[1], device=self.device)
+        return buffer[:size].view(shape)
 
 
 @contextlib.contextmanager
 def borrowed(dtype: torch.dtype, device: torch.device) -> Iterator[Workspace]:
     """Yield a workspace that no other thread uses; at most two idle workspaces are kept."""
     with _lock:
-        fits = [w for w in _idle if (w.dtype, w.device) == (dtype, device)]
-        work = fits[-1] if fits else Workspace(dtype, device)
-        if fits:
+        idle_fitting = [w for w in _idle if (w.dtype, w.device) == (dtype, device)]
+        work = idle_fitting[-1] if idle_fitting else Workspace(dtype, device)
+        if idle_fitting:
             _idle.remove(work)
     try:
         yield work

@@ -46,73 +46,96 @@ class Lowest:
         the normal matrix.
         """
         self.torus = problem.torus
-        count = min(modes, 3 * modes // len(problem.picture), int(math.prod(problem.torus) / SHARE))
-        self.fy, self.fx = (f.to(gain.device) for f in _lowest(problem.torus, max(1, count // 2)))
-        root = gain[:, self.fy, self.fx].double().sqrt()
-        root[:, 0] *= 0.5**0.5  # the mean is its own mirror image
-        root = torch.cat([root, root[:, 1:]], 1).flatten()
-        matrix = self._matrix(problem).mul_(root[:, None]).mul_(root)
+        # each frequency has two unknowns, real and imaginary
+        unknowns = min(
+            # more than three channels share the total of three
+            modes,
+            3 * modes // len(problem.picture),
+            int(math.prod(problem.torus) / SHARE),
+        )
+        self.fy, self.fx = (
+            f.to(gain.device) for f in _lowest(problem.torus, max(1, unknowns // 2))
+        )
+        root_gain = gain[:, self.fy, self.fx].double().sqrt()
+        root_gain[:, 0] *= 0.5**0.5  # the mean is its own mirror image
+        root_gain = torch.cat([root_gain, root_gain[:, 1:]], 1).flatten()
+        matrix = self._matrix(problem).mul_(root_gain[:, None]).mul_(root_gain)
         matrix.diagonal().add_(_LEAST * matrix.diagonal().max())
-        whiten = _inverse(torch.linalg.cholesky(matrix)).mul_(root)
+        inverse_factor = _inverse(torch.linalg.cholesky(matrix)).mul_(root_gain)
         # lower triangular: numbers beyond `end` are 0
-        ends = range(_ROWS, len(whiten) + _ROWS, _ROWS)
-        self.whiten = [whiten[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
+        ends = range(_ROWS, len(inverse_factor) + _ROWS, _ROWS)
+        self.whiten = [inverse_factor[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:
         """Add a step, the inverse normal matrix times the gradient `slope`, to `onto`.
 
         Return the inner product of the step and `slope`.
         """
-        risen = _real(slope[:, self.fy, self.fx])
-        both, rise = (
-            torch.zeros_like(risen),
+        real_slope = _real(slope[:, self.fy, self.fx])
+        real_step, inner_product = (
+            torch.zeros_like(real_slope),
             torch.zeros((), dtype=torch.float64, device=slope.device),
         )
-        for some in self.whiten:  # both products while the rows are in the cache
-            white = some @ risen[: some.shape[1]]
-            both[: some.shape[1]] += white @ some
-            rise += white.square().sum(dtype=torch.float64)
-        both = both.reshape(len(slope), -1)
-        real, imag = both[:, : len(self.fy)], pad(both[:, len(self.fy) :], (1, 0))
+        for rows in self.whiten:  # both products while the rows are in the cache
+            whitened = rows @ real_slope[: rows.shape[1]]
+            real_step[: rows.shape[1]] += whitened @ rows
+            inner_product += whitened.square().sum(dtype=torch.float64)
+        real_step = real_step.reshape(len(slope), -1)
+        real, imag = real_step[:, : len(self.fy)], pad(real_step[:, len(self.fy) :], (1, 0))
         step = torch.complex(real, imag)
+        # the mean, which is its own mirror image
         step[:, 0] *= 2.0
         onto[:, self.fy, self.fx] += step
-        mirrored = (self.fx == 0) & (self.fy > 0)
-        onto[:, -self.fy[mirrored], 0] += step[:, mirrored].conj()
-        return rise * (2.0 / (self.torus[0] * self.torus[1]))
+        in_first_column = (self.fx == 0) & (self.fy > 0)
+        # in the column fx = 0, half a spectrum holds both mirror images
+        onto[:, -self.fy[in_first_column], 0] += step[:, in_first_column].conj()
+        return inner_product * (2.0 / (self.torus[0] * self.torus[1]))
 
     def _matrix(self, problem: Blurred) -> Tensor:
-        """Return the float64 normal matrix of prior, noise and glare, for real and imaginary
-        parts of each channel.
+        """Return the float64 normal matrix of prior, noise and glare, for real and imaginary parts
+        of each channel: (channel and part, channel and part).
         """
         transfer = problem.transfer[:, self.fy, self.fx].to(torch.complex128)
-        inverse = 1.0 / problem.power[self.fy, self.fx].double().clamp_min(1e-30)
-        inverse = torch.cat([2.0 * inverse[:1], inverse[1:], inverse[1:]])
-        own, shared = inverse_colour(len(transfer), problem.grey)
+        inverse_power = 1.0 / problem.power[self.fy, self.fx].double().clamp_min(1e-30)
+        # real part of the mean, real parts of the others, their imaginary parts
+        inverse_power = torch.cat([2.0 * inverse_power[:1], inverse_power[1:], inverse_power[1:]])
+        own_factor, shared_factor = inverse_colour(len(transfer), problem.grey)
         colours = (
-            own * torch.eye(len(transfer), dtype=torch.float64, device=inverse.device) - shared
+            own_factor * torch.eye(len(transfer), dtype=torch.float64, device=inverse_power.device)
+            - shared_factor
         )
-        matrix = inverse.new_zeros(len(transfer), len(inverse), len(transfer), len(inverse))
-        matrix.diagonal(dim1=1, dim2=3).copy_(colours[..., None] * inverse)
-        for channel, through in enumerate(transfer):
+        matrix = inverse_power.new_zeros(
+            len(transfer), len(inverse_power), len(transfer), len(inverse_power)
+        )
+        matrix.diagonal(dim1=1, dim2=3).copy_(colours[..., None] * inverse_power)
+        for channel, channel_transfer in enumerate(transfer):
             weight = torch.fft.rfft2(problem.weight[channel].double(), s=problem.torus)
-            matrix[channel, :, channel] += self._noise(weight, through)
+            matrix[channel, :, channel] += self._noise(weight, channel_transfer)
             if problem.held is not None:
-                held = torch.fft.rfft2(problem.held[channel].double(), s=problem.torus)
-                matrix[channel, :, channel] += self._noise(held, torch.ones_like(through))
-        size = len(transfer) * len(inverse)
+                held_spectrum = torch.fft.rfft2(problem.held[channel].double(), s=problem.torus)
+                matrix[channel, :, channel] += self._noise(
+                    held_spectrum, torch.ones_like(channel_transfer)
+                )
+        size = len(transfer) * len(inverse_power)
         return self._without_glare(matrix.view(size, size), problem, transfer)
 
     def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
         """Return the part of the normal matrix from the noise of one channel, for all pairs of
-        frequencies.
+        frequencies; ``weight`` is the spectrum of the weights, ``through`` the transfer at the
+        lowest frequencies.
         """
-        plus, minus = (self._at(weight, s) * through.conj()[:, None] for s in (-1, 1))
-        plus, minus = plus * through, minus * through.conj()
-        top = torch.cat([plus.real + minus.real, (minus.imag - plus.imag)[:, 1:]], 1)
-        bottom = torch.cat([plus.imag + minus.imag, (plus.real - minus.real)[:, 1:]], 1)
-        both: Tensor = torch.cat([top, bottom[1:]]) / (self.torus[0] * self.torus[1])
-        return both
+        difference_part, sum_part = (self._at(weight, s) * through.conj()[:, None] for s in (-1, 1))
+        difference_part, sum_part = difference_part * through, sum_part * through.conj()
+        real_rows = torch.cat(
+            [difference_part.real + sum_part.real, (sum_part.imag - difference_part.imag)[:, 1:]], 1
+        )
+        imaginary_rows = torch.cat(
+            [difference_part.imag + sum_part.imag, (difference_part.real - sum_part.real)[:, 1:]], 1
+        )
+        matrix: Tensor = torch.cat([real_rows, imaginary_rows[1:]]) / (
+            self.torus[0] * self.torus[1]
+        )
+        return matrix
 
     def _at(self, spectrum: Tensor, sign: int) -> Tensor:
         """Return the spectrum at the sums (`sign` 1) or differences (`sign` -1) of all pairs of
@@ -120,9 +143,12 @@ class Lowest:
         """
         y, x = self.torus
         fy, fx = self.fy[:, None] + sign * self.fy, (self.fx[:, None] + sign * self.fx) % x
-        far = fx > x // 2
-        values = spectrum[torch.where(far, -fy, fy) % y, torch.where(far, x - fx, fx)]
-        return torch.where(far, values.conj(), values)
+        # the other half of the spectrum: conjugate of the mirror frequency
+        beyond_half = fx > x // 2
+        values = spectrum[
+            torch.where(beyond_half, -fy, fy) % y, torch.where(beyond_half, x - fx, fx)
+        ]
+        return torch.where(beyond_half, values.conj(), values)
 
     def _without_glare(self, matrix: Tensor, problem: Blurred, transfer: Tensor) -> Tensor:
         """Subtract from the normal matrix the information lost to unknown glare strengths, and
@@ -130,16 +156,19 @@ class Lowest:
         """
         if not problem.glare:
             return matrix
-        flat = torch.stack(problem.glare).double().flatten(1)
-        weighted = problem.weight.double().flatten() * flat
-        products = with_bounds(weighted @ flat.T, problem.bounded)
-        inverse = torch.linalg.pinv(products, hermitian=True) * (
+        flat_patterns = torch.stack(problem.glare).double().flatten(1)
+        weighted_patterns = problem.weight.double().flatten() * flat_patterns
+        products = with_bounds(weighted_patterns @ flat_patterns.T, problem.bounded)
+        inverse_products = torch.linalg.pinv(products, hermitian=True) * (
             2.0 / (self.torus[0] * self.torus[1])
         )
-        shapes = weighted.reshape(-1, *problem.picture.shape)
-        spectra = (torch.fft.rfft2(shape, s=problem.torus)[:, self.fy, self.fx] for shape in shapes)
-        rows = torch.stack([_real(transfer.conj() * s) for s in spectra])
-        return matrix.addmm_(rows.T, inverse @ rows, alpha=-1.0)
+        weighted_pictures = weighted_patterns.reshape(-1, *problem.picture.shape)
+        spectra = (
+            torch.fft.rfft2(shape, s=problem.torus)[:, self.fy, self.fx]
+            for shape in weighted_pictures
+        )
+        blurred_back = torch.stack([_real(transfer.conj() * s) for s in spectra])
+        return matrix.addmm_(blurred_back.T, inverse_products @ blurred_back, alpha=-1.0)
 
 
 def _inverse(lower: Tensor) -> Tensor:
@@ -152,15 +181,18 @@ def _inverse(lower: Tensor) -> Tensor:
 
 
 def _invert(lower: Tensor, inverse: Tensor) -> None:
-    half = len(lower) // 2
-    if half < 128:
+    """Write the inverse of a lower triangular matrix to ``inverse``, by the inverses of its
+    diagonal quarters A and B: [[A, 0], [C, B]]^-1 = [[A^-1, 0], [-B^-1 C A^-1, B^-1]].
+    """
+    middle = len(lower) // 2
+    if middle < 128:
         unit = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
         inverse.copy_(torch.linalg.solve_triangular(lower, unit, upper=False))
         return
-    _invert(lower[:half, :half], inverse[:half, :half])
-    _invert(lower[half:, half:], inverse[half:, half:])
-    inverse[half:, :half] = (
-        inverse[half:, half:] @ (lower[half:, :half] @ inverse[:half, :half])
+    _invert(lower[:middle, :middle], inverse[:middle, :middle])
+    _invert(lower[middle:, middle:], inverse[middle:, middle:])
+    inverse[middle:, :middle] = (
+        inverse[middle:, middle:] @ (lower[middle:, :middle] @ inverse[:middle, :middle])
     ).neg_()
 
 
@@ -179,6 +211,7 @@ def _lowest(size: Size, count: int) -> tuple[Tensor, Tensor]:
     fy = torch.arange(-reach, reach + 1)[:, None]
     fx = torch.arange((size[1] - 1) // 2 + 1)
     squared = (fy / size[0]).square() + (fx / size[1]).square()
+    # of each mirror pair in the column fx = 0, the one with negative fy is left out
     squared[:reach, 0] = torch.inf
     order = squared.flatten().argsort(stable=True)[: min(count, squared.numel() - reach)]
     return order // len(fx) - reach, order % len(fx)
@@ -206,19 +239,22 @@ def descend(
     if steps < 1:
         return x
     normal, inverse = _Normal(problem), inverse or Preconditioner(problem)
-    left, way, change = normal.slope(x), torch.empty_like(x), torch.empty_like(x)
-    size = inverse(left, way)
-    enough = max(enough, 1e-20 * float(size))
+    # gradient at the start, search direction, and normal matrix times direction
+    residual, direction, product = normal.slope(x), torch.empty_like(x), torch.empty_like(x)
+    residual_norm = inverse(residual, direction)
+    # below 1e-20 of the first norm all is rounding
+    enough = max(enough, 1e-20 * float(residual_norm))
     for _ in range(steps):
-        if not float(size) > enough:
+        if not float(residual_norm) > enough:
             break
-        length = float(size / normal(way, change))
+        step = float(residual_norm / normal(direction, product))
         for rows in pieces(x):
-            x[:, rows].add_(way[:, rows], alpha=length)
-            left[:, rows].sub_(change[:, rows], alpha=length)
-        new = inverse(left, change)
-        way.mul_(float(new / size)).add_(change)
-        size = new
+            x[:, rows].add_(direction[:, rows], alpha=step)
+            residual[:, rows].sub_(product[:, rows], alpha=step)
+        new_norm = inverse(residual, product)
+        # Fletcher and Reeves: the next direction is conjugate to the last ones
+        direction.mul_(float(new_norm / residual_norm)).add_(product)
+        residual_norm = new_norm
     return x
 
 
@@ -240,11 +276,11 @@ def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
     faster than `irfft2`.
     """
     rows, columns = pixels.shape
-    tall = spectrum.new_empty(rows, spectrum.shape[1])
-    for some in _few(spectrum.shape[1], torus[0]):
-        tall[:, some] = torch.fft.ifft(spectrum[:, some], dim=0)[:rows]
-    for some in _few(rows, torus[1]):
-        pixels[some] = torch.fft.irfft(tall[some], n=torus[1])[:, :columns]
+    column_transforms = spectrum.new_empty(rows, spectrum.shape[1])
+    for block in _few(spectrum.shape[1], torus[0]):
+        column_transforms[:, block] = torch.fft.ifft(spectrum[:, block], dim=0)[:rows]
+    for block in _few(rows, torus[1]):
+        pixels[block] = torch.fft.irfft(column_transforms[block], n=torus[1])[:, :columns]
 
 
 class _Normal:
@@ -253,6 +289,9 @@ class _Normal:
     """
 
     def __init__(self, problem: Blurred) -> None:
+        """Prepare the products of a problem; its plane and pixels are memory that each product uses
+        again.
+        """
         self.seen, self.weigh = problem, weighing(problem)
         self.inverse = 1.0 / problem.power.clamp_min(1e-30)
         self.plane, self.pixels = (
@@ -278,6 +317,7 @@ class _Normal:
         return result if self.seen.pull is None else result.add_(self.seen.pull)
 
     def _blurred(self, x: Tensor, room: Tensor) -> Tensor:
+        """Return the blurred picture of spectrum x, in `self.pixels`; ``room`` is overwritten."""
         for channel, transfer in enumerate(self.seen.transfer):
             torch.mul(transfer, x[channel], out=room[channel])
             corner(room[channel], self.seen.torus, self.pixels[channel])
@@ -299,18 +339,18 @@ class _Normal:
         if self.seen.held is None:
             return
         rows, columns = self.pixels.shape[-2:]
-        for channel, held in enumerate(self.seen.held):
+        for channel, precision in enumerate(self.seen.held):
             corner(x[channel], self.seen.torus, self.pixels[channel])
-            self.plane[:rows, :columns] = self.pixels[channel].mul_(held)
+            self.plane[:rows, :columns] = self.pixels[channel].mul_(precision)
             result[channel].add_(torch.fft.rfft2(self.plane), alpha=sign)
 
     def _finish(self, x: Tensor, result: Tensor, sign: float) -> None:
         """Multiply `result` by the adjoint of the blur, and add `sign` times the inverse prior
         covariance times x.
         """
-        own, shared = inverse_colour(len(x), self.seen.grey)
+        own_factor, shared_factor = inverse_colour(len(x), self.seen.grey)
         for rows in pieces(x):
-            prior = mixed(x[:, rows], own, -shared).mul_(self.inverse[rows])
+            prior = mixed(x[:, rows], own_factor, -shared_factor).mul_(self.inverse[rows])
             result[:, rows].mul_(self.seen.transfer[:, rows].conj()).add_(prior, alpha=sign)
 
 
@@ -320,11 +360,14 @@ class Preconditioner:
     """
 
     def __init__(self, problem: Blurred, modes: int = MODES) -> None:
-        own, shared = inverse_colour(len(problem.picture), problem.grey)
+        """Build the inverse of (prior + mean weight x |transfer|^2) for each frequency; the lowest
+        frequencies of pictures that are not too wide are exact.
+        """
+        own_factor, shared_factor = inverse_colour(len(problem.picture), problem.grey)
         count = (problem.weight > 0).sum((-2, -1)).clamp_min(1)
-        mean = (problem.weight.sum((-2, -1)) / count)[:, None, None]
-        held = (
-            torch.zeros_like(mean)
+        mean_weight = (problem.weight.sum((-2, -1)) / count)[:, None, None]
+        mean_held = (
+            torch.zeros_like(mean_weight)
             if problem.held is None
             else problem.held.mean((-2, -1), keepdim=True)
         )
@@ -334,12 +377,15 @@ class Preconditioner:
         )
         self.shared = torch.empty_like(problem.power)
         for rows in pieces(self.gain):
-            inverse = 1.0 / problem.power[rows].clamp_min(1e-30)
-            through = problem.transfer[:, rows]
-            information = mean * (through.real.square() + through.imag.square())
-            self.gain[:, rows] = 1.0 / (own * inverse + information + held)
+            inverse_power = 1.0 / problem.power[rows].clamp_min(1e-30)
+            transfer = problem.transfer[:, rows]
+            information = mean_weight * (transfer.real.square() + transfer.imag.square())
+            self.gain[:, rows] = 1.0 / (own_factor * inverse_power + information + mean_held)
+            # Sherman and Morrison: the prior couples all channels by one shared term
             self.shared[rows] = (
-                shared * inverse / (1.0 - shared * inverse * self.gain[:, rows].sum(0))
+                shared_factor
+                * inverse_power
+                / (1.0 - shared_factor * inverse_power * self.gain[:, rows].sum(0))
             )
         self.lowest = (
             Lowest(problem, self.gain, modes) if max(problem.picture.shape[-2:]) <= LOWEST else None
@@ -351,19 +397,22 @@ class Preconditioner:
         """
         for rows in pieces(slope):
             gain = self.gain[:, rows]
-            own = torch.mul(slope[:, rows], gain, out=result[:, rows])
-            own += gain * (self.shared[rows] * own.sum(0))
+            step = torch.mul(slope[:, rows], gain, out=result[:, rows])
+            step += gain * (self.shared[rows] * step.sum(0))
         total = inner(slope, result, self.torus)
         return total if self.lowest is None else total + self.lowest.add(slope, result)
 
 
 def inner(a: Tensor, b: Tensor, torus: Size) -> Tensor:
     """Return the inner product of two pictures, given half of their Fourier transforms."""
-    half_sum = (
+    total_over_halves = (
         torch.stack([torch.vdot(p.flatten(), q.flatten()) for p, q in zip(a, b, strict=True)]).sum()
         * 2.0
     )
+    # columns that the whole spectrum has only once
     for column in (0,) if torus[1] % 2 else (0, -1):
-        half_sum = half_sum - torch.linalg.vecdot(a[..., column], b[..., column]).sum()
-    total: Tensor = half_sum.real.double() / (torus[0] * torus[1])
+        total_over_halves = (
+            total_over_halves - torch.linalg.vecdot(a[..., column], b[..., column]).sum()
+        )
+    total: Tensor = total_over_halves.real.double() / (torus[0] * torus[1])
     return total

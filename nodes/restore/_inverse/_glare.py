@@ -95,6 +95,7 @@ def square_mean(picture: Tensor, radius: int) -> Tensor:
         size = picture.shape[dim]
         sums = torch.cat([torch.zeros_like(picture.narrow(dim, 0, 1)), picture.cumsum(dim)], dim)
         index = torch.arange(size, device=picture.device)
+        # pixels beyond the picture are dark: the divisor stays the whole square
         upper, lower = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
         picture = (sums.index_select(dim, upper) - sums.index_select(dim, lower)) / (2 * radius + 1)
     return picture
@@ -119,26 +120,37 @@ def doubted(
         return unclipped, light, torch.zeros_like(unclipped[:, :1, :1])
     trusted = unclipped
     for _ in range(2):
-        own = noise(average(electrons - light.sum, trusted))
-        trusted = unclipped * own / (own + _total(light))
+        noise_variance = noise(average(electrons - light.sum, trusted))
+        trusted = unclipped * noise_variance / (noise_variance + _total(light))
         light = _estimated(electrons, trusted, glare, doubt)
     return trusted, light, average(_total(light), trusted)
 
 
 def _estimated(electrons: Tensor, weights: Tensor, glare: Glare, doubt: float) -> Light:
-    """Return the glare whose strengths fit a picture best, and its uncertainty at these
-    strengths.
+    """Return the glare whose strengths fit a picture best, and its uncertainty at these strengths:
+    by pixel for ``doubt``, by modes for nearby patterns.
     """
-    dark = torch.zeros_like(electrons)
-    fit = strengths(electrons, weights, glare.patterns)
-    parts = [strength * pattern for strength, pattern in zip(fit, glare.patterns, strict=True)]
-    doubtful = zip(fit, glare.around or (), strict=True) if doubt else ()
-    own = sum(((doubt * strength * around).square() for strength, around in doubtful), dark)
+    zeros = torch.zeros_like(electrons)
+    strength_of_patterns = strengths(electrons, weights, glare.patterns)
+    patterns_in_picture = [
+        strength * pattern
+        for strength, pattern in zip(strength_of_patterns, glare.patterns, strict=True)
+    ]
+    strengths_and_light_around = (
+        zip(strength_of_patterns, glare.around or (), strict=True) if doubt else ()
+    )
+    pixel_variance = sum(
+        ((doubt * strength * around).square() for strength, around in strengths_and_light_around),
+        zeros,
+    )
     modes = []
-    for strength, pattern, others in zip(fit, glare.patterns, glare.nearby, strict=True):
+    for strength, pattern, others in zip(
+        strength_of_patterns, glare.patterns, glare.nearby, strict=True
+    ):
         if others is not None:
+            # their outer products add up to the mean over the nearby patterns, a covariance
             modes += [strength * (other - pattern) / len(others) ** 0.5 for other in others]
-    return Light(sum(parts, dark), own, modes)
+    return Light(sum(patterns_in_picture, zeros), pixel_variance, modes)
 
 
 def _total(light: Light) -> Tensor:
@@ -158,17 +170,27 @@ def strengths(electrons: Tensor, weights: Tensor, glare: Sequence[Tensor]) -> Te
     """
     if not glare:
         return electrons.new_zeros(0)
-    means = [average(pattern, weights) for pattern in glare]
-    products = torch.zeros(len(glare), len(glare) + 1, dtype=torch.float64, device=electrons.device)
+    # patterns without their weighted means: that fits the constant too
+    pattern_means = [average(pattern, weights) for pattern in glare]
+    normal_equations = torch.zeros(
+        len(glare), len(glare) + 1, dtype=torch.float64, device=electrons.device
+    )
     for channel in range(len(electrons)):
-        for some in range(0, electrons.shape[-2], _ROWS):
-            block = (channel, slice(some, some + _ROWS))
-            flat = [(p[block] - m[channel]).flatten() for p, m in zip(glare, means, strict=True)]
+        for first_row in range(0, electrons.shape[-2], _ROWS):
+            block = (channel, slice(first_row, first_row + _ROWS))
+            centred_patterns = [
+                (p[block] - m[channel]).flatten() for p, m in zip(glare, pattern_means, strict=True)
+            ]
             weight = weights[block].flatten()
-            every = torch.stack([*flat, electrons[block].flatten()]).double()
-            products += (every[:-1] * weight) @ every.T
-    fit: Tensor = torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]
-    return fit.to(electrons)
+            patterns_and_picture = torch.stack(
+                [*centred_patterns, electrons[block].flatten()]
+            ).double()
+            # the last column is the right side: products of patterns and picture
+            normal_equations += (patterns_and_picture[:-1] * weight) @ patterns_and_picture.T
+    fitted: Tensor = (
+        torch.linalg.pinv(normal_equations[:, :-1], hermitian=True) @ normal_equations[:, -1]
+    )
+    return fitted.to(electrons)
 
 
 # --- glare doubt ----------------------------------------------------------------------------------
@@ -207,12 +229,15 @@ def likeliest_doubt(
     def likelihood(doubt: float) -> float:
         trusted, light, _ = doubted(electrons, unclipped, glare, doubt, noise)
         remainder = electrons - light.sum
+        # 8 / 9: the variance of white noise less its mean over 3 x 3 pixels
         variance = 8 / 9 * (noise(average(remainder, trusted)) + light.variance)
         for mode in light.modes:
             variance = variance + _sharp(mode).square()
         channels = zip(_sharp(remainder), variance, interior, strict=True)
         return sum(
-            _profile(errors[use].square(), own[use]) for errors, own, use in channels if use.any()
+            _profile(errors[use].square(), variances[use])
+            for errors, variances, use in channels
+            if use.any()
         )
 
     with torch.no_grad():
@@ -223,11 +248,13 @@ def _profile(squares: Tensor, variance: Tensor) -> float:
     """Return the log likelihood of squared Gaussian errors, with the likeliest constant added to
     their variance.
     """
-    some = slice(None, None, max(1, len(squares) // _SAMPLE))
-    top = float(squares.mean())
-    variances = [top * 2 ** (-n / 2) for n in range(_STEPS)]
-    best = max(variances, key=lambda scene: _gaussian(squares[some], variance[some] + scene))
-    return _gaussian(squares, variance + best)
+    sample = slice(None, None, max(1, len(squares) // _SAMPLE))
+    mean_square = float(squares.mean())
+    variances = [mean_square * 2 ** (-n / 2) for n in range(_STEPS)]
+    likeliest_constant = max(
+        variances, key=lambda scene: _gaussian(squares[sample], variance[sample] + scene)
+    )
+    return _gaussian(squares, variance + likeliest_constant)
 
 
 def _gaussian(squares: Tensor, variance: Tensor) -> float:
@@ -287,14 +314,14 @@ def scattered(
         glare = with_smooth(glare)
     strength, *shares = _likeliest(electrons, unclipped, glare, noise)
     light = _light(glare, strength, shares)
-    total = sum((mode.square() for mode in light.modes), light.variance)
+    light_variance = sum((mode.square() for mode in light.modes), light.variance)
     # a channel without known pixels has a mean
     unclipped = torch.where(unclipped.amax((-2, -1), keepdim=True) > 0, unclipped, 1.0)
     trusted = unclipped
     for _ in range(2):
-        own = noise(average(electrons - light.sum, trusted))
-        trusted = unclipped * own / (own + total)
-    return trusted, light, average(total, trusted)
+        noise_variance = noise(average(electrons - light.sum, trusted))
+        trusted = unclipped * noise_variance / (noise_variance + light_variance)
+    return trusted, light, average(light_variance, trusted)
 
 
 def speckle(
@@ -317,31 +344,35 @@ def with_smooth(glare: Glare) -> Glare:
 
 def _spread(pattern: Tensor, radius: int) -> Tensor:
     """Return a pattern spread over about ``radius`` pixels; beyond the picture is no light."""
-    wide = pattern.double()
+    spread = pattern.double()
     for _ in range(_TIMES):
-        wide = square_mean(wide, max(1, round(radius / _TIMES**0.5)))
-    return wide.to(pattern)
+        spread = square_mean(spread, max(1, round(radius / _TIMES**0.5)))
+    return spread.to(pattern)
 
 
 def _light(glare: Glare, strength: float, shares: Sequence[float]) -> Light:
-    """Return the light of all patterns, with its uncertainty, if ``shares`` of each are
-    scattered.
+    """Return the light of all patterns, with its uncertainty, for patterns of ``strength`` times
+    the light that is told, of which ``shares``, one for each of the `RADII`, are scattered.
     """
-    total = variance = torch.zeros_like(glare.patterns[0])
+    light_sum = variance = torch.zeros_like(glare.patterns[0])
     modes: list[Tensor] = []
     sources = zip(glare.patterns, glare.peaks, glare.nearby, glare.smooth or (), strict=True)
-    for pattern, peak, others, smooth in sources:
+    for pattern, peak, others, spread_patterns in sources:
         straight = strength * peak * pattern
-        scattered_light = [share * peak * wide for share, wide in zip(shares, smooth, strict=True)]
-        wide = sum(scattered_light, torch.zeros_like(pattern))
-        total, variance = (
-            total + straight + wide,
-            variance + _GRAINY * (wide.square() + 2.0 * straight * wide),
+        scattered_light = [
+            share * peak * spread_light
+            for share, spread_light in zip(shares, spread_patterns, strict=True)
+        ]
+        spread_light = sum(scattered_light, torch.zeros_like(pattern))
+        light_sum, variance = (
+            light_sum + straight + spread_light,
+            # variance of speckle, d^2 + 2 c d, for scattered light d and straight light c
+            variance + _GRAINY * (spread_light.square() + 2.0 * straight * spread_light),
         )
         modes += [_SMOOTH * x for x in scattered_light] + [_SIZE * straight]
         if others is not None:
             modes += [strength * peak * (other - pattern) / len(others) ** 0.5 for other in others]
-    return Light(total, variance, modes)
+    return Light(light_sum, variance, modes)
 
 
 # --- what a picture tells of the shares -----------------------------------------------------------
@@ -373,8 +404,8 @@ class _Hidden(NamedTuple):
 def _likeliest(
     electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> tuple[float, ...]:
-    """Return the strength of the patterns over that told, and the share scattered over each
-    radius: the likeliest.
+    """Return the likeliest strength of the patterns over that told, and then the light scattered
+    over each of the `RADII`, over the light told.
     """
     from scipy.optimize import minimize
 
@@ -383,15 +414,16 @@ def _likeliest(
         likelihood = _likelihood(electrons, unclipped, glare, noise)
     if likelihood is None:
         return tuple(math.exp(x) for x in start)
+    # Nelder-Mead searches the logarithms; a step of 1.2 is a factor of 3.3
     simplex = [
         start,
         *([x + 1.2 * (i == j) for j, x in enumerate(start)] for i in range(len(start))),
     ]
     options = {"maxfev": _EVALUATIONS, "xatol": 0.05, "fatol": 0.1, "initial_simplex": simplex}
-    fit = minimize(
+    minimum = minimize(
         lambda x: -likelihood(x) / _ALIKE - _prior(x), start, method="Nelder-Mead", options=options
     )
-    return tuple(math.exp(x) for x in fit.x)
+    return tuple(math.exp(x) for x in minimum.x)
 
 
 def _prior(logs: Sequence[float]) -> float:
@@ -412,55 +444,72 @@ def _likelihood(
     pixels = _pixels(electrons, unclipped, glare, noise)
     if pixels is None:
         return None
-    scenes: list[float] = []
+    last_scene_variance: list[float] = []
 
     def likelihood(logs: Sequence[float]) -> float:
-        amounts = torch.tensor([math.exp(x) for x in logs]).to(pixels.picture)[:, None, None]
-        straight, wide = amounts[0] * pixels.light[0], (amounts[1:] * pixels.light[1:]).sum(0)
-        speckle = wide.square() + 2.0 * straight * wide
-        mean = _average(pixels.whole - straight - wide, pixels.noise / (pixels.noise + speckle))
+        strength_and_shares = torch.tensor([math.exp(x) for x in logs]).to(pixels.picture)[
+            :, None, None
+        ]
+        straight, scattered = (
+            strength_and_shares[0] * pixels.light[0],
+            (strength_and_shares[1:] * pixels.light[1:]).sum(0),
+        )
+        speckle = scattered.square() + 2.0 * straight * scattered
+        mean = _average(
+            pixels.whole - straight - scattered, pixels.noise / (pixels.noise + speckle)
+        )
         arguments = (
-            pixels.picture - (amounts * pixels.parts).sum(0),
+            pixels.picture - (strength_and_shares * pixels.parts).sum(0),
+            # 8 / 9: the variance of white noise less its mean over 3 x 3 pixels
             8 / 9 * torch.maximum(pixels.noise, mean),
             _SHARP * speckle,
             mean / mean.norm(),
         )
-        top = float(arguments[0].square().mean())
-        tried = (
-            [scenes[-1] * f for f in (0.5, 0.7, 1.0, 1.4, 2.0)]
-            if scenes
-            else [top * 0.5**n for n in range(20)]
+        mean_square = float(arguments[0].square().mean())
+        # around the variance of the last call, because the search moves little
+        scene_variances = (
+            [last_scene_variance[-1] * f for f in (0.5, 0.7, 1.0, 1.4, 2.0)]
+            if last_scene_variance
+            else [mean_square * 0.5**n for n in range(20)]
         )
-        best = max((_log_density(*arguments, scene), scene) for scene in tried)
-        scenes[:] = best[1:]
-        return best[0] + _log_full(pixels.hidden, amounts[:, :, 0], mean[:, 0])
+        density_and_variance = max(
+            (_log_density(*arguments, scene), scene) for scene in scene_variances
+        )
+        last_scene_variance[:] = density_and_variance[1:]
+        return density_and_variance[0] + _log_full(
+            pixels.hidden, strength_and_shares[:, :, 0], mean[:, 0]
+        )
 
     return likelihood
 
 
 def _light_by_kind(glare: Glare, electrons: Tensor) -> list[Tensor]:
     """Return the light of all patterns as told: straight, and scattered over each radius."""
-    smooth, dark = glare.smooth or (), torch.zeros_like(electrons)
-    kinds = [glare.patterns]
+    smooth, zeros = glare.smooth or (), torch.zeros_like(electrons)
+    patterns_by_kind = [glare.patterns]
     for number in range(len(RADII)):
-        kinds.append([widened[number] for widened in smooth])
+        patterns_by_kind.append([widened[number] for widened in smooth])
     lights = []
-    for patterns in kinds:
-        weighted = (peak * x for x, peak in zip(patterns, glare.peaks, strict=True))
-        lights.append(sum(weighted, dark).detach())
+    for patterns in patterns_by_kind:
+        told_light = (peak * x for x, peak in zip(patterns, glare.peaks, strict=True))
+        lights.append(sum(told_light, zeros).detach())
     return lights
 
 
 def _hidden_pixels(
     electrons: Tensor, unclipped: Tensor, lights: Sequence[Tensor], joint: bool
 ) -> _Hidden:
-    """Return a sample of the clipped pixels."""
-    sample = tuple(
+    """Return a sample of the clipped pixels; ``joint`` says that the rows of `_Pixels` are
+    channels.
+    """
+    sample_indices = tuple(
         indices[:: max(1, len(indices) // _GLARE_SAMPLE)]
         for indices in (unclipped == 0).nonzero(as_tuple=True)
     )
-    rows = sample[0] if joint else torch.zeros_like(sample[0])
-    return _Hidden(torch.stack([x[sample] for x in lights]), electrons[sample], rows)
+    channel_rows = sample_indices[0] if joint else torch.zeros_like(sample_indices[0])
+    return _Hidden(
+        torch.stack([x[sample_indices] for x in lights]), electrons[sample_indices], channel_rows
+    )
 
 
 def _pixels(
@@ -469,22 +518,27 @@ def _pixels(
     """Return the pixels of a frame that tell of speckle; None for too few."""
     lights = _light_by_kind(glare, electrons)
     use = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are known
-    dark = noise(torch.zeros_like(average(electrons, torch.ones_like(electrons))))
-    together = use.all(0)
-    joint = int(together.sum()) >= _FEW
+    dark_noise = noise(torch.zeros_like(average(electrons, torch.ones_like(electrons))))
+    known_in_all_channels = use.all(0)
+    # pixels known in all channels tell more, by their colour; else those of any channel
+    joint = int(known_in_all_channels.sum()) >= _FEW
     if not joint and int(use.sum()) < _FEW:
         return None
-    some = slice(None, None, max(1, int((together if joint else use).sum()) // _GLARE_SAMPLE))
+    sample = slice(
+        None, None, max(1, int((known_in_all_channels if joint else use).sum()) // _GLARE_SAMPLE)
+    )
 
     def picked(picture: Tensor) -> Tensor:
-        return picture[:, together][:, some] if joint else picture[use][None, some]
+        return picture[:, known_in_all_channels][:, sample] if joint else picture[use][None, sample]
 
     parts, light = (
         torch.stack([picked(x) for x in pictures])
         for pictures in ([_sharp(x) for x in lights], lights)
     )
-    full = _hidden_pixels(electrons, unclipped, lights, joint)
-    return _Pixels(picked(_sharp(electrons)), parts, light, picked(dark), picked(electrons), full)
+    hidden = _hidden_pixels(electrons, unclipped, lights, joint)
+    return _Pixels(
+        picked(_sharp(electrons)), parts, light, picked(dark_noise), picked(electrons), hidden
+    )
 
 
 def _log_density(
@@ -499,29 +553,42 @@ def _log_density(
     if len(error) == 1:
         variance = noise + scene + speckle
         return -0.5 * float((variance.log() + error.square() / variance).sum())
-    inverse, colour = 1.0 / (noise + _COLOUR * speckle + scene), speckle.sqrt()
+    # covariance of a pixel's channels: D + s s', for s the root of the speckle's variance. Its
+    # inverse by Sherman and Morrison: D^-1 - D^-1 s s' D^-1 / (1 + s' D^-1 s)
+    inverse_variance, colour = 1.0 / (noise + _COLOUR * speckle + scene), speckle.sqrt()
     grey = grey.expand_as(error)
 
     def products(a: Tensor, b: Tensor) -> Tensor:
-        return (a * b * inverse).sum(0)
+        return (a * b * inverse_variance).sum(0)
 
-    own, lost = products(colour, colour), products(colour, grey)
-    across, share = products(colour, error), 1.0 / (1.0 + products(colour, colour))
-    greys = products(grey, grey) - share * lost.square()
-    dull = products(grey, error) - share * lost * across
-    squares = products(error, error) - share * across.square() - dull.square() / greys
-    return -0.5 * float((own.log1p() - inverse.log().sum(0) + greys.log() + squares).sum())
+    colour_square, colour_grey = products(colour, colour), products(colour, grey)
+    colour_error, speckle_gain = products(colour, error), 1.0 / (1.0 + products(colour, colour))
+    # products through this inverse; then the grey part of the error is projected out
+    grey_square = products(grey, grey) - speckle_gain * colour_grey.square()
+    grey_error = products(grey, error) - speckle_gain * colour_grey * colour_error
+    error_square = (
+        products(error, error)
+        - speckle_gain * colour_error.square()
+        - grey_error.square() / grey_square
+    )
+    return -0.5 * float(
+        (
+            colour_square.log1p() - inverse_variance.log().sum(0) + grey_square.log() + error_square
+        ).sum()
+    )
 
 
 def _log_full(hidden: _Hidden, amounts: Tensor, mean: Tensor) -> float:
-    """Return the log probability that pixels which are not known are full."""
-    straight, wide = amounts[0] * hidden.light[0], (amounts[1:] * hidden.light[1:]).sum(0)
+    """Return the log probability that the pixels which are not known are full, for ``amounts``
+    (part, 1) of the straight and scattered light and the ``mean`` of each channel's scene.
+    """
+    straight, scattered = amounts[0] * hidden.light[0], (amounts[1:] * hidden.light[1:]).sum(0)
     scene = mean[hidden.channel]
-    over = straight + wide + scene - hidden.full
-    short = torch.special.ndtr(
-        -over / (wide.square() + 2.0 * straight * wide + scene.square()).sqrt()
+    excess = straight + scattered + scene - hidden.full
+    probability_below_full = torch.special.ndtr(
+        -excess / (scattered.square() + 2.0 * straight * scattered + scene.square()).sqrt()
     )
-    return float(torch.log1p(-(1.0 - _BRIGHT) * short).sum())
+    return float(torch.log1p(-(1.0 - _BRIGHT) * probability_below_full).sum())
 
 
 def _average(values: Tensor, weights: Tensor) -> Tensor:
@@ -594,17 +661,22 @@ def nearby_glare(
         )
         return channels
 
-    own = pattern_of(pupil, direction).sum(dtype=torch.float64)
-    unit = (glare.sum(dtype=torch.float64) / own.where(own > 0, 1.0)).to(share)
-    bowl, patterns_drawn = _bowl(pupil), []
-    for y, x, longer, further in _normal(patterns, rng).tolist():
-        moved = direction + pixels * pixel_pitch / focal_length * direction.new_tensor([y, x])
-        path = pupil.path + further * defocus * DEFOCUS_WAVELENGTH * bowl
+    drawn_light = pattern_of(pupil, direction).sum(dtype=torch.float64)
+    # so that the pattern drawn without errors has the light of the glare
+    unit = (glare.sum(dtype=torch.float64) / drawn_light.where(drawn_light > 0, 1.0)).to(share)
+    defocus_shape, patterns_drawn = _bowl(pupil), []
+    for y, x, wavelength_step, defocus_step in _normal(patterns, rng).tolist():
+        moved_direction = direction + pixels * pixel_pitch / focal_length * direction.new_tensor(
+            [y, x]
+        )
+        path = pupil.path + defocus_step * defocus * DEFOCUS_WAVELENGTH * defocus_shape
         patterns_drawn.append(
             unit
             * pattern_of(
-                pupil._replace(path=path, wavelengths=pupil.wavelengths + longer * wavelength),
-                moved,
+                pupil._replace(
+                    path=path, wavelengths=pupil.wavelengths + wavelength_step * wavelength
+                ),
+                moved_direction,
             )
         )
     return torch.stack(patterns_drawn)
@@ -613,15 +685,19 @@ def nearby_glare(
 @nearby_glare.check
 def _(result: Tensor, glare: Tensor, *inputs: Any, **params: Any) -> list[Check]:
     size = float(glare.square().mean().sqrt())
-    apart = float((result - glare).square().mean().sqrt()) / size if size else 0.0
+    relative_difference = float((result - glare).square().mean().sqrt()) / size if size else 0.0
     return [
         Check(
-            f"{len(result)} patterns, rms difference {apart:.2g} of the glare", math.isfinite(apart)
+            f"{len(result)} patterns, rms difference {relative_difference:.2g} of the glare",
+            math.isfinite(relative_difference),
         )
     ]
 
 
 def _agree(glare: Tensor, pupil: Pupil, line: Bands, responses: Tensor) -> None:
+    """Raise ValueError unless glare (channel, y, x), pupil, line and responses have the same bands
+    and channels.
+    """
     if len(pupil.wavelengths) != len(line.centres) or responses.shape != (
         len(glare),
         len(line.centres),
@@ -638,21 +714,26 @@ def _bowl(pupil: Pupil) -> Tensor:
     the clear aperture.
     """
     side = pupil.aperture.shape[-1]
-    offset = torch.arange(side, dtype=torch.float64, device=pupil.path.device) - (side - 1) / 2
-    rim = pupil.aperture.sum(dtype=torch.float64).clamp_min(1.0) / math.pi
-    return ((offset[:, None].square() + offset.square()) * (pupil.aperture > 0) / rim).to(
-        pupil.path
+    offset_from_axis = (
+        torch.arange(side, dtype=torch.float64, device=pupil.path.device) - (side - 1) / 2
     )
+    rim_squared = pupil.aperture.sum(dtype=torch.float64).clamp_min(1.0) / math.pi
+    return (
+        (offset_from_axis[:, None].square() + offset_from_axis.square())
+        * (pupil.aperture > 0)
+        / rim_squared
+    ).to(pupil.path)
 
 
 def _normal(count: int, rng: Generator) -> Tensor:
     """Return (count, 4) normal numbers, one in each of ``count`` equally likely parts of each of
-    the four axes.
+    the four axes (a Latin hypercube).
     """
     shape = (4, count)
+    # ranks of random numbers: a random order of the parts, for each axis
     order = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64).argsort(-1)
-    even = (
+    even_probabilities = (
         order + torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64)
     ) / count
-    numbers: Tensor = torch.special.ndtri(even.clamp(1e-9, 1 - 1e-9)).T
+    numbers: Tensor = torch.special.ndtri(even_probabilities.clamp(1e-9, 1 - 1e-9)).T
     return numbers

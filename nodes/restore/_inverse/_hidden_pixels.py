@@ -97,13 +97,19 @@ def most_likely(
     inverses = inverses or Inverses()
     tensors = (problem.picture, problem.weight, problem.transfer, *problem.glare)
     with torch.no_grad():
-        alone = fixed(problem)
-        lower = problem.picture.new_empty(0) if halvings(_size(problem)) else inverses.factor(alone)
+        constant_problem = fixed(problem)
+        # empty: the picture is too large for a dense factor
+        lower = (
+            problem.picture.new_empty(0)
+            if halvings(_size(problem))
+            else inverses.factor(constant_problem)
+        )
         enough = enough * float((problem.weight > 0).sum())
         if coarser or lower.numel():
-            x = _solved(alone, lower, steps, enough, inverses)
+            x = _solved(constant_problem, lower, steps, enough, inverses)
         else:
-            x = descend(alone, torch.zeros_like(alone.transfer), MOST, enough)
+            x = descend(constant_problem, torch.zeros_like(constant_problem.transfer), MOST, enough)
+    # derivatives go through the residual of the linear problem, which is 0 in value
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if not (followed or transformed()):
         return x
@@ -120,12 +126,12 @@ def most_likely(
 
 def fixed(problem: Blurred) -> Blurred:
     """Return the problem without gradients and tangents."""
-    parts = {
+    detached = {
         name: getattr(problem, name).detach() for name in ("picture", "weight", "transfer", "power")
     }
     held = None if problem.held is None else problem.held.detach()
     return replace(
-        problem, **parts, glare=tuple(pattern.detach() for pattern in problem.glare), held=held
+        problem, **detached, glare=tuple(pattern.detach() for pattern in problem.glare), held=held
     )
 
 
@@ -170,6 +176,7 @@ class _Solved(torch.autograd.Function):
 
     @staticmethod
     def forward(right: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
+        # in the order of `others` in `most_likely`
         lower, weight, transfer, power, *glare = fixed
         pull, nothing = torch.fft.rfft2(right), torch.zeros_like(weight)
         problem = Blurred(
@@ -183,6 +190,7 @@ class _Solved(torch.autograd.Function):
             pull,
             frame.bounded,
         )
+        # relative to the squared norm of the right side in units of the posterior
         enough = 1e-10 * float(inner(pull, _spread(problem, pull), problem.torus))
         solution: Tensor = torch.fft.irfft2(
             _solved(problem, lower, frame.steps, enough, Inverses()), s=problem.torus
@@ -214,12 +222,15 @@ def _solved(
 
 
 def _nested(problem: Blurred, steps: int, enough: float, inverses: Inverses) -> Tensor:
+    """Solve a problem, from the answer on a grid half as fine; a grid small enough is solved
+    exactly.
+    """
     if not halvings(_size(problem)):
         return _by_factor(problem, inverses.factor(problem))
-    coarse = halved(problem)
+    coarser_problem = halved(problem)
     start = widened(
-        _nested(coarse, min(4 * steps, MOST), enough / CAREFUL, inverses),
-        coarse.torus,
+        _nested(coarser_problem, min(4 * steps, MOST), enough / CAREFUL, inverses),
+        coarser_problem.torus,
         problem.torus,
     )
     return descend(problem, start, steps, enough, inverses.preconditioner(problem))
@@ -239,32 +250,42 @@ def halved(problem: Blurred) -> Blurred:
         _pooled(problem.weight * p) / weight.clamp_min(1e-30)
         for p in (problem.picture, *problem.glare)
     )
-    size = (problem.torus[0] // 2, problem.torus[1] // 2)
-    y_mean, x_mean = (_pooling(n, problem.transfer) for n in problem.torus)
-    lost = problem.power.new_zeros(len(problem.transfer))
+    half_size = (problem.torus[0] // 2, problem.torus[1] // 2)
+    y_transfer, x_transfer = (_pooling(n, problem.transfer) for n in problem.torus)
+    lost_variance = problem.power.new_zeros(len(problem.transfer))
     for rows in pieces(problem.transfer):
-        passed = (
+        averaged_power = (
             problem.power[rows]
-            * y_mean[rows, None].abs().square()
-            * x_mean[: problem.transfer.shape[-1]].abs().square()
+            * y_transfer[rows, None].abs().square()
+            * x_transfer[: problem.transfer.shape[-1]].abs().square()
         )
-        through = problem.transfer[:, rows]
-        lost = lost + variance(
-            (through.real.square() + through.imag.square()) * passed, problem.torus
+        transfer_rows = problem.transfer[:, rows]
+        lost_variance = lost_variance + variance(
+            (transfer_rows.real.square() + transfer_rows.imag.square()) * averaged_power,
+            problem.torus,
         )
-    up, right = (size[0] + 1) // 2, size[1] // 2 + 1
-    y_mean = torch.cat([y_mean[:up], y_mean[len(y_mean) - size[0] + up :]])
-    transfer = narrowed(problem.transfer, size) * y_mean[:, None] * x_mean[:right]
-    power = narrowed(problem.power, size) / 4.0
-    lost = (lost - variance(transfer.abs().square() * power, size)).clamp_min(0.0)[:, None, None]
-    pull = None if problem.pull is None else narrowed(problem.pull, size)
+    nonnegative_rows, columns = (half_size[0] + 1) // 2, half_size[1] // 2 + 1
+    y_transfer = torch.cat(
+        [
+            y_transfer[:nonnegative_rows],
+            y_transfer[len(y_transfer) - half_size[0] + nonnegative_rows :],
+        ]
+    )
+    transfer = narrowed(problem.transfer, half_size) * y_transfer[:, None] * x_transfer[:columns]
+    # 4: the variance is the mean over a quarter as many frequencies
+    power = narrowed(problem.power, half_size) / 4.0
+    # variance of the blurred picture at the frequencies that the coarser grid has not
+    lost_variance = (
+        lost_variance - variance(transfer.abs().square() * power, half_size)
+    ).clamp_min(0.0)[:, None, None]
+    pull = None if problem.pull is None else narrowed(problem.pull, half_size)
     return replace(
         problem,
         picture=picture,
-        weight=weight / (1.0 + weight * lost),
+        weight=weight / (1.0 + weight * lost_variance),
         transfer=transfer,
         power=power,
-        torus=size,
+        torus=half_size,
         glare=tuple(glare),
         pull=pull,
     )
@@ -280,9 +301,10 @@ def _pooling(size: int, like: Tensor) -> Tensor:
     """Return the transfer function of the mean of two neighbouring pixels along an axis of
     `size` pixels.
     """
-    turns = torch.arange(size, dtype=torch.float64, device=like.device) / size
-    turns = torch.where(turns > 0.5, turns - 1.0, turns)
-    return ((1.0 + torch.exp(2j * math.pi * turns)) / 2.0).to(like)
+    cycles_per_pixel = torch.arange(size, dtype=torch.float64, device=like.device) / size
+    cycles_per_pixel = torch.where(cycles_per_pixel > 0.5, cycles_per_pixel - 1.0, cycles_per_pixel)
+    # (1 + exp(2 pi i f)) / 2
+    return ((1.0 + torch.exp(2j * math.pi * cycles_per_pixel)) / 2.0).to(like)
 
 
 def _factor(problem: Blurred) -> Tensor:
@@ -293,18 +315,22 @@ def _factor(problem: Blurred) -> Tensor:
     1e-16 of its norm, so that a picture with less noise than that has the factor of a square root
     of the covariance: ten times slower.
     """
-    fine, root, colours = _fine(problem), _root(problem), _colours(problem)
+    precise, root_weight, colour_correlation = _fine(problem), _root(problem), _colours(problem)
+    # blocks of the covariance of the blurred pixels of channels i and j
     rows = [
         torch.cat(
-            [colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)],
+            [
+                colour_correlation[i, j] * _covariance(precise, a * b.conj())
+                for j, b in enumerate(precise.transfer)
+            ],
             1,
         )
-        for i, a in enumerate(fine.transfer)
+        for i, a in enumerate(precise.transfer)
     ]
-    matrix = root[:, None] * torch.cat(rows) * root
+    matrix = root_weight[:, None] * torch.cat(rows) * root_weight
     patterns = _spread_patterns(problem)
     if float(matrix.detach().abs().sum(-1).max()) > _NOISELESS:
-        return _factor_of_root(fine, patterns)
+        return _factor_of_root(precise, patterns)
     for pattern in patterns:
         matrix = matrix + torch.outer(pattern, pattern)
     matrix.diagonal().add_(1.0)
@@ -320,14 +346,16 @@ def _factor_of_root(fine: Blurred, patterns: list[Tensor]) -> Tensor:
     the scene, channel by channel, and the strengths of the glare ``patterns``. The factor has the
     rounding of A, not that of its square.
     """
-    root, mixing = _root(fine), torch.linalg.cholesky(_colours(fine))
+    root_weight, colour_factor = _root(fine), torch.linalg.cholesky(_colours(fine))
     responses = [_response(fine, transfer) for transfer in fine.transfer]
-    upper = torch.eye(len(root), dtype=root.dtype, device=root.device)
-    for shares in mixing.T:
-        columns = torch.cat(
+    upper = torch.eye(len(root_weight), dtype=root_weight.dtype, device=root_weight.device)
+    for shares in colour_factor.T:
+        unknown_response = torch.cat(
             [share * response for share, response in zip(shares, responses, strict=True)]
         )
-        upper = torch.linalg.qr(torch.cat([upper, (root[:, None] * columns).T]), mode="r").R
+        upper = torch.linalg.qr(
+            torch.cat([upper, (root_weight[:, None] * unknown_response).T]), mode="r"
+        ).R
     if patterns:
         upper = torch.linalg.qr(torch.cat([upper, torch.stack(patterns)]), mode="r").R
     lower: Tensor = (upper * upper.diagonal().sign()[:, None]).T
@@ -339,12 +367,14 @@ def _response(problem: Blurred, transfer: Tensor) -> Tensor:
     prior, (pixel, unknown).
     """
     impulse = torch.fft.irfft2(transfer * problem.power.sqrt(), s=problem.torus)
-    y, x = (torch.arange(count, device=impulse.device) for count in _size(problem))
-    v, u = (torch.arange(count, device=impulse.device) for count in problem.torus)
-    down = (y[:, None] - v) % problem.torus[0]
-    right = (x[:, None] - u) % problem.torus[1]
-    square: Tensor = impulse[down[:, None, :, None], right[None, :, None, :]]
-    return square.reshape(len(y) * len(x), -1)
+    rows, columns = (torch.arange(count, device=impulse.device) for count in _size(problem))
+    grid_rows, grid_columns = (
+        torch.arange(count, device=impulse.device) for count in problem.torus
+    )
+    row_offsets = (rows[:, None] - grid_rows) % problem.torus[0]
+    column_offsets = (columns[:, None] - grid_columns) % problem.torus[1]
+    response: Tensor = impulse[row_offsets[:, None, :, None], column_offsets[None, :, None, :]]
+    return response.reshape(len(rows) * len(columns), -1)
 
 
 def _colours(problem: Blurred) -> Tensor:
@@ -360,11 +390,14 @@ def _spread_patterns(problem: Blurred) -> list[Tensor]:
     """Return the whitened glare patterns (pixel,), times the standard deviation of their
     strengths.
     """
-    root, patterns = _root(problem), []
+    root_weight, patterns = _root(problem), []
     for number, pattern in enumerate(problem.glare):
-        shape = root * pattern.double().flatten()
-        free = number < len(problem.glare) - problem.bounded
-        patterns.append(shape * (1e4 / shape.norm().clamp_min(1e-15)) if free else shape)
+        whitened = root_weight * pattern.double().flatten()
+        is_free = number < len(problem.glare) - problem.bounded
+        # a strength of any value: of a deviation of 1e4 in whitened units
+        patterns.append(
+            whitened * (1e4 / whitened.norm().clamp_min(1e-15)) if is_free else whitened
+        )
     return patterns
 
 
@@ -372,26 +405,32 @@ def _by_factor(problem: Blurred, lower: Tensor) -> Tensor:
     """Return the exact deconvolution of a small picture, given the factor of its matrix that
     `_factor` returns.
     """
-    fine, root = _fine(problem), _root(problem)
-    before = (
-        torch.zeros_like(fine.transfer)
+    precise, root_weight = _fine(problem), _root(problem)
+    # the answer to `problem.pull` alone, without pixels
+    pulled_picture = (
+        torch.zeros_like(precise.transfer)
         if problem.pull is None
-        else _spread(fine, problem.pull.to(torch.complex128))
+        else _spread(precise, problem.pull.to(torch.complex128))
     )
-    residual = (root * (problem.picture.double() - fine.blur(before)).flatten())[:, None]
-    answer = root * torch.cholesky_solve(residual, lower)[:, 0]
-    return (before + _spread(fine, fine.gathered(answer.reshape(problem.picture.shape)))).to(
-        problem.transfer
-    )
+    residual = (root_weight * (problem.picture.double() - precise.blur(pulled_picture)).flatten())[
+        :, None
+    ]
+    weighted_answer = root_weight * torch.cholesky_solve(residual, lower)[:, 0]
+    return (
+        pulled_picture
+        + _spread(precise, precise.gathered(weighted_answer.reshape(problem.picture.shape)))
+    ).to(problem.transfer)
 
 
 def _fine(problem: Blurred) -> Blurred:
+    """Return the problem with transfer and power in double precision."""
     return replace(
         problem, transfer=problem.transfer.to(torch.complex128), power=problem.power.double()
     )
 
 
 def _root(problem: Blurred) -> Tensor:
+    """Return the square roots of the weights of all pixels in a row, float64."""
     weight = problem.weight.double().flatten()
     # the gradient of sqrt is infinite at 0
     return weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)
@@ -401,11 +440,18 @@ def _covariance(problem: Blurred, passed: Tensor) -> Tensor:
     """Return the prior covariance of all pairs of picture pixels, given the product of two
     transfer functions.
     """
-    lags = torch.fft.irfft2(passed * problem.power, s=problem.torus)
-    y, x = (torch.arange(n, device=lags.device) for n in problem.picture.shape[-2:])
-    down, right = (y[:, None] - y) % problem.torus[0], (x[:, None] - x) % problem.torus[1]
-    square: Tensor = lags[down[:, None, :, None], right[None, :, None, :]]
-    return square.reshape(len(y) * len(x), -1)
+    covariance_by_lag = torch.fft.irfft2(passed * problem.power, s=problem.torus)
+    rows, columns = (
+        torch.arange(n, device=covariance_by_lag.device) for n in problem.picture.shape[-2:]
+    )
+    row_lags, column_lags = (
+        (rows[:, None] - rows) % problem.torus[0],
+        (columns[:, None] - columns) % problem.torus[1],
+    )
+    covariance: Tensor = covariance_by_lag[
+        row_lags[:, None, :, None], column_lags[None, :, None, :]
+    ]
+    return covariance.reshape(len(rows) * len(columns), -1)
 
 
 def _spread(problem: Blurred, spectrum: Tensor) -> Tensor:
@@ -439,20 +485,23 @@ def pulled(
     respect to the problem itself.
     """
     y, x = problem.picture.shape[-2:]
-    right = precision * towards
-    still = replace(problem, picture=torch.zeros_like(problem.picture), held=precision)
-    solver = _Solver(fixed(still), steps)
+    right_side = precision * towards
+    without_picture = replace(problem, picture=torch.zeros_like(problem.picture), held=precision)
+    solver = _Solver(fixed(without_picture), steps)
     with torch.no_grad():
-        change = solver(torch.fft.rfft2(right, s=problem.torus))
+        change = solver(torch.fft.rfft2(right_side, s=problem.torus))
+    # as in `most_likely`: the residual carries the derivatives
     tensors = (problem.weight, problem.transfer, *problem.glare)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
         residual = torch.fft.irfft2(
-            replace(still, pull=torch.fft.rfft2(right, s=problem.torus)).slope(change),
+            replace(without_picture, pull=torch.fft.rfft2(right_side, s=problem.torus)).slope(
+                change
+            ),
             s=problem.torus,
         )
     else:  # what else is in the residual is constant
         residual = pad(
-            right - precision * problem.first(change),
+            right_side - precision * problem.first(change),
             (0, problem.torus[1] - x, 0, problem.torus[0] - y),
         )
     torus_change = torch.fft.irfft2(change, s=problem.torus)
@@ -470,6 +519,9 @@ class _Solver:
         self._inverse: Preconditioner | None = None
 
     def __call__(self, right: Tensor) -> Tensor:
+        """Return A^-1 times half a spectrum; the preconditioner is built once, when it is first
+        needed.
+        """
         start = torch.zeros_like(right)
         if not right.any():
             return start

@@ -30,10 +30,10 @@ def effective_psf(
     """Return the PSF of each channel of the sensor for a grey scene, (channel, y, x), in the more
     precise of the types of the PSF and ``dtype``.
     """
-    lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
-    if len(lengths) > 1:
+    counts = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
+    if len(counts) > 1:
         raise ValueError(
-            f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands`"
+            f"PSF, illuminant, responses and bands have {sorted(counts)} bands: use one `bands`"
             " step"
         )
     intensity = single(psf.intensity)
@@ -81,13 +81,18 @@ def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
     """Return the radii (y, x) that hold 99.9 % of the PSF, at most the larger of 256 pixels and
     half the picture.
     """
-    reach = []
+    radii = []
     for dim, size in ((-1, picture[0]), (-2, picture[1])):
+        # light of each row (then column) of all channels; added up from the middle outwards
         profile = kernels.detach().sum((0, dim)).double()
         radius = (torch.arange(len(profile), device=profile.device) - len(profile) // 2).abs()
-        inside = profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
-        reach.append(min(int((inside < _LIGHT * inside[-1]).sum()), max(256, size // 2), size))
-    return reach[0], reach[1]
+        light_within = (
+            profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
+        )
+        radii.append(
+            min(int((light_within < _LIGHT * light_within[-1]).sum()), max(256, size // 2), size)
+        )
+    return radii[0], radii[1]
 
 
 def bordered(reach: tuple[int, int], border: float) -> tuple[int, int]:
@@ -102,11 +107,13 @@ def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
     wraps around.
     """
     (m, n), (y, x) = kernels.shape[-2:], size
-    rows, columns = -(-m // y), -(-n // x)
-    around = pad(kernels, (0, columns * x - n, 0, rows * y - m))
-    if rows * columns > 1:
-        around = around.reshape(-1, rows, y, columns, x).sum((1, 3))
-    return around.roll((-(m // 2), -(n // 2)), (-2, -1))
+    # whole grids that cover the PSF, rounded up
+    grids_down, grids_across = -(-m // y), -(-n // x)
+    padded = pad(kernels, (0, grids_across * x - n, 0, grids_down * y - m))
+    if grids_down * grids_across > 1:
+        # the samples that fall on the same place of the grid are added
+        padded = padded.reshape(-1, grids_down, y, grids_across, x).sum((1, 3))
+    return padded.roll((-(m // 2), -(n // 2)), (-2, -1))
 
 
 # --- masked blur ----------------------------------------------------------------------------------
@@ -155,8 +162,8 @@ class Blurred:
         """Return the pixels of x in the frame of the picture, given half the spectrum of x."""
         y, x = self.picture.shape[-2:]
         # one batch takes twice as long
-        parts = [torch.fft.irfft2(s, s=self.torus)[:y, :x] for s in spectrum]
-        return torch.stack(parts)
+        pictures = [torch.fft.irfft2(s, s=self.torus)[:y, :x] for s in spectrum]
+        return torch.stack(pictures)
 
     def gathered(self, pixels: Tensor) -> Tensor:
         """Return half the spectrum that results from the adjoint of `blur`, applied to a
@@ -168,12 +175,12 @@ class Blurred:
         """Return the gradient of the log posterior at the picture of spectrum x; the most likely
         picture has 0.
         """
-        own, shared = inverse_colour(len(x), self.grey)
-        prior = mixed(x, own, -shared) / self.power.clamp_min(1e-30)
-        rise = self.gathered(weighing(self)(self.picture - self.blur(x))) - prior
+        own_factor, shared_factor = inverse_colour(len(x), self.grey)
+        prior = mixed(x, own_factor, -shared_factor) / self.power.clamp_min(1e-30)
+        gradient = self.gathered(weighing(self)(self.picture - self.blur(x))) - prior
         if self.held is not None:
-            rise = rise - torch.fft.rfft2(self.held * self.first(x), s=self.torus)
-        return rise if self.pull is None else rise + self.pull
+            gradient = gradient - torch.fft.rfft2(self.held * self.first(x), s=self.torus)
+        return gradient if self.pull is None else gradient + self.pull
 
 
 def blurred(transfer: Tensor, spectrum: Tensor, torus: Size, size: Size) -> Tensor:
@@ -202,18 +209,22 @@ def weighing(problem: Blurred) -> Map:
     """
     if not problem.glare:
         return lambda residual: problem.weight * residual
-    flat = torch.stack(problem.glare).flatten(1)
-    weighted = problem.weight.flatten() * flat
-    products = with_bounds(weighted.double() @ flat.double().T, problem.bounded)
+    flat_patterns = torch.stack(problem.glare).flatten(1)
+    weighted_patterns = problem.weight.flatten() * flat_patterns
+    products = with_bounds(weighted_patterns.double() @ flat_patterns.double().T, problem.bounded)
     if problem.bounded:  # similar patterns: differences of large sums would lose digits in float32
-        weighted, inverse = _apart(weighted, products), None
+        # the outer products of these combinations hold the inverse already
+        weighted_patterns, inverse = _apart(weighted_patterns, products), None
     else:
-        inverse = torch.linalg.pinv(products, hermitian=True).to(flat)
+        inverse = torch.linalg.pinv(products, hermitian=True).to(flat_patterns)
 
     def weigh(residual: Tensor) -> Tensor:
-        weighted_residual, strengths = problem.weight * residual, weighted @ residual.flatten()
+        weighted_residual, strengths = (
+            problem.weight * residual,
+            weighted_patterns @ residual.flatten(),
+        )
         for strength, pattern in zip(
-            strengths if inverse is None else inverse @ strengths, weighted, strict=True
+            strengths if inverse is None else inverse @ strengths, weighted_patterns, strict=True
         ):
             weighted_residual.addcmul_(strength, pattern.view_as(weighted_residual), value=-1.0)
         return weighted_residual
@@ -233,19 +244,24 @@ def with_bounds(products: Tensor, bounded: int) -> Tensor:
 
 
 def _apart(weighted: Tensor, products: Tensor) -> Tensor:
-    """Return combinations of patterns whose outer products add up to those of the patterns through
-    inverse products.
+    """Return combinations of patterns whose outer products add up to those of the ``weighted``
+    patterns through the inverse of their ``products``.
 
     The combinations are the rows of L^-1 for the Cholesky factor L of the products, computed in
     float64 piece by piece.
     """
     scale = products.diagonal().detach().clamp_min(1e-300).rsqrt()
-    even = scale[:, None] * products * scale
-    even = even + _ALIKE * torch.eye(len(even), dtype=even.dtype, device=even.device)
-    lower = torch.linalg.cholesky(even)
+    scaled_products = scale[:, None] * products * scale
+    scaled_products = scaled_products + _ALIKE * torch.eye(
+        len(scaled_products), dtype=scaled_products.dtype, device=scaled_products.device
+    )
+    lower_factor = torch.linalg.cholesky(scaled_products)
     pieces = (scale[:, None] * patterns.double() for patterns in torch.split(weighted, _PIECE, 1))
     return torch.cat(
-        [torch.linalg.solve_triangular(lower, piece, upper=False).to(weighted) for piece in pieces],
+        [
+            torch.linalg.solve_triangular(lower_factor, piece, upper=False).to(weighted)
+            for piece in pieces
+        ],
         1,
     )
 
@@ -276,6 +292,7 @@ def times(size: Size, like: Tensor) -> Tensor:
     spectrum.
     """
     count = torch.full((size[1] // 2 + 1,), 2.0, dtype=like.real.dtype, device=like.device)
+    # the mean and, of an even size, the Nyquist frequency have no mirror image
     count[0] = 1.0
     if size[1] % 2 == 0:
         count[-1] = 1.0
@@ -286,21 +303,36 @@ def narrowed(spectrum: Tensor, size: Size) -> Tensor:
     """Return half a spectrum cropped to the frequencies of a coarser grid `size`; the Nyquist
     frequencies are 0.
     """
-    up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
-    cut = spectrum.new_zeros(*spectrum.shape[:-2], size[0], size[1] // 2 + 1)
-    cut[..., :up, :right] = spectrum[..., :up, :right]
-    cut[..., size[0] - down :, :right] = spectrum[..., spectrum.shape[-2] - down :, :right]
-    return cut
+    nonnegative_rows, negative_rows, columns = (
+        (size[0] + 1) // 2,
+        (size[0] - 1) // 2,
+        (size[1] + 1) // 2,
+    )
+    narrow_spectrum = spectrum.new_zeros(*spectrum.shape[:-2], size[0], size[1] // 2 + 1)
+    narrow_spectrum[..., :nonnegative_rows, :columns] = spectrum[..., :nonnegative_rows, :columns]
+    narrow_spectrum[..., size[0] - negative_rows :, :columns] = spectrum[
+        ..., spectrum.shape[-2] - negative_rows :, :columns
+    ]
+    return narrow_spectrum
 
 
 def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
     """Return half a spectrum of a grid `size`, extended by zeros to a grid `wide` that is twice
     as fine.
     """
-    up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
+    nonnegative_rows, negative_rows, columns = (
+        (size[0] + 1) // 2,
+        (size[0] - 1) // 2,
+        (size[1] + 1) // 2,
+    )
     wide_spectrum = spectrum.new_zeros(*spectrum.shape[:-2], wide[0], wide[1] // 2 + 1)
-    wide_spectrum[..., :up, :right] = 4.0 * spectrum[..., :up, :right]
-    wide_spectrum[..., wide[0] - down :, :right] = 4.0 * spectrum[..., size[0] - down :, :right]
+    # 4: a grid twice as fine has four times the pixels in each FFT sum
+    wide_spectrum[..., :nonnegative_rows, :columns] = (
+        4.0 * spectrum[..., :nonnegative_rows, :columns]
+    )
+    wide_spectrum[..., wide[0] - negative_rows :, :columns] = (
+        4.0 * spectrum[..., size[0] - negative_rows :, :columns]
+    )
     return wide_spectrum
 
 
@@ -326,6 +358,7 @@ def _smooth(n: int) -> int:
     """Return the least whole number of at least ``n`` without prime factors above 7, for which
     FFTs are fast.
     """
+    # 210 = 2 x 3 x 5 x 7
     while 210**32 % n:
         n += 1
     return n

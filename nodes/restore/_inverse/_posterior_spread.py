@@ -72,23 +72,24 @@ def frame_deviation(
     """
     problem, inverses = scaled.problem, Inverses()
     scenes = max(1, draws // 2)
+    # one draw of noise is the frame itself
     noises = max(1, draws - scenes - 1)
     with torch.no_grad():
         law = fitted_law(problem, scaled.doubt)
-        own = _details(problem.first(most_likely(problem, inverses=inverses)))
+        frame_details = _details(problem.first(most_likely(problem, inverses=inverses)))
     drawn = _of_scenes(scaled, law.power, scenes, rng, kernels, inverses)
     scenes_found = _Scenes.of(drawn, scenes, scaled, matrix)
-    noisy, details = torch.zeros_like(scenes_found.coarse), scenes_found.restored
+    noise_square, drawn_details = torch.zeros_like(scenes_found.coarse), scenes_found.restored
     for error in _of_noise(scaled, law.noise**0.5, noises, rng, inverses):
-        noisy = noisy + _square(scaled.scale / scaled.share * error, matrix) / noises
-        details = details + _details(error) / noises
-    ratio = _ratio(own, details, problem.weight)
+        noise_square = noise_square + _square(scaled.scale / scaled.share * error, matrix) / noises
+        drawn_details = drawn_details + _details(error) / noises
+    detail_ratio = _ratio(frame_details, drawn_details, problem.weight)
     # a lack of details means little where none could be seen
-    ratio = ratio.where(ratio > 1.0, ratio**scenes_found.told)
-    slow = _COARSE * law.low * scenes_found.coarse + noisy
-    total: Tensor = ratio * _around(scenes_found.fine, _SMOOTH) + ratio.clamp_min(1.0) * _around(
-        slow, _SMOOTH
-    )
+    detail_ratio = detail_ratio.where(detail_ratio > 1.0, detail_ratio**scenes_found.told)
+    coarse_square = _COARSE * law.low * scenes_found.coarse + noise_square
+    total: Tensor = detail_ratio * _around(scenes_found.fine, _SMOOTH) + detail_ratio.clamp_min(
+        1.0
+    ) * _around(coarse_square, _SMOOTH)
     return total.sqrt()
 
 
@@ -106,20 +107,23 @@ class _Scenes(NamedTuple):
         cls, drawn: Iterator[tuple[Tensor, Tensor]], count: int, scaled: Scaled, matrix: Tensor
     ) -> _Scenes:
         """Return the mean squares of drawn errors and restored scenes."""
-        coarse = fine = scaled.problem.picture.new_zeros(
+        # tensors are never changed in place, so that both may start from the same zeros
+        coarse_square = fine_square = scaled.problem.picture.new_zeros(
             len(matrix), *scaled.problem.picture.shape[-2:]
         )
-        restored = true = torch.zeros_like(coarse[0])
+        restored = true_details = torch.zeros_like(coarse_square[0])
         for error, contrast in drawn:
             smooth = _around(error, _NEAR)
-            coarse = coarse + _square(smooth, matrix) / count
-            fine = fine + _square(error - smooth, matrix) / count
+            coarse_square = coarse_square + _square(smooth, matrix) / count
+            fine_square = fine_square + _square(error - smooth, matrix) / count
             restored = restored + _details(contrast) / count
-            true = true + _details(contrast + error * scaled.share / scaled.scale) / count
-        resolved = (_around(restored, _NEAR) / (_SHOWN * _around(true, _NEAR) + _DARK)).clamp(
-            max=1.0
-        )
-        return cls(coarse, fine, restored, resolved)
+            true_details = (
+                true_details + _details(contrast + error * scaled.share / scaled.scale) / count
+            )
+        resolved = (
+            _around(restored, _NEAR) / (_SHOWN * _around(true_details, _NEAR) + _DARK)
+        ).clamp(max=1.0)
+        return cls(coarse_square, fine_square, restored, resolved)
 
 
 def drawn_scene(problem: Blurred, power: Tensor, rng: Generator) -> Tensor:
@@ -127,8 +131,8 @@ def drawn_scene(problem: Blurred, power: Tensor, rng: Generator) -> Tensor:
     prior.
     """
     white = _normal((len(problem.picture), *problem.torus), problem.picture, rng)
-    own, shared = _root_of_colour(len(white), problem.grey)
-    return mixed(torch.fft.rfft2(white), own, shared) * power.clamp_min(0.0).sqrt()
+    own_factor, shared_factor = _root_of_colour(len(white), problem.grey)
+    return mixed(torch.fft.rfft2(white), own_factor, shared_factor) * power.clamp_min(0.0).sqrt()
 
 
 def drawn_noise(problem: Blurred, rng: Generator) -> Tensor:
@@ -154,8 +158,8 @@ def _transfer(scaled: Scaled, kernels: Tensor | None, number: int) -> Tensor:
     """
     if kernels is None:
         return scaled.problem.transfer
-    other = kernels[number % len(kernels)].to(scaled.share) / scaled.share
-    transfer: Tensor = torch.fft.rfft2(wrapped(other, scaled.problem.torus))
+    kernel = kernels[number % len(kernels)].to(scaled.share) / scaled.share
+    transfer: Tensor = torch.fft.rfft2(wrapped(kernel, scaled.problem.torus))
     return transfer
 
 
@@ -172,10 +176,10 @@ def _of_scenes(
     """
     problem = scaled.problem
     size = (problem.picture.shape[-2], problem.picture.shape[-1])
-    for number in range(draws):
+    for draw in range(draws):
         with torch.no_grad():
             scene = drawn_scene(problem, power, rng)
-            picture = blurred(_transfer(scaled, kernels, number), scene, problem.torus, size)
+            picture = blurred(_transfer(scaled, kernels, draw), scene, problem.torus, size)
             answer = most_likely(replace(problem, picture=picture), inverses=inverses)
             error_and_contrast = scaled.pixels(scene - answer), problem.first(answer)
         yield error_and_contrast
@@ -197,6 +201,9 @@ def _of_noise(
 
 
 def _square(error: Tensor, matrix: Tensor) -> Tensor:
+    """Return the square of an error (channel, y, x) after ``matrix`` (colour, channel): (colour, y,
+    x).
+    """
     square: Tensor = torch.tensordot(matrix.to(error), error, 1).square()
     return square
 
@@ -220,19 +227,20 @@ def _ratio(energy: Tensor, drawn: Tensor, weight: Tensor) -> Tensor:
 
 def _around(pictures: Tensor, side: int) -> Tensor:
     """Return the mean over a square of odd side around each pixel, of the pixels in the picture."""
-    wide = pictures.reshape(1, -1, *pictures.shape[-2:])
+    averaged = pictures.reshape(1, -1, *pictures.shape[-2:])
     for window in ((side, 1), (1, side)):
-        rim = (window[0] // 2, window[1] // 2)
-        wide = avg_pool2d(wide, window, stride=1, padding=rim, count_include_pad=False)
-    return wide.reshape(pictures.shape)
+        padding = (window[0] // 2, window[1] // 2)
+        averaged = avg_pool2d(averaged, window, stride=1, padding=padding, count_include_pad=False)
+    return averaged.reshape(pictures.shape)
 
 
 def _root_of_colour(channels: int, grey: float) -> tuple[float, float]:
     """Return (own, shared) such that  own I + shared  is the root of the correlation  (1 - grey) I
     + grey.
     """
-    own = (1.0 - grey) ** 0.5
-    return own, ((1.0 - grey + channels * grey) ** 0.5 - own) / channels
+    own_factor = (1.0 - grey) ** 0.5
+    # the eigenvalue of the grey colour is 1 - grey + channels x grey, that of others 1 - grey
+    return own_factor, ((1.0 - grey + channels * grey) ** 0.5 - own_factor) / channels
 
 
 # --- posterior spread -----------------------------------------------------------------------------
@@ -304,13 +312,15 @@ def wiener_spread(
     """
     with torch.no_grad():
         light = LaserLight(glare, nearby, ghosts)
-        fine, unclipped, shapes = known_and_light(psf, responses, single(electrons), clipped, light)
-        kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-        white = grey_white(illuminant, responses, bands).to(fine)
+        picture, unclipped, visible_glare = known_and_light(
+            psf, responses, single(electrons), clipped, light
+        )
+        kernels = effective_psf(psf, illuminant, responses, bands, picture.dtype).to(picture)
+        white = grey_white(illuminant, responses, bands).to(picture)
         settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
-        scaled = posed(fine, unclipped, kernels, shapes, settings, white)
-    drawn = drawn_deviation if law == "filter" else frame_deviation
-    return drawn(scaled, matrix, draws, rng).to(single(electrons))
+        scaled = posed(picture, unclipped, kernels, visible_glare, settings, white)
+    deviation = drawn_deviation if law == "filter" else frame_deviation
+    return deviation(scaled, matrix, draws, rng).to(single(electrons))
 
 
 def drawn_deviation(scaled: Scaled, matrix: Tensor, draws: int, rng: Generator) -> Tensor:
@@ -318,7 +328,7 @@ def drawn_deviation(scaled: Scaled, matrix: Tensor, draws: int, rng: Generator) 
     from its prior.
     """
     problem, inverses = scaled.problem, Inverses()
-    total = problem.picture.new_zeros(len(matrix), *problem.picture.shape[-2:])
+    square_sum = problem.picture.new_zeros(len(matrix), *problem.picture.shape[-2:])
     for _ in range(draws):
         with torch.no_grad():
             scene = drawn_scene(problem, problem.power, rng)
@@ -326,8 +336,8 @@ def drawn_deviation(scaled: Scaled, matrix: Tensor, draws: int, rng: Generator) 
             error = scaled.pixels(
                 scene - most_likely(replace(problem, picture=picture), inverses=inverses)
             )
-        total = total + torch.tensordot(matrix.to(error), error, 1).square()
-    return (total / draws).sqrt()
+        square_sum = square_sum + torch.tensordot(matrix.to(error), error, 1).square()
+    return (square_sum / draws).sqrt()
 
 
 @wiener_spread.check

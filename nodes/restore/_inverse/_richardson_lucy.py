@@ -66,25 +66,26 @@ def richardson_lucy(
     electrons = single(electrons)
     glare = [*(glare or ()), *(ghosts or ())]
     refuse_other_pictures(electrons, psf, responses, clipped, glare)
-    size = (electrons.shape[-2], electrons.shape[-1])
+    frame = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
     unclipped = _known(clipped, electrons)
     patterns = []
     for light in glare:
-        pattern = crop(light.to(electrons), shape=size)
+        pattern = crop(light.to(electrons), shape=frame)
         peak = float((pattern.detach().abs() * unclipped).max())
         if peak > 0:
             patterns.append(pattern / peak)
-    wide = torus(size, edge(kernels, size))
-    total = kernels.sum((-2, -1), keepdim=True)
-    total = torch.where(total > 0, total, 1.0)
+    grid = torus(frame, edge(kernels, frame))
+    psf_sum = kernels.sum((-2, -1), keepdim=True)
+    psf_sum = torch.where(psf_sum > 0, psf_sum, 1.0)
     # of sum 1, so that no scale of the PSF overflows
-    blur = _Blur(torch.fft.rfft2(wrapped(kernels / total, wide)), wide)
-    return _climb(electrons, unclipped, blur, patterns, iterations, read_noise**2) / total
+    blur = _Blur(torch.fft.rfft2(wrapped(kernels / psf_sum, grid)), grid)
+    return _climb(electrons, unclipped, blur, patterns, iterations, read_noise**2) / psf_sum
 
 
 @richardson_lucy.check
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    # inputs[4] is `clipped`, after psf, illuminant, responses and bands
     share = float(inputs[4].any(-3).double().mean())
     ratio = float(result.mean() / electrons.mean())
     return [
@@ -129,22 +130,27 @@ def _climb(
     iterations: int,
     variance: float,
 ) -> Tensor:
-    """Return the scene after ``iterations`` steps from an even scene of the mean of the picture."""
+    """Return the scene after ``iterations`` steps from an even scene of the mean of the picture.
+
+    Each step also finds the strengths of the ``patterns`` of glare. The ``variance`` of the read
+    noise is added to data and expectation, which makes a Gaussian noise nearly Poisson.
+    """
     y, x = electrons.shape[-2:]
-    counts = (electrons + variance).clamp_min(0) * unclipped
+    shifted_counts = (electrons + variance).clamp_min(0) * unclipped
     mean = (electrons * unclipped).sum((-2, -1), keepdim=True) / unclipped.sum(
         (-2, -1), keepdim=True
     )
     scene = mean.clamp_min(0).expand(-1, *blur.grid)
-    share = blur.gathered(unclipped).clamp_min(_UNSEEN)
+    seen_share = blur.gathered(unclipped).clamp_min(_UNSEEN)
     strengths = [mean.mean().clamp_min(0) for _ in patterns]
     for _ in range(iterations):
         expected = blur.picture(scene)[..., :y, :x].clamp_min(0) + variance
         for strength, pattern in zip(strengths, patterns, strict=True):
             expected = expected + strength * pattern
-        ratio = counts / expected.clamp_min(_DARK)
+        # the step of Richardson and Lucy: scene times the blurred-back ratio of data to model
+        ratio = shifted_counts / expected.clamp_min(_DARK)
         scene = torch.where(
-            scene <= _GONE, 0.0, scene * (blur.gathered(ratio) / share).clamp_min(0)
+            scene <= _GONE, 0.0, scene * (blur.gathered(ratio) / seen_share).clamp_min(0)
         )
         strengths = [
             s * (p * ratio).sum() / (p * unclipped).sum()

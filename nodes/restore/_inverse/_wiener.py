@@ -187,17 +187,22 @@ def known_and_light(
     )
     _refuse_other_glare(glare or [], nearby)
     size = (electrons.shape[-2], electrons.shape[-1])
-    fine = electrons.double() if max(size) <= PRECISE else electrons
-    patterns, others, ghostly = (
-        [crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts)
+    # small pictures are computed in float64, see `PRECISE`
+    picture = electrons.double() if max(size) <= PRECISE else electrons
+    patterns, nearby_patterns, ghost_patterns = (
+        [crop(x.to(picture), shape=size) for x in g or ()] for g in (glare, nearby, ghosts)
     )
-    unclipped = (~clipped).to(fine)
+    unclipped = (~clipped).to(picture)
     return (
-        fine,
+        picture,
         unclipped,
         visible(
-            [*patterns, *ghostly],
-            [*others, *[None] * (len(patterns) + len(ghostly) - len(others))],
+            [*patterns, *ghost_patterns],
+            # None where nothing is known of other patterns, as for ghosts
+            [
+                *nearby_patterns,
+                *[None] * (len(patterns) + len(ghost_patterns) - len(nearby_patterns)),
+            ],
             unclipped,
         ),
     )
@@ -205,6 +210,7 @@ def known_and_light(
 
 @wiener.check
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[Check]:
+    # inputs[4] is `clipped`, after psf, illuminant, responses and bands
     share = float(inputs[4].any(-3).double().mean())
     finite = math.isfinite(float(result.sum()))
     return [
@@ -217,6 +223,9 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
 
 
 def _refuse_other_glare(glare: list[Tensor], nearby: list[Tensor] | None) -> None:
+    """Raise ValueError unless each glare (channel, y, x) has one nearby (pattern, channel, y, x) of
+    its shape, where any is given.
+    """
     if nearby and [x.shape[-3:] for x in nearby] != [x.shape for x in glare]:
         nearby_shapes, glare_shapes = (
             [tuple(x.shape) for x in nearby],
@@ -244,6 +253,7 @@ def refuse_other_pictures(
         "psf": [psf.intensity],
         "glare": glare or (),
     }.items():
+        # a sum is NaN or infinite if any of its pixels is: cheaper than a test of each
         for x in values:
             refuse_not_finite(
                 "the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)}
@@ -273,12 +283,12 @@ def pose(
     """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings`
     says.
     """
-    fine, unclipped, glare = known_and_light(view.psf, view.responses, electrons, clipped, light)
-    kernels = effective_psf(view.psf, view.illuminant, view.responses, view.bands, fine.dtype).to(
-        fine
-    )
-    white = grey_white(view.illuminant, view.responses, view.bands).to(fine)
-    return posed(fine, unclipped, kernels, glare, settings, white)
+    picture, unclipped, glare = known_and_light(view.psf, view.responses, electrons, clipped, light)
+    kernels = effective_psf(
+        view.psf, view.illuminant, view.responses, view.bands, picture.dtype
+    ).to(picture)
+    white = grey_white(view.illuminant, view.responses, view.bands).to(picture)
+    return posed(picture, unclipped, kernels, glare, settings, white)
 
 
 def posed(
@@ -295,24 +305,43 @@ def posed(
     channels that glare covers take mean and contrast of others.
     """
     frame = (electrons.shape[-2], electrons.shape[-1])
-    read, scatter = settings.read_noise, settings.scatter
-    with_blind, some = unclipped, unclipped.amax((-2, -1), keepdim=True)
-    unclipped = torch.where(some > 0, unclipped, 1.0)
+    read_noise, scatter = settings.read_noise, settings.scatter
+    # 1 for a channel with any unclipped pixel; a blind channel counts as unclipped, so that its
+    # averages below are not 0 / 0
+    unclipped_or_blind, has_unclipped = unclipped, unclipped.amax((-2, -1), keepdim=True)
+    unclipped = torch.where(has_unclipped > 0, unclipped, 1.0)
     share = power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
     # the same bits, and the floors below concern the shape of the PSF, not a grey filter
     kernels = kernels / share
 
-    free, trusted, light, wrong = _found_light(electrons, (unclipped, with_blind), glare, settings)
+    free, trusted, light, glare_error = _found_light(
+        electrons, (unclipped, unclipped_or_blind), glare, settings
+    )
     picture = electrons - light.sum
     mean = average(picture, trusted)
-    total_variance = average((picture - mean).square(), trusted)
-    size, transfer, power, passed = _on_torus(kernels, frame, settings.border)
-    moments = mean, (total_variance - mean - read**2 - wrong) / passed
-    scale = torch.maximum(moments[1], 0.01 * total_variance / passed).clamp_min(1e-6).sqrt()
+    picture_variance = average((picture - mean).square(), trusted)
+    size, transfer, power, variance_factor = _on_torus(kernels, frame, settings.border)
+    # variance of a scene = (variance of the picture - photons - read noise - glare) / what the
+    # blur leaves of the variance 1; photon noise has the variance of the mean
+    mean_and_variance = (
+        mean,
+        (picture_variance - mean - read_noise**2 - glare_error) / variance_factor,
+    )
+    # at least a hundredth of the picture's variance, where noise exceeds it
+    scale = (
+        torch.maximum(mean_and_variance[1], 0.01 * picture_variance / variance_factor)
+        .clamp_min(1e-6)
+        .sqrt()
+    )
     if scatter and white is not None and light.modes:
-        trust = trusted.sum((-2, -1), keepdim=True) / unclipped.sum((-2, -1), keepdim=True) * some
+        trust = (
+            trusted.sum((-2, -1), keepdim=True)
+            / unclipped.sum((-2, -1), keepdim=True)
+            * has_unclipped
+        )
         mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
-    noise = settings.balance * picture_noise(electrons, mean, read) + light.variance
+    noise = settings.balance * picture_noise(electrons, mean, read_noise) + light.variance
+    # inverse noise variance, in units of the scaled picture
     weight = unclipped * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*free, *light.modes))
     problem = Blurred(
@@ -323,34 +352,48 @@ def posed(
         size,
         GREY,
         scaled,
+        # the last patterns, the modes, have strengths of variance 1
         bounded=len(light.modes),
     )
-    bright = mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share
+    # mean of the scene: that of the picture over the sum of the PSF, `kernels` x `share`
+    scene_mean = mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share
     if not scatter:
-        return Scaled(problem, scale, bright, share, kernels)
-    full = float(electrons.detach().max())
-    both = told_of_scene(*moments, wrong / passed, light, trusted, (some == 0) * full)
+        return Scaled(problem, scale, scene_mean, share, kernels)
+    fullest_pixel = float(electrons.detach().max())
+    evidence = told_of_scene(
+        *mean_and_variance,
+        glare_error / variance_factor,
+        light,
+        trusted,
+        (has_unclipped == 0) * fullest_pixel,
+    )
     return Scaled(
-        problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light)
+        problem,
+        scale,
+        scene_mean,
+        share,
+        kernels,
+        scene_doubt((mean, scale), evidence, white, fullest_pixel, light),
     )
 
 
 def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor, Tensor, Tensor]:
-    """Return the torus of a picture, the transfer of the PSF, the prior, and the variance that a
-    picture then has.
+    """Return the torus of a picture, the transfer of the PSF, the prior's power spectrum, and the
+    variance (channel, 1, 1) that a picture of a scene of variance 1 then has.
     """
     size = torus(frame, bordered(edge(kernels, frame), border))
-    transfer, wide = torch.fft.rfft2(wrapped(kernels, size)), border > 1
-    power = fall(size, (2 * frame[0], 2 * frame[1]) if wide else None).to(kernels)
-    varying = about_mean(power, frame, size) if wide else power
-    return size, transfer, power, expected_variance(transfer, varying, size).clamp_min(1e-6)
+    transfer, wider_than_reach = torch.fft.rfft2(wrapped(kernels, size)), border > 1
+    power = fall(size, (2 * frame[0], 2 * frame[1]) if wider_than_reach else None).to(kernels)
+    varying_power = about_mean(power, frame, size) if wider_than_reach else power
+    return size, transfer, power, expected_variance(transfer, varying_power, size).clamp_min(1e-6)
 
 
 def _found_light(
     electrons: Tensor, unclipped: tuple[Tensor, Tensor], glare: Glare, settings: Settings
 ) -> tuple[list[Tensor], Tensor, Light, Tensor]:
-    """Return the patterns of unknown strength, and what `doubted` returns; ``unclipped`` with and
-    without blind channels.
+    """Return the patterns of unknown strength, then the weights of pixels, the estimate of the
+    glare and the mean variance of its pattern, as `doubted` returns them; ``unclipped`` is with
+    blind channels counted as unclipped, and without.
 
     With `Settings.scatter` the strengths are found too, so that no pattern of unknown strength is
     left.
@@ -373,7 +416,9 @@ def _doubted(
     doubts: tuple[float | None, float],
     noise: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Light, Tensor]:
-    """Return what `doubted` returns, for a doubt, or None and the least doubt that is found."""
+    """Return what `doubted` returns (weights, light, mean variance), for ``doubts``: a doubt, or
+    None for the likeliest one, and the least doubt that may be found.
+    """
     doubt, smallest = doubts
     if doubt != 0 and glare.around is None:
         glare = with_light_around(glare)
@@ -435,16 +480,26 @@ def _(result: WienerProblem, *inputs: Any, **params: Any) -> list[Check]:
 def packed(scaled: Scaled) -> WienerProblem:
     """Return a posed deconvolution and its answer as a value."""
     problem = scaled.problem
-    free = len(problem.glare) - problem.bounded
-    none = problem.picture.new_zeros(0, *problem.picture.shape)
-    parts = [
-        torch.stack(some) if some else none for some in (problem.glare[:free], problem.glare[free:])
+    free_count = len(problem.glare) - problem.bounded
+    no_patterns = problem.picture.new_zeros(0, *problem.picture.shape)
+    free_and_bounded = [
+        torch.stack(patterns) if patterns else no_patterns
+        for patterns in (problem.glare[:free_count], problem.glare[free_count:])
     ]
     spectrum = most_likely(problem)
     scale = scaled.scale / scaled.share
     answer = (problem.first(spectrum), problem.blur(spectrum))
+    # in the order of the fields of `WienerProblem`
     return WienerProblem._make(
-        (problem.picture, problem.weight, scaled.kernels, *parts, *answer, scale, scaled.mean)
+        (
+            problem.picture,
+            problem.weight,
+            scaled.kernels,
+            *free_and_bounded,
+            *answer,
+            scale,
+            scaled.mean,
+        )
     )
 
 
@@ -539,16 +594,19 @@ def maps(
     """
     unclipped = (problem.weight > 0).to(answer)
     # the slope of sqrt is infinite at 0
-    root = torch.where(problem.weight > 0, problem.weight, 1.0).sqrt() * unclipped
-    free = len(problem.glare) - problem.bounded
-    glare = sum(problem.glare[:free], torch.zeros_like(answer))
-    doubt = sum((mode.square() for mode in problem.glare[free:]), torch.zeros_like(answer))
+    inverse_deviation = torch.where(problem.weight > 0, problem.weight, 1.0).sqrt() * unclipped
+    free_count = len(problem.glare) - problem.bounded
+    # the first patterns have any strength, the last are modes of the doubt
+    glare = sum(problem.glare[:free_count], torch.zeros_like(answer))
+    doubt = sum((mode.square() for mode in problem.glare[free_count:]), torch.zeros_like(answer))
+    # 1 / (noise variance + doubt): the weight of a pixel whose glare is uncertain
     deviation, octaves = _predicted(problem, problem.weight / (1.0 + problem.weight * doubt))
+    # divisors bring each map to about 1 for a network
     channel_maps = [
         answer,
         brightness.sign() * brightness.abs().clamp_min(1e-12).pow(_GAMMA),
         problem.picture.asinh(),
-        (root * (problem.picture - blurred)).asinh(),
+        (inverse_deviation * (problem.picture - blurred)).asinh(),
         problem.weight.log1p() / 10.0,
         unclipped,
         (_BRIGHT / glare.detach().amax().clamp_min(1e-30) * glare).asinh() / 5.0,
@@ -559,20 +617,24 @@ def maps(
 
 
 def _predicted(problem: Blurred, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the deviation of the answer from the scene that the filter expects, and a map for each
-    octave.
+    """Return the deviation (channel, y, x) of the answer from the scene that the filter expects,
+    and a map (octave, y, x) of the share that the frame tells, for each octave.
 
     The mean square over the frame follows from the share of each frequency that the frame tells. It
     is divided over the pixels by the inverse of 1 + I, where I is the diagonal of B' W B: a pixel
     behind a clipped one is less certain.
     """
-    gain = problem.transfer.abs().square() * weight.mean((-2, -1), keepdim=True) * problem.power
-    untold = _whole_mean(problem.power / (1.0 + gain), problem.torus) / _whole_mean(
-        problem.power, problem.torus
+    signal_to_noise = (
+        problem.transfer.abs().square() * weight.mean((-2, -1), keepdim=True) * problem.power
     )
+    untold_share = _whole_mean(
+        problem.power / (1.0 + signal_to_noise), problem.torus
+    ) / _whole_mean(problem.power, problem.torus)
     information = _information(problem, weight)
     uneven = (1.0 + information.mean((-2, -1), keepdim=True)) / (1.0 + information)
-    return (untold * uneven).clamp(1e-6, 1.0).sqrt(), _octaves(gain / (1.0 + gain), problem)
+    return (untold_share * uneven).clamp(1e-6, 1.0).sqrt(), _octaves(
+        signal_to_noise / (1.0 + signal_to_noise), problem
+    )
 
 
 def _whole_mean(half: Tensor, size: tuple[int, int]) -> Tensor:
@@ -584,9 +646,12 @@ def _information(problem: Blurred, weight: Tensor) -> Tensor:
     """Return the diagonal of B' W B for the blur B: the information of the frame on each pixel
     of the scene.
     """
-    squared = torch.fft.rfft2(torch.fft.irfft2(problem.transfer, s=problem.torus).square())
+    squared_psf_transfer = torch.fft.rfft2(
+        torch.fft.irfft2(problem.transfer, s=problem.torus).square()
+    )
+    # (B' W B) at pixel i = sum over j of psf(j - i)^2 W(j), a correlation
     information: Tensor = torch.fft.irfft2(
-        squared.conj() * torch.fft.rfft2(weight, s=problem.torus), s=problem.torus
+        squared_psf_transfer.conj() * torch.fft.rfft2(weight, s=problem.torus), s=problem.torus
     )
     return information[..., : problem.picture.shape[-2], : problem.picture.shape[-1]].clamp_min(0.0)
 
@@ -596,6 +661,7 @@ def _octaves(shares: Tensor, problem: Blurred) -> Tensor:
     mean_share = shares.mean(0)
     rows = torch.fft.fftfreq(problem.torus[0], dtype=mean_share.dtype, device=mean_share.device)
     columns = torch.fft.rfftfreq(problem.torus[1], dtype=mean_share.dtype, device=mean_share.device)
+    # octave k holds the frequencies from 0.5 / 2^(k + 1) to 0.5 / 2^k; the last all below
     octave = (
         (-torch.hypot(rows[:, None], columns).clamp(1e-9, 0.5).log2() - 1.0)
         .floor()

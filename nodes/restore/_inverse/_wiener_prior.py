@@ -31,10 +31,11 @@ def picture_noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
     """Return the noise variance of each pixel, from the larger of the local mean and the mean of
     the picture.
     """
-    around = electrons[None]
+    local_mean = electrons[None]
+    # mean over 9 x 9 pixels, first down, then across
     for window, rim in (((9, 1), (4, 0)), ((1, 9), (0, 4))):
-        around = avg_pool2d(around, window, stride=1, padding=rim, count_include_pad=False)
-    return (torch.maximum(around[0], mean) + read**2).clamp_min(1e-3)
+        local_mean = avg_pool2d(local_mean, window, stride=1, padding=rim, count_include_pad=False)
+    return (torch.maximum(local_mean[0], mean) + read**2).clamp_min(1e-3)
 
 
 def expected_variance(transfer: Tensor, power: Tensor, size: Size) -> Tensor:
@@ -43,9 +44,9 @@ def expected_variance(transfer: Tensor, power: Tensor, size: Size) -> Tensor:
     """
     total = power.new_zeros(len(transfer))
     for rows in pieces(transfer):
-        through = transfer[:, rows]
+        transfer_rows = transfer[:, rows]
         total = total + variance(
-            (through.real.square() + through.imag.square()) * power[rows], size
+            (transfer_rows.real.square() + transfer_rows.imag.square()) * power[rows], size
         )
     return total[:, None, None]
 
@@ -71,12 +72,13 @@ def about_mean(power: Tensor, frame: Size, torus: Size) -> Tensor:
     frame has.
     """
     rows, columns = (torch.ones(n, dtype=power.dtype, device=power.device) / n for n in frame)
+    # share of each frequency that the mean over the frame holds: |FFT of 1 / size|^2
     share = (
         torch.fft.fft(rows, torus[0]).abs().square()[:, None]
         * torch.fft.rfft(columns, torus[1]).abs().square()
     )
-    left: Tensor = power * (1.0 - share)
-    return left
+    varying_power: Tensor = power * (1.0 - share)
+    return varying_power
 
 
 def power_of_two(x: Tensor) -> Tensor:
@@ -95,9 +97,9 @@ def shared_level(level: Tensor, trust: Tensor, white: Tensor) -> Tensor:
     """
     grey = level / white
     weight = trust.clamp_min(1e-12)
-    common = ((weight * grey.log()).sum() / weight.sum()).exp()
-    own = trust / (trust + _TOLD)
-    shared: Tensor = white * (own * grey.log() + (1.0 - own) * common.log()).exp()
+    common_grey = ((weight * grey.log()).sum() / weight.sum()).exp()
+    own_share = trust / (trust + _TOLD)
+    shared: Tensor = white * (own_share * grey.log() + (1.0 - own_share) * common_grey.log()).exp()
     return shared
 
 
@@ -171,9 +173,11 @@ def scene_doubt(
     blotches = _BLOTCHES * light.variance.sqrt() / scale
     if white is None:
         return SceneDoubt(0.0, 1.0, blotches)
-    level, squares = level_and_variance(*evidence, white, full)
-    wrong = (level.deviation.square() + (level.value - mean).square()) / scale.square()
-    return SceneDoubt(float(wrong.mean()), float((squares.value / scale.square()).mean()), blotches)
+    level, variance = level_and_variance(*evidence, white, full)
+    mean_square_error = (level.deviation.square() + (level.value - mean).square()) / scale.square()
+    return SceneDoubt(
+        float(mean_square_error.mean()), float((variance.value / scale.square()).mean()), blotches
+    )
 
 
 def told_of_scene(
@@ -197,22 +201,27 @@ def level_and_variance(
     fullest pixel.
     """
     grey = white.flatten().double()
-    level, log, spread = _likely(mean, grey, math.log(_EXPOSED * full), _EXPOSURE, _COLOUR)
-    ratio = 2.0 * (log + math.log(_CONTRAST))
-    width = 2.0 * math.hypot(spread, _CONTRASTS)
-    squares, _, _ = _likely(variance, grey.square(), ratio, width, 2.0 * _TINT, _ROUGH)
-    return level, squares
+    level, log_exposure, log_deviation = _likely(
+        mean, grey, math.log(_EXPOSED * full), _EXPOSURE, _COLOUR
+    )
+    # the logarithm of a variance is twice that of a deviation
+    log_variance = 2.0 * (log_exposure + math.log(_CONTRAST))
+    log_variance_deviation = 2.0 * math.hypot(log_deviation, _CONTRASTS)
+    variance_level, _, _ = _likely(
+        variance, grey.square(), log_variance, log_variance_deviation, 2.0 * _TINT, _ROUGH
+    )
+    return level, variance_level
 
 
 def drawn_blotches(blotches: Tensor, rng: Generator) -> Tensor:
     """Return a draw of light (channel, y, x) that is nearly the same over some pixels, and of
     one colour.
     """
-    y, x = (_hats(n).to(blotches) for n in blotches.shape[-2:])
-    drawn = torch.randn(len(y), len(x), generator=rng, device=rng.device, dtype=blotches.dtype).to(
-        blotches
-    )
-    field: Tensor = blotches * (y.T @ drawn @ x)
+    y_hats, x_hats = (_hats(n).to(blotches) for n in blotches.shape[-2:])
+    drawn = torch.randn(
+        len(y_hats), len(x_hats), generator=rng, device=rng.device, dtype=blotches.dtype
+    ).to(blotches)
+    field: Tensor = blotches * (y_hats.T @ drawn @ x_hats)
     return field
 
 
@@ -220,6 +229,7 @@ def _hats(size: int) -> Tensor:
     """Return the weights (blotch, pixel) of blotches in the pixels of an axis, whose squares add
     up to 1.
     """
+    # triangles, 1 at the middle of a blotch and 0 at the next ones
     position = torch.arange(size) / _BLOTCH
     hats = (1.0 - (position - torch.arange(size // _BLOTCH + 2)[:, None]).abs()).clamp_min(0.0)
     return hats / hats.square().sum(0).sqrt()
@@ -232,33 +242,43 @@ def _likely(
     channels share.
 
     The shared logarithm is normal, of mean ``middle`` and deviation ``width``; a channel differs
-    from ``grey`` times the shared quantity by a relative deviation ``own``.
+    from ``grey`` times the shared quantity by a relative deviation ``own``. ``rough`` is the
+    relative error of the evidence. The posterior is a sum over a grid of shared logarithms.
     """
     value, errors = evidence.value.flatten().double(), evidence.errors.flatten(1).double()
     error_covariance = errors.T @ errors
+    # a part of each error is that of its channel alone; 1 e- so that the matrix has a Cholesky
+    # factor
     error_covariance = error_covariance + (_ALONE * error_covariance.diagonal() + 1.0).diag()
     logs = (
         torch.linspace(-_WIDE, _WIDE, _GRID, dtype=torch.float64, device=value.device) * width
         + middle
     )
     expected = logs.exp()[:, None] * grey
-    free = (own * expected).square()
-    covariance = error_covariance + (free + (rough * expected).square()).diag_embed()
+    channel_variance = (own * expected).square()
+    covariance = error_covariance + (channel_variance + (rough * expected).square()).diag_embed()
     deviation = value - expected
-    lower = torch.linalg.cholesky(covariance)
-    solved = torch.cholesky_solve(deviation[..., None], lower)[..., 0]
-    half = -0.5 * ((logs - middle) / width).square() - lower.diagonal(dim1=-2, dim2=-1).log().sum(
-        -1
-    )
-    share = torch.softmax(half - 0.5 * (deviation * solved).sum(-1), 0)[:, None]
-    posterior_mean = (expected + free * solved).clamp_min(0.0)
-    left = free - free.square() * torch.cholesky_inverse(lower).diagonal(dim1=-2, dim2=-1)
-    mean = (share * posterior_mean).sum(0)
-    variance = (share * (left.clamp_min(0.0) + (posterior_mean - mean).square())).sum(0)
-    log = float((share[:, 0] * logs).sum())
-    spread = float((share[:, 0] * (logs - log).square()).sum().sqrt())
-    level = (x[:, None, None].to(evidence.value) for x in (mean, variance.sqrt()))
-    return Level(*level), log, spread
+    lower_factor = torch.linalg.cholesky(covariance)
+    solved_deviation = torch.cholesky_solve(deviation[..., None], lower_factor)[..., 0]
+    log_prior = -0.5 * ((logs - middle) / width).square() - lower_factor.diagonal(
+        dim1=-2, dim2=-1
+    ).log().sum(-1)
+    # posterior probability of each logarithm: log of the Gaussian density of the evidence
+    probability = torch.softmax(log_prior - 0.5 * (deviation * solved_deviation).sum(-1), 0)[
+        :, None
+    ]
+    posterior_mean = (expected + channel_variance * solved_deviation).clamp_min(0.0)
+    posterior_variance = channel_variance - channel_variance.square() * torch.cholesky_inverse(
+        lower_factor
+    ).diagonal(dim1=-2, dim2=-1)
+    mean = (probability * posterior_mean).sum(0)
+    variance = (
+        probability * (posterior_variance.clamp_min(0.0) + (posterior_mean - mean).square())
+    ).sum(0)
+    log_mean = float((probability[:, 0] * logs).sum())
+    log_deviation = float((probability[:, 0] * (logs - log_mean).square()).sum().sqrt())
+    value_and_deviation = (x[:, None, None].to(evidence.value) for x in (mean, variance.sqrt()))
+    return Level(*value_and_deviation), log_mean, log_deviation
 
 
 # --- frame spectrum -------------------------------------------------------------------------------
@@ -309,25 +329,37 @@ def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
     contrast = picture - (picture * window).sum((-2, -1), keepdim=True) / window.sum(
         (-2, -1), keepdim=True
     )
-    far = _squared(size).to(window) > (_LOWEST / min(size)) ** 2
-    step = max(1, int(far.sum()) * len(window) // _MOST)
-    periodogram = _sampled(torch.fft.rfft2(contrast * window).abs().square() / area, far, step)
+    # without the frequencies that the window mixes with the mean
+    counted = _squared(size).to(window) > (_LOWEST / min(size)) ** 2
+    step = max(1, int(counted.sum()) * len(window) // _MOST)
+    periodogram = _sampled(torch.fft.rfft2(contrast * window).abs().square() / area, counted, step)
     variance = torch.where(problem.weight > 0, 1.0 / problem.weight.clamp_min(1e-30), 0.0).detach()
     noise = (window.square() * variance).sum((-2, -1), keepdim=True) / area
-    level = _sampled(noise.expand(-1, *far.shape), far, step)
-    twice = (2 * size[0], 2 * size[1])
-    lags = torch.fft.irfft2(torch.fft.rfft2(window, s=twice).abs().square(), s=twice) / area
+    noise_level = _sampled(noise.expand(-1, *counted.shape), counted, step)
+    twice_size = (2 * size[0], 2 * size[1])
+    window_correlation = (
+        torch.fft.irfft2(torch.fft.rfft2(window, s=twice_size).abs().square(), s=twice_size) / area
+    )
     best, slope, strength, factor = float("inf"), 3.0, 0.0, 1.0
     for exponent in torch.linspace(*_SLOPES[:2], int(_SLOPES[2])).tolist():
-        law = _sampled(_expected(problem, exponent, lags), far, step)
-        unit = float(periodogram.sum() / law.sum().clamp_min(1e-30))
-        loss, times, extra = _likeliest(
-            periodogram, unit * law, level, _before(problem, doubt, exponent) - math.log(unit)
+        expected = _sampled(_expected(problem, exponent, window_correlation), counted, step)
+        scale = float(periodogram.sum() / expected.sum().clamp_min(1e-30))
+        loss, strength_over_scale, noise_factor = _likeliest(
+            periodogram,
+            scale * expected,
+            noise_level,
+            _before(problem, doubt, exponent) - math.log(scale),
         )
         if loss < best:
-            best, slope, strength, factor = loss, exponent, unit * times, extra
+            best, slope, strength, factor = (
+                loss,
+                exponent,
+                scale * strength_over_scale,
+                noise_factor,
+            )
     power = strength * _law(problem, slope)
     low = max(1.0, math.exp(_before(problem, doubt, slope)) / max(strength, 1e-30))
+    # the mean of the scene has its own doubt
     power[0, 0] += doubt.mean * problem.torus[0] * problem.torus[1] if doubt else 0.0
     return FrameLaw(power, factor, low)
 
@@ -341,44 +373,56 @@ def _before(problem: Blurred, doubt: SceneDoubt | None, slope: float) -> float:
 
 
 def _window(problem: Blurred) -> Tensor:
-    """Return the window (channel, y, x) of the periodogram."""
+    """Return the window (channel, y, x) of the periodogram: it falls to 0 at the edges and where
+    the weight of a pixel is far below the quantile `_SURE` of its channel.
+    """
     y, x = problem.picture.shape[-2:]
     weight = problem.weight.detach()
-    falling = (torch.hann_window(n + 2, periodic=False)[1:-1].to(weight) for n in (y, x))
-    sure = []
+    edge_windows = (torch.hann_window(n + 2, periodic=False)[1:-1].to(weight) for n in (y, x))
+    certain_weights = []
     for channel_weight in weight:
         unclipped = channel_weight[channel_weight > 0]
-        sure.append(torch.quantile(unclipped[:: max(1, len(unclipped) // _SAMPLE)], _SURE))
-    own = weight / torch.stack(sure)[:, None, None]
-    rows, columns = falling
-    return rows[:, None] * columns * own / (1.0 + own)
+        certain_weights.append(
+            torch.quantile(unclipped[:: max(1, len(unclipped) // _SAMPLE)], _SURE)
+        )
+    relative_weight = weight / torch.stack(certain_weights)[:, None, None]
+    rows, columns = edge_windows
+    return rows[:, None] * columns * relative_weight / (1.0 + relative_weight)
 
 
 def _expected(problem: Blurred, slope: float, lags: Tensor) -> Tensor:
     """Return the expected periodogram of a blurred scene of power 1 / f^slope, given the
     correlation of the window.
     """
-    through = problem.transfer.detach().abs().square()
-    correlation = torch.fft.irfft2(_law(problem, slope) * through, s=problem.torus)
-    down, right = (
+    squared_transfer = problem.transfer.detach().abs().square()
+    scene_correlation = torch.fft.irfft2(_law(problem, slope) * squared_transfer, s=problem.torus)
+    row_lags, column_lags = (
         _lags(n).to(lags.device) % side
         for n, side in zip(lags.shape[-2:], problem.torus, strict=True)
     )
-    spectrum: Tensor = torch.fft.rfft2(correlation[:, down[:, None], right] * lags).real
+    spectrum: Tensor = torch.fft.rfft2(
+        scene_correlation[:, row_lags[:, None], column_lags] * lags
+    ).real
+    # lags on a grid twice as wide: every second frequency is one of the window's
     return spectrum[:, ::2, ::2].clamp_min(0.0)
 
 
 def _lags(size: int) -> Tensor:
+    """Return the lags (size,) in FFT order: 0 and up, then negative ones."""
     return (torch.arange(size) + size // 2) % size - size // 2
 
 
 def _law(problem: Blurred, slope: float) -> Tensor:
+    """Return the power (fy, fx) of a scene, (f^2 + 1 / pixels)^(-slope / 2), of strength 1."""
     y, x = problem.picture.shape[-2:]
     law: Tensor = (_squared(problem.torus).to(problem.picture) + 1.0 / (y * x)) ** (-slope / 2)
     return law
 
 
 def _sampled(spectrum: Tensor, far: Tensor, step: int) -> Tensor:
+    """Return every ``step``-th of the frequencies in ``far`` of all channels, as one row in
+    float64.
+    """
     sampled: Tensor = spectrum[:, far].flatten()[::step].double()
     return sampled
 
@@ -389,21 +433,22 @@ def _likeliest(
     """Return the least loss of a law, its strength, and the factor of the noise, which grows while
     the loss falls.
 
-    The logarithm of the strength has the mean ``middle`` before the frame is seen.
+    The logarithm of the strength has the mean ``middle`` before the frame is seen. The loss is
+    Whittle's, the mean of log(expected) + periodogram / expected, plus the prior of the strength.
     """
-    best = (float("inf"), 0.0, 1.0)
-    many = len(periodogram) / _ALIKE
+    best_of_all = (float("inf"), 0.0, 1.0)
+    independent_count = len(periodogram) / _ALIKE
     for factor in _NOISES:
-        here = (float("inf"), 0.0, factor)
+        best_of_factor = (float("inf"), 0.0, factor)
         for strength in torch.linspace(*_POWERS[:2], int(_POWERS[2])).exp().tolist():
             expected = strength * law + factor * noise
             loss = float((expected.log() + periodogram / expected).mean())
-            loss += ((math.log(strength) - middle) / _PRIOR) ** 2 / many
-            here = min(here, (loss, strength, factor))
-        if here[0] >= best[0]:
+            loss += ((math.log(strength) - middle) / _PRIOR) ** 2 / independent_count
+            best_of_factor = min(best_of_factor, (loss, strength, factor))
+        if best_of_factor[0] >= best_of_all[0]:
             break
-        best = here
-    return best
+        best_of_all = best_of_factor
+    return best_of_all
 
 
 def _squared(size: Size) -> Tensor:

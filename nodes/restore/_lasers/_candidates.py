@@ -51,22 +51,30 @@ def line_templates(pupil: Pupil, responses: Tensor, bands: Bands, lens: Lens) ->
     low, high = float(bands.centres.min()), float(bands.centres.max())
     count = max(2, math.ceil((high - low) / _STEP) + 1)
     wavelengths = torch.linspace(low, high, count, dtype=torch.float64)
-    heard = torch.stack([response_at(x, responses.cpu().double(), bands) for x in wavelengths])
-    wavelengths, heard = (
-        wavelengths[heard.amax(1) > 0.01 * heard.max()],
-        heard[heard.amax(1) > 0.01 * heard.max()],
+    line_responses = torch.stack(
+        [response_at(x, responses.cpu().double(), bands) for x in wavelengths]
+    )
+    # lines that the camera hardly sees tell nothing
+    wavelengths, line_responses = (
+        wavelengths[line_responses.amax(1) > 0.01 * line_responses.max()],
+        line_responses[line_responses.amax(1) > 0.01 * line_responses.max()],
     )
     index = torch.stack([index_at(x, pupil) for x in wavelengths])
-    reach = (
+    half_field = (
+        # pixels to half the alias-free field, beyond which a pattern repeats itself
         float(wavelengths.min()) * lens.focal_length / (2 * float(pupil.pitch) * lens.pixel_pitch)
     )
-    sides = tuple(2 * min(n - 1, int(reach) - 1, _REACH) + 1 for n in lens.shape)
+    window_sides = tuple(2 * min(n - 1, int(half_field) - 1, _REACH) + 1 for n in lens.shape)
     line_pupil = pupil._replace(
         wavelengths=wavelengths.to(pupil.wavelengths), index=index.to(pupil.index)
     )
-    camera = {"focal_length": lens.focal_length, "pixel_pitch": lens.pixel_pitch, "shape": sides}
+    camera = {
+        "focal_length": lens.focal_length,
+        "pixel_pitch": lens.pixel_pitch,
+        "shape": window_sides,
+    }
     intensity = focus(line_pupil, sensor=lens.sensor, **camera).intensity
-    return Templates(wavelengths, intensity[:, None], heard)
+    return Templates(wavelengths, intensity[:, None], line_responses)
 
 
 def candidates(
@@ -77,18 +85,25 @@ def candidates(
     """
     residual = residual.float()  # a start needs no more
     weights = Weights(*(x.float() for x in weights))
-    white, frame = weights(residual), residual.shape[-2:]
+    white_residual, frame = weights(residual), residual.shape[-2:]
     peaks: list[Candidate] = []
-    for line, pattern, heard in zip(*templates, strict=True):
+    for line, pattern, line_response in zip(*templates, strict=True):
         size = _size(frame, pattern)
-        own = use.sharp(pattern.to(residual))
-        by = weights(heard.to(residual)[:, None, None].expand_as(residual))
+        sharp_pattern = use.sharp(pattern.to(residual))
+        response_weights = weights(line_response.to(residual)[:, None, None].expand_as(residual))
         if len(pattern) == 1:
-            top, low = (by * white).sum(0, keepdim=True), by.square().sum(0, keepdim=True)
+            # the least-squares strength is numerator over denominator, see `_gain`
+            numerator, denominator = (
+                (response_weights * white_residual).sum(0, keepdim=True),
+                response_weights.square().sum(0, keepdim=True),
+            )
         else:  # each channel has its own pattern: channels count as independent
-            top, low = heard.to(residual)[:, None, None] * weights(white), by.square()
-        product = _correlated(top, own, size).sum(0)
-        norm = _correlated(low, own.square(), size).sum(0).clamp_min(0.0)
+            numerator, denominator = (
+                line_response.to(residual)[:, None, None] * weights(white_residual),
+                response_weights.square(),
+            )
+        product = _correlated(numerator, sharp_pattern, size).sum(0)
+        norm = _correlated(denominator, sharp_pattern.square(), size).sum(0).clamp_min(0.0)
         peaks += _peaks(
             _gain(product, norm),
             product / norm.clamp_min(1e-30),
@@ -110,36 +125,58 @@ def clipped_candidates(
     times as many, of which some lie beyond the frame. Each channel is clipped by itself: those that
     hardly see a wavelength show more of its pattern.
     """
+    # the pattern must clip about as many pixels: that tells its strength
     clipped = int((picture >= 0.98 * full).any(0).sum())
     picture, frame = picture.float(), picture.shape[-2:]
     weights = Weights(*(x.float() for x in weights))
     size = _size(frame, templates.patterns[0])
     pairs = list(itertools.combinations_with_replacement(range(len(picture)), 2))
-    both = torch.fft.rfft2(weights.twice(use.sharp(picture)), s=size)
-    inverse = torch.fft.rfft2(
-        torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]), s=size
+    weighted_spectra = torch.fft.rfft2(weights.twice(use.sharp(picture)), s=size)
+    pair_spectra = torch.fft.rfft2(
+        # pairs of different channels count twice in a quadratic form
+        torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]),
+        s=size,
     )
     peaks: list[Candidate] = []
-    for (line, pattern, heard), margin in itertools.product(zip(*templates, strict=True), _MORE):
-        share, level = (heard / heard.max()).to(picture), _level(pattern, round(margin * clipped))
-        own = use.sharp((share[:, None, None] * pattern.to(picture) / level).clamp_max(1.0))
-        squares = torch.stack([own[first] * own[other] for first, other in pairs])
-        product, norm = (
-            torch.fft.irfft2((data * torch.fft.rfft2(model, s=size).conj()).sum(0), s=size)
-            for data, model in ((both, own), (inverse, squares))
+    for (line, pattern, line_response), margin in itertools.product(
+        zip(*templates, strict=True), _MORE
+    ):
+        relative_response, clip_value = (
+            (line_response / line_response.max()).to(picture),
+            _level(pattern, round(margin * clipped)),
         )
-        strength = torch.full_like(norm, full / (level * float(heard.max())))
+        # the pattern as a sensor would show it whose full well lies at the clip value
+        sharp_pattern = use.sharp(
+            (relative_response[:, None, None] * pattern.to(picture) / clip_value).clamp_max(1.0)
+        )
+        squares = torch.stack(
+            [sharp_pattern[first] * sharp_pattern[other] for first, other in pairs]
+        )
+        numerator, denominator = (
+            torch.fft.irfft2((data * torch.fft.rfft2(model, s=size).conj()).sum(0), s=size)
+            for data, model in ((weighted_spectra, sharp_pattern), (pair_spectra, squares))
+        )
+        strength = torch.full_like(denominator, full / (clip_value * float(line_response.max())))
         peaks += _peaks(
-            _gain(product, norm.clamp_min(0.0)), strength, float(line), pattern, frame, count
+            _gain(numerator, denominator.clamp_min(0.0)),
+            strength,
+            float(line),
+            pattern,
+            frame,
+            count,
         )
     return _apart(sorted(peaks, reverse=True), count)
 
 
 def _size(frame: torch.Size, pattern: Tensor) -> list[int]:
+    """Return the size of a periodic grid on which a frame and a pattern do not wrap around."""
     return [fast_size(n + k - 1) for n, k in zip(frame, pattern.shape[-2:], strict=True)]
 
 
 def _gain(product: Tensor, norm: Tensor) -> Tensor:
+    """Return the log likelihood that a pattern of the best strength >= 0 gains: product^2 / (2
+    norm).
+    """
     return 0.5 * product.clamp_min(0.0).square() / (norm + 1e-6 * norm.max() + 1e-30)
 
 
@@ -162,16 +199,20 @@ def _peaks(
 ) -> list[Candidate]:
     """Return the largest gains with the spot within the frame."""
     rows, columns = (
+        # spot of the pattern in each row: its middle, wrapped around the grid
         (torch.arange(n, device=gain.device) - k // 2) % s
         for n, k, s in zip(frame, pattern.shape[-2:], gain.shape, strict=True)
     )
-    inside, sizes = gain[rows[:, None], columns], strength[rows[:, None], columns]
-    best = torch.topk(inside.flatten(), min(3 * count, inside.numel()))
+    gain_within, strength_within = gain[rows[:, None], columns], strength[rows[:, None], columns]
+    # more than asked for, because neighbours of a peak are left out
+    best = torch.topk(gain_within.flatten(), min(3 * count, gain_within.numel()))
     spots = []
     for value, index in zip(best.values.tolist(), best.indices.tolist(), strict=True):
         y, x = divmod(index, frame[1])
         spots.append(
-            Candidate(value, (y - frame[0] // 2, x - frame[1] // 2), line, float(sizes[y, x]))
+            Candidate(
+                value, (y - frame[0] // 2, x - frame[1] // 2), line, float(strength_within[y, x])
+            )
         )
     return _apart(spots, count)
 
@@ -188,8 +229,8 @@ def _apart(ranked: list[Candidate], count: int) -> list[Candidate]:
 
 
 def _differ(a: Candidate, b: Candidate) -> bool:
-    away = math.dist(a.spot, b.spot)
-    return away > _APART[0] or abs(a.wavelength - b.wavelength) > _APART[1]
+    distance = math.dist(a.spot, b.spot)
+    return distance > _APART[0] or abs(a.wavelength - b.wavelength) > _APART[1]
 
 
 # --- nearest --------------------------------------------------------------------------------------
@@ -241,10 +282,10 @@ def nearest(
     """
     window, middle = _window(residual, start.spot)
     local_filter = Filter(data.use.seen[..., *window], data.use.kernel)
-    within = Weights(*(x[..., *window] for x in data.weights))
-    white, best = within(residual[..., *window]), start._replace(gain=0.0)
+    local_weights = Weights(*(x[..., *window] for x in data.weights))
+    white, best_candidate = local_weights(residual[..., *window]), start._replace(gain=0.0)
     lens = camera.lens._replace(shape=(white.shape[-2], white.shape[-1]))
-    down, right = (
+    row_places, column_places = (
         torch.tensor(
             [spot_place + half - m for half in halves], dtype=torch.float64, device=white.device
         )
@@ -254,28 +295,37 @@ def nearest(
         wavelength = torch.tensor(
             start.wavelength + nm * NANOMETRE, dtype=torch.float64, device=white.device
         )
-        heard = start.strength * response_at(wavelength, camera.responses, camera.bands).to(white)
-        patterns = grid_patterns(camera.pupil, down, right, wavelength, lens).to(white)
-        light = within(heard[:, None, None] * local_filter(patterns.flatten(0, 1)[:, None]))
-        product, norm = (
+        line_response = start.strength * response_at(wavelength, camera.responses, camera.bands).to(
+            white
+        )
+        patterns = grid_patterns(camera.pupil, row_places, column_places, wavelength, lens).to(
+            white
+        )
+        light = local_weights(
+            line_response[:, None, None] * local_filter(patterns.flatten(0, 1)[:, None])
+        )
+        numerator, denominator = (
             (light * white).sum((1, 2, 3)),
             light.square().sum((1, 2, 3)).clamp_min(1e-30),
         )
-        gain = 0.5 * product.clamp_min(0.0).square() / norm
-        n = int(gain.argmax())
-        if float(gain[n]) > best.gain:
-            y, x = divmod(n, len(halves))
+        # log likelihood that a pattern of the best strength >= 0 gains
+        gain = 0.5 * numerator.clamp_min(0.0).square() / denominator
+        best_number = int(gain.argmax())
+        if float(gain[best_number]) > best_candidate.gain:
+            y, x = divmod(best_number, len(halves))
             spot = (start.spot[0] + halves[y], start.spot[1] + halves[x])
-            strength = max(float(product[n] / norm[n]), 0.01) * start.strength
-            best = Candidate(float(gain[n]), spot, float(wavelength), strength)
-    return best
+            strength = (
+                max(float(numerator[best_number] / denominator[best_number]), 0.01) * start.strength
+            )
+            best_candidate = Candidate(float(gain[best_number]), spot, float(wavelength), strength)
+    return best_candidate
 
 
 def _window(
     frame: Tensor, spot: tuple[float, float]
 ) -> tuple[tuple[slice, slice], tuple[int, int]]:
-    """Return the window of a frame around a spot that tells the candidates apart, and where its
-    middle lies.
+    """Return the rows and columns of a frame around a spot that tell the candidates apart, and the
+    pixels (y, x) from the middle of the frame to that of this window.
     """
     window, middle = [], []
     for n, spot_place in zip(frame.shape[-2:], spot, strict=True):

@@ -69,17 +69,34 @@ def lamp_light(
     kinds = _kinds(illuminant, responses, bands).to(psf.intensity.device, kind)
     finer, (y, x) = _finer(pupil, lens), (lens.shape[0] + _RIM, lens.shape[1] + _RIM)
     torus = (fast_size(2 * y + 1), fast_size(2 * x + 1))  # pixels
-    fine = (finer * torus[0], finer * torus[1])
-    spectra = torch.fft.rfft2(_fine_patterns(kinds, pupil, lens, finer), s=fine)
-    spectra = spectra * phases(fine, torch.tensor([-float(finer * y), -float(finer * x)]).to(kinds))
-    spectra = spectra * _pixel(fine, finer, lens).to(kinds)
-    coarse = torch.fft.irfft2(spectra, s=fine)[..., ::finer, ::finer].roll((y, x), (-2, -1))
-    coarse = coarse[..., : 2 * y + 1, : 2 * x + 1]
-    beyond = _beyond_pupil(torch.einsum("kcb,byx->kcyx", kinds, psf.intensity.to(kinds)), coarse)
-    back = phases(torus, torch.tensor([-float(y), -float(x)]).to(kinds))
-    spectra = spectra + _between_pixels(torch.fft.rfft2(beyond, s=torus) * back, torus, finer)
-    heard = (responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()).sum(-1)
-    return LampLight(spectra, fine, finer, (heard / heard.max()).to(kinds), (coarse + beyond)[0])
+    fine_torus = (finer * torus[0], finer * torus[1])
+    spectra = torch.fft.rfft2(_fine_patterns(kinds, pupil, lens, finer), s=fine_torus)
+    # the spot from the middle of the window to the first sample
+    spectra = spectra * phases(
+        fine_torus, torch.tensor([-float(finer * y), -float(finer * x)]).to(kinds)
+    )
+    spectra = spectra * _pixel(fine_torus, finer, lens).to(kinds)
+    coarse_patterns = torch.fft.irfft2(spectra, s=fine_torus)[..., ::finer, ::finer].roll(
+        (y, x), (-2, -1)
+    )
+    coarse_patterns = coarse_patterns[..., : 2 * y + 1, : 2 * x + 1]
+    beyond_pupil = _beyond_pupil(
+        torch.einsum("kcb,byx->kcyx", kinds, psf.intensity.to(kinds)), coarse_patterns
+    )
+    phase_to_corner = phases(torus, torch.tensor([-float(y), -float(x)]).to(kinds))
+    spectra = spectra + _between_pixels(
+        torch.fft.rfft2(beyond_pupil, s=torus) * phase_to_corner, torus, finer
+    )
+    channel_light = (
+        responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
+    ).sum(-1)
+    return LampLight(
+        spectra,
+        fine_torus,
+        finer,
+        (channel_light / channel_light.max()).to(kinds),
+        (coarse_patterns + beyond_pupil)[0],
+    )
 
 
 def phases(torus: tuple[int, int], move: Tensor) -> Tensor:
@@ -103,38 +120,49 @@ def _finer(pupil: Pupil, lens: Lens) -> int:
     """Return how many samples a pixel the finest fringe of the lens asks for, within limits of
     time and memory.
     """
-    width = max(int((pupil.aperture.amax(axis) > 0).sum()) for axis in (0, 1)) * float(pupil.pitch)
-    needed = 2.0 * lens.pixel_pitch * width / (float(pupil.wavelengths.min()) * lens.focal_length)
-    return max(1, min(math.ceil(needed), _FINEST, _MOST // (2 * max(lens.shape) + 1)))
+    pupil_width = max(int((pupil.aperture.amax(axis) > 0).sum()) for axis in (0, 1)) * float(
+        pupil.pitch
+    )
+    # Nyquist: two samples for the finest fringe, wavelength x focal length / pupil width
+    samples_needed = (
+        2.0 * lens.pixel_pitch * pupil_width / (float(pupil.wavelengths.min()) * lens.focal_length)
+    )
+    return max(1, min(math.ceil(samples_needed), _FINEST, _MOST // (2 * max(lens.shape) + 1)))
 
 
 def _fine_patterns(kinds: Tensor, pupil: Pupil, lens: Lens, finer: int) -> Tensor:
     """Return the patterns (kind, channel, y, x) with the spot in the middle sample, as the light
     in each sample.
     """
-    sides = tuple(2 * finer * (n + _RIM) + 1 for n in lens.shape)
+    window_sides = tuple(2 * finer * (n + _RIM) + 1 for n in lens.shape)
     pitch = lens.pixel_pitch / finer
-    total = torch.zeros(*kinds.shape[:2], *sides).to(kinds)
+    total = torch.zeros(*kinds.shape[:2], *window_sides).to(kinds)
     for band in range(kinds.shape[-1]):
         band_pupil = pupil._replace(
             wavelengths=pupil.wavelengths[band][None], index=pupil.index[band][None]
         )
         # samples
-        free = float(band_pupil.wavelengths[0]) * lens.focal_length / (float(pupil.pitch) * pitch)
-        shape = tuple(min(side, 2 * max(int(free / 2) - 1, 0) + 1) for side in sides)
+        alias_free = (
+            float(band_pupil.wavelengths[0]) * lens.focal_length / (float(pupil.pitch) * pitch)
+        )
+        pattern_sides = tuple(
+            min(side, 2 * max(int(alias_free / 2) - 1, 0) + 1) for side in window_sides
+        )
         camera = {"focal_length": lens.focal_length, "pixel_pitch": pitch, "sensor": lens.sensor}
-        light = _framed(focus(band_pupil, shape=shape, **camera).intensity[0].to(kinds), sides)
+        light = _framed(
+            focus(band_pupil, shape=pattern_sides, **camera).intensity[0].to(kinds), window_sides
+        )
         total += kinds[:, :, band, None, None] * light
-    down, right = (_fading(n, finer).to(kinds) for n in lens.shape)
-    return total * down[:, None] * right
+    row_fading, column_fading = (_fading(n, finer).to(kinds) for n in lens.shape)
+    return total * row_fading[:, None] * column_fading
 
 
 def _fading(pixels: int, finer: int) -> Tensor:
     """Return the factor of the samples along one axis, 1 as far as the frame reaches from any
     spot in it.
     """
-    away = torch.arange(-finer * (pixels + _RIM), finer * (pixels + _RIM) + 1).abs() / finer
-    return 0.5 + 0.5 * torch.cos(torch.pi * ((away - pixels - 1) / (_RIM - 1)).clamp(0.0, 1.0))
+    distance = torch.arange(-finer * (pixels + _RIM), finer * (pixels + _RIM) + 1).abs() / finer
+    return 0.5 + 0.5 * torch.cos(torch.pi * ((distance - pixels - 1) / (_RIM - 1)).clamp(0.0, 1.0))
 
 
 def _pixel(fine: tuple[int, int], finer: int, lens: Lens) -> Tensor:
@@ -143,10 +171,13 @@ def _pixel(fine: tuple[int, int], finer: int, lens: Lens) -> Tensor:
     """
     if lens.sensor != "integrated":  # a pixel has the light of its middle, times its area
         return torch.tensor(float(finer**2))
-    steps = torch.arange(finer, dtype=torch.float64) - (finer - 1) / 2
+    sample_offsets = torch.arange(finer, dtype=torch.float64) - (finer - 1) / 2
     fy, fx = torch.fft.fftfreq(fine[0]).double(), torch.fft.rfftfreq(fine[1]).double()
-    y, x = (torch.cos(2 * torch.pi * f[:, None] * steps).sum(1) for f in (fy, fx))
-    return y[:, None] * x
+    # sum of the phases of the samples in a pixel, symmetric about its middle
+    row_factor, column_factor = (
+        torch.cos(2 * torch.pi * f[:, None] * sample_offsets).sum(1) for f in (fy, fx)
+    )
+    return row_factor[:, None] * column_factor
 
 
 def _beyond_pupil(inner: Tensor, coarse: Tensor) -> Tensor:
@@ -162,11 +193,14 @@ def _between_pixels(spectra: Tensor, torus: tuple[int, int], finer: int) -> Tens
     """Return half spectra of pictures in pixels as those of the smoothest pictures on the finer
     grid.
     """
-    (y, x), some = torus, (torus[1] + 1) // 2
-    wide = spectra.new_zeros(*spectra.shape[:-2], finer * y, finer * x // 2 + 1)
-    wide[..., : (y + 1) // 2, :some] = spectra[..., : (y + 1) // 2, :some]
-    wide[..., finer * y - (y - 1) // 2 :, :some] = spectra[..., y - (y - 1) // 2 :, :some]
-    return wide * finer**2
+    (y, x), columns = torus, (torus[1] + 1) // 2
+    fine_spectra = spectra.new_zeros(*spectra.shape[:-2], finer * y, finer * x // 2 + 1)
+    fine_spectra[..., : (y + 1) // 2, :columns] = spectra[..., : (y + 1) // 2, :columns]
+    fine_spectra[..., finer * y - (y - 1) // 2 :, :columns] = spectra[
+        ..., y - (y - 1) // 2 :, :columns
+    ]
+    # an FFT on a finer grid sums over so many more samples
+    return fine_spectra * finer**2
 
 
 def _framed(picture: Tensor, sides: tuple[int, ...]) -> Tensor:
@@ -237,8 +271,8 @@ class Laser:
 
     def channels(self) -> Tensor:
         """Return the electrons of each channel over the whole pattern."""
-        heard, spread = self._response(self.values[2])
-        return self.values[3] * (heard + spread * self.values[5:])
+        response, spread = self._response(self.values[2])
+        return self.values[3] * (response + spread * self.values[5:])
 
     def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
         """Return ``of`` of the change of the light for a unit change of each value: (value,
@@ -251,19 +285,22 @@ class Laser:
         filtered = of(self._slopes()[:, None])
         ones = (1,) * (filtered.ndim - 2)
         channels = self.channels().view(-1, *ones)
-        heard, spread = self._response(self.values[2])
-        wave = channels * filtered[3] + self._response_slope().view(-1, *ones) * filtered[0]
+        response, spread = self._response(self.values[2])
+        wavelength_column = (
+            channels * filtered[3] + self._response_slope().view(-1, *ones) * filtered[0]
+        )
+        # in the order of `values`: y, x, nm, strength, variance of the line, errors of responses
         columns = [
             channels * filtered[1],
             channels * filtered[2],
-            wave,
+            wavelength_column,
             (channels / self.values[3].clamp_min(1e-9)) * filtered[0],
         ]
         columns.append(channels * filtered[4])
-        for i in range(len(heard)):
-            unit = torch.zeros_like(heard)
-            unit[i] = self.values[3] * spread[i]
-            columns.append(unit.view(-1, *ones) * filtered[0])
+        for i in range(len(response)):
+            response_column = torch.zeros_like(response)
+            response_column[i] = self.values[3] * spread[i]
+            columns.append(response_column.view(-1, *ones) * filtered[0])
         return torch.stack(columns)
 
     def _slopes(self) -> Tensor:
@@ -296,26 +333,31 @@ class Laser:
         """Return the change of the electrons of each channel for a unit change of each value:
         (channel, value).
         """
-        heard, spread = self._response(self.values[2])
-        slopes = torch.zeros(len(heard), len(self.values)).to(self.values)
+        response, spread = self._response(self.values[2])
+        slopes = torch.zeros(len(response), len(self.values)).to(self.values)
         slopes[:, 2] = self._response_slope()
-        slopes[:, 3] = heard + spread * self.values[5:]
+        slopes[:, 3] = response + spread * self.values[5:]
         slopes[:, 5:] = torch.diag(self.values[3] * spread)
         return slopes
 
     def _response(self, nm: Tensor) -> tuple[Tensor, Tensor]:
-        heard = response_at(nm * NANOMETRE, self.camera.responses, self.camera.bands)
-        return heard, _KNOWN * heard + _BLIND * self.camera.responses.max()
+        """Return the response (channel,) at a wavelength in nm, and its standard deviation."""
+        response = response_at(nm * NANOMETRE, self.camera.responses, self.camera.bands)
+        return response, _KNOWN * response + _BLIND * self.camera.responses.max()
 
     def _response_slope(self) -> Tensor:
-        ends = [self._response(self.values[2] + sign)[0] for sign in (1, -1)]
-        return self.values[3] * (ends[0] - ends[1]) / 2.0
+        """Return the change of each channel's electrons with wavelength, by nm: a central
+        difference.
+        """
+        responses = [self._response(self.values[2] + sign)[0] for sign in (1, -1)]
+        return self.values[3] * (responses[0] - responses[1]) / 2.0
 
     def _pattern(self, place: Tensor) -> Tensor:
+        """Return the share (y, x) of the light in each pixel, for y, x in pixels and nm."""
         lens = self.camera.lens
         place = place.double()  # phases need that
-        towards = place[:2] * (lens.pixel_pitch / lens.focal_length)
-        pattern = line_pattern(self.camera.pupil, towards, place[2] * NANOMETRE, lens, self.fwhm)
+        direction = place[:2] * (lens.pixel_pitch / lens.focal_length)
+        pattern = line_pattern(self.camera.pupil, direction, place[2] * NANOMETRE, lens, self.fwhm)
         return pattern.to(self.values)
 
 
@@ -350,6 +392,7 @@ class Lamp:
         amounts = filtered.new_zeros(kinds * channels, *filtered.shape[1:])
         for k in range(kinds):
             for c in range(channels):
+                # an amount of a kind changes its own channel alone; the first two are y and x
                 amounts[k * channels + c, c] = filtered[2 + k, c]
         return torch.cat([filtered[:2], amounts])
 
@@ -375,15 +418,22 @@ class Lamp:
         return replace(self, values=values)
 
     def _spectra(self) -> Tensor:
-        amounts = self.values[2:].view(len(self.light.spectra), -1, 1, 1)
-        return (amounts * self.light.spectra).sum(0) * self._phase()
+        """Return the spectra (channel, fy, fx) of the lamp's light, with its spot in place."""
+        amount_by_kind = self.values[2:].view(len(self.light.spectra), -1, 1, 1)
+        return (amount_by_kind * self.light.spectra).sum(0) * self._phase()
 
     def _phase(self) -> Tensor:
-        middle = torch.tensor([self.shape[0] // 2, self.shape[1] // 2]).to(self.values)
-        return phases(self.light.torus, self.light.finer * (self.values[:2] + middle))
+        """Return the factor (fy, fx) that moves a spot from the first sample to its place."""
+        middle_pixel = torch.tensor([self.shape[0] // 2, self.shape[1] // 2]).to(self.values)
+        return phases(self.light.torus, self.light.finer * (self.values[:2] + middle_pixel))
 
     def _pictures(self, spectra: Tensor) -> Tensor:
-        step, (y, x) = self.light.finer, self.light.torus
-        rows = torch.fft.ifft(spectra, n=y, dim=-2)[..., : step * self.shape[0] : step, :]
-        wide: Tensor = torch.fft.irfft(rows, n=x, dim=-1)
-        return wide[..., : step * self.shape[1] : step]
+        """Return the pictures (..., y, x) of half spectra on the torus of fine samples: one sample
+        of each pixel of the frame.
+        """
+        samples_per_pixel, (y, x) = self.light.finer, self.light.torus
+        rows = torch.fft.ifft(spectra, n=y, dim=-2)[
+            ..., : samples_per_pixel * self.shape[0] : samples_per_pixel, :
+        ]
+        row_samples: Tensor = torch.fft.irfft(rows, n=x, dim=-1)
+        return row_samples[..., : samples_per_pixel * self.shape[1] : samples_per_pixel]

@@ -73,19 +73,24 @@ def at_the_aperture(
     # the scatter is a mean over the frame, so that it falls as 1 / side
     side = min(unclipped[0].numel() ** 0.5, _MOST)
     clipped = 1.0 - unclipped.mean((-2, -1)).to(straight)
-    size = torch.maximum(straight, spread).clamp_min(1e-30) * (_SIDE / side)
-    scatter = (spread.square() - ideal.square()).clamp_min(0.0).sqrt() / size
-    faint = math.sqrt(_PLAIN**2 - 1.0) * ideal / size
-    measurable = scatter > faint
-    hidden = torch.special.ndtr((faint / _USUAL).log() / math.log(_FACTOR))
-    dirty = torch.ones_like(size) if bool(measurable.any()) else hidden / (1.0 + hidden)
-    scatter = torch.where(measurable, scatter, faint.clamp_max(_USUAL))
-    width = torch.where(measurable, _WIDTHS[0], _WIDTHS[1])
-    middle = math.log(_LOST) + _POWER * scatter.log() + _CLIPPED * clipped
-    lost = torch.exp(middle[:, None] + width[:, None] * _normal_quantiles().to(size)).clamp_max(
-        _ALL
+    electrons = torch.maximum(straight, spread).clamp_min(1e-30) * (_SIDE / side)
+    scatter = (spread.square() - ideal.square()).clamp_min(0.0).sqrt() / electrons
+    # the least scatter that shows: it lets the deviation grow by `_PLAIN`
+    least_scatter = math.sqrt(_PLAIN**2 - 1.0) * ideal / electrons
+    measurable = scatter > least_scatter
+    # a dirty lens whose scatter does not show, over a clean one; both as likely before
+    dirty_odds = torch.special.ndtr((least_scatter / _USUAL).log() / math.log(_FACTOR))
+    dirty_probability = (
+        torch.ones_like(electrons) if bool(measurable.any()) else dirty_odds / (1.0 + dirty_odds)
     )
-    return _quantiles(straight, spread, lost, dirty)
+    scatter = torch.where(measurable, scatter, least_scatter.clamp_max(_USUAL))
+    width = torch.where(measurable, _WIDTHS[0], _WIDTHS[1])
+    # see the law above: a power of the scatter, an exponential of the clipped share
+    log_of_median = math.log(_LOST) + _POWER * scatter.log() + _CLIPPED * clipped
+    log_loss = torch.exp(
+        log_of_median[:, None] + width[:, None] * _normal_quantiles().to(electrons)
+    ).clamp_max(_ALL)
+    return _quantiles(straight, spread, log_loss, dirty_probability)
 
 
 def _normal_quantiles() -> Tensor:
@@ -104,18 +109,25 @@ def _quantiles(
     ``lost`` (channel, node) are equally likely values for a dirty lens, ``dirty`` (channel,) is its
     probability.
     """
+    # the first strength is that of a clean lens: nothing is lost
     strengths = straight[:, None] * torch.cat([torch.ones_like(lost[:, :1]), lost.exp()], 1)
-    weight = torch.cat([1.0 - dirty[:, None], (dirty / lost.shape[1])[:, None].expand_as(lost)], 1)
+    probability_of_strength = torch.cat(
+        [1.0 - dirty[:, None], (dirty / lost.shape[1])[:, None].expand_as(lost)], 1
+    )
     probabilities = torch.tensor(_ENDS).to(strengths).expand(len(strengths), -1)
     low = (strengths.amin(1) - 8.0 * spread)[:, None].expand_as(probabilities)
     high = (strengths.amax(1) + 8.0 * spread)[:, None].expand_as(probabilities)
+    # bisection: the distribution is a mixture of normal ones, without an inverse
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        below = torch.special.ndtr(
+        share_below = torch.special.ndtr(
             (middle[..., None] - strengths[:, None]) / spread.clamp_min(1e-30)[:, None, None]
         )
-        short = (weight[:, None] * below).sum(-1) < probabilities
-        low, high = torch.where(short, middle, low), torch.where(short, high, middle)
+        below_probability = (probability_of_strength[:, None] * share_below).sum(-1) < probabilities
+        low, high = (
+            torch.where(below_probability, middle, low),
+            torch.where(below_probability, high, middle),
+        )
     return high[:, 0], high[:, 1:]
 
 
@@ -201,21 +213,21 @@ def find_lasers(
     _refuse(electrons, clipped, psf, pupil, responses, bands)
     lens = Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor)
     with torch.no_grad():
-        precise = max(electrons.shape[-2:]) <= _PRECISE
-        frame = electrons.detach().to(torch.float64 if precise else torch.float32)
-        plain = Pupil(*(x.detach() for x in pupil))
+        small_frame = max(electrons.shape[-2:]) <= _PRECISE
+        frame = electrons.detach().to(torch.float64 if small_frame else torch.float32)
+        constant_pupil = Pupil(*(x.detach() for x in pupil))
         frame_and_camera = Known(
             frame,
             (~clipped).to(frame),
             Camera(
-                plain,
+                constant_pupil,
                 responses.detach().to(frame),
                 bands,
                 lens,
                 torch.tensor(widths[0], dtype=torch.float64),
             ),
-            lamp_light(psf, plain, illuminant, responses, bands, lens, frame.dtype),
-            line_templates(plain, responses, bands, lens),
+            lamp_light(psf, constant_pupil, illuminant, responses, bands, lens, frame.dtype),
+            line_templates(constant_pupil, responses, bands, lens),
             read_noise,
             widths,
         )
@@ -258,17 +270,20 @@ def _(
             f"{y:+.2f}, {x:+.2f} px, {float(result.wavelength[n]) / NANOMETRE:.1f} nm ({low:.1f} to"
             f" {high:.1f}){doubt_text}"
         )
-    alone = (
+    one_channel_text = (
         ""
         if len(electrons) > 1
         else "; with one channel, wavelengths come from the scale of the patterns alone"
     )
-    return [Check(f"{count} laser{'s' * (count > 1)} found: {'; '.join(texts)}{alone}")]
+    return [Check(f"{count} laser{'s' * (count > 1)} found: {'; '.join(texts)}{one_channel_text}")]
 
 
 def _refuse(
     electrons: Tensor, clipped: Tensor, psf: Psf, pupil: Pupil, responses: Tensor, bands: Bands
 ) -> None:
+    """Raise ValueError unless frame, camera and bands fit each other, are finite, and are of a kind
+    in which lasers can be found.
+    """
     if electrons.ndim != 3 or len(electrons) not in _CHANNELS:
         raise ValueError(f"electrons {tuple(electrons.shape)}: {_COLOURS}")
     refuse_other_pictures(electrons, psf, responses, clipped, None)
@@ -297,61 +312,81 @@ def _table(search_result: Found, frame: Known, rows: int) -> FoundLasers:
         n for n, component in enumerate(search_result.fit.parts) if isinstance(component, Laser)
     ]
     spread = spreads(search_result.fit, frame.seen) if laser_indices else []
-    order = sorted(
+    rows_by_gain = sorted(
         range(len(laser_indices)), key=lambda n: -search_result.choices[laser_indices[n]].gain
     )
     result = _empty(rows, len(frame.electrons))
-    pixel = frame.camera.lens.pixel_pitch / frame.camera.lens.focal_length
-    for row, n in enumerate(order):
+    radians_per_pixel = frame.camera.lens.pixel_pitch / frame.camera.lens.focal_length
+    for row, n in enumerate(rows_by_gain):
         laser = search_result.fit.parts[laser_indices[n]]
         assert isinstance(laser, Laser)
+        # y and x in pixels, wavelength in nm, electrons of each channel
         values = torch.cat([laser.values[:3], laser.channels()]).cpu().double()
         covariance = spread[n].covariance.cpu().double()
-        half = NORMAL * covariance.diagonal().sqrt()
-        ends = torch.stack([values - half, values + half], -1)
-        result.direction[row], result.direction_interval[row] = pixel * values[:2], pixel * ends[:2]
+        half_interval = NORMAL * covariance.diagonal().sqrt()
+        value_intervals = torch.stack([values - half_interval, values + half_interval], -1)
+        result.direction[row], result.direction_interval[row] = (
+            radians_per_pixel * values[:2],
+            radians_per_pixel * value_intervals[:2],
+        )
         result.wavelength[row], result.wavelength_interval[row] = (
             NANOMETRE * values[2],
-            NANOMETRE * ends[2],
+            NANOMETRE * value_intervals[2],
         )
         result.fwhm[row] = laser.fwhm
-        result.straight[row], result.straight_spread[row] = values[3:], half[3:] / NORMAL
-        light = (result.straight[row], result.straight_spread[row], spread[n].ideal.cpu().double())
-        result.strength[row], result.strength_interval[row] = at_the_aperture(
-            *light, frame.seen.cpu()
+        result.straight[row], result.straight_spread[row] = values[3:], half_interval[3:] / NORMAL
+        strength_and_deviations = (
+            result.straight[row],
+            result.straight_spread[row],
+            spread[n].ideal.cpu().double(),
         )
+        result.strength[row], result.strength_interval[row] = at_the_aperture(
+            *strength_and_deviations, frame.seen.cpu()
+        )
+        # the intervals of place and wavelength must also be narrow, see `_WIDEST`
         choice = search_result.choices[laser_indices[n]]
-        alone = choice.rival > _RIVAL
-        result.identifiable[row, 0] = alone and float(half[:2].max()) < _WIDEST[0]
-        result.identifiable[row, 1] = alone and float(half[2]) < _WIDEST[1]
+        without_rival = choice.rival > _RIVAL
+        result.identifiable[row, 0] = without_rival and float(half_interval[:2].max()) < _WIDEST[0]
+        result.identifiable[row, 1] = without_rival and float(half_interval[2]) < _WIDEST[1]
         result.gain[row] = torch.tensor([choice.gain, choice.margin])
-        result.correlation[row] = covariance / torch.outer(half / NORMAL, half / NORMAL)
+        result.correlation[row] = covariance / torch.outer(
+            half_interval / NORMAL, half_interval / NORMAL
+        )
     return result._replace(number=torch.tensor(len(laser_indices)))
 
 
 def _empty(rows: int, channels: int) -> FoundLasers:
+    """Return a table of ``rows`` lasers, none of which is found: all 0."""
     shapes = ((2,), (), (), (channels,), (2, 2), (2,), (channels, 2))
-    blank = [torch.zeros(rows, *shape, dtype=torch.float64) for shape in shapes]
-    certain = torch.zeros(rows, 2, dtype=torch.bool)
-    gain, spread = (
+    tables = [torch.zeros(rows, *shape, dtype=torch.float64) for shape in shapes]
+    identifiable = torch.zeros(rows, 2, dtype=torch.bool)
+    gain, correlation = (
         torch.zeros(rows, *shape, dtype=torch.float64)
         for shape in ((2,), (3 + channels, 3 + channels))
     )
-    places, wave, width, size, ends, wave_ends, size_ends = blank
-    none = torch.tensor(0)
-    straight = (torch.zeros_like(size), torch.zeros_like(size))
+    (
+        directions,
+        wavelengths,
+        widths,
+        strengths,
+        direction_intervals,
+        wavelength_intervals,
+        strength_intervals,
+    ) = tables
+    no_lasers = torch.tensor(0)
+    straight = (torch.zeros_like(strengths), torch.zeros_like(strengths))
     return FoundLasers(
-        none,
-        places,
-        wave,
-        width,
-        size,
-        ends,
-        wave_ends,
-        size_ends,
-        certain,
+        no_lasers,
+        directions,
+        wavelengths,
+        widths,
+        strengths,
+        direction_intervals,
+        wavelength_intervals,
+        strength_intervals,
+        identifiable,
         gain,
-        spread,
+        correlation,
         *straight,
     )
 
@@ -460,25 +495,29 @@ def _drawn(lasers: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
     """Return draws (draw, value) of direction, wavelength and the strength of each channel of
     one found laser.
     """
-    middle = torch.cat([lasers.direction[row], lasers.wavelength[row][None], lasers.straight[row]])
+    most_likely = torch.cat(
+        [lasers.direction[row], lasers.wavelength[row][None], lasers.straight[row]]
+    )
     intervals = (lasers.direction_interval[row], lasers.wavelength_interval[row][None])
     spread = torch.cat(
         [
+            # a 90 % interval is `NORMAL` deviations wide on each side
             *((ends[:, 1] - ends[:, 0]) / (2 * NORMAL) for ends in intervals),
             lasers.straight_spread[row],
         ]
     )
     # the factor reads one triangle alone
-    even = (lasers.correlation[row] + lasers.correlation[row].mT) / 2
-    lower = torch.linalg.cholesky(even + 1e-9 * torch.eye(len(even)).to(even))
-    numbers = torch.randn(
-        count, len(middle), generator=rng, device=rng.device, dtype=torch.float64
-    ).to(middle)
-    draws: Tensor = middle + spread * (numbers @ lower.mT)
+    symmetric = (lasers.correlation[row] + lasers.correlation[row].mT) / 2
+    lower_factor = torch.linalg.cholesky(symmetric + 1e-9 * torch.eye(len(symmetric)).to(symmetric))
+    normal_numbers = torch.randn(
+        count, len(most_likely), generator=rng, device=rng.device, dtype=torch.float64
+    ).to(most_likely)
+    draws: Tensor = most_likely + spread * (normal_numbers @ lower_factor.mT)
     return draws
 
 
 def _agree(lasers: FoundLasers, electrons: Tensor) -> None:
+    """Raise ValueError unless the frame has the channels of the lasers that were found in it."""
     if electrons.ndim != 3 or len(electrons) != lasers.strength.shape[-1]:
         raise ValueError(
             f"electrons {tuple(electrons.shape)} and found lasers of {lasers.strength.shape[-1]}"

@@ -83,6 +83,7 @@ def search(
     parts: Parts = ()
     choices: list[Choice] = []
     while True:
+        # filter and weights follow the scene that is left without the parts
         data = _data(frame, parts)
         fit = fitted(data, parts, _LAST) if parts else _empty(data)
         parts = fit.parts
@@ -104,16 +105,20 @@ def _pruned(search_result: Found, smallest_gain: float) -> Found:
     parts, choices = search_result.fit.parts, search_result.choices
     data = search_result.data._replace(clipped=None)
     while len(parts) > 1:
-        now = misfit_of(data, parts, 1)[1]
-        others = [parts[:n] + parts[n + 1 :] for n in range(len(parts))]
-        costs = [misfit_of(data, remaining, _FIRST)[1] - now for remaining in others]
+        misfit = misfit_of(data, parts, 1)[1]
+        parts_without_one = [parts[:n] + parts[n + 1 :] for n in range(len(parts))]
+        # the gain of a part beside the rest is the misfit that its absence costs
+        costs = [misfit_of(data, remaining, _FIRST)[1] - misfit for remaining in parts_without_one]
         choices = tuple(
             choice._replace(gain=cost) for choice, cost in zip(choices, costs, strict=True)
         )
         least_needed = min(range(len(parts)), key=lambda n: costs[n])
         if costs[least_needed] >= smallest_gain:
             break
-        parts, choices = others[least_needed], choices[:least_needed] + choices[least_needed + 1 :]
+        parts, choices = (
+            parts_without_one[least_needed],
+            choices[:least_needed] + choices[least_needed + 1 :],
+        )
     fit = (
         fitted(search_result.data, parts, _LAST)
         if len(parts) < len(search_result.fit.parts)
@@ -129,6 +134,7 @@ def _full(candidate: Laser | Lamp, parts: Parts, largest_number: int, lamps: int
 
 
 def _light(frame: Known, parts: Parts) -> Tensor:
+    """Return the electrons (channel, y, x) of all parts."""
     return sum((component.electrons() for component in parts), torch.zeros_like(frame.electrons))
 
 
@@ -149,9 +155,10 @@ def _data(frame: Known, parts: Parts) -> Data:
 
 
 def _empty(data: Data) -> Fit:
+    """Return the fit without any laser or lamp."""
     white_residual = data.weights(data.use(data.electrons)).flatten()
-    none = white_residual.new_zeros(0, 0)
-    return Fit((), 0.5 * float(white_residual.square().sum()), none, none, white_residual)
+    no_slopes = white_residual.new_zeros(0, 0)
+    return Fit((), 0.5 * float(white_residual.square().sum()), no_slopes, no_slopes, white_residual)
 
 
 class _Left(NamedTuple):
@@ -165,40 +172,47 @@ class _Left(NamedTuple):
 
 
 def _rough(frame: Known, fit: Fit, data: Data) -> _Left:
-    left = (frame.electrons - _light(frame, fit.parts)).float()
+    """Return a frame without the light of the fitted parts, and what the candidates need of it, in
+    float32.
+    """
+    remainder = (frame.electrons - _light(frame, fit.parts)).float()
     weights = Weights(*(x.float() for x in data.weights))
     camera = frame.camera._replace(responses=frame.camera.responses.float())
-    light, unclipped = frame.lamp, frame.seen.float()
-    lamp = light._replace(
-        spectra=light.spectra.to(torch.complex64),
-        colour=light.colour.float(),
-        patterns=light.patterns.float(),
+    lamp_light, unclipped = frame.lamp, frame.seen.float()
+    single_lamp = lamp_light._replace(
+        spectra=lamp_light.spectra.to(torch.complex64),
+        colour=lamp_light.colour.float(),
+        patterns=lamp_light.patterns.float(),
     )
-    less = frame._replace(
-        electrons=frame.electrons.float(), seen=unclipped, camera=camera, lamp=lamp
+    single_frame = frame._replace(
+        electrons=frame.electrons.float(), seen=unclipped, camera=camera, lamp=single_lamp
     )
-    rough = Data(left, Filter(unclipped, data.use.kernel.float()), weights)
-    return _Left(less, rough, misfit_of(rough, (), 0)[1])
+    single_data = Data(remainder, Filter(unclipped, data.use.kernel.float()), weights)
+    return _Left(single_frame, single_data, misfit_of(single_data, (), 0)[1])
 
 
 def _best(frame: Known, fit: Fit, data: Data, smallest_gain: float, margin: float) -> Choice | None:
     """Return the laser or lamp that explains most of what is left; None if nothing does."""
-    left = _rough(frame, fit, data)
-    residual = left.data.use(left.data.electrons)
-    starts = _unclipped_starts(left, residual, frame.lines)
+    remainder = _rough(frame, fit, data)
+    residual = remainder.data.use(remainder.data.electrons)
+    starts = _unclipped_starts(remainder, residual, frame.lines)
     clipped = _clipped_starts(frame, fit.parts, data.use)
-    near = [nearest(left.known.camera, left.data, residual, start) for start in clipped]
-    starts += sorted(near, reverse=True)[:_TRIED]
-    grown = _all_grown(left, sorted(starts, reverse=True))
-    if clipped and _leaves_dark(frame, fit.parts, grown):
-        many = [
-            nearest_of_many(left.known.camera, left.data, residual, start)
+    nearest_starts = [
+        nearest(remainder.known.camera, remainder.data, residual, start) for start in clipped
+    ]
+    # the first ones alone: each is fitted, which takes long
+    starts += sorted(nearest_starts, reverse=True)[:_TRIED]
+    grown_choices = _all_grown(remainder, sorted(starts, reverse=True))
+    if clipped and _leaves_dark(frame, fit.parts, grown_choices):
+        nearest_of_tiles = [
+            nearest_of_many(remainder.known.camera, remainder.data, residual, start)
             for start in clipped[:_TRIED]
         ]
-        grown = _with_more(left, grown, many)
-    grown = _with_far_wavelengths(left, grown, residual)
-    new_choices = [choice for choice in grown if not _known_already(choice.part, fit.parts)]
-    best = _first_or_ahead(left, new_choices, smallest_gain, margin)
+        grown_choices = _with_more(remainder, grown_choices, nearest_of_tiles)
+    # colours that do not fit ask for another wavelength
+    grown_choices = _with_far_wavelengths(remainder, grown_choices, residual)
+    new_choices = [choice for choice in grown_choices if not _known_already(choice.part, fit.parts)]
+    best = _first_or_ahead(remainder, new_choices, smallest_gain, margin)
     return best and best._replace(part=_precise(best.part, frame))
 
 
@@ -217,10 +231,11 @@ def _with_far_wavelengths(left: _Left, grown: list[Choice], residual: Tensor) ->
     responses.
     """
     for _ in range(_TRIED):
-        best = next((choice.part for choice in grown if isinstance(choice.part, Laser)), None)
-        if best is None or float(best.values[5:].square().sum()) < _ODD:
+        best_laser = next((choice.part for choice in grown if isinstance(choice.part, Laser)), None)
+        # values[5:] are the errors of the responses, in standard deviations
+        if best_laser is None or float(best_laser.values[5:].square().sum()) < _ODD:
             break
-        start = nearest(left.known.camera, left.data, residual, _start(best), near=FAR)
+        start = nearest(left.known.camera, left.data, residual, _start(best_laser), near=FAR)
         grown = _with_more(left, grown, [start])
     return grown
 
@@ -247,18 +262,19 @@ def _ahead(
     """
     if new_choices[0].gain < smallest_gain:
         return None
-    best = _widened(left, lasers[0])
-    y, x = (round(float(coordinate)) for coordinate in best.part.values[:2])
+    best_laser = _widened(left, lasers[0])
+    y, x = (round(float(coordinate)) for coordinate in best_laser.part.values[:2])
     lamps = [choice for choice in new_choices if isinstance(choice.part, Lamp)]
-    lamps += _all_grown(left, [Candidate(0.0, (y, x), 0.0, float(best.part.values[3]))])
+    # also a lamp at the place of the laser, of its strength
+    lamps += _all_grown(left, [Candidate(0.0, (y, x), 0.0, float(best_laser.part.values[3]))])
     lamps.sort(key=lambda choice: -choice.gain)
-    ahead = best.gain - (lamps[0].gain if lamps else 0.0)
-    if lamps and ahead < max(margin * best.gain, _AHEAD):
-        return lamps[0]._replace(margin=-ahead)
-    rival = max(
-        (laser.gain for laser in lasers[1:] if _elsewhere(best.part, laser.part)), default=0.0
+    gain_ahead = best_laser.gain - (lamps[0].gain if lamps else 0.0)
+    if lamps and gain_ahead < max(margin * best_laser.gain, _AHEAD):
+        return lamps[0]._replace(margin=-gain_ahead)
+    rival_gain = max(
+        (laser.gain for laser in lasers[1:] if _elsewhere(best_laser.part, laser.part)), default=0.0
     )
-    return best._replace(margin=ahead, rival=best.gain - rival)
+    return best_laser._replace(margin=gain_ahead, rival=best_laser.gain - rival_gain)
 
 
 def _precise(component: Laser | Lamp, frame: Known) -> Laser | Lamp:
@@ -316,8 +332,9 @@ def _known_already(component: Laser | Lamp, parts: Parts) -> bool:
     """Return True for a laser that is told from one of the parts only by the width of a line."""
     for other in parts:
         if isinstance(component, Laser) and isinstance(other, Laser):
-            away = (component.values[:3] - other.values[:3]).abs().tolist()
-            if max(away[:2]) < _SAME[0] and away[2] < _SAME[1]:
+            distances = (component.values[:3] - other.values[:3]).abs().tolist()
+            # y and x in pixels, then nm
+            if max(distances[:2]) < _SAME[0] and distances[2] < _SAME[1]:
                 return True
     return False
 
@@ -348,32 +365,35 @@ def _clipped_starts(frame: Known, parts: Parts, use: Filter) -> list[Candidate]:
     """Return candidates whose clipped pixels are those that no part explains; none where all are
     explained.
     """
-    full, light = _full_well(frame), _light(frame, parts)
+    full_light, light = _full_well(frame), _light(frame, parts)
     if _dark(frame, light) < _FEW:
         return []
-    picture = frame.electrons - torch.minimum(light, full.where(full > 0, torch.inf))
-    every = Filter(torch.ones_like(frame.seen), use.kernel)
-    noise = noise_of(frame.electrons, every.seen, frame.read_noise)
-    weights = weights_of(every(picture), every, noise, picture)
-    starts = clipped_candidates(picture, float(full.max()), every, weights, frame.lines, _CLIPPED)
+    picture = frame.electrons - torch.minimum(light, full_light.where(full_light > 0, torch.inf))
+    all_pixels = Filter(torch.ones_like(frame.seen), use.kernel)
+    noise = noise_of(frame.electrons, all_pixels.seen, frame.read_noise)
+    weights = weights_of(all_pixels(picture), all_pixels, noise, picture)
+    starts = clipped_candidates(
+        picture, float(full_light.max()), all_pixels, weights, frame.lines, _CLIPPED
+    )
     return [start for start in starts if start.gain >= _BEHIND * starts[0].gain]
 
 
 def _laser(frame: Known, start: Candidate, like: Tensor) -> Laser:
-    wavelength_and_strengths = torch.zeros(3 + len(like)).to(like)
-    wavelength_and_strengths[0], wavelength_and_strengths[1] = (
+    """Return a laser at a candidate's spot, wavelength and strength, with a line of the camera's
+    width, in the precision of ``like``.
+    """
+    values_after_spot = torch.zeros(3 + len(like)).to(like)
+    values_after_spot[0], values_after_spot[1] = (
         start.wavelength / NANOMETRE,
         max(start.strength, 1.0),
     )
-    return Laser(
-        frame.camera, torch.cat([torch.tensor(start.spot).to(like), wavelength_and_strengths])
-    )
+    return Laser(frame.camera, torch.cat([torch.tensor(start.spot).to(like), values_after_spot]))
 
 
 def _elsewhere(first: Laser | Lamp, other: Laser | Lamp) -> bool:
     """Return True if two fits ended at different places or wavelengths."""
-    away = (first.values[:3] - other.values[:3]).abs().tolist()
-    return bool(max(away[:2]) > 0.5 or away[2] > 5.0)
+    distances = (first.values[:3] - other.values[:3]).abs().tolist()
+    return bool(max(distances[:2]) > 0.5 or distances[2] > 5.0)
 
 
 def _grown(left: _Left, start: Candidate) -> Choice | None:
@@ -381,12 +401,15 @@ def _grown(left: _Left, start: Candidate) -> Choice | None:
     electrons, frame = left.data.electrons, left.known
     spot = torch.tensor(start.spot).to(electrons)
     component: Laser | Lamp
+    # a candidate of wavelength 0 is a lamp, see `Templates`
     if start.wavelength:
         component = _laser(frame, start, electrons)
     else:
-        amounts = torch.zeros_like(frame.lamp.spectra[:, :, 0, 0].real)
-        amounts[0] = max(start.strength, 1.0) * frame.lamp.colour
-        component = Lamp(frame.lamp, frame.camera.lens.shape, torch.cat([spot, amounts.flatten()]))
+        light_by_kind = torch.zeros_like(frame.lamp.spectra[:, :, 0, 0].real)
+        light_by_kind[0] = max(start.strength, 1.0) * frame.lamp.colour
+        component = Lamp(
+            frame.lamp, frame.camera.lens.shape, torch.cat([spot, light_by_kind.flatten()])
+        )
     parts, misfit = misfit_of(left.data, (component,), _FIRST)
     gain = left.before - misfit
     return Choice(parts[0], gain, 0.0, 0.0) if gain > 0 else None
@@ -410,19 +433,24 @@ def without_scattered(search_result: Found, frame: Known, smallest_gain: float) 
     be; its variance is added to that of the noise, beginning with the weakest laser, whose stronger
     ones may have scattered it.
     """
-    every, choices = search_result.fit.parts, search_result.choices
-    lasers = [n for n, component in enumerate(every) if isinstance(component, Laser)]
-    remaining = set(range(len(every)))
+    all_parts, choices = search_result.fit.parts, search_result.choices
+    lasers = [n for n, component in enumerate(all_parts) if isinstance(component, Laser)]
+    remaining = set(range(len(all_parts)))
+    # the weakest first; the strongest is always a laser
     for n in sorted(lasers, key=lambda n: choices[n].gain)[:-1]:
         stronger = [m for m in lasers if choices[m].gain > choices[n].gain]
-        data = _with_speckle(search_result.data, frame, every, _numbered(every, stronger))
-        parts = _numbered(every, sorted(remaining))
-        others = _numbered(every, sorted(remaining - {n}))
-        if misfit_of(data, others, _FEW_SPECKLES)[1] - misfit_of(data, parts, 1)[1] < smallest_gain:
+        data = _with_speckle(search_result.data, frame, all_parts, _numbered(all_parts, stronger))
+        parts_with_laser = _numbered(all_parts, sorted(remaining))
+        parts_without_laser = _numbered(all_parts, sorted(remaining - {n}))
+        if (
+            misfit_of(data, parts_without_laser, _FEW_SPECKLES)[1]
+            - misfit_of(data, parts_with_laser, 1)[1]
+            < smallest_gain
+        ):
             remaining.remove(n)
-    if len(remaining) == len(every):
+    if len(remaining) == len(all_parts):
         return search_result
-    fit = fitted(search_result.data, _numbered(every, sorted(remaining)), _STEPS)
+    fit = fitted(search_result.data, _numbered(all_parts, sorted(remaining)), _STEPS)
     return search_result._replace(fit=fit, choices=tuple(choices[n] for n in sorted(remaining)))
 
 
@@ -434,18 +462,19 @@ def _with_speckle(data: Data, frame: Known, parts: Parts, lasers: Parts) -> Data
     """Return the frame with weights for which the likeliest speckle of some lasers is noise,
     without clipped pixels.
     """
-    dark = torch.zeros_like(frame.electrons)
-    every, own = (
-        sum((component.electrons() for component in some), dark) for some in (parts, lasers)
+    dark_frame = torch.zeros_like(frame.electrons)
+    light_of_parts, light_of_lasers = (
+        sum((component.electrons() for component in components), dark_frame)
+        for components in (parts, lasers)
     )
-    left = frame.electrons - every
+    remainder = frame.electrons - light_of_parts
 
     def noise(mean: Tensor) -> Tensor:
-        return picture_noise(left + own, mean, frame.read_noise)
+        return picture_noise(remainder + light_of_lasers, mean, frame.read_noise)
 
     glare = visible([laser.electrons() for laser in lasers], [None] * len(lasers), frame.seen)
     variance = noise_of(frame.electrons, frame.seen, frame.read_noise) + speckle(
-        left + own, frame.seen, glare, noise
+        remainder + light_of_lasers, frame.seen, glare, noise
     )
-    weights = weights_of(data.use(left), data.use, variance, left)
+    weights = weights_of(data.use(remainder), data.use, variance, remainder)
     return data._replace(weights=weights, clipped=None)

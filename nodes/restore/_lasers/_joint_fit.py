@@ -61,13 +61,18 @@ class Censored(NamedTuple):
 
 
 def _root(over: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the root of twice the misfit of a pixel by so many deviations over full, and its
-    slope, downwards.
+    """Return numbers whose half square is `_WORTH` times the misfit of clipped pixels, and how they
+    fall with ``over``.
+
+    ``over`` is by how many standard deviations the light of a pixel exceeds what fills it. The
+    misfit is -log(1 - p), where p is the probability that the pixel is not full, and the scene
+    alone does not fill it.
     """
-    short = (1.0 - _BRIGHT) * torch.special.ndtr(-over)
-    root = (-2.0 * torch.log1p(-short)).sqrt()
+    below_full = (1.0 - _BRIGHT) * torch.special.ndtr(-over)
+    root = (-2.0 * torch.log1p(-below_full)).sqrt()
     density = torch.exp(-0.5 * over.square()) / (2.0 * torch.pi) ** 0.5
-    slope = (1.0 - _BRIGHT) * density / ((1.0 - short) * root.clamp_min(1e-6))
+    # derivative of sqrt(-2 log(1 - p)) with respect to the deviations
+    slope = (1.0 - _BRIGHT) * density / ((1.0 - below_full) * root.clamp_min(1e-6))
     return _WORTH**0.5 * root, _WORTH**0.5 * slope
 
 
@@ -119,29 +124,32 @@ def fitted(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> Fit:
     """Return the parts after at most ``steps`` steps, each of which lowers the misfit, with the
     slopes at the end.
     """
-    parts_fitted, left, white_residual, misfit = _walked(data, tuple(parts), steps)
-    columns = _columns(data, parts_fitted, left)
+    parts_fitted, remainder, white_residual, misfit = _walked(data, tuple(parts), steps)
+    columns = _columns(data, parts_fitted, remainder)
     return Fit(parts_fitted, misfit, _normal(parts_fitted, columns), columns, white_residual)
 
 
 def misfit_of(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> tuple[Parts, float]:
     """Return the parts after at most ``steps`` steps, and their misfit."""
-    now, _, _, misfit = _walked(data, tuple(parts), steps)
-    return now, misfit
+    fitted_parts, _, _, misfit = _walked(data, tuple(parts), steps)
+    return fitted_parts, misfit
 
 
 def _walked(data: Data, now: Parts, steps: int) -> tuple[Parts, Tensor, Tensor, float]:
-    """Return parts after steps, the frame less their light, the white residual and the misfit."""
-    left, white_residual, misfit = _misfit(data, now)
+    """Return the parts after at most ``steps`` steps, the frame less their light, the white
+    residual and the misfit.
+    """
+    remainder, white_residual, misfit = _misfit(data, now)
     for _ in range(steps):
-        better = _step(data, now, left, white_residual, misfit)
-        if better is None:
+        next_fit = _step(data, now, remainder, white_residual, misfit)
+        if next_fit is None:
             break
-        gained = misfit - better[3]
-        now, left, white_residual, misfit = better
-        if gained < _ENOUGH:
+        # next_fit is (parts, remainder, residual, misfit)
+        gain = misfit - next_fit[3]
+        now, remainder, white_residual, misfit = next_fit
+        if gain < _ENOUGH:
             break
-    return now, left, white_residual, misfit
+    return now, remainder, white_residual, misfit
 
 
 def _step(
@@ -152,18 +160,18 @@ def _step(
     """
     columns = _columns(data, now, left)
     normal = _normal(now, columns)
-    pulled = torch.cat([component.values * component.precision for component in now])
-    slope = columns @ white_residual - pulled
+    prior_pull = torch.cat([component.values * component.precision for component in now])
+    slope = columns @ white_residual - prior_pull
     sizes = [len(component.values) for component in now]
     for damping in _DAMPED:
         step = solved(normal + damping * normal.diagonal().diag(), slope).to(slope)
         moved = tuple(
-            component.moved(own)
-            for component, own in zip(now, torch.split(step, sizes), strict=True)
+            component.moved(own_step)
+            for component, own_step in zip(now, torch.split(step, sizes), strict=True)
         )
-        after, white, new = _misfit(data, moved)
-        if new < misfit:
-            return moved, after, white, new
+        remainder, residual_after, misfit_after = _misfit(data, moved)
+        if misfit_after < misfit:
+            return moved, remainder, residual_after, misfit_after
     return None
 
 
@@ -174,11 +182,16 @@ def _columns(data: Data, parts: Parts, left: Tensor) -> Tensor:
     )
     if data.clipped is None:
         return white
-    lit = torch.cat([data.clipped.of(component.columns(data.clipped.lit)) for component in parts])
-    return torch.cat([white, data.clipped.slopes(left, lit)], 1)
+    clipped_light = torch.cat(
+        [data.clipped.of(component.columns(data.clipped.lit)) for component in parts]
+    )
+    return torch.cat([white, data.clipped.slopes(left, clipped_light)], 1)
 
 
 def _normal(parts: Parts, columns: Tensor) -> Tensor:
+    """Return the matrix (value, value) of second derivatives: products of slopes, and the prior's
+    precision.
+    """
     return (
         products(columns) + torch.cat([component.precision for component in parts]).double().diag()
     )
@@ -201,27 +214,29 @@ def products(columns: Tensor) -> Tensor:
 def solved(normal: Tensor, right: Tensor) -> Tensor:
     """Solve a normal system, whose values have any scale, in spite of values that nothing tells."""
     scale = normal.diagonal().clamp_min(1e-30).rsqrt()
-    even = scale[:, None] * normal * scale
-    even = even + 1e-12 * torch.eye(len(even)).to(even)
+    scaled_matrix = scale[:, None] * normal * scale
+    scaled_matrix = scaled_matrix + 1e-12 * torch.eye(len(scaled_matrix)).to(scaled_matrix)
     row_scale = scale if right.ndim == 1 else scale[:, None]
-    answer: Tensor = row_scale * torch.linalg.solve(even, row_scale * right.to(even))
-    return answer
+    solution: Tensor = row_scale * torch.linalg.solve(
+        scaled_matrix, row_scale * right.to(scaled_matrix)
+    )
+    return solution
 
 
 def _misfit(data: Data, parts: Parts) -> tuple[Tensor, Tensor, float]:
     """Return the frame less the light of the parts, the numbers that are squared, and the
     misfit.
     """
-    left = data.electrons
+    remainder = data.electrons
     for component in parts:
-        left = left - component.electrons()
-    numbers = data.weights(data.use(left)).flatten()
+        remainder = remainder - component.electrons()
+    numbers = data.weights(data.use(remainder)).flatten()
     if data.clipped is not None:
-        numbers = torch.cat([numbers, data.clipped.misfits(left)])
+        numbers = torch.cat([numbers, data.clipped.misfits(remainder)])
     prior = sum(
         float((component.precision * component.values.square()).sum()) for component in parts
     )
-    return left, numbers, 0.5 * (float(numbers.double().square().sum()) + prior)
+    return remainder, numbers, 0.5 * (float(numbers.double().square().sum()) + prior)
 
 
 # --- intervals ------------------------------------------------------------------------------------
@@ -256,38 +271,46 @@ def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
     all. The inverse of the second derivatives is enlarged where the slopes of blocks of the frame
     scatter more than the model says.
     """
-    count = len(fit.normal)
-    inverse = solved(fit.normal, torch.eye(count).to(fit.normal))
+    value_count = len(fit.normal)
+    inverse = solved(fit.normal, torch.eye(value_count).to(fit.normal))
+    # each number's part of the slope of the misfit with respect to each value
     scores_by_number = (fit.columns * fit.rest).double()
-    pictures = scores_by_number[:, : unclipped.numel()].view(count, *unclipped.shape)
+    pictures = scores_by_number[:, : unclipped.numel()].view(value_count, *unclipped.shape)
     if scores_by_number.shape[1] > unclipped.numel():
         pictures[:, unclipped == 0] = scores_by_number[
             :, unclipped.numel() :
         ]  # a clipped pixel has no residual
     scores = pictures.sum(1)
-    y, x = (-n % _BLOCK for n in unclipped.shape[-2:])
+    # up to whole blocks
+    rows_missing, columns_missing = (-n % _BLOCK for n in unclipped.shape[-2:])
     blocks = (
-        pad(scores, (0, x, 0, y))
+        pad(scores, (0, columns_missing, 0, rows_missing))
         .unfold(1, _BLOCK, _BLOCK)
         .unfold(2, _BLOCK, _BLOCK)
         .sum((-2, -1))
         .flatten(1)
     )
     prior = fit.normal - products(fit.columns)
-    scattered = inverse @ (blocks @ blocks.T + prior) @ inverse
-    growth = (scattered.diagonal() / inverse.diagonal().clamp_min(1e-300)).clamp_min(1.0).sqrt()
-    covariance = growth[:, None] * inverse * growth
-    laser_spreads, first = [], 0
+    # Huber's sandwich: the scatter of the blocks' scores in place of their expectation
+    sandwich = inverse @ (blocks @ blocks.T + prior) @ inverse
+    deviation_growth = (
+        (sandwich.diagonal() / inverse.diagonal().clamp_min(1e-300)).clamp_min(1.0).sqrt()
+    )
+    covariance = deviation_growth[:, None] * inverse * deviation_growth
+    laser_spreads, first_value = [], 0
     for component in fit.parts:
-        own = slice(first, first + len(component.values))
-        first += len(component.values)
+        own_values = slice(first_value, first_value + len(component.values))
+        first_value += len(component.values)
         if isinstance(component, Laser):
             pixels = int(unclipped.amin(0).sum())
-            grown, ideal = (
-                _of_channels(component, matrix[own, own], pixels)
+            covariance_of_laser, ideal_covariance = (
+                _of_channels(component, matrix[own_values, own_values], pixels)
                 for matrix in (covariance, inverse)
             )
-            laser_spreads.append(Spread(grown, ideal.diagonal()[3:].sqrt()))
+            # after y, x and nm come the electrons of the channels
+            laser_spreads.append(
+                Spread(covariance_of_laser, ideal_covariance.diagonal()[3:].sqrt())
+            )
     return laser_spreads
 
 
@@ -298,12 +321,13 @@ def _of_channels(laser: Laser, own: Tensor, pixels: int) -> Tensor:
     ``pixels`` counts those that no channel clips.
     """
     slopes = laser.channel_slopes().to(own)
-    to = torch.zeros(3 + len(slopes), len(own)).to(own)
-    to[:3, :3] = torch.eye(3).to(own)
-    to[3:] = slopes
-    neglected = torch.zeros(len(to)).to(own)
-    grains = torch.tensor(_GRAINS).to(own).square() / max(pixels, 1)
-    neglected[:3] = torch.tensor(_MODEL).to(own).square() + grains
+    # from y, x, nm, ... of `Laser.values` to y, x, nm and the electrons of each channel
+    jacobian = torch.zeros(3 + len(slopes), len(own)).to(own)
+    jacobian[:3, :3] = torch.eye(3).to(own)
+    jacobian[3:] = slopes
+    neglected = torch.zeros(len(jacobian)).to(own)
+    grain_variance = torch.tensor(_GRAINS).to(own).square() / max(pixels, 1)
+    neglected[:3] = torch.tensor(_MODEL).to(own).square() + grain_variance
     neglected[2] += (_SHAPE * laser.fwhm.to(own) / NANOMETRE).square()
     neglected[3:] = (_AMOUNT * laser.channels()).square().to(own)
-    return to @ own @ to.T + neglected.diag()
+    return jacobian @ own @ jacobian.T + neglected.diag()

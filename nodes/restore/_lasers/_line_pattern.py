@@ -74,14 +74,22 @@ def _parts(fwhm: Tensor) -> tuple[list[float], list[float]]:
 
 
 def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
+    """Return the share (y, x) of the clear pupil's light in each pixel, for one wavelength in m.
+
+    The far field is the Fourier transform of the pupil's field, by a matrix for each axis.
+    """
     field = _field(pupil, wavelength)
     spot = direction.to(wavelength) * (lens.focal_length / lens.pixel_pitch)
-    reach = _reach(pupil, wavelength, lens)
-    window = _Window.of(lens, field, reach)
-    rows, columns = (_axis(window.places[i], reach, spot[i], field, i) for i in (0, 1))
-    far = rows @ field @ columns.T
-    light = window.seen(far.real.square() + far.imag.square(), (spot[0], spot[1]), reach)
-    return light * _share(pupil, wavelength, reach).to(light)
+    turns_per_pixel = _reach(pupil, wavelength, lens)
+    window = _Window.of(lens, field, turns_per_pixel)
+    row_phasors, column_phasors = (
+        _axis(window.places[i], turns_per_pixel, spot[i], field, i) for i in (0, 1)
+    )
+    amplitude = row_phasors @ field @ column_phasors.T
+    light = window.seen(
+        amplitude.real.square() + amplitude.imag.square(), (spot[0], spot[1]), turns_per_pixel
+    )
+    return light * _share(pupil, wavelength, turns_per_pixel).to(light)
 
 
 class _Window(NamedTuple):
@@ -95,30 +103,31 @@ class _Window(NamedTuple):
 
     @classmethod
     def of(cls, lens: Lens, field: Tensor, reach: Tensor) -> _Window:
+        # `reach` is that of `_reach`: turns of phase by one sample of the pupil and one pixel
         y, x = (
             torch.arange(n, dtype=torch.float64, device=field.device) - n // 2 for n in lens.shape
         )
         if lens.sensor != "integrated":
             return cls((y, x), (y, x), None)
-        rows, columns = (
+        row_grid, column_grid = (
             fine_axis(n, k * float(reach.detach()), _FILTER_ERROR)
             for n, k in zip(lens.shape, field.shape, strict=True)
         )
-        down, across = (
+        row_places, column_places = (
             centred(grid.samples, field.device) / grid.per_pixel + pixels.mean()
-            for grid, pixels in ((rows, y), (columns, x))
+            for grid, pixels in ((row_grid, y), (column_grid, x))
         )
-        return cls((down, across), (y, x), (rows, columns))
+        return cls((row_places, column_places), (y, x), (row_grid, column_grid))
 
     def seen(self, light: Tensor, spot: tuple[Tensor, Tensor], reach: Tensor) -> Tensor:
         """Return the light (y, x) of each pixel; 0 where the pattern of a spot would repeat."""
         if self.grids is not None:
             light = averaged(light, *self.grids)
-        y, x = (
+        rows_within, columns_within = (
             _within(pixels, place, reach).to(light)
             for pixels, place in zip(self.pixels, spot, strict=True)
         )
-        return light * y[:, None] * x
+        return light * rows_within[:, None] * columns_within
 
 
 def _reach(pupil: Pupil, wavelength: Tensor, lens: Lens) -> Tensor:
@@ -131,8 +140,8 @@ def _share(pupil: Pupil, wavelength: Tensor, reach: Tensor) -> Tensor:
     pixel.
     """
     area = pupil.aperture.double().square().sum()
-    passed = passed_by_notches(pupil._replace(wavelengths=wavelength[None]))[0]
-    return reach.square() * passed / area
+    notch_share = passed_by_notches(pupil._replace(wavelengths=wavelength[None]))[0]
+    return reach.square() * notch_share / area
 
 
 def _turns(samples: int, reach: Tensor, field: Tensor) -> Tensor:
@@ -157,15 +166,22 @@ def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm:
     The slopes with wavelength and variance are means over the line too, by parts of the integral
     over a Gaussian line.
     """
-    wide = fwhm.clamp_min(_NARROW)
-    sigma, sums = deviation(wide), [torch.zeros(1)] * 5
-    for offset, share in zip(*_parts(wide), strict=True):
-        still, down, right = _moves(pupil, spot, wavelength + offset * sigma, lens)
-        by = (share * still, share * down, share * right, share * offset / sigma * still)
-        blur = share * (offset * offset - 1.0) / (2.0 * sigma.square()) * still
+    line_width = fwhm.clamp_min(_NARROW)
+    sigma, sums = deviation(line_width), [torch.zeros(1)] * 5
+    for offset, share in zip(*_parts(line_width), strict=True):
+        pattern, down, right = _moves(pupil, spot, wavelength + offset * sigma, lens)
+        contributions = (
+            share * pattern,
+            share * down,
+            share * right,
+            share * offset / sigma * pattern,
+        )
+        # Gauss and Hermite: means of the pattern times the Hermite polynomials t and t^2 - 1 are
+        # slopes with wavelength and variance
+        blur = share * (offset * offset - 1.0) / (2.0 * sigma.square()) * pattern
         sums = [
             total.to(contribution) + contribution
-            for total, contribution in zip(sums, (*by, blur), strict=True)
+            for total, contribution in zip(sums, (*contributions, blur), strict=True)
         ]
     return Moves(*sums)
 
@@ -174,19 +190,26 @@ def _moves(
     pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the pattern of one wavelength, and its slopes along y and x by pixel."""
-    field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
-    turn_y, turn_x = (_turns(n, reach, field) for n in field.shape)
-    window, spot_place = _Window.of(lens, field, reach), (spot[0], spot[1])
-    rows, columns = (_axis(window.places[i], reach, spot[i], field, i) for i in (0, 1))
-    both = field @ torch.cat([columns, turn_x * columns]).T
-    far, right = (rows @ both).chunk(2, dim=1)
-    down = (turn_y * rows) @ both[:, : len(columns)]
-    light = window.seen(far.real.square() + far.imag.square(), spot_place, reach)
+    field, turns_per_pixel = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
+    row_factor, column_factor = (_turns(n, turns_per_pixel, field) for n in field.shape)
+    window, spot_place = _Window.of(lens, field, turns_per_pixel), (spot[0], spot[1])
+    row_phasors, column_phasors = (
+        _axis(window.places[i], turns_per_pixel, spot[i], field, i) for i in (0, 1)
+    )
+    amplitude_and_slope = field @ torch.cat([column_phasors, column_factor * column_phasors]).T
+    amplitude, right_slope = (row_phasors @ amplitude_and_slope).chunk(2, dim=1)
+    down_slope = (row_factor * row_phasors) @ amplitude_and_slope[:, : len(column_phasors)]
+    light = window.seen(
+        amplitude.real.square() + amplitude.imag.square(), spot_place, turns_per_pixel
+    )
+    # slope of |a|^2 = 2 Re(conj(a) a'), whose 2 is applied below
     by_pixel = [
-        window.seen(far.real * way.real + far.imag * way.imag, spot_place, reach)
-        for way in (down, right)
+        window.seen(
+            amplitude.real * slope.real + amplitude.imag * slope.imag, spot_place, turns_per_pixel
+        )
+        for slope in (down_slope, right_slope)
     ]
-    share = _share(pupil, wavelength, reach).to(light)
+    share = _share(pupil, wavelength, turns_per_pixel).to(light)
     return share * light, 2 * share * by_pixel[0], 2 * share * by_pixel[1]
 
 
@@ -196,23 +219,30 @@ def grid_patterns(
     """Return the patterns (row, column, y, x) of one wavelength with spots at each of ``down`` x
     ``right`` pixels.
     """
-    field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
-    window = _Window.of(lens, field, reach)
-    rows = torch.cat([_axis(window.places[0], reach, place, field, 0) for place in down])
-    columns = torch.cat([_axis(window.places[1], reach, place, field, 1) for place in right])
-    far = rows @ (field @ columns.T)
-    light = far.real.square() + far.imag.square()
-    tall, wide = (len(places) for places in window.places)
+    field, turns_per_pixel = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
+    window = _Window.of(lens, field, turns_per_pixel)
+    # the phasors of all spots below one another: one product for all patterns
+    row_phasors = torch.cat(
+        [_axis(window.places[0], turns_per_pixel, place, field, 0) for place in down]
+    )
+    column_phasors = torch.cat(
+        [_axis(window.places[1], turns_per_pixel, place, field, 1) for place in right]
+    )
+    amplitude = row_phasors @ (field @ column_phasors.T)
+    light = amplitude.real.square() + amplitude.imag.square()
+    row_count, column_count = (len(places) for places in window.places)
     patterns = [
         torch.stack(
             [
-                window.seen(columns_of_spot, (y, x), reach)
-                for x, columns_of_spot in zip(right, torch.split(row, wide, 1), strict=True)
+                window.seen(columns_of_spot, (y, x), turns_per_pixel)
+                for x, columns_of_spot in zip(
+                    right, torch.split(light_of_row, column_count, 1), strict=True
+                )
             ]
         )
-        for y, row in zip(down, torch.split(light, tall), strict=True)
+        for y, light_of_row in zip(down, torch.split(light, row_count), strict=True)
     ]
-    return _share(pupil, wavelength, reach).to(light) * torch.stack(patterns)
+    return _share(pupil, wavelength, turns_per_pixel).to(light) * torch.stack(patterns)
 
 
 def _field(pupil: Pupil, wavelength: Tensor) -> Tensor:
@@ -232,8 +262,8 @@ def _axis(places: Tensor, reach: Tensor, spot: Tensor, field: Tensor, dim: int) 
 
 def _within(pixels: Tensor, spot: Tensor, reach: Tensor) -> Tensor:
     """Return True for pixels within half the alias-free field from the spot."""
-    away: Tensor = ((pixels - spot) * reach).abs()
-    return away <= 0.5 * (1 + 1e-9)
+    distance_in_fields: Tensor = ((pixels - spot) * reach).abs()
+    return distance_in_fields <= 0.5 * (1 + 1e-9)
 
 
 def _radians(turns: Tensor) -> Tensor:
@@ -252,15 +282,19 @@ def index_at(wavelength: Tensor, pupil: Pupil) -> Tensor:
             count // 2, len(wavelengths) - count + count // 2
         )
     )
-    near, value = (
+    near_wavelengths, near_values = (
         x[first - count // 2 : first - count // 2 + count] for x in (wavelengths, values)
     )
-    total = torch.zeros_like(wavelength)
+    index = torch.zeros_like(wavelength)
     for i in range(count):
         others = [j for j in range(count) if j != i]
-        factors = [(wavelength - near[j]) / (near[i] - near[j]) for j in others]
-        total = total + value[i] * (torch.stack(factors).prod() if factors else 1.0)
-    return total
+        # Lagrange's polynomial
+        factors = [
+            (wavelength - near_wavelengths[j]) / (near_wavelengths[i] - near_wavelengths[j])
+            for j in others
+        ]
+        index = index + near_values[i] * (torch.stack(factors).prod() if factors else 1.0)
+    return index
 
 
 def interpolated(place: Tensor, places: Tensor, values: Tensor) -> Tensor:
@@ -269,9 +303,9 @@ def interpolated(place: Tensor, places: Tensor, values: Tensor) -> Tensor:
     """
     if len(places) == 1:
         return values[:, 0] + 0.0 * place
-    right = int(torch.searchsorted(places.detach(), place.detach()).clamp(1, len(places) - 1))
-    share = (place - places[right - 1]) / (places[right] - places[right - 1])
-    return values[:, right - 1] * (1.0 - share) + values[:, right] * share
+    upper = int(torch.searchsorted(places.detach(), place.detach()).clamp(1, len(places) - 1))
+    share = (place - places[upper - 1]) / (places[upper] - places[upper - 1])
+    return values[:, upper - 1] * (1.0 - share) + values[:, upper] * share
 
 
 def response_at(wavelength: Tensor, responses: Tensor, bands: Bands) -> Tensor:

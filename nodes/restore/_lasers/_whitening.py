@@ -33,8 +33,9 @@ class Weights(NamedTuple):
 
     def __call__(self, filtered: Tensor) -> Tensor:
         """Return filtered pictures (..., channel, y, x) as numbers of mean 0 and variance 1."""
-        own = self.diagonal * filtered
-        return own - self.grey * (self.share * (self.grey * own).sum(-3, keepdim=True))
+        scaled = self.diagonal * filtered
+        # (D^2 + s s')^(-1/2) applied for all channels, up to a rotation: one shared colour s
+        return scaled - self.grey * (self.share * (self.grey * scaled).sum(-3, keepdim=True))
 
     def twice(self, filtered: Tensor) -> Tensor:
         """Return the product of these weights' transpose and of what they make of filtered
@@ -47,9 +48,14 @@ class Weights(NamedTuple):
 
     def pair(self, first: int, other: int) -> Tensor:
         """Return the element (y, x) of the inverse covariance for two channels."""
-        total = self.grey.square().sum(0)
-        lost = (2.0 - self.share[0] * total) * self.share[0] * self.grey[first] * self.grey[other]
-        return self.diagonal[first] * self.diagonal[other] * (float(first == other) - lost)
+        shared_square = self.grey.square().sum(0)
+        shared_part = (
+            (2.0 - self.share[0] * shared_square)
+            * self.share[0]
+            * self.grey[first]
+            * self.grey[other]
+        )
+        return self.diagonal[first] * self.diagonal[other] * (float(first == other) - shared_part)
 
 
 class Filter(NamedTuple):
@@ -85,6 +91,7 @@ def _convolved(pictures: Tensor, kernel: Tensor) -> Tensor:
     size = [fast_size(n) for n in padded.shape[-2:]]
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
     y, x = pictures.shape[-2:]
+    # the kernel's middle is `rim` in, and the padding another `rim`
     inner: Tensor = torch.fft.irfft2(product, s=size)[
         :, 2 * rim : 2 * rim + y, 2 * rim : 2 * rim + x
     ]
@@ -111,19 +118,19 @@ def filled(pictures: Tensor, unclipped: Tensor) -> Tensor:
 
 
 def _from_coarse(pictures: Tensor, unclipped: Tensor) -> Tensor:
-    """Return pictures (picture, channel, y, x) filled from the means over two by two pixels, and
-    so on.
+    """Return pictures (picture, channel, y, x) whose clipped pixels are filled from the means over
+    two by two pixels; where none of these is seen, from the means over four by four, and so on.
     """
     y, x = unclipped.shape[-2:]
     if bool(unclipped.all()) or max(y, x) < 2:
         return pictures
-    rim = (0, x % 2, 0, y % 2)
-    weight = avg_pool2d(pad(unclipped, rim), 2)
-    coarse = avg_pool2d(pad(pictures * unclipped, rim), 2) / weight.clamp_min(0.1)
-    wide = interpolate(
-        _from_coarse(coarse, (weight > 0).to(unclipped)), scale_factor=2, mode="bilinear"
+    odd_padding = (0, x % 2, 0, y % 2)
+    seen_share = avg_pool2d(pad(unclipped, odd_padding), 2)
+    block_means = avg_pool2d(pad(pictures * unclipped, odd_padding), 2) / seen_share.clamp_min(0.1)
+    filled_from_coarse = interpolate(
+        _from_coarse(block_means, (seen_share > 0).to(unclipped)), scale_factor=2, mode="bilinear"
     )
-    return torch.where(unclipped > 0, pictures, wide[..., :y, :x])
+    return torch.where(unclipped > 0, pictures, filled_from_coarse[..., :y, :x])
 
 
 def box(pictures: Tensor, side: int) -> Tensor:
@@ -141,27 +148,33 @@ def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
     nearly white.
     """
     grey = filled(picture, unclipped).mean(0)
-    y, x = (
+    y_window, x_window = (
         torch.hann_window(n, periodic=False, dtype=grey.dtype, device=grey.device)
         for n in grey.shape
     )
-    window = y[:, None] * x
+    window = y_window[:, None] * x_window
     grey = (grey - (grey * window).sum() / window.sum()) * window
     power = torch.fft.rfft2(grey).abs().square() / window.square().sum()
     fy, fx = torch.fft.fftfreq(grey.shape[0]).to(grey), torch.fft.rfftfreq(grey.shape[1]).to(grey)
-    away = torch.hypot(fy[:, None], fx)
-    level = noise.mean() / len(noise)
-    some = (away > 0.05) & (away < 0.2)
-    # the median of an exponential law is ln 2
-    size = ((power - level) * away**3)[some].median() / 0.69
+    frequency = torch.hypot(fy[:, None], fx)
+    noise_level = noise.mean() / len(noise)
+    middle_frequencies = (frequency > 0.05) & (frequency < 0.2)
+    # a scene has the power strength / f^3, and the powers of a periodogram are exponential, with a
+    # median of ln 2 times the mean
+    scene_strength = ((power - noise_level) * frequency**3)[middle_frequencies].median() / 0.69
     side = 2 * _RADIUS + 1
-    fine = torch.fft.fftfreq(64).to(grey)
-    far = torch.hypot(fine[:, None], torch.fft.rfftfreq(64).to(grey))
-    spectrum = (far**3 / (size.clamp_min(1e-6 * level) + level * far**3)).sqrt()
+    kernel_frequencies = torch.fft.fftfreq(64).to(grey)
+    kernel_frequency = torch.hypot(kernel_frequencies[:, None], torch.fft.rfftfreq(64).to(grey))
+    # 1 / sqrt(strength / f^3 + noise): what makes the sum white
+    spectrum = (
+        kernel_frequency**3
+        / (scene_strength.clamp_min(1e-6 * noise_level) + noise_level * kernel_frequency**3)
+    ).sqrt()
     kernel = torch.fft.irfft2(spectrum, s=(64, 64)).roll((_RADIUS, _RADIUS), (0, 1))[:side, :side]
     taper = torch.hann_window(side + 2, periodic=False, dtype=grey.dtype, device=grey.device)[1:-1]
     taper = taper[:, None] * taper
     kernel = kernel * taper
+    # of sum 0, so that it passes no mean
     kernel = kernel - taper * (kernel.sum() / taper.sum())
     return Filter(unclipped, kernel / kernel.square().sum().sqrt())
 
@@ -177,26 +190,38 @@ def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) ->
     """
     unclipped = use.seen
     spread = masked_variance(picture, unclipped)
-    own = use.squared(noise) + LOST * spread * use.squared(1.0 - unclipped)
-    colour = (picture * unclipped).sum((-2, -1)) / unclipped.sum((-2, -1)).clamp_min(1.0)
-    colour = (colour / colour.abs().max().clamp_min(1e-9)).clamp_min(0.05)[:, None, None]
-    inverse = unclipped / own
-    precision = (colour.square() * inverse).sum(0, keepdim=True)
-    grey = (colour * inverse * filtered).sum(0, keepdim=True) / precision.clamp_min(1e-30)
-    some = (precision > 0).to(unclipped)
-    details = _around(grey.square(), some) - _around(1.0 / precision.clamp_min(1e-12), some)
-    details = details.clamp_min(0.0)
-    details = torch.maximum(details, _LEAST * (details * some).sum() / some.sum().clamp_min(1.0))
-    colour_variance = _around((filtered - colour * grey).square(), unclipped)
-    variance = torch.where(unclipped > 0, torch.maximum(own, colour_variance), _UNSEEN)
+    noise_variance = use.squared(noise) + LOST * spread * use.squared(1.0 - unclipped)
+    scene_colour = (picture * unclipped).sum((-2, -1)) / unclipped.sum((-2, -1)).clamp_min(1.0)
+    scene_colour = (scene_colour / scene_colour.abs().max().clamp_min(1e-9)).clamp_min(0.05)[
+        :, None, None
+    ]
+    seen_precision = unclipped / noise_variance
+    precision = (scene_colour.square() * seen_precision).sum(0, keepdim=True)
+    # the most likely detail that has the scene's colour in all channels
+    grey_details = (scene_colour * seen_precision * filtered).sum(
+        0, keepdim=True
+    ) / precision.clamp_min(1e-30)
+    any_seen = (precision > 0).to(unclipped)
+    # their mean square, less the variance that noise gives them
+    detail_variance = _around(grey_details.square(), any_seen) - _around(
+        1.0 / precision.clamp_min(1e-12), any_seen
+    )
+    detail_variance = detail_variance.clamp_min(0.0)
+    detail_variance = torch.maximum(
+        detail_variance, _LEAST * (detail_variance * any_seen).sum() / any_seen.sum().clamp_min(1.0)
+    )
+    colour_variance = _around((filtered - scene_colour * grey_details).square(), unclipped)
+    variance = torch.where(unclipped > 0, torch.maximum(noise_variance, colour_variance), _UNSEEN)
     diagonal = variance.rsqrt()
-    shared = colour * details.sqrt() * diagonal
-    total = shared.square().sum(0, keepdim=True)
-    share = (1.0 - (1.0 + total).rsqrt()) / total.clamp_min(1e-30)
-    return Weights(diagonal, shared, share)
+    shared_deviation = scene_colour * detail_variance.sqrt() * diagonal
+    shared_square = shared_deviation.square().sum(0, keepdim=True)
+    # (1 + s s')^(-1/2) = 1 - s s' (1 - (1 + |s|^2)^(-1/2)) / |s|^2
+    share = (1.0 - (1.0 + shared_square).rsqrt()) / shared_square.clamp_min(1e-30)
+    return Weights(diagonal, shared_deviation, share)
 
 
 def _around(values: Tensor, unclipped: Tensor) -> Tensor:
+    """Return the mean over the pixels of a square around each pixel that are not clipped."""
     return box(values * unclipped, _AROUND) / box(unclipped.expand_as(values), _AROUND).clamp_min(
         1e-9
     )

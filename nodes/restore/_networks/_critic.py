@@ -27,6 +27,9 @@ class Critic(nn.Module):
     gain = LEAKY
 
     def __init__(self, width: int = 64) -> None:
+        """Build a critic of ``width`` channels at half the size, doubled with each halving up to
+        eight times.
+        """
         super().__init__()
         sizes = [3, width, 2 * width, 4 * width, 8 * width]
         layers: list[nn.Module] = []

@@ -40,6 +40,9 @@ class Scan(nn.Module):
     """
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
+        """Build a scan of ``channels`` with ``states`` numbers each; ``rank`` numbers give the time
+        steps.
+        """
         super().__init__()
         self.sizes = [rank, states, states]
         self.read = nn.Linear(channels, sum(self.sizes), bias=False)
@@ -62,11 +65,13 @@ class Scan(nn.Module):
         self.D.fill_(1.0)
 
     def forward(self, u: Tensor) -> Tensor:
-        rate, into, out = self.read(u).split(self.sizes, -1)
+        rate, input_weight, output_weight = self.read(u).split(self.sizes, -1)
         rate = single(self.rate(rate))
         with torch.autocast(u.device.type, enabled=False):
             u, step, decay = single(u), _step(rate, self.dt_bias), _decay(self.A_log)
-            return selective_scan(u, step, decay, single(into), single(out), self.D).to(u.dtype)
+            return selective_scan(
+                u, step, decay, single(input_weight), single(output_weight), self.D
+            ).to(u.dtype)
 
 
 class BothWays(nn.Module):
@@ -87,14 +92,19 @@ def _first_steps(count: int, rng: torch.Generator) -> Tensor:
     """
     low, high = map(math.log, STEPS)
     steps = torch.rand(count, generator=rng, device=rng.device).mul_(high - low).add_(low).exp_()
+    # inverse of softplus: log(exp(step) - 1) = step + log(1 - exp(-step))
     return steps + torch.log(-torch.expm1(-steps))
 
 
 def _step(rate: Tensor, bias: Tensor) -> Tensor:
+    """Return the time step, softplus of the rate plus its bias, within the range that the scan
+    computes well.
+    """
     return F.softplus(rate + bias).clamp(1e-5, 8.0)
 
 
 def _decay(A_log: Tensor) -> Tensor:
+    """Return the rate of decay, below 0, for its logarithm."""
     return -torch.exp(A_log.clamp(-12.0, 6.0))
 
 
@@ -122,6 +132,9 @@ class Spatial(nn.Module):
         by_columns: bool,
         directions: Directions = 2,
     ) -> None:
+        """Build a layer for ``width`` channels, twice as many inside, with ``states`` numbers each
+        in a scan.
+        """
         super().__init__()
         inner, self.by_columns = 2 * width, by_columns
         self.enter = nn.Conv2d(width, 2 * inner, 1)
@@ -177,11 +190,13 @@ def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, T
     """
     y, x = size
     with torch.inference_mode(False):  # the cache may serve a caller that trains
+        # (fy / y)^2 + (fx / x)^2, times (x y)^2
         rows = torch.fft.fftfreq(y, 1 / y, dtype=torch.float64).round().long()[:, None] * x
         columns = torch.arange(x // 2 + 1)[None] * y
         # whole numbers, so that equal radii compare equal
         radius = (rows * rows + columns * columns).flatten()
         angle = torch.atan2(rows.double(), columns.double()).flatten()
+        # sorted by radius, and by angle where radii are equal
         order = angle.argsort(stable=True)
         order = order[radius[order].argsort(stable=True)]
         return order.to(device), order.argsort().to(device)
@@ -197,6 +212,9 @@ class Frequency(nn.Module):
     """
 
     def __init__(self, width: int, states: int, form: Form = "complex") -> None:
+        """Build a layer for ``width`` channels, whose real and imaginary parts enter side by
+        side.
+        """
         super().__init__()
         self.form = form
         self.norm = nn.LayerNorm(2 * width)
@@ -211,20 +229,23 @@ class Frequency(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         x, size = single(x), (x.shape[-2], x.shape[-1])
-        order, place = radial_order(size, x.device)
+        order, rank = radial_order(size, x.device)
         with torch.autocast(x.device.type, enabled=False):  # FFTs need full precision
             spectrum = torch.fft.rfft2(x, norm="ortho")
-            sorted_ = spectrum.flatten(2).index_select(2, order)
-            features = self.norm(torch.cat(self._parts(sorted_), 1).transpose(1, 2))
-        value, gate = self.enter(features).chunk(2, -1)
-        drawn = single(self.leave(self.scanned(self.scan(F.silu(value))) * F.silu(gate)))
-        first, second = drawn.transpose(1, 2).index_select(2, place).chunk(2, 1)
+            by_radius = spectrum.flatten(2).index_select(2, order)
+            features = self.norm(torch.cat(self._parts(by_radius), 1).transpose(1, 2))
+        scan_input, gate = self.enter(features).chunk(2, -1)
+        changes = single(self.leave(self.scanned(self.scan(F.silu(scan_input))) * F.silu(gate)))
+        real_or_amplitude, imaginary_or_phase = (
+            changes.transpose(1, 2).index_select(2, rank).chunk(2, 1)
+        )
         with torch.autocast(x.device.type, enabled=False):
-            factor = self._factor(first, second).view_as(spectrum)
+            factor = self._factor(real_or_amplitude, imaginary_or_phase).view_as(spectrum)
             result: Tensor = torch.fft.irfft2(spectrum * factor, s=size, norm="ortho")
         return result
 
     def _parts(self, spectrum: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the spectrum as real and imaginary part, or as amplitude and phase."""
         real, imaginary = spectrum.real, spectrum.imag
         if self.form == "complex":
             return real, imaginary
@@ -254,6 +275,7 @@ class Block(nn.Module):
         directions: Directions = 2,
         form: Form = "complex",
     ) -> None:
+        """Build a block for ``width`` channels; its feed-forward layer has four times as many."""
         super().__init__()
         self.norm, self.second_norm = ChannelNorm(width), ChannelNorm(width)
         self.spatial = Spatial(width, states, by_columns, directions)
@@ -301,6 +323,12 @@ class FFTMamba(PictureRestorer):
         pyramid: bool = False,
         frequency: Form = "complex",
     ) -> None:
+        """Build the network: ``width`` channels, ``blocks`` of scans with ``states`` numbers for
+        each channel.
+
+        ``shuffle`` is the side of the squares of pixels that become channels; ``pyramid`` computes
+        only the full size and reduces it for the coarse estimate.
+        """
         super().__init__()
         self.shuffle, self.multiple, self.one_pass = shuffle, 2 * shuffle, pyramid
         self.options = {
@@ -308,6 +336,7 @@ class FFTMamba(PictureRestorer):
             "pyramid": pyramid,
             "frequency": frequency,
         }
+        # channels of a shuffled colour picture
         inside = 3 * shuffle**2
         self.enter = nn.Conv2d(2 * inside, width, 3, padding=1)
         self.blocks = nn.Sequential(
@@ -321,8 +350,8 @@ class FFTMamba(PictureRestorer):
         if self.one_pass:
             fine = self.improved(picture, picture)
             return resize(fine, y // 2, x // 2), fine
-        small = resize(picture, y // 2, x // 2)
-        coarse = self.improved(small, small)
+        half_picture = resize(picture, y // 2, x // 2)
+        coarse = self.improved(half_picture, half_picture)
         return coarse, self.improved(picture, resize(coarse, y, x))
 
     def improved(self, picture: Tensor, guess: Tensor) -> Tensor:

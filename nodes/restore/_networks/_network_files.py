@@ -54,8 +54,8 @@ class _Graph(nn.Module):
 
     def forward(self, picture: Tensor) -> Tensor:
         if isinstance(self.net, OwnNetwork):
-            own: Tensor = self.net.inner(picture)
-            return own
+            result: Tensor = self.net.inner(picture)
+            return result
         assert isinstance(self.net, Flat)
         return picture + self.net.change(picture)
 
@@ -95,14 +95,22 @@ def export_network(net: Restorer, file: Path) -> None:
             not have.
     """
     require_exportable(net, file.suffix)
-    graph, step = _Graph(net).eval(), net.multiple
-    count = -(-2 * _LEAST // step)
+    graph, multiple = _Graph(net).eval(), net.multiple
+    multiples = -(-2 * _LEAST // multiple)
+    # sides that differ, so that the graph does not take them for one
     example = torch.rand(
-        1, 3, count * step, (count + 1) * step, generator=torch.Generator().manual_seed(0)
+        1,
+        3,
+        multiples * multiple,
+        (multiples + 1) * multiple,
+        generator=torch.Generator().manual_seed(0),
     )
-    low, high = -(-_LEAST // step), _LARGEST // step
-    y, x = (torch.export.Dim(name, min=low, max=high) for name in ("rows", "columns"))
-    sides = ({2: step * y, 3: step * x},)
+    least_multiples, largest_multiples = -(-_LEAST // multiple), _LARGEST // multiple
+    y, x = (
+        torch.export.Dim(name, min=least_multiples, max=largest_multiples)
+        for name in ("rows", "columns")
+    )
+    sides = ({2: multiple * y, 3: multiple * x},)
     unfinished = file.with_name(f".{os.getpid()}.{file.name}")
     try:
         with torch.no_grad(), warnings.catch_warnings():
@@ -110,15 +118,18 @@ def export_network(net: Restorer, file: Path) -> None:
             _write(graph, example, sides, unfinished)
         unfinished.replace(file)
     except Exception as error:
-        said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        error_text = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         raise ParameterError(
-            "export", f"the network cannot be written as {file.suffix} ({said})"
+            "export", f"the network cannot be written as {file.suffix} ({error_text})"
         ) from error
     finally:
         unfinished.unlink(missing_ok=True)
 
 
 def _write(graph: nn.Module, example: Tensor, sides: Any, file: Path) -> None:
+    """Write a module as a graph for pictures like ``example``, with free ``sides``, by the suffix
+    of the file.
+    """
     program = torch.export.export(graph, (example,), dynamic_shapes=sides)
     if file.suffix == ".pt2":
         torch.export.save(program, file)
@@ -193,8 +204,10 @@ def exported_network(file: Path, multiple: int | None = None) -> OwnNetwork:
             " network again"
         )
         raise _refused(file, f"cannot be loaded ({cause}); {hint}") from error
-    own = math.lcm(*(side.multiple for side in graph.sides)) if multiple is None else multiple
-    return _Exported(inner, file.name, own, {})
+    multiple_used = (
+        math.lcm(*(side.multiple for side in graph.sides)) if multiple is None else multiple
+    )
+    return _Exported(inner, file.name, multiple_used, {})
 
 
 class _Exported(OwnNetwork):
@@ -222,8 +235,8 @@ def read_sizes(file: Path, multiple: int | None, sizes: tuple[int, int] | None) 
     if sizes is None:
         return
     for axis, size, side in zip("yx", sizes, sides, strict=True):
-        own = side.multiple if multiple is None else multiple
-        size += -size % own
+        padded_multiple = side.multiple if multiple is None else multiple
+        size += -size % padded_multiple
         if not side.least <= size <= side.most or size % side.multiple:
             allowed = (
                 f"{side.least}"
@@ -240,14 +253,15 @@ def read_sizes(file: Path, multiple: int | None, sizes: tuple[int, int] | None) 
 @once_per_version
 def _tried(file: Path, multiple: int) -> tuple[Side, Side]:
     """Try an exported network on a small picture with sides of a multiple, and return the sizes
-    that it takes.
+    that it takes along y and x.
     """
     net = exported_network(file)
     sides = _checked(file, _bytes(file)).sides
-    steps = [math.lcm(side.multiple, multiple) for side in sides]
+    multiples = [math.lcm(side.multiple, multiple) for side in sides]
     y, x = (
+        # the least multiple that is above 32, and within the sizes of the file
         step * math.ceil(max(side.least, 33) / step)
-        for side, step in zip(sides, steps, strict=True)
+        for side, step in zip(sides, multiples, strict=True)
     )
     y, x = int(min(y, sides[0].most)), int(min(x, sides[1].most))
     if y * x <= _TRIED:
@@ -306,6 +320,7 @@ def _check_member(file: Path, name: str, data: bytes) -> None:
 
 
 def _graph(file: Path, program: Any) -> Graph:
+    """Return what the graph of a file says, after all checks of what it calls and takes."""
     _check_calls(file, program)
     module = program["graph_module"]
     if any(_trains(node) for node in module["graph"]["nodes"]):
@@ -319,6 +334,7 @@ def _graph(file: Path, program: Any) -> Graph:
 
 
 def _check_calls(file: Path, program: Any) -> None:
+    """Raise ParameterError for a graph that calls anything but operators of aten and arithmetic."""
     for key, value in _pairs(program):
         if key == "target" and isinstance(value, str) and not _OPERATOR.fullmatch(value):
             raise _refused(file, f"calls {value}, and only operators of aten are run")
@@ -334,9 +350,14 @@ def _check_formulas(file: Path, program: Any, module: Any) -> None:
         *program.get("range_constraints", {}),
         *(program.get("guards_code") or ()),
     ):
-        bare = re.sub(r"L\['\w+'\]", "L", str(text))  # the input of the network, by its name
-        wrong = [word for word in re.findall(r"\w+", bare) if not _IN_FORMULA.fullmatch(word)]
-        if wrong or not re.fullmatch(r"[\w\s()\[\]'\".,=<>!*/%+-]*", bare):
+        # the input of the network, by its name
+        without_input_name = re.sub(r"L\['\w+'\]", "L", str(text))
+        other_names = [
+            word
+            for word in re.findall(r"\w+", without_input_name)
+            if not _IN_FORMULA.fullmatch(word)
+        ]
+        if other_names or not re.fullmatch(r"[\w\s()\[\]'\".,=<>!*/%+-]*", without_input_name):
             raise _refused(file, f"has a formula of sizes with other names: {str(text)[:60]}")
 
 
@@ -351,6 +372,7 @@ def _trains(node: Any) -> bool:
 
 
 def _check_containers(file: Path, spec: Any) -> None:
+    """Raise ParameterError for a structure of inputs or results that is no plain container."""
     for key, value in _pairs(spec):
         if key == "type" and value not in _CONTAINERS:
             raise _refused(file, f"takes or returns a {value}: {_FIX}")
@@ -392,20 +414,22 @@ def _picture_and_result(file: Path, module: Any) -> tuple[Any, Any]:
         or len(signature["output_specs"]) != 1
         or "as_tensor" not in user_inputs[0]
     ):
-        many = (
+        counts_text = (
             f"takes {len(user_inputs)} inputs and returns {len(signature['output_specs'])} results,"
             " state included"
         )
-        raise _refused(file, f"{many}: {_FIX}")
+        raise _refused(file, f"{counts_text}: {_FIX}")
     picture = values[user_inputs[0]["as_tensor"]["name"]]
     return picture, values[user_outputs[0]["as_tensor"]["name"]]
 
 
 def _shape(sizes: Any) -> str:
+    """Return sizes as text, with "any" for a free one."""
     return " x ".join(str(size.get("as_int", "any")) for size in sizes)
 
 
 def _plain(sizes: Any) -> list[Any]:
+    """Return each size as a number, or as the formula that the file has for it."""
     return [size.get("as_int", size.get("as_expr", {}).get("expr_str")) for size in sizes]
 
 
@@ -415,29 +439,29 @@ def _side(size: Any, limits: Any) -> Side:
     """
     if "as_int" in size:
         return Side(size["as_int"], size["as_int"], 1)
-    text = size["as_expr"]["expr_str"]
-    symbol = re.search(r"\bs\d+\b", text)
-    factor = re.match(r"Mul\(Integer\((\d+)\), Symbol|(\d+)\*s\d+$", text)
-    times = int(factor[1] or factor[2]) if factor else 1
+    formula = size["as_expr"]["expr_str"]
+    symbol = re.search(r"\bs\d+\b", formula)
+    factor = re.match(r"Mul\(Integer\((\d+)\), Symbol|(\d+)\*s\d+$", formula)
+    multiple = int(factor[1] or factor[2]) if factor else 1
     limit = limits.get(symbol[0], {}) if symbol else {}
     largest = limit.get("max_val")
     return Side(
-        times * int(limit.get("min_val") or 1),
-        math.inf if largest is None else times * int(largest),
-        times,
+        multiple * int(limit.get("min_val") or 1),
+        math.inf if largest is None else multiple * int(largest),
+        multiple,
     )
 
 
 def _pairs(value: Any) -> Iterator[tuple[str, Any]]:
     """Yield each key with its value, at any depth."""
-    todo = [value]
-    while todo:
-        item = todo.pop()
+    pending = [value]
+    while pending:
+        item = pending.pop()
         if isinstance(item, dict):
             yield from item.items()
-            todo += item.values()
+            pending += item.values()
         elif isinstance(item, list):
-            todo += item
+            pending += item
 
 
 def _refused(file: Path, text: str) -> ParameterError:
@@ -508,6 +532,9 @@ def _ready(
 
 
 def _class(architecture: Architecture | type[nn.Module] | None) -> Architecture:
+    """Return the class of the network in the form that checks its parameters; raise ParameterError
+    for none.
+    """
     if architecture is None:
         text = (
             "name the class of the network, such as mynet.SmallUNet, or give weights: a .pt2 file"
@@ -522,6 +549,7 @@ def _class(architecture: Architecture | type[nn.Module] | None) -> Architecture:
 
 
 def _weights(weights: Path | None) -> Path:
+    """Return the file of weights; raise ParameterError for none, and for a pickle."""
     if weights is None:
         text = (
             "a network needs trained weights: train them by `neusee train`, and give the"

@@ -51,6 +51,9 @@ class OwnNetwork(PictureRestorer):
     def __init__(
         self, inner: nn.Module, name: str, multiple: int, options: Mapping[str, Any]
     ) -> None:
+        """Take a module of a user and its name for messages; sides of pictures become multiples of
+        ``multiple``.
+        """
         super().__init__()
         self.inner, self.name, self.multiple = inner, name, multiple
         #: what a file of weights says of the class that was trained
@@ -76,11 +79,12 @@ class OwnNetwork(PictureRestorer):
         """Return the result of the user's network; raise ValueError with its name for a wrong
         result or an error.
         """
-        before = picture._version
+        # torch counts the changes of a tensor in place
+        version_before = picture._version
         with self._located(picture):
             result = self.inner(picture)
         sizes = _sizes(picture)
-        if picture._version != before:
+        if picture._version != version_before:
             raise ValueError(f"{self.name} {_CHANGES}")
         if not isinstance(result, Tensor):
             raise ValueError(
@@ -108,18 +112,21 @@ class OwnNetwork(PictureRestorer):
         except torch.OutOfMemoryError:
             raise
         except _FAILURES as error:
-            text = " ".join(str(error).split()) or type(error).__name__
+            error_text = " ".join(str(error).split()) or type(error).__name__
             frames = traceback.extract_tb(error.__traceback__)
-            lines = [
+            user_frames = [
                 frame
                 for frame in frames
                 if "/torch/" not in frame.filename and frame.name != "__torch_function__"
             ]
-            place = (
-                f"{lines[-1].filename.rpartition('/')[2]}:{lines[-1].lineno}: " if lines[1:] else ""
+            file_and_line = (
+                # the first frame is this file's own call
+                f"{user_frames[-1].filename.rpartition('/')[2]}:{user_frames[-1].lineno}: "
+                if user_frames[1:]
+                else ""
             )
             raise ValueError(
-                f"{self.name} fails for a picture {_sizes(picture)}: {place}{text}"
+                f"{self.name} fails for a picture {_sizes(picture)}: {file_and_line}{error_text}"
             ) from error
 
 
@@ -148,16 +155,17 @@ def own_network(
             else f"{architecture}({_listed(parameters)}): {error}"
         )
         raise ParameterError("parameters", text) from error
-    own = getattr(inner, "multiple", 1) if multiple is None else multiple
-    if type(own) is not int or own < 1:
+    network_multiple = getattr(inner, "multiple", 1) if multiple is None else multiple
+    if type(network_multiple) is not int or network_multiple < 1:
         raise ParameterError(
-            "architecture", f"{architecture}.multiple = {own!r} must be a whole number from 1"
+            "architecture",
+            f"{architecture}.multiple = {network_multiple!r} must be a whole number from 1",
         )
     options = {
         "class": architecture.network.__qualname__,
         "parameters": json.loads(json.dumps(arguments, default=str)),
     }
-    return OwnNetwork(inner, str(architecture), own, options)
+    return OwnNetwork(inner, str(architecture), network_multiple, options)
 
 
 def try_network(
@@ -172,8 +180,9 @@ def try_network(
     The sides of the picture differ, and no smaller power of two than `multiple` divides them, so
     that a network that needs certain sizes and does not say so fails here.
     """
-    multiples = math.ceil(_LEAST / net.multiple) | 1
-    y, x = sizes or (net.multiple * multiples, net.multiple * (multiples + 2))
+    # odd, so that a network that needs sides of more even factors shows it
+    side_in_multiples = math.ceil(_LEAST / net.multiple) | 1
+    y, x = sizes or (net.multiple * side_in_multiples, net.multiple * (side_in_multiples + 2))
     random = torch.Generator().manual_seed(1)
     picture = torch.rand(1, 3, y, x, generator=random, dtype=torch.float64).to(device, dtype)
     net.to(device, dtype).eval()
@@ -185,24 +194,24 @@ def try_network(
             exact_convolutions(picture, deterministic=True),
         ):
             with _Counting() as counted:
-                first = net.called(argument)
-            second = net.called(picture.clone())
+                result = net.called(argument)
+            second_result = net.called(picture.clone())
     except ValueError as error:
-        hint = (
+        multiple_hint = (
             "; if it needs sides of a certain multiple, write multiple = 8 in the class (now"
             f" {net.multiple})"
         )
         raise ParameterError(
-            "architecture", f"{error}{hint if 'picture 1 x' in str(error) else ''}"
+            "architecture", f"{error}{multiple_hint if 'picture 1 x' in str(error) else ''}"
         ) from error
     if not torch.equal(argument, picture):
         raise ParameterError("architecture", f"{net.name} {_CHANGES}")
-    if first.dtype != dtype:
+    if result.dtype != dtype:
         raise ParameterError(
             "architecture",
-            f"{net.name} returns {first.dtype} for {dtype}: keep the type of the input",
+            f"{net.name} returns {result.dtype} for {dtype}: keep the type of the input",
         )
-    if not torch.equal(first, second):
+    if not torch.equal(result, second_result):
         raise ParameterError(
             "architecture",
             f"{net.name} gives other numbers for the same picture in eval(): {_DRAWS}",
@@ -239,10 +248,15 @@ class _Counting(TorchFunctionMode):
         self.operations, self.memory = 0.0, 0.0
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run a torch function, and count its operations and the bytes of its result if these are
+        new.
+        """
         result = func(*args, **(kwargs or {}))
-        tensors = [x for x in args if isinstance(x, Tensor)]
-        if isinstance(result, Tensor) and result.data_ptr() not in [x.data_ptr() for x in tensors]:
-            self.operations += _operations(getattr(func, "__name__", ""), tensors, result)
+        input_tensors = [x for x in args if isinstance(x, Tensor)]
+        if isinstance(result, Tensor) and result.data_ptr() not in [
+            x.data_ptr() for x in input_tensors
+        ]:
+            self.operations += _operations(getattr(func, "__name__", ""), input_tensors, result)
             self.memory += result.nbytes
         return result
 
@@ -252,6 +266,7 @@ def _operations(name: str, tensors: list[Tensor], result: Tensor) -> float:
     one for each number.
     """
     if name.startswith("conv_transpose"):
+        # tensors[1] is the weights: all products of one input number, or of one output number
         return 2.0 * tensors[0].numel() * tensors[1][0].numel()
     if name.startswith(("conv", "linear")):
         return 2.0 * result.numel() * tensors[1][0].numel()

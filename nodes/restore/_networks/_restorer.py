@@ -38,16 +38,16 @@ def tiled(change: Callable[[Tensor], Tensor], picture: Tensor, side: int) -> Ten
     size = (picture.shape[-2], picture.shape[-1])
     if max(size) <= side:
         return change(picture)
-    total, weights = torch.zeros_like(picture), picture.new_zeros(size)
+    weighted_sum, weights = torch.zeros_like(picture), picture.new_zeros(size)
     rows, columns = (_starts(n, side) for n in size)
     for top, left in product(rows, columns):
         window = (..., slice(top, top + side), slice(left, left + side))
         weight = torch.outer(
             *(_ramp(start, side, n, picture) for start, n in zip((top, left), size, strict=True))
         )
-        total[window] += change(picture[window]) * weight
+        weighted_sum[window] += change(picture[window]) * weight
         weights[window] += weight
-    return total / weights
+    return weighted_sum / weights
 
 
 def _starts(length: int, side: int) -> list[int]:
@@ -66,12 +66,12 @@ def _ramp(start: int, side: int, length: int, like: Tensor) -> Tensor:
     """
     side = min(side, length)
     position = torch.arange(side, dtype=like.dtype, device=like.device) + 0.5
-    rise = (position / (side * _OVERLAP)).clamp(max=1.0)
+    rising = (position / (side * _OVERLAP)).clamp(max=1.0)
     ramp = torch.ones_like(position)
     if start > 0:
-        ramp = ramp * rise
+        ramp = ramp * rising
     if start + side < length:
-        ramp = ramp * rise.flip(0)
+        ramp = ramp * rising.flip(0)
     return ramp
 
 
@@ -207,10 +207,11 @@ def parameter_groups(
     """Return the network's parameters in two groups for an optimiser; the second group has the
     biases of layers.
     """
-    of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
-    in_layers = set(map(id, of_layers))
-    others = [p for p in net.parameters() if id(p) not in in_layers]
-    return [{"params": others, "lr": weights}, {"params": of_layers, "lr": biases}]
+    layer_biases = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
+    # by identity, because `in` would compare tensors by value
+    bias_ids = set(map(id, layer_biases))
+    others = [p for p in net.parameters() if id(p) not in bias_ids]
+    return [{"params": others, "lr": weights}, {"params": layer_biases, "lr": biases}]
 
 
 def restored(
@@ -276,6 +277,7 @@ def fitting(
 
 
 def _needed(weights: Path | None) -> Path:
+    """Return the file of weights; raise ParameterError for none."""
     if weights is None:
         text = (
             "a network needs trained weights: give the .safetensors file of its weights, or choose"
@@ -290,10 +292,10 @@ def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Chec
     not finite.
     """
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
-    before = float(picture.square().mean(dtype=torch.float64).sqrt())
+    picture_rms = float(picture.square().mean(dtype=torch.float64).sqrt())
     return [
         Check(
-            f"network changed the picture by {change:.3g} rms, of {before:.3g} rms before",
+            f"network changed the picture by {change:.3g} rms, of {picture_rms:.3g} rms before",
             math.isfinite(change),
         )
     ]

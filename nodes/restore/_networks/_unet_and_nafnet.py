@@ -34,6 +34,9 @@ class UNet(Flat):
     multiple, gain = 8, LEAKY
 
     def __init__(self, width: int = 32) -> None:
+        """Build the network with ``width`` channels at full size, doubled at each of three
+        halvings.
+        """
         super().__init__()
         sizes = [width, 2 * width, 4 * width, 8 * width]
         self.down = nn.ModuleList(_pair(a, b) for a, b in pairwise([3, *sizes]))
@@ -43,17 +46,18 @@ class UNet(Flat):
         self.last = nn.Conv2d(width, 3, 1)
 
     def change(self, picture: Tensor) -> Tensor:
-        passed = [self.down[0](picture)]
-        for level in self.down[1:]:
-            passed.append(level(self.shrink(passed[-1])))
-        x = passed[-1]
-        for grow, level, skip in zip(self.grow, self.up, passed[-2::-1], strict=True):
-            x = level(torch.cat([grow(x), skip], 1))
-        result: Tensor = self.last(x)
+        level_outputs = [self.down[0](picture)]
+        for convolutions in self.down[1:]:
+            level_outputs.append(convolutions(self.shrink(level_outputs[-1])))
+        features = level_outputs[-1]
+        for grow, convolutions, skip in zip(self.grow, self.up, level_outputs[-2::-1], strict=True):
+            features = convolutions(torch.cat([grow(features), skip], 1))
+        result: Tensor = self.last(features)
         return result
 
 
 def _pair(inputs: int, outputs: int) -> nn.Sequential:
+    """Return two convolutions of 3 x 3 pixels, each with a leaky activation."""
     first, second = (
         nn.Conv2d(inputs, outputs, 3, padding=1),
         nn.Conv2d(outputs, outputs, 3, padding=1),
@@ -101,6 +105,7 @@ class NAFBlock(nn.Module):
     """
 
     def __init__(self, width: int) -> None:
+        """Build a block for ``width`` channels."""
         super().__init__()
         self.norm, self.second_norm = ChannelNorm(width), ChannelNorm(width)
         self.widen = nn.Conv2d(width, 2 * width, 1)
@@ -111,9 +116,9 @@ class NAFBlock(nn.Module):
         self.scale, self.second_scale = Scale(width), Scale(width)
 
     def forward(self, x: Tensor) -> Tensor:
-        y = _multiplied(self.mix(self.widen(self.norm(x))))
-        y = self.narrow(y * self.attend(y.mean((-2, -1), keepdim=True)))
-        x = x + self.scale(y)
+        features = _multiplied(self.mix(self.widen(self.norm(x))))
+        features = self.narrow(features * self.attend(features.mean((-2, -1), keepdim=True)))
+        x = x + self.scale(features)
         result: Tensor = x + self.second_scale(
             self.fed(_multiplied(self.feed(self.second_norm(x))))
         )
@@ -133,6 +138,12 @@ class NAFNet(Flat):
         inputs: int = 3,
         outputs: int = 3,
     ) -> None:
+        """Build the network with ``width`` channels at full size, doubled at each of its
+        ``levels``.
+
+        ``levels`` are the numbers of blocks in the encoder, ``middle`` that at the smallest size,
+        and ``inputs`` and ``outputs`` the channels of the picture before and after.
+        """
         super().__init__()
         self.multiple = 2 ** len(levels)
         widths = [width * 2**i for i in range(len(levels))]
@@ -150,14 +161,14 @@ class NAFNet(Flat):
         self.up = nn.ModuleList(_blocks(c, 1) for c in widths[::-1])
 
     def change(self, picture: Tensor) -> Tensor:
-        x, passed = self.enter(picture), []
+        features, level_outputs = self.enter(picture), []
         for blocks, shrink in zip(self.down, self.shrink, strict=True):
-            passed.append(blocks(x))
-            x = shrink(passed[-1])
-        x = self.middle(x)
-        for grow, blocks, skip in zip(self.grow, self.up, passed[::-1], strict=True):
-            x = blocks(grow(x) + skip)
-        result: Tensor = self.last(x)
+            level_outputs.append(blocks(features))
+            features = shrink(level_outputs[-1])
+        features = self.middle(features)
+        for grow, blocks, skip in zip(self.grow, self.up, level_outputs[::-1], strict=True):
+            features = blocks(grow(features) + skip)
+        result: Tensor = self.last(features)
         return result
 
 

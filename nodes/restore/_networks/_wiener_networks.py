@@ -73,12 +73,15 @@ class Informed(Restorer):
         rows, columns = maps.shape[-2:]
         batch = maps.to(self.body.last.weight).reshape(-1, *maps.shape[-3:])
         padded = mirrored(batch, -rows % self.multiple, -columns % self.multiple)
-        numbers: Tensor = self.body.change(padded)[..., :rows, :columns].to(answer)
-        free, share, grey = torch.tensor_split(
-            numbers.reshape(*answer.shape[:-3], -1, rows, columns), 3, -3
+        network_output: Tensor = self.body.change(padded)[..., :rows, :columns].to(answer)
+        # three numbers of each channel: times the deviation, the answer and its grey
+        change_in_deviations, change_in_answer, change_in_grey = torch.tensor_split(
+            network_output.reshape(*answer.shape[:-3], -1, rows, columns), 3, -3
         )
         result: Tensor = (
-            free * deviation.sqrt() + share * answer + grey * answer.mean(-3, keepdim=True)
+            change_in_deviations * deviation.sqrt()
+            + change_in_answer * answer
+            + change_in_grey * answer.mean(-3, keepdim=True)
         )
         return result
 
@@ -166,6 +169,7 @@ def _(*, weights: Path | None = None, width: int = 16, **others: Any) -> list[st
 
 @informed.check
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    # inputs[4] is `clipped`, after psf, illuminant, responses and bands
     share = float(inputs[4].any(-3).double().mean())
     ratio = float(result.mean() / electrons.mean())
     finite = bool(torch.isfinite(result).all())
@@ -195,6 +199,7 @@ class Unrolled(Restorer):
     """
 
     def __init__(self, width: int = 16, steps: int = 2, iterations: int = PULLED_STEPS) -> None:
+        """Build ``steps`` networks of ``width`` channels at full size, one for each step."""
         super().__init__()
         self.iterations = iterations  #: of the conjugate gradients in each step
         self.priors = nn.ModuleList(
@@ -223,11 +228,11 @@ class Unrolled(Restorer):
         """Return what the steps add to the filter's answer (3, y, x), given this answer and its
         blur by the camera.
         """
-        added = of_added = torch.zeros_like(answer)
+        change = blurred_change = torch.zeros_like(answer)
         for prior in self.priors:
-            pull, precision = _found(prior, problem, answer + added, blurred + of_added)
-            added, of_added = pulled(problem, added + pull, precision, self.iterations)
-        return added
+            pull, precision = _found(prior, problem, answer + change, blurred + blurred_change)
+            change, blurred_change = pulled(problem, change + pull, precision, self.iterations)
+        return change
 
 
 def _found(prior: nn.Module, problem: Blurred, x: Tensor, blurred: Tensor) -> tuple[Tensor, Tensor]:
@@ -237,9 +242,10 @@ def _found(prior: nn.Module, problem: Blurred, x: Tensor, blurred: Tensor) -> tu
     rows, columns = problem.picture.shape[-2:]
     weight = next(prior.parameters())
     maps = mirrored(_maps(problem, x, blurred).to(weight)[None], -rows % 8, -columns % 8)
-    change, certain = prior.change(maps)[0, :, :rows, :columns].to(x).split(3)  # type: ignore[operator]
+    change, precision_logarithm = prior.change(maps)[0, :, :rows, :columns].to(x).split(3)  # type: ignore[operator]
     return change, _PRECISION * torch.exp(
-        _REACH * torch.tanh(certain.mean((-2, -1), keepdim=True))
+        # one precision for a channel, within exp(-5) to exp(5) of the first
+        _REACH * torch.tanh(precision_logarithm.mean((-2, -1), keepdim=True))
     ).expand_as(change)
 
 
@@ -248,19 +254,19 @@ def _maps(problem: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
     pixels, and glare.
     """
     unclipped = problem.weight > 0
-    root = (
+    inverse_deviation = (
         torch.where(unclipped, problem.weight, 1.0).sqrt() * unclipped
     )  # the slope of sqrt is infinite at 0
-    residual = root * (problem.picture - blurred)
+    residual = inverse_deviation * (problem.picture - blurred)
     glare = sum(problem.glare, torch.zeros_like(residual))
     brightest = glare.detach().amax().clamp_min(1e-30)
     # 0 for a clipped pixel, 1 for a noise of 0.7 % of the contrast of the scene
-    certain = problem.weight.log1p() / 10.0
+    certainty = problem.weight.log1p() / 10.0
     return torch.cat(
         [
             x,
             residual.asinh(),
-            certain,
+            certainty,
             unclipped.to(residual),
             (_BRIGHT / brightest * glare).asinh(),
         ]
@@ -354,6 +360,7 @@ def _(*, weights: Path | None = None, width: int = 16, steps: int = 2, **others:
 
 @unrolled.check
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    # inputs[4] is `clipped`, after psf, illuminant, responses and bands
     share = float(inputs[4].any(-3).double().mean())
     ratio = float(result.mean() / electrons.mean())
     finite = bool(torch.isfinite(result).all())

@@ -42,8 +42,9 @@ def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
     Each group of channels sums its own gradients of B and C.
     """
     (batch, length, d), n, threads = u.shape, rate.shape[1], torch.get_num_threads()
-    summed = -(-d // operators().neusee_scan_channels(u.element_size()))
-    return batch, length, d, n, min(summed, -(-threads // batch)), threads
+    # groups of as many channels as the C++ takes at a time
+    most_groups = -(-d // operators().neusee_scan_channels(u.element_size()))
+    return batch, length, d, n, min(most_groups, -(-threads // batch)), threads
 
 
 def _call(name: str, sizes: tuple[int, ...], *tensors: Tensor) -> None:

@@ -60,18 +60,23 @@ def reference(
     """
     _check_shapes(u, dt, A, B, C, D)
     u, dt, A, B, C = (x.double() for x in (u, dt, A, B, C))
-    h, rows = u.new_zeros(u.shape[0], *A.shape), []
+    states, outputs = u.new_zeros(u.shape[0], *A.shape), []
     # unbind, because the gradient of an indexed row is as long as all rows
-    for push, step, into, out in zip(
+    for step_input, step, input_weight, output_weight in zip(
         (dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True
     ):
-        h = torch.exp(step[..., None] * A) * h + push[..., None] * into[:, None]
-        rows.append((h @ out[..., None])[..., 0])
-    y = torch.stack(rows, 1)
+        states = (
+            torch.exp(step[..., None] * A) * states + step_input[..., None] * input_weight[:, None]
+        )
+        outputs.append((states @ output_weight[..., None])[..., 0])
+    y = torch.stack(outputs, 1)
     return y if D is None else y + D.double() * u
 
 
 def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None) -> None:
+    """Raise ValueError unless u, dt (batch, length, d), A (d, n), B, C (batch, length, n) and D
+    (d,) fit each other and lie on one device.
+    """
     if u.ndim != 3 or A.ndim != 2:
         raise ValueError(
             f"u must be (batch, length, d) and A (d, n), not {tuple(u.shape)} and {tuple(A.shape)}"
@@ -97,6 +102,9 @@ def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Ten
 
 
 def _kind(*tensors: Tensor) -> torch.dtype:
+    """Return float64 if any tensor is, else float32; raise ValueError for numbers not in floating
+    point.
+    """
     for x in tensors:
         if not x.is_floating_point():
             raise ValueError(
@@ -106,15 +114,19 @@ def _kind(*tensors: Tensor) -> torch.dtype:
 
 
 def _auto(u: Tensor) -> Backend:
-    named = os.environ.get("NEUSEE_SCAN") or ""
-    if named not in ("", *get_args(Backend)):
-        raise ValueError(f"NEUSEE_SCAN is {named!r}: write torch or cpp")
-    if named == "torch" or u.device.type != "cpu":
+    """Return the backend that the variable NEUSEE_SCAN names, else the C++ one on a CPU if it can
+    be compiled.
+    """
+    backend_named = os.environ.get("NEUSEE_SCAN") or ""
+    if backend_named not in ("", *get_args(Backend)):
+        raise ValueError(f"NEUSEE_SCAN is {backend_named!r}: write torch or cpp")
+    if backend_named == "torch" or u.device.type != "cpu":
         return "torch"
     return "cpp" if _cpp_scan.compiled() else "torch"
 
 
 def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
+    """Return the scan (batch, length, d) without the term of D, by the named backend."""
     if backend not in get_args(Backend):
         raise ValueError(f"backend is {backend!r}: write auto, {', '.join(get_args(Backend))}")
     if backend == "cpp" and u.device.type != "cpu":

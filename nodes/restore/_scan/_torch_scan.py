@@ -66,10 +66,12 @@ class _Segment:
     """
 
     def __init__(self, division: Plan, rows: slice, rate: Tensor, *lines: Tensor) -> None:
+        """Cut ``rows`` out of the sequences u, dt, B and C (``lines``) and compute their decays."""
         self.division, self.rows, self.rate = division, rows, rate
         self.size = min(division.segment, lines[0].shape[1] - rows.start)
         self.u, self.dt, self.into, self.out = (self.turn(x) for x in lines)
         self.pushed = self.u * self.dt
+        # decay - 1 in each step
         self.lost = (self.dt[..., None] * rate).expm1_()
 
     def turn(self, x: Tensor) -> Tensor:
@@ -101,31 +103,41 @@ class _Segment:
         The gradient of a state is the sum of the gradients through its output, ``output_slope``,
         and through the next state, or ``end`` for the last state.
         """
-        g = output_slope[..., None] * self.out[..., None, :]
-        first, *others = self.lost.unbind(0)
-        next_chunk = torch.cat([first[1:], torch.zeros_like(first[:1])])
-        at_first = _walk(g, [next_chunk, *others[::-1]], end, back=True)
-        return g, at_first + first[0] * at_first
+        state_slopes = output_slope[..., None] * self.out[..., None, :]
+        first_decay, *later_decays = self.lost.unbind(0)
+        next_first_decay = torch.cat([first_decay[1:], torch.zeros_like(first_decay[:1])])
+        slope_at_first = _walk(
+            state_slopes, [next_first_decay, *later_decays[::-1]], end, back=True
+        )
+        return state_slopes, slope_at_first + first_decay[0] * slope_at_first
 
     def gradients(self, dy: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, ...]:
         """Return the gradients of u, dt, B, C (batch, rows, m), A and the state before the first
         step (batch, d, n).
         """
         output_slope = self.turn(dy)
-        (h, _), (g, before) = self.states(start), self.slopes(output_slope, end)
-        pushed = (g @ self.into[..., None])[..., 0]
-        into, out = (
-            seen_by[..., None, :] @ x for seen_by, x in ((self.pushed, g), (output_slope, h))
+        (state_values, _), (state_slopes, start_slope) = (
+            self.states(start),
+            self.slopes(output_slope, end),
         )
-        g[1:] *= h[:-1]
-        g[0, 1:] *= h[-1, :-1]
-        g[0, 0] *= start
+        pushed_slope = (state_slopes @ self.into[..., None])[..., 0]
+        into_slope, out_slope = (
+            factor[..., None, :] @ x
+            for factor, x in ((self.pushed, state_slopes), (output_slope, state_values))
+        )
+        state_slopes[1:] *= state_values[:-1]
+        state_slopes[0, 1:] *= state_values[-1, :-1]
+        state_slopes[0, 0] *= start
         # now the gradient of dt * A
-        g *= torch.mul(self.dt[..., None], self.rate, out=self.lost).exp_()
-        dt = torch.mul(g, self.rate, out=h).sum(-1).addcmul_(pushed, self.u)
-        rate = g.mul_(self.dt[..., None]).sum((0, 1, 2))
-        lines = (self.dt * pushed, dt, into[..., 0, :], out[..., 0, :])
-        return *(self.back(x) for x in lines), rate, before
+        state_slopes *= torch.mul(self.dt[..., None], self.rate, out=self.lost).exp_()
+        dt = (
+            torch.mul(state_slopes, self.rate, out=state_values)
+            .sum(-1)
+            .addcmul_(pushed_slope, self.u)
+        )
+        rate = state_slopes.mul_(self.dt[..., None]).sum((0, 1, 2))
+        line_slopes = (self.dt * pushed_slope, dt, into_slope[..., 0, :], out_slope[..., 0, :])
+        return *(self.back(x) for x in line_slopes), rate, start_slope
 
 
 def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> Tensor:
@@ -137,21 +149,26 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
     and the state that earlier chunks carry over is added afterwards. The last state is returned in
     float64.
     """
-    turn = slice(None, None, -1 if back else 1)
-    rows, through = h.unbind(0)[turn], torch.empty_like(h)
-    shares = through.unbind(0)[turn]
-    shares[0].copy_(lost[0])
-    for less, before, now, share, further in zip(
-        lost[1:], rows, rows[1:], shares, shares[1:], strict=False
+    order = slice(None, None, -1 if back else 1)
+    states, growth = h.unbind(0)[order], torch.empty_like(h)
+    growth_by_step = growth.unbind(0)[order]
+    growth_by_step[0].copy_(lost[0])
+    for loss, state_before, state, growth_here, growth_next in zip(
+        lost[1:], states, states[1:], growth_by_step, growth_by_step[1:], strict=False
     ):
-        now.addcmul_(less, before).add_(before)
+        state.addcmul_(loss, state_before).add_(state_before)
         # (1 + e)(1 + l) - 1, exact near 0
-        torch.add(less, share, out=further).addcmul_(less, share)
-    left, through_chunk, starts = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
-    for chunk in range(h.shape[1])[turn]:
-        starts[chunk] = start
-        start = (left[chunk] + start).addcmul_(through_chunk[chunk], start)
-    h.addcmul_(through, starts).add_(starts)
+        torch.add(loss, growth_here, out=growth_next).addcmul_(loss, growth_here)
+    last_state, last_growth, chunk_starts = (
+        states[-1].double(),
+        growth_by_step[-1].double(),
+        torch.empty_like(states[-1]),
+    )
+    for chunk in range(h.shape[1])[order]:
+        chunk_starts[chunk] = start
+        start = (last_state[chunk] + start).addcmul_(last_growth[chunk], start)
+    # each state plus what its chunk's start has grown to: s + l s, l being growth - 1
+    h.addcmul_(growth, chunk_starts).add_(chunk_starts)
     return start
 
 
