@@ -170,7 +170,7 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/answers/repeated_command.py",
-        "_recipe_folders(self._words) | beside",
+        "_recipe_folders(self._words) | recipe_neighbours",
         "_recipe_folders(self._words)",
         within("workflows/answers", "repeated_command.py::test_what_has_changed_is_computed_anew"),
     ),
@@ -659,8 +659,14 @@ MUTANTS = (
         ),
         ("hooks.propagate_scattered or hook, _parts", "hook, _parts"),
         ("rms *= hooks.skip_draw(facts, **step.params)", "rms *= 1.0"),
-        ("rms=bound.rms + added, scattered=bound.scattered + added", "rms=bound.rms + added"),
-        ("scattered=bound.scattered + added, estimated=True", "scattered=bound.scattered + added"),
+        (
+            "rms=bound.rms + added_rms, scattered=bound.scattered + added_rms",
+            "rms=bound.rms + added_rms",
+        ),
+        (
+            "scattered=bound.scattered + added_rms, estimated=True",
+            "scattered=bound.scattered + added_rms",
+        ),
         ("estimated=hooks.skip_estimated, scattered=", "estimated=False, scattered="),
     ),
     *faults(
@@ -2167,8 +2173,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/store/lease.py",
-        "now - since > WINDOW",
-        "now - since > 0",
+        "present_time - unchanged_since > WINDOW",
+        "present_time - unchanged_since > 0",
         within(
             "workflows/store",
             "lease.py::test_a_foreign_holder_is_dead_after_a_window_without_a_heartbeat",
@@ -2215,8 +2221,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/placement/tasks_and_devices.py",
-        "held + graph.own[i] + ",
-        "held + ",
+        "held_bytes + graph.own[i] + ",
+        "held_bytes + ",
         within(
             "workflows/placement",
             "heft_schedule.py::test_no_other_depth_first_order_of_a_tree_holds_less",
@@ -2248,8 +2254,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/sweeps/point_order.py",
-        "if n % 2 == 0",
-        "if n % 2 == 2",
+        "if row_number % 2 == 0",
+        "if row_number % 2 == 2",
         within("workflows/sweeps", "point_order.py::test_no_order_of_a_small_sweep_needs_less"),
     ),
     Mutant(
@@ -2500,7 +2506,7 @@ MUTANTS = (
             "workflows/store",
             "budget_eviction.py::test_of_values_that_together_free_too_much_the_dearest_stays",
         ),
-        ("for candidate in going[::-1]:", "for candidate in list(going):"),
+        ("for candidate in to_evict[::-1]:", "for candidate in list(to_evict):"),
     ),
     *faults(
         "workflows/store/eviction.py",
@@ -2509,8 +2515,8 @@ MUTANTS = (
             "budget_eviction.py::test_a_value_saves_its_time_without_that_of_reading_it",
         ),
         ("or 0.0) - read_seconds", "or 0.0) + read_seconds"),
-        ('read_seconds(float(about.get("bytes") or 0))', "read_seconds(0.0)"),
-        ("payload + inline + derived", "inline + derived"),
+        ('read_seconds(float(entry.get("bytes") or 0))', "read_seconds(0.0)"),
+        ("payload_bytes + inline_bytes + derived_bytes", "inline_bytes + derived_bytes"),
     ),
     *faults(
         "workflows/store/eviction.py",
@@ -2518,7 +2524,7 @@ MUTANTS = (
             "workflows/store",
             "budget_eviction.py::test_all_bytes_but_receipts_are_divided_among_the_values",
         ),
-        ("sizes.get(name, 0) / users[name] for", "sizes.get(name, 0) for"),
+        ("sizes.get(name, 0) / users_of_band[name] for", "sizes.get(name, 0) for"),
     ),
     *faults(
         "workflows/store/eviction.py",
@@ -2526,20 +2532,20 @@ MUTANTS = (
             "workflows/store",
             "budget_eviction.py::test_a_value_that_this_program_does_not_read_saves_no_time_and_frees_its_record_too",
         ),
-        ('payload + sizes.get(f"{key}.json", 0), 0.0', "payload, 0.0"),
+        ('payload_bytes + sizes.get(f"{key}.json", 0), 0.0', "payload_bytes, 0.0"),
         ('f"{key}.json", 0), 0.0, frozenset()', 'f"{key}.json", 0), 1.0, frozenset()'),
     ),
     *faults(
         "workflows/store/eviction.py",
         within("workflows/store", "budget_eviction.py::test_small_values_go_too"),
-        ("payload + inline + derived", "payload + derived"),
+        ("payload_bytes + inline_bytes + derived_bytes", "payload_bytes + derived_bytes"),
     ),
     *faults(
         "workflows/store/eviction.py",
         within(
             "workflows/store", "budget_eviction.py::test_pictures_go_with_their_entry_and_count"
         ),
-        ("payload + inline + derived", "payload + inline"),
+        ("payload_bytes + inline_bytes + derived_bytes", "payload_bytes + inline_bytes"),
     ),
     *faults(
         "workflows/safety/what_helps.py",

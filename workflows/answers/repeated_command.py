@@ -87,7 +87,7 @@ def command_name(words: Sequence[str], terminal: Sequence[object]) -> str:
     `IGNORED`, the terminal, Python with its options and search path, and the machine. Answers of
     another form have other names.
     """
-    python = [
+    python_state = [
         sys.version,
         sys.executable,
         list(sys.flags),
@@ -95,11 +95,17 @@ def command_name(words: Sequence[str], terminal: Sequence[object]) -> str:
         dict(sys._xoptions),
         sys.path,
     ]
-    place = [os.getcwd(), sorted(_decisive(os.environ).items()), list(os.uname()), os.cpu_count()]
-    return digest("answer 2", list(words), list(terminal), python, place)
+    machine_and_folder = [
+        os.getcwd(),
+        sorted(_decisive(os.environ).items()),
+        list(os.uname()),
+        os.cpu_count(),
+    ]
+    return digest("answer 2", list(words), list(terminal), python_state, machine_and_folder)
 
 
 def _decisive(variables: Mapping[str, str]) -> dict[str, str]:
+    """Return the variables of the environment that may decide an answer."""
     return {name: value for name, value in variables.items() if name not in IGNORED}
 
 
@@ -135,32 +141,33 @@ def program_state(root: Path = ROOT) -> ProgramState:
 
     Raises `OSError` if the package is not a folder of files.
     """
-    text, changed = hashlib.blake2b(digest_size=16), 0
+    hasher, changed = hashlib.blake2b(digest_size=16), 0
     for name in _source_files(root):
         with open(root / name, "rb") as file:
             stat, content = os.fstat(file.fileno()), file.read()
-        text.update(b"%s\0%d\0" % (os.fsencode(name), len(content)) + content)
+        hasher.update(b"%s\0%d\0" % (os.fsencode(name), len(content)) + content)
         changed = max(changed, stat.st_mtime_ns, stat.st_ctime_ns)
-    text.update(
+    hasher.update(
         repr([[_importable(folder) for folder in dict.fromkeys(sys.path)], _devices()]).encode(
             errors="replace"
         )
     )
-    return ProgramState(text.hexdigest(), changed)
+    return ProgramState(hasher.hexdigest(), changed)
 
 
 def _source_files(root: Path) -> list[str]:
     """Return the paths of all source files relative to the package, sorted."""
     files = [name for name in ("__init__.py", "__main__.py") if (root / name).is_file()]
     for folder in SOURCES:
-        inside = [os.path.join(folder, name) for name in _below(os.fspath(root / folder))]
-        if not inside:
+        files_of_folder = [os.path.join(folder, name) for name in _below(os.fspath(root / folder))]
+        if not files_of_folder:
             raise FileNotFoundError(f"{root / folder} has no source files")
-        files += inside
+        files += files_of_folder
     return sorted(files)
 
 
 def _below(folder: str, above: str = "") -> Iterator[str]:
+    """Yield the paths of all files below a folder, relative to it, without byte code."""
     with os.scandir(folder) as entries:
         for entry in entries:
             name = f"{above}{entry.name}"
@@ -178,25 +185,27 @@ def _importable(folder: str) -> list[tuple[str, int]]:
 
     The folders of Python itself count by the version of Python.
     """
-    where = os.path.realpath(folder or ".")
-    installed = os.path.basename(where) in SITES
-    if not installed and f"{where}/".startswith(f"{standard_library()}/"):
+    real_folder = os.path.realpath(folder or ".")
+    is_site = os.path.basename(real_folder) in SITES
+    if not is_site and f"{real_folder}/".startswith(f"{standard_library()}/"):
         return []
     try:
-        with os.scandir(where) as entries:
-            code = [
+        with os.scandir(real_folder) as entries:
+            code_entries = [
                 entry
                 for entry in entries
-                if (entry.name.endswith(_ABOUT) if installed else _is_code(entry))
+                if (entry.name.endswith(_ABOUT) if is_site else _is_code(entry))
             ]
+            # code of the user counts by name: with imported code no answer is kept
             return sorted(
-                (entry.name, entry.stat().st_mtime_ns if installed else 0) for entry in code
+                (entry.name, entry.stat().st_mtime_ns if is_site else 0) for entry in code_entries
             )
     except OSError as error:
         return [(type(error).__name__, 0)]
 
 
 def _is_code(entry: os.DirEntry[str]) -> bool:
+    """Return True for a file of code or a package."""
     return entry.name.endswith(_CODE) or os.path.isfile(f"{entry.path}/__init__.py")
 
 
@@ -378,16 +387,16 @@ class Command:
         results: Results | RunResults | Said | None,
     ) -> Answer:
         """Return the answer to keep: the text, what decided it, and the folder if there is one."""
-        written = results if results and results.out else None
-        out = str(written.out) if written else ""
-        label, key = _parts(written.folder.name) if written else ("", "")
+        folder_results = results if results and results.out else None
+        results_folder = str(folder_results.out) if folder_results else ""
+        label, key = _parts(folder_results.folder.name) if folder_results else ("", "")
         fields = results.fields() if results else {"files": {}}
         return Answer(
             self._state.digest,
             witnesses,
             text,
             as_json,
-            out=out,
+            out=results_folder,
             label=label,
             key=key,
             **fields,
@@ -416,11 +425,11 @@ class Command:
         """Return True if the program may have changed since the command began, or if the command
         said more.
         """
-        state = program_state()
+        state_now = program_state()
         return (
             self._doubtful
-            or state != self._state
-            or state.changed > self._started() - _IMPORTED
+            or state_now != self._state
+            or state_now.changed > self._started() - _IMPORTED
             or any(name in sys.modules for name in _NATIVE)
             or any(_own_code())
         )
@@ -428,17 +437,21 @@ class Command:
     def _witnesses(self, out: Path | None, inputs: Iterable[str]) -> Witnesses:
         """Return the witnesses of the answer; folders of results in ``out`` are no witnesses."""
         cache = Folders([self._disk.folder])
-        written = os.path.abspath(out) if out else None
+        written_folder = os.path.abspath(out) if out else None
         ignored = self._ignored()
         files = self._files_opened(ignored)
         # a recipe that another one extends may lie anywhere, with options beside it
-        beside = {os.path.dirname(path) for path in files if path.endswith(_RECIPES)}
-        recipes = _recipe_folders(self._words) | beside
-        if any(path in cache for path in (os.getcwd(), *files)) or written in recipes:
+        recipe_neighbours = {os.path.dirname(path) for path in files if path.endswith(_RECIPES)}
+        recipes = _recipe_folders(self._words) | recipe_neighbours
+        if any(path in cache for path in (os.getcwd(), *files)) or written_folder in recipes:
             raise Unsettled("a recipe is in the folder of the cache or of results")
         folders = self._folders_listed(ignored)
-        listed = {path: listing for path, listing in folders.items() if path != written}
-        return witnesses_of([*files, *inputs], recipes, listed, self._started() - _TICK, written)
+        listed_folders = {
+            path: listing for path, listing in folders.items() if path != written_folder
+        }
+        return witnesses_of(
+            [*files, *inputs], recipes, listed_folders, self._started() - _TICK, written_folder
+        )
 
     def _ignored(self) -> Folders:
         """Return the folders of what is installed and of the cache, which have other witnesses."""
@@ -447,8 +460,8 @@ class Command:
 
     def _files_opened(self, ignored: Folders) -> list[str]:
         """Return the files that were opened and are neither ignored nor made from other ones."""
-        opened = [path for path in self._opened.files if not _DERIVED.search(path)]
-        return [path for path in opened if path.endswith(_RECIPES) or path not in ignored]
+        opened_files = [path for path in self._opened.files if not _DERIVED.search(path)]
+        return [path for path in opened_files if path.endswith(_RECIPES) or path not in ignored]
 
     def _folders_listed(self, ignored: Folders) -> dict[str, Listing]:
         """Return what was in the folders that were listed, but for ignored and unfinished ones."""
@@ -477,6 +490,7 @@ def _are_free(memory: int) -> bool:
 
 
 def _inside(path: str, folder: str) -> str:
+    """Return a path relative to a folder, links followed."""
     return os.path.relpath(os.path.realpath(path), os.path.realpath(folder))
 
 
@@ -496,11 +510,12 @@ def _recipe_folders(words: Sequence[str]) -> set[str]:
     """Return the folders in which the recipe and its options are looked for."""
     from neusee.workflows.recipe.text.recipe_files import shared_folders
 
-    beside = (
+    folders_of_recipes = (
         os.path.dirname(os.path.expanduser(word)) for word in words if word.endswith(_RECIPES)
     )
     return {
-        os.path.abspath(folder or ".") for folder in [".", *beside, *map(str, shared_folders())]
+        os.path.abspath(folder or ".")
+        for folder in [".", *folders_of_recipes, *map(str, shared_folders())]
     }
 
 
@@ -508,16 +523,16 @@ def _input_files(recipe: Recipe) -> set[str]:
     """Return the paths of all files that the values of a recipe name; one that is a folder is
     refused later.
     """
-    values: list[Any] = list(recipe.config.values.values())
+    values_left: list[Any] = list(recipe.config.values.values())
     paths = set()
-    while values:
-        value = values.pop()
+    while values_left:
+        value = values_left.pop()
         if isinstance(value, Path):
             paths.add(os.path.abspath(value))
         elif isinstance(value, dict):
-            values += [*value, *value.values()]
+            values_left += [*value, *value.values()]
         elif isinstance(value, list | tuple | set | frozenset):
-            values += value
+            values_left += value
     return paths
 
 
@@ -535,13 +550,13 @@ def _own_code() -> Iterable[str]:
     """Yield the modules of this process that are neither neusee nor installed: a recipe names
     code of its own.
     """
-    covered = Folders([*_installed(), ROOT])
+    covered_folders = Folders([*_installed(), ROOT])
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)  # of torch.ops it is a name without a folder
         if (
             file
             and name not in _MAIN
             and os.path.isfile(file)
-            and os.path.abspath(file) not in covered
+            and os.path.abspath(file) not in covered_folders
         ):
             yield name

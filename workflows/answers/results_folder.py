@@ -54,19 +54,23 @@ def kept_files(folder: Path, report: StudyReport) -> dict[str, bytes]:
     document = json.loads(files[DOCUMENT])
     if document.get("warnings"):
         raise NotRepeatable("a command with a warning")
-    with TemporaryDirectory(prefix="neusee-") as place:
-        report.write(RunFolder(Path(place)), {**document, "date": DATE, "seconds": SECONDS})
-        marked = {name: (Path(place) / name).read_bytes() for name in _MARKED}
-    for name, content in marked.items():
+    # written once more, with marks in place of date and seconds
+    with TemporaryDirectory(prefix="neusee-") as temporary_folder:
+        report.write(
+            RunFolder(Path(temporary_folder)), {**document, "date": DATE, "seconds": SECONDS}
+        )
+        marked_files = {name: (Path(temporary_folder) / name).read_bytes() for name in _MARKED}
+    for name, content in marked_files.items():
         if filled(name, content, document["date"], document["seconds"]) != files[name]:
             raise NotRepeatable(name)
-    return files | marked
+    return files | marked_files
 
 
 def filled(name: str, content: bytes, date: str, seconds: float) -> bytes:
     """Return the content of a file with a date and seconds in place of the marks."""
     if name not in _MARKED:
         return content
+    # in JSON a number, in quotes as long as it is a mark
     content = content.replace(f'"{SECONDS}"'.encode(), repr(seconds).encode())
     return content.replace(SECONDS.encode(), f"{seconds:.3g}".encode()).replace(
         DATE.encode(), date.encode()
@@ -81,9 +85,9 @@ def write_again(answer: Answer, seconds: float) -> Path:
     """
     date = datetime.now(UTC).isoformat(timespec="seconds")
     files = {name: filled(name, content, date, seconds) for name, content in answer.files.items()}
-    document: dict[str, Any] = json.loads(files[DOCUMENT])
+    run_document: dict[str, Any] = json.loads(files[DOCUMENT])
     with new_run(Path(answer.out), answer.label, answer.key) as folder:
-        folder.said = document
+        folder.said = run_document
         for name, content in files.items():
             folder.write(name, content)
     return folder.path
@@ -91,8 +95,9 @@ def write_again(answer: Answer, seconds: float) -> Path:
 
 def printed(answer: Answer, page: Path) -> str:
     """Return the text of an answer with the path of its page."""
-    path = json.dumps(str(page))[1:-1] if answer.as_json else str(page)
-    return answer.text.replace(PAGE, path)
+    # with the escapes of JSON, without its quotes
+    page_text = json.dumps(str(page))[1:-1] if answer.as_json else str(page)
+    return answer.text.replace(PAGE, page_text)
 
 
 # --- repeated run ---------------------------------------------------------------------------------
@@ -133,17 +138,18 @@ class RunResults(NamedTuple):
             or document["missed"]
         ):
             raise NotRepeatable("a run that computed a step, warned or missed a number")
-        made_again = {CRATE, REPORT_PAGE, *self.taken}
+        not_kept = {CRATE, REPORT_PAGE, *self.taken}
         files: dict[str, bytes] = {}
         for path in sorted(filter(Path.is_file, folder.rglob("*"))):
             name = path.relative_to(folder).as_posix()
-            if name not in made_again:
+            if name not in not_kept:
                 files[name] = bytes_of(path, _ANY)
-        said = json.loads(files[DOCUMENT])
-        made = page(said, _pictures(folder, self.taken))
+        document_again = json.loads(files[DOCUMENT])
+        # the answer is only kept if the same page can be made of it
+        page_again = page(document_again, _pictures(folder, self.taken))
         if (
-            made.encode() != bytes_of(folder / REPORT_PAGE, _ANY)
-            or document_text(said).encode() != files[DOCUMENT]
+            page_again.encode() != bytes_of(folder / REPORT_PAGE, _ANY)
+            or document_text(document_again).encode() != files[DOCUMENT]
         ):
             raise NotRepeatable("the page or the document is not the same when it is written again")
         return {"kind": RUN, "files": files, "stored": taken_from(self.store, self.taken)}
@@ -180,8 +186,8 @@ def _of_now(document: dict[str, Any], seconds: float) -> dict[str, Any]:
     run that it repeats.
     """
     memory = process_peak()
-    now = {"engine": f"{seconds:.3f} s", "peak memory": format_size(memory)}
-    facts = [[name, now.get(name, value)] for name, value in document["facts"]]
+    present_facts = {"engine": f"{seconds:.3f} s", "peak memory": format_size(memory)}
+    facts = [[name, present_facts.get(name, value)] for name, value in document["facts"]]
     facts.append(
         [
             "answer",

@@ -78,11 +78,11 @@ def write_answer(disk: Disk, name: str, answer: Answer) -> bool:
 
     Raises `OSError` if the folder cannot be written.
     """
-    raw, path = packed(name, answer), answer_path(disk, name)
-    if len(raw) > MOST:
+    content, path = packed(name, answer), answer_path(disk, name)
+    if len(content) > MOST:
         return False
     with disk.temporary(f"{name[:8]}{SUFFIX}") as (temporary, file):
-        file.write(raw)
+        file.write(content)
         file.flush()
         disk.make_folder(f"{disk.folder}/{FOLDER}")
         disk.share(temporary)
@@ -104,9 +104,9 @@ def packed(name: str, answer: Answer) -> bytes:
         if key not in ("files", "witnesses", "stored")
     }
     sizes = [[file, len(content)] for file, content in answer.files.items()]
-    rests = {"witnesses": answer.witnesses._asdict(), "stored": answer.stored._asdict()}
-    head = json.dumps({**fields, **rests, "files": sizes}).encode()
-    content = b"".join([head, b"\n", *answer.files.values()])
+    foundations = {"witnesses": answer.witnesses._asdict(), "stored": answer.stored._asdict()}
+    head_line = json.dumps({**fields, **foundations, "files": sizes}).encode()
+    content = b"".join([head_line, b"\n", *answer.files.values()])
     return seal_file("answer", f"{FOLDER}/{name}", content) + b"\n" + content
 
 
@@ -117,13 +117,16 @@ def unpacked(name: str, raw: bytes) -> Answer:
     `TypeError`, `KeyError` or `AttributeError` for any other content.
     """
     seal, _, content = raw.partition(b"\n")
-    head, _, body = unseal_file("answer", f"{FOLDER}/{name}", seal, content).partition(b"\n")
-    fields: dict[str, Any] = json.loads(head)
+    head_line, _, file_bytes = unseal_file("answer", f"{FOLDER}/{name}", seal, content).partition(
+        b"\n"
+    )
+    fields: dict[str, Any] = json.loads(head_line)
     files, offset = {}, 0
     for file, size in fields.pop("files"):
-        files[_checked(_FILE, file)] = body[offset : offset + abs(size)]
+        # abs: a wrong answer must not read backwards
+        files[_checked(_FILE, file)] = file_bytes[offset : offset + abs(size)]
         offset += abs(size)
-    if offset != len(body):
+    if offset != len(file_bytes):
         raise ValueError("the files of the answer are not as long as it says")
     witnesses = Witnesses(**fields.pop("witnesses"))
     stored = checked(fields.pop("stored"))
@@ -139,17 +142,20 @@ def unpacked(name: str, raw: bytes) -> Answer:
 
 def _refuse_other_types(answer: Answer) -> None:
     """Raise ValueError if a field of an answer is not of its type."""
-    files, absent, recipes, listed = answer.witnesses
+    files, absent_paths, recipes, listed_folders = answer.witnesses
     texts = [answer.state, answer.text, answer.out, answer.label, answer.key, answer.kind]
-    for mapping in (files, recipes, listed):
+    for mapping in (files, recipes, listed_folders):
         texts += [*mapping, *mapping.values()]
     if type(answer.memory) is not int:
         raise ValueError("a field of the answer is not of its type")
-    if not isinstance(absent, list) or not all(isinstance(text, str) for text in [*texts, *absent]):
+    if not isinstance(absent_paths, list) or not all(
+        isinstance(text, str) for text in [*texts, *absent_paths]
+    ):
         raise ValueError("a field of the answer is not of its type")
 
 
 def _checked(form: re.Pattern[str], text: str) -> str:
+    """Return a text that has a form; raise `ValueError` for any other text."""
     if not form.fullmatch(text):
         raise ValueError(f"{text!r} is no name of a file in a folder of results")
     return text
@@ -179,10 +185,16 @@ def answers(disk: Disk) -> list[Kept]:
 
 
 def _found(disk: Disk) -> Iterator[Kept]:
+    """Yield the stored answers, in no order."""
     for entry in below(f"{disk.folder}/{FOLDER}"):
         with suppress(OSError):
-            about = entry.stat(follow_symlinks=False)
-            yield Kept(entry.name.removesuffix(SUFFIX), entry.path, about.st_size, about.st_mtime)
+            file_status = entry.stat(follow_symlinks=False)
+            yield Kept(
+                entry.name.removesuffix(SUFFIX),
+                entry.path,
+                file_status.st_size,
+                file_status.st_mtime,
+            )
 
 
 def make_room(disk: Disk, budget: int | None = None) -> None:
@@ -191,10 +203,10 @@ def make_room(disk: Disk, budget: int | None = None) -> None:
 
     With a ``budget`` of the store in bytes, at most a twentieth of it is left.
     """
-    size, limit = 0, BYTES if budget is None else min(BYTES, budget // 20)
+    total_bytes, limit = 0, BYTES if budget is None else min(BYTES, budget // 20)
     for number, answer in enumerate(answers(disk)):
-        size += answer.size
-        if number >= COUNT or size > limit:
+        total_bytes += answer.size
+        if number >= COUNT or total_bytes > limit:
             _remove(disk, answer)
 
 
@@ -202,26 +214,29 @@ def sweep(disk: Disk, dry: bool = False, everything: bool = False) -> list[Kept]
     """Remove the answers that nobody used for a week, or ``everything``, or only list them if
     ``dry``; return them.
     """
-    old = [answer for answer in answers(disk) if everything or time.time() - answer.used > _WEEK]
-    return old if dry else [answer for answer in old if _remove(disk, answer)]
+    old_answers = [
+        answer for answer in answers(disk) if everything or time.time() - answer.used > _WEEK
+    ]
+    return old_answers if dry else [answer for answer in old_answers if _remove(disk, answer)]
 
 
 def check(disk: Disk) -> tuple[list[Kept], list[Kept]]:
     """Return the answers that are as written, and those that are not, which are moved to the
     folder ``bad/``.
     """
-    right, damaged = [], []
+    undamaged, damaged = [], []
     for answer in answers(disk):
         is_readable = read_answer(disk, answer.name) is not None
         # one of another format or without a signature stays where it is
         if is_readable or os.path.lexists(answer.path):
-            right.append(answer)
+            undamaged.append(answer)
         else:
             damaged.append(answer)
-    return right, damaged
+    return undamaged, damaged
 
 
 def _remove(disk: Disk, answer: Kept) -> bool:
+    """Remove an answer; return False if it cannot be removed."""
     try:
         disk.unlink(answer.path)
     except OSError:

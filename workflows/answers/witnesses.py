@@ -54,10 +54,10 @@ class Listing(NamedTuple):
 def listing(folder: str) -> Listing:
     """Return the names in a folder as they are now."""
     try:
-        about = os.stat(folder)
+        folder_status = os.stat(folder)
     except OSError:
         return Listing(all_names(folder), 0)
-    return Listing(all_names(folder), max(about.st_mtime_ns, about.st_ctime_ns))
+    return Listing(all_names(folder), max(folder_status.st_mtime_ns, folder_status.st_ctime_ns))
 
 
 def witnesses_of(
@@ -74,29 +74,34 @@ def witnesses_of(
     is no change. Raises `Unsettled` for what changed after the time ``before`` (ns), and for a
     folder in place of a file.
     """
-    for folder, then in listed.items():
-        now = _names_but(folder, then, made)
-        if then.changed > before or now != then.names:
+    for folder, listing_before in listed.items():
+        names_now = _names_but(folder, listing_before, made)
+        if listing_before.changed > before or names_now != listing_before.names:
             raise Unsettled(f"{folder} changed while the command ran")
     digests: dict[str, str] = {}
-    absent = []
+    absent_paths = []
+    # digests of the files as they are now
     for path in sorted(set(files)):
         try:
             digests[path] = file_digest(path, before)
         except FileNotFoundError:
-            absent.append(path)
+            absent_paths.append(path)
         except OSError as error:
             raise Unsettled(f"{path} cannot be read: {error}") from None
-    names = {folder: _digest(recipe_names(folder)) for folder in sorted(set(recipes))}
+    recipe_digests = {folder: _digest(recipe_names(folder)) for folder in sorted(set(recipes))}
     return Witnesses(
-        digests, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(listed)}
+        digests,
+        absent_paths,
+        recipe_digests,
+        {folder: _digest(all_names(folder)) for folder in sorted(listed)},
     )
 
 
 def _names_but(folder: str, then: Listing, made: str | None) -> list[str]:
     """Return the names in a folder as it is now, without the folder ``made`` if it is new."""
-    own = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
-    return [name for name in all_names(folder) if name != own or name in then.names]
+    # the folder below the listed one that leads to it
+    made_name = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
+    return [name for name in all_names(folder) if name != made_name or name in then.names]
 
 
 def hold(witnesses: Witnesses) -> bool:
@@ -124,14 +129,15 @@ def file_digest(path: str, before: int | None = None) -> str:
     (ns).
     """
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
-        about = os.fstat(file.fileno())
-        if not stat.S_ISREG(about.st_mode):
+        # again after the reading
+        file_status = os.fstat(file.fileno())
+        if not stat.S_ISREG(file_status.st_mode):
             raise Unsettled(f"{path} is not a file")
-        digits = hashlib.file_digest(file, _blake).hexdigest()
-        about = os.fstat(file.fileno())
-    if before is not None and max(about.st_mtime_ns, about.st_ctime_ns) > before:
+        hex_digest = hashlib.file_digest(file, _blake).hexdigest()
+        file_status = os.fstat(file.fileno())
+    if before is not None and max(file_status.st_mtime_ns, file_status.st_ctime_ns) > before:
         raise Unsettled(f"{path} changed while the command ran")
-    return digits
+    return hex_digest
 
 
 def recipe_names(folder: str) -> list[str]:
@@ -142,6 +148,9 @@ def recipe_names(folder: str) -> list[str]:
 
 
 def _yaml_in(folder: str, groups: bool) -> Iterator[str]:
+    """Yield the YAML files in a folder, each with whether it is a file, and with ``groups``
+    those of its subfolders.
+    """
     try:
         with os.scandir(folder) as scan:
             entries = list(scan)
@@ -163,10 +172,12 @@ def all_names(folder: str) -> list[str]:
 
 
 def _blake() -> hashlib.blake2b:
+    """Return a hasher of 16 bytes."""
     return hashlib.blake2b(digest_size=16)
 
 
 def _digest(names: list[str]) -> str:
+    """Return a digest of names in their order."""
     return hashlib.blake2b(
         "\0".join(names).encode(errors="surrogateescape"), digest_size=16
     ).hexdigest()
@@ -217,6 +228,7 @@ class Opened:
             self.files[os.path.abspath(os.fsdecode(path))] = None
 
     def _list(self, folder: str) -> None:
+        """Note what is in a folder when it is listed first."""
         if self._lists or folder in self.folders:
             return
         self._lists = True  # listing is an event too
@@ -230,10 +242,10 @@ class Folders:
     """Some folders with all that is below them."""
 
     def __init__(self, roots: Iterable[str | os.PathLike[str]]) -> None:
-        named: list[str] = []
+        paths: list[str] = []
         for root in roots:
-            named += [str(os.path.abspath(root)), str(os.path.realpath(root))]
-        self._starts = tuple(f"{path.rstrip('/')}/" for path in named)
+            paths += [str(os.path.abspath(root)), str(os.path.realpath(root))]
+        self._starts = tuple(f"{path.rstrip('/')}/" for path in paths)
 
     def __contains__(self, path: object) -> bool:
         """Return True if a path is one of the folders or below one of them, whatever links lead
@@ -252,6 +264,7 @@ def _is_written(mode: Any, flags: Any) -> bool:
 
 
 def _hear(event: str, arguments: tuple[Any, ...]) -> None:
+    """Hand an audit event to the record under way, if there is one."""
     if _listeners and (event == "open" or event in _LISTS):
         _listeners[0].hear(event, arguments)
 
@@ -290,17 +303,19 @@ def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
     Raises `Unsettled` for a file that is not in the store, and `OSError` for one that cannot be
     read.
     """
-    asked, loaded = store.asked(), sorted(store.loaded())
+    metadata_by_key, loaded = store.asked(), sorted(store.loaded())
     paths = {name: os.path.relpath(path, store.root) for name, path in taken.items()}
-    bands: list[str] = []
+    band_paths: list[str] = []
     for key in loaded:
-        names = metadata.bands(asked[key] or {})
-        bands += [f"bands/{name[:2]}/{name}" for name in names]
-    read_files = sorted({*paths.values(), *bands})
-    if outside := [path for path in read_files if not _FILE.fullmatch(path)]:
-        raise Unsettled(f"{outside[0]} is not in the folders of a store")
+        band_names = metadata.bands(metadata_by_key[key] or {})
+        band_paths += [f"bands/{name[:2]}/{name}" for name in band_names]
+    read_files = sorted({*paths.values(), *band_paths})
+    if foreign_paths := [path for path in read_files if not _FILE.fullmatch(path)]:
+        raise Unsettled(f"{foreign_paths[0]} is not in the folders of a store")
     files = {path: _digest_of_results(f"{store.disk.folder}/{path}") for path in read_files}
-    results = {key: _said(about) for key, about in sorted(asked.items())}
+    results = {
+        key: _said(metadata_of_key) for key, metadata_of_key in sorted(metadata_by_key.items())
+    }
     return StoredResults(results, tuple(loaded), files, paths)
 
 
@@ -308,12 +323,12 @@ def still_there(disk: Disk, then: StoredResults) -> bool:
     """Return True if every result is as it was and every file has the same content; change
     nothing in the cache.
     """
-    small = SmallResults(disk)
+    small_results = SmallResults(disk)
     try:
-        abouts = {key: _about(disk, small, key) for key in then.results}
+        metadata_by_key = {key: _about(disk, small_results, key) for key in then.results}
         return (
-            all(_said(abouts[key]) == digest for key, digest in then.results.items())
-            and all(_is_whole(disk, abouts[key]) for key in then.loaded)
+            all(_said(metadata_by_key[key]) == digest for key, digest in then.results.items())
+            and all(_is_whole(disk, metadata_by_key[key]) for key in then.loaded)
             and all(
                 _digest_of_results(f"{disk.folder}/{path}") == digest
                 for path, digest in then.files.items()
@@ -343,6 +358,7 @@ def checked(fields: Mapping[str, Any]) -> StoredResults:
     if not (all(map(_KEY.fullmatch, keys)) and all(map(_FILE.fullmatch, paths))):
         raise ValueError("the answer names what is no result and no file of a cache")
     digests = [*results.results.values(), *results.files.values()]
+    # each taken file must have a digest
     if not all(isinstance(text, str) for text in digests) or not {*results.taken.values()} <= {
         *results.files
     }:
@@ -356,11 +372,12 @@ def _about(disk: Disk, small: SmallResults, key: str) -> Metadata | None:
     """Return the metadata of a result as a store finds them, without moving a damaged result
     away.
     """
-    about = small.find(key)
-    return about if is_kept(about) else metadata.find(disk, key) or about
+    small_metadata = small.find(key)
+    return small_metadata if is_kept(small_metadata) else metadata.find(disk, key) or small_metadata
 
 
 def _said(about: Metadata | None) -> str:
+    """Return a digest of metadata; an empty text for a missing result."""
     if about is None:
         return ""
     return hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16).hexdigest()
@@ -375,9 +392,9 @@ def _is_whole(disk: Disk, about: Metadata | None) -> bool:
     payload = about.get("payload")
     if not payload:
         return True
-    name = "sha256" if secrets() else "xxh3"
+    digest_name = "sha256" if secrets() else "xxh3"
     content_digest = _digest_of_results(disk.path(about["key"], "safetensors"))
-    return bool(content_digest == payload.get(name))
+    return bool(content_digest == payload.get(digest_name))
 
 
 def _digest_of_results(path: str) -> str:

@@ -87,6 +87,7 @@ def serve(pipe: int) -> None:
                 process = fork.Process(target=_answer, args=(connection, asked))
                 process.start()
                 process.join()
+                # an exit code instead of an outcome: the fork has ended
                 connection.send_bytes(pickle.dumps(process.exitcode))
         except (EOFError, OSError):
             return
@@ -102,13 +103,18 @@ def _answer(connection: Connection, asked: Asked) -> None:
 
 
 def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
+    """Return the outcome of one call, after a change of what other code changes between two
+    calls.
+    """
     _disturb(asked.settings)
     try:
         import_missing(asked.files, module)
         function = pickle.loads(pickled)
     except (Exception, SystemExit) as error:
-        outcome = failed(error, module)
-        return Outcome(failure=f"cannot be imported: it {outcome.failure}", place=outcome.place)
+        import_outcome = failed(error, module)
+        return Outcome(
+            failure=f"cannot be imported: it {import_outcome.failure}", place=import_outcome.place
+        )
     _disturb(asked.settings)  # again, as the import may have changed it back
     return outcome_of(function, module)
 
@@ -122,6 +128,7 @@ def _settle(settings: Settings) -> None:
             os.environ.pop(name, None)
         else:
             os.environ[name] = value
+    # TZ may be among the variables
     time.tzset()
     if settings.folder:
         os.chdir(settings.folder)
@@ -156,8 +163,8 @@ def _work() -> None:
     """Do what other steps may have done before: numbers, and settings of libraries that code of
     others changes.
     """
-    x = torch.full((_SIDE, _SIDE), 3.0)
-    torch.fft.fft2(x @ x).abs().sort()
+    matrix = torch.full((_SIDE, _SIDE), 3.0)
+    torch.fft.fft2(matrix @ matrix).abs().sort()
     np.linalg.svd(np.full((_SIDE, _SIDE), 7.0))
     np.set_printoptions(precision=3, suppress=True)
     torch.set_printoptions(precision=2)  # type: ignore[no-untyped-call]
@@ -201,16 +208,16 @@ class Trial:
         self.others = others
         self.findings = dict[str, Finding]()  #: by the name of the call
         self._pickled = dict[str, bytes]()
-        for attempt in tried:
+        for call in tried:
             try:
-                self._pickled[attempt.name] = pickle.dumps(attempt.function)
+                self._pickled[call.name] = pickle.dumps(call.function)
             except Exception as error:
                 text = (
                     "not tried: its example cannot be sent to another process:"
                     f" {type(error).__name__}: {error}"
                 )
-                self.findings[attempt.name] = Finding(RULE, None, text)
-        self._tried = {attempt.name: attempt for attempt in tried if attempt.name in self._pickled}
+                self.findings[call.name] = Finding(RULE, None, text)
+        self._tried = {call.name: call for call in tried if call.name in self._pickled}
         self._here: Found = {}
         self._processes = dict[Changes, Elsewhere]()  # by what only a new process can have
 
@@ -222,22 +229,23 @@ class Trial:
             self._compare(first)
 
     def _compare(self, first: Elsewhere) -> None:
-        away = self._outcomes(first, frozenset(self.others.changed()))
-        self._leave_out_ends([name for name, outcome in away.items() if outcome.is_end])
+        """Find what differs, and then what decides it; see `compare`."""
+        outcomes_away = self._outcomes(first, frozenset(self.others.changed()))
+        # first, since a call that ends its process would end this one
+        self._leave_out_ends([name for name, outcome in outcomes_away.items() if outcome.is_end])
         self._here = {
-            name: outcome_of(attempt.function, attempt.module)
-            for name, attempt in self._tried.items()
+            name: outcome_of(call.function, call.module) for name, call in self._tried.items()
         }
-        open_names = list[str]()
-        for name, here in self._here.items():
-            if here.failure:
+        differing_names = list[str]()
+        for name, outcome_here in self._here.items():
+            if outcome_here.failure:
                 self.findings[name] = Finding(RULE, None, "not tried: the example fails here")
-            elif self._difference(name, away[name], here):
-                open_names.append(name)
+            elif self._difference(name, outcomes_away[name], outcome_here):
+                differing_names.append(name)
             else:
                 self._say_same(name)
-        self._settle_rounding(open_names, away)
-        self._settle_others([name for name in open_names if name not in self.findings])
+        self._settle_rounding(differing_names, outcomes_away)
+        self._settle_others([name for name in differing_names if name not in self.findings])
 
     def ends(self, name: str) -> bool:
         """Return True if a call ends its process also in the same surroundings, so that it is
@@ -257,25 +265,27 @@ class Trial:
         if WORK in changes:
             names.reverse()
         declared: dict[str, str] = {}
-        for attempt in self._tried.values():
-            declared |= attempt.declared
+        for call in self._tried.values():
+            declared |= call.declared
         settings = (others or self.others).settings(changes, Path(process.folder.name), declared)
         calls = tuple((self._tried[name].module, self._pickled[name]) for name in names)
+        # by name, whatever the order of the calls
         return dict(zip(names, process.outcomes(Asked(settings, own_files(), calls)), strict=True))
 
     def _each(self, sets: Sequence[Iterable[Surrounding]]) -> list[Found]:
         """Return the outcomes for each set of changes; the processes that they need start at the
         same time.
         """
-        changes = [frozenset(change_set) for change_set in sets]
-        for change_set in changes:
+        change_sets = [frozenset(change_set) for change_set in sets]
+        for change_set in change_sets:
+            # processes that differ in nothing that only a new one can have are shared
             if change_set & FRESH not in self._processes:
                 self._processes[change_set & FRESH] = self._stack.enter_context(
                     closing(Elsewhere(self.others, change_set))
                 )
         return [
             self._outcomes(self._processes[change_set & FRESH], change_set)
-            for change_set in changes
+            for change_set in change_sets
         ]
 
     # --- what decides -----------------------------------------------------------------------------
@@ -286,26 +296,30 @@ class Trial:
         """
         if not names:
             return
-        [same] = self._each([()])
+        # without a change
+        [outcomes_in_same] = self._each([()])
         for name in names:
-            if same[name].is_end:
+            if outcomes_in_same[name].is_end:
                 self._fail(
-                    name, f"the call {same[name].failure}; the rules on values were not tried"
+                    name,
+                    f"the call {outcomes_in_same[name].failure}; the rules on values were not"
+                    " tried",
                 )
                 del self._tried[name]
 
     def _settle_rounding(self, names: list[str], away: Found) -> None:
         """Say which results differ by rounding alone, and with the number of threads alone."""
-        sizes = dict[str, float]()
+        rounding_errors = dict[str, float]()
         for name in names:
             deviation = self._difference(name, away[name], self._here[name])
             if deviation and deviation.is_rounding:
-                sizes[name] = deviation.size
-        if not sizes:
+                rounding_errors[name] = deviation.size
+        if not rounding_errors:
             return
-        [others] = self._each([set(self.others.changed()) - {THREADS}])
-        for name, size in sizes.items():
-            if not self._difference(name, others[name], self._here[name]):
+        # all changes but the number of threads, which may change rounding
+        [outcomes_of_others] = self._each([set(self.others.changed()) - {THREADS}])
+        for name, size in rounding_errors.items():
+            if not self._difference(name, outcomes_of_others[name], self._here[name]):
                 self._say_same(name, size)
 
     def _settle_others(self, names: list[str]) -> None:
@@ -313,20 +327,27 @@ class Trial:
         if not names:
             return
         changed = self.others.changed()
-        same, *singles = self._each([(), *([surrounding] for surrounding in changed)])
-        unsteady = self._differences(names, same, self._here)
-        again = self._each([()])[0] if unsteady else same
+        outcomes_in_same, *outcomes_by_surrounding = self._each(
+            [(), *([surrounding] for surrounding in changed)]
+        )
+        differing_from_here = self._differences(names, outcomes_in_same, self._here)
+        # the same surroundings a second time: what differs now depends on chance or a clock
+        second_outcomes = self._each([()])[0] if differing_from_here else outcomes_in_same
         for name in names:
-            if deviation := self._difference(name, again[name], same[name]):
+            if deviation := self._difference(name, second_outcomes[name], outcomes_in_same[name]):
                 self._fail(
                     name,
                     f"{_UNSTEADY} {deviation.text}; other surroundings were not compared",
                     deviation.place,
                 )
             else:
-                for surrounding, outcomes in zip(changed, singles, strict=True):
-                    self._settle_one(name, surrounding, outcomes, same)
-        self._settle_hidden([name for name in names if name not in self.findings], same, unsteady)
+                for surrounding, outcomes in zip(changed, outcomes_by_surrounding, strict=True):
+                    self._settle_one(name, surrounding, outcomes, outcomes_in_same)
+        self._settle_hidden(
+            [name for name in names if name not in self.findings],
+            outcomes_in_same,
+            differing_from_here,
+        )
 
     def _settle_one(
         self, name: str, surrounding: Surrounding, outcomes: Found, same: Found
@@ -349,18 +370,20 @@ class Trial:
         halving.
         """
         process = self._processes[frozenset()]
-        todo, deciding = [self.others.variables], list[str]()
-        while todo:
-            few = todo.pop()
+        sets_left, deciding = [self.others.variables], list[str]()
+        while sets_left:
+            left_out = sets_left.pop()
             outcomes = self._outcomes(
-                process, frozenset({VARIABLES}), replace(self.others, variables=few)
+                process, frozenset({VARIABLES}), replace(self.others, variables=left_out)
             )
-            if not few or not self._difference(name, outcomes[name], same[name]):
+            # none of these variables decides
+            if not left_out or not self._difference(name, outcomes[name], same[name]):
                 continue
-            if len(few) == 1:
-                deciding += few
+            if len(left_out) == 1:
+                deciding += left_out
             else:
-                todo += [few[: len(few) // 2], few[len(few) // 2 :]]
+                # two halves
+                sets_left += [left_out[: len(left_out) // 2], left_out[len(left_out) // 2 :]]
         return sorted(deciding)
 
     def _settle_hidden(
@@ -369,9 +392,10 @@ class Trial:
         """Say what decides where no surrounding that was changed alone does."""
         if not names:
             return
+        # two seeds may give the same order of a small set
         for seed in range(_MORE_SEEDS):
-            others = replace(self.others, hash_seed=self.others.hash_seed + 1 + seed)
-            with closing(Elsewhere(others, frozenset({HASH}))) as process:
+            other_seed = replace(self.others, hash_seed=self.others.hash_seed + 1 + seed)
+            with closing(Elsewhere(other_seed, frozenset({HASH}))) as process:
                 outcomes = self._outcomes(process, frozenset({HASH}))
             for name in names:
                 deviation = self._difference(name, outcomes[name], same[name])
@@ -380,11 +404,10 @@ class Trial:
         for name in names:
             if name in self.findings:
                 continue
+            # the call after others here differs from that of a new process
             if name in unsteady:
-                found_text = (
-                    f"in a process that has done nothing else, {unsteady[name].text}: {WORK.fix}"
-                )
-                self._fail(name, found_text, unsteady[name].place)
+                text = f"in a process that has done nothing else, {unsteady[name].text}: {WORK.fix}"
+                self._fail(name, text, unsteady[name].place)
             else:
                 self._fail(
                     name,
@@ -394,9 +417,13 @@ class Trial:
     # --- words ------------------------------------------------------------------------------------
 
     def _difference(self, name: str, outcome: Outcome, expected: Outcome) -> Difference | None:
+        """Return how an outcome of a call differs from the expected one, or None if it is equal."""
         return difference(outcome, expected, self._tried[name].rtol)
 
     def _say_same(self, name: str, rounding: float = 0.0) -> None:
+        """Note that a call gives the same in other surroundings; ``rounding`` is its error with
+        other threads.
+        """
         count = len(self.others.changed()) - (rounding > 0)
         text = (
             f"the same bits in {count} changed surroundings:"
@@ -416,15 +443,16 @@ class Trial:
         deviation: Difference,
         variables: Sequence[str] = (),
     ) -> None:
+        """Note that a call depends on a surrounding, and on these variables of the environment."""
         differs = self.others.differs(surrounding, variables)
         fix = surrounding.fix.replace("NAME", variables[0]) if variables else surrounding.fix
         self._fail(name, f"{differs} {deviation.text}: {fix}", deviation.place)
 
     def _fail(self, name: str, text: str, place: str = "") -> None:
         """Add a sentence on a call; several surroundings make several sentences."""
-        before = f"{self.findings[name].text}; " if name in self.findings else ""
+        earlier_text = f"{self.findings[name].text}; " if name in self.findings else ""
         self.findings[name] = Finding(
-            RULE, False, f"{before}{place or self._tried[name].place}: {text}"
+            RULE, False, f"{earlier_text}{place or self._tried[name].place}: {text}"
         )
 
 
@@ -439,14 +467,12 @@ def check_elsewhere(
     if not tried:
         return {}, set()
     try:
-        first = process()
-        trial = Trial(tried, first.others)
-        trial.compare(first)
+        changed_process = process()
+        trial = Trial(tried, changed_process.others)
+        trial.compare(changed_process)
     except NotStartedError as error:
-        return {
-            attempt.name: Finding(RULE, None, f"not tried: {error}") for attempt in tried
-        }, set()
-    return trial.findings, {attempt.name for attempt in tried if trial.ends(attempt.name)}
+        return {call.name: Finding(RULE, None, f"not tried: {error}") for call in tried}, set()
+    return trial.findings, {call.name for call in tried if trial.ends(call.name)}
 
 
 # --- tried calls ----------------------------------------------------------------------------------
@@ -463,10 +489,12 @@ def node_call(name: str, call: Call) -> Tried:
     """Return the call of a node's example; files of its parameters are named by their full
     paths.
     """
-    full = Call(
+    call_with_full_paths = Call(
         call.node, call.inputs, {key: _with_full_paths(value) for key, value in call.params.items()}
     )
-    return _tried(name, call.node.fn, call.node.rtol, full.result, call.node.depends)
+    return _tried(
+        name, call.node.fn, call.node.rtol, call_with_full_paths.result, call.node.depends
+    )
 
 
 def network_call(name: str, network: type[nn.Module]) -> Tried:
@@ -478,6 +506,9 @@ def network_call(name: str, network: type[nn.Module]) -> Tried:
 def _tried(
     name: str, code: Any, rtol: float, function: Callable[[], Any], depends: tuple[str, ...]
 ) -> Tried:
+    """Return a call to try elsewhere, with the variables of the environment that its code
+    declares.
+    """
     module = code.__module__
     variables = [*depends, *_declarations(module)]
     names = {entry.removeprefix(_VARIABLE) for entry in variables if entry.startswith(_VARIABLE)}
@@ -499,16 +530,19 @@ def _declarations(module: str) -> Iterator[str]:
 
 
 def _with_full_paths(value: Any) -> Any:
+    """Return a parameter with full paths, since another process has another working folder."""
     if isinstance(value, Path):
         return value.absolute()
     return type(value)(map(_with_full_paths, value)) if type(value) in (tuple, list) else value
 
 
 def _on_a_picture(architecture: Architecture) -> torch.Tensor:
+    """Return the result of a network with its first weights, on a picture that a seed gives."""
     net = own_network(architecture, None, None).eval()
     picture = torch.rand(
         1,
         3,
+        # odd sides, as a picture may have
         _TRIED_SIDE + 1,
         _TRIED_SIDE + 3,
         generator=torch.Generator().manual_seed(3),
@@ -519,8 +553,9 @@ def _on_a_picture(architecture: Architecture) -> torch.Tensor:
 
 
 def _place(code: Any) -> str:
+    """Return file and line of a function or class, or its module."""
     try:
-        lines = inspect.getsourcelines(inspect.unwrap(code))[1]
-        return f"{Path(inspect.getfile(inspect.unwrap(code))).name}:{lines}"
+        first_line = inspect.getsourcelines(inspect.unwrap(code))[1]
+        return f"{Path(inspect.getfile(inspect.unwrap(code))).name}:{first_line}"
     except (OSError, TypeError):
         return str(code.__module__)

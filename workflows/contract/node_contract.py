@@ -47,12 +47,12 @@ def check_reach(call: Call) -> Iterator[Finding]:
     """Find whether a call of own code reaches more than its cache key covers."""
     with tempfile.TemporaryDirectory() as folder:
         try:
-            own = own_code_of(call.node, call.params, [], Code(Path(folder) / "code.json"))
+            own_code = own_code_of(call.node, call.params, [], Code(Path(folder) / "code.json"))
         except LookupError:
             return  # the rule on the key says so
-    if own is None:
+    if own_code is None:
         return
-    _, taints = call_observed(call.result, own)
+    _, taints = call_observed(call.result, own_code)
     for taint in taints:
         yield Finding(
             "reach",
@@ -116,7 +116,7 @@ def example_call(node: Node, example: Mapping[str, Any] | None = None) -> Call |
     if example is None and node.hooks.example is None:
         return _no_example(node)
     try:
-        validated = node.params
+        parameter_model = node.params
     except Exception:
         return Finding(
             "example",
@@ -127,12 +127,13 @@ def example_call(node: Node, example: Mapping[str, Any] | None = None) -> Call |
         arguments = _arguments(node, example)
     except Exception as error:
         return Finding("example", False, f"the example raises {type(error).__name__}: {error}")
+    # what is left of the arguments are parameters
     inputs = {name: arguments.pop(name, None) for name in node.inputs}
     missing = _missing(node, inputs)
     if missing:
         return Finding("example", False, f"lacks the inputs {', '.join(missing)}")
     try:
-        params = dict(validated(**arguments))
+        params = dict(parameter_model(**arguments))
     except ValidationError as error:
         return Finding("example", False, _first_mistake(error))
     return Call(node, list(inputs.values()), params)
@@ -146,12 +147,13 @@ def _missing(node: Node, inputs: Mapping[str, Any]) -> list[str]:
 
 def _first_mistake(error: ValidationError) -> str:
     """Return the first mistake in the parameters of an example."""
-    first = error.errors(include_url=False)[0]
-    text = first["msg"].removeprefix("Value error, ")
-    return f"{'.'.join(map(str, first['loc']))}: {text}"
+    first_error = error.errors(include_url=False)[0]
+    text = first_error["msg"].removeprefix("Value error, ")
+    return f"{'.'.join(map(str, first_error['loc']))}: {text}"
 
 
 def _no_example(node: Node) -> Finding:
+    """Return the finding on a node without an example."""
     name = node.fn.__name__
     return Finding(
         "example",
@@ -190,14 +192,16 @@ def whole_networks(module: ModuleType) -> dict[str, type[nn.Module]]:
     their file use.
     """
     classes = network_classes(module)
-    named: set[str] = set()
-    for name in {value.__module__ for value in classes.values()}:
+    names_used: set[str] = set()
+    for name in {network.__module__ for network in classes.values()}:
         for item in ast.parse(inspect.getsource(sys.modules[name])).body:
-            own = getattr(item, "name", "")
-            named |= {
-                leaf.id for leaf in ast.walk(item) if isinstance(leaf, ast.Name) and leaf.id != own
+            own_name = getattr(item, "name", "")
+            names_used |= {
+                leaf.id
+                for leaf in ast.walk(item)
+                if isinstance(leaf, ast.Name) and leaf.id != own_name
             }
-    return {name: value for name, value in classes.items() if name not in named}
+    return {name: network for name, network in classes.items() if name not in names_used}
 
 
 def check_network(name: str, network: type[nn.Module]) -> list[Finding]:
@@ -218,6 +222,7 @@ def check_network(name: str, network: type[nn.Module]) -> list[Finding]:
 
 
 def _guarded_network(rule: Callable[[Make], Iterator[Finding]], make: Make) -> Iterator[Finding]:
+    """Yield what a rule finds on a network, and an error of the network as a finding."""
     try:
         yield from rule(make)
     except (ParameterError, RuntimeError, TypeError, ValueError) as error:
@@ -226,10 +231,10 @@ def _guarded_network(rule: Callable[[Make], Iterator[Finding]], make: Make) -> I
 
 def _check_docstring(network: type[nn.Module]) -> Iterator[Finding]:
     """Find whether the class has a docstring of its own that begins with a sentence."""
-    first = (vars(network).get("__doc__") or "").strip().partition("\n")[0]
-    ok = first[:1].isupper() and first.endswith(".")
-    wrong = "begin the class with one sentence that ends with a stop"
-    yield Finding.of("docstring", ok, "one sentence", wrong)
+    first_line = (vars(network).get("__doc__") or "").strip().partition("\n")[0]
+    is_sentence = first_line[:1].isupper() and first_line.endswith(".")
+    advice = "begin the class with one sentence that ends with a stop"
+    yield Finding.of("docstring", is_sentence, "one sentence", advice)
 
 
 def _check_network_key(network: type[nn.Module]) -> Iterator[Finding]:
@@ -269,17 +274,17 @@ def _check_weights(make: Make) -> Iterator[Finding]:
     """Find whether the weights of one network make another one, built with other random numbers,
     equal to it.
     """
-    first, second = make(1).eval(), make(2).eval()
-    second.inner.load_state_dict(first.inner.state_dict())
+    network, other_network = make(1).eval(), make(2).eval()
+    other_network.inner.load_state_dict(network.inner.state_dict())
     picture = _picture()
     with torch.no_grad():
-        same = torch.equal(first(picture), second(picture))
-    text = "a file of weights holds all that the network has drawn"
-    wrong = (
+        is_same = torch.equal(network(picture), other_network(picture))
+    kept_text = "a file of weights holds all that the network has drawn"
+    broken_text = (
         "two networks with the same weights differ: register each drawn tensor as a parameter or a"
         " buffer"
     )
-    yield Finding.of("weights", same, text, wrong)
+    yield Finding.of("weights", is_same, kept_text, broken_text)
 
 
 def _check_gradient(make: Make) -> Iterator[Finding]:
@@ -287,18 +292,23 @@ def _check_gradient(make: Make) -> Iterator[Finding]:
     net = make(0).train()
     with torch.random.fork_rng([]):
         torch.manual_seed(0)
+        # any target will do, such as the mirrored picture
         (net(_picture()) - _picture().flip(-1)).square().mean().backward()
     trainable = {name: p for name, p in net.inner.named_parameters() if p.requires_grad}
     if not trainable:
         yield Finding("gradient", False, "the class has no parameters: there is nothing to train")
         return
-    unused = [name for name, parameter in trainable.items() if parameter.grad is None]
-    wrong = [name for name, parameter in trainable.items() if not _has_finite_gradient(parameter)]
-    if wrong:
-        yield Finding("gradient", False, f"the gradient of {wrong[0]} is not finite")
-    elif unused:
+    without_gradient = [name for name, parameter in trainable.items() if parameter.grad is None]
+    not_finite = [
+        name for name, parameter in trainable.items() if not _has_finite_gradient(parameter)
+    ]
+    if not_finite:
+        yield Finding("gradient", False, f"the gradient of {not_finite[0]} is not finite")
+    elif without_gradient:
         yield Finding(
-            "gradient", False, f"{unused[0]} has no gradient: the result does not depend on it"
+            "gradient",
+            False,
+            f"{without_gradient[0]} has no gradient: the result does not depend on it",
         )
     else:
         yield Finding("gradient", True, f"finite for each of {len(trainable)} parameters")
@@ -310,6 +320,7 @@ def _has_finite_gradient(parameter: nn.Parameter) -> bool:
 
 
 def _picture() -> torch.Tensor:
+    """Return a small picture that a seed gives, with odd sides."""
     random = torch.Generator().manual_seed(3)
     return torch.rand(1, 3, _SIDE + 1, _SIDE + 3, generator=random)
 
@@ -333,12 +344,12 @@ def check_all(
     calls = {name: example_call(node) for name, node in nodes.items()}
     tried = [node_call(name, call) for name, call in calls.items() if isinstance(call, Call)]
     tried += [network_call(name, network) for name, network in networks.items()]
-    away, ending = check_elsewhere(tried, process)
+    findings_away, names_ending = check_elsewhere(tried, process)
     for name, call in calls.items():
-        findings[name] += _on_values(call, name in ending)
+        findings[name] += _on_values(call, name in names_ending)
     for name, network in networks.items():
-        findings[name] = [] if name in ending else check_network(name, network)
-    for name, finding in away.items():
+        findings[name] = [] if name in names_ending else check_network(name, network)
+    for name, finding in findings_away.items():
         findings[name].append(finding)
     return findings
 

@@ -61,9 +61,13 @@ _HOOKS = ("reference", "skip_bound", "skip_scale", "zero_bound", "preflight", "s
 def check_docstring(node: Node) -> Iterator[Finding]:
     """Find whether the docstring begins with one sentence and has the lines of a node."""
     text = inspect.getdoc(node.fn) or ""
-    first, lines = text.split("\n\n")[0], text.splitlines()
+    first_paragraph, lines = text.split("\n\n")[0], text.splitlines()
     faults = []
-    if not first.endswith(".") or not first[:1].isupper() or len(first) > _LONGEST:
+    if (
+        not first_paragraph.endswith(".")
+        or not first_paragraph[:1].isupper()
+        or len(first_paragraph) > _LONGEST
+    ):
         faults.append("the first paragraph must be one sentence")
     faults += [f"one line must begin with {word}" for word in _LINES if not _has_line(lines, word)]
     if "Raises:" not in text and _raises(node):
@@ -77,8 +81,8 @@ def check_docstring(node: Node) -> Iterator[Finding]:
 
 def _has_line(lines: Sequence[str], word: str) -> bool:
     """Return True if one line alone begins with a word, and says something."""
-    begun = [line for line in lines if line.startswith(word)]
-    return len(begun) == 1 and len(begun[0].removeprefix(word).strip()) >= 2
+    lines_with_word = [line for line in lines if line.startswith(word)]
+    return len(lines_with_word) == 1 and len(lines_with_word[0].removeprefix(word).strip()) >= 2
 
 
 def check_signature(node: Node) -> Iterator[Finding]:
@@ -86,34 +90,44 @@ def check_signature(node: Node) -> Iterator[Finding]:
     validated.
     """
     try:
-        names = inspect.signature(node.fn).parameters
-        bare = [name for name in names if name not in node.hints and name != "rng"]
-        bare += [] if "return" in node.hints else ["the result"]
-        fields = [] if bare else list(node.params.model_fields)
+        argument_names = inspect.signature(node.fn).parameters
+        without_annotation = [
+            name for name in argument_names if name not in node.hints and name != "rng"
+        ]
+        without_annotation += [] if "return" in node.hints else ["the result"]
+        # the model of the parameters fails where one cannot be validated
+        fields = [] if without_annotation else list(node.params.model_fields)
     except Exception as error:
         yield Finding(
             "signature", False, f"an annotation cannot be read: {type(error).__name__}: {error}"
         )
         return
     count = f"{len(fields)} parameter{'s' * (len(fields) != 1)}"
-    text = f"without an annotation: {', '.join(bare)}" if bare else f"{count}, all annotated"
-    yield Finding("signature", not bare, text)
+    text = (
+        f"without an annotation: {', '.join(without_annotation)}"
+        if without_annotation
+        else f"{count}, all annotated"
+    )
+    yield Finding("signature", not without_annotation, text)
 
 
 def check_hooks(node: Node) -> Iterator[Finding]:
     """Find whether each hook takes arguments that the node has."""
-    own = {*inspect.signature(node.fn).parameters, "result"}
+    own_names = {*inspect.signature(node.fn).parameters, "result"}
     faults = []
     for name in _HOOKS:
         hook = getattr(node.hooks, name)
-        for p in inspect.signature(hook).parameters.values() if hook else ():
-            if p.kind is p.KEYWORD_ONLY and p.name not in own:
-                faults.append(f"{name} asks for {p.name}, which {node.fn.__name__} does not have")
+        for parameter in inspect.signature(hook).parameters.values() if hook else ():
+            if parameter.kind is parameter.KEYWORD_ONLY and parameter.name not in own_names:
+                faults.append(
+                    f"{name} asks for {parameter.name}, which {node.fn.__name__} does not have"
+                )
     attached = [name for name in _HOOKS if getattr(node.hooks, name)]
     yield Finding("hooks", not faults, "; ".join(faults) or (", ".join(attached) or "none"))
 
 
 def _raises(node: Node) -> bool:
+    """Return True if the code of a node has a ``raise`` statement."""
     try:
         source = textwrap.dedent(inspect.getsource(node.fn))
     except OSError:
@@ -154,30 +168,34 @@ def check_result(call: Call) -> Iterator[Finding]:
     """Find whether the result is finite, of the annotated type, the same twice, and the inputs
     are left alone.
     """
-    before = [x.clone() for x in tensors_in(list(call.inputs))]
-    first, second = call.result(), call.result()
-    after = tensors_in(list(call.inputs))
-    same = all(torch.equal(x, y) for x, y in zip(before, after, strict=True))
+    inputs_before = [x.clone() for x in tensors_in(list(call.inputs))]
+    result, second_result = call.result(), call.result()
+    inputs_after = tensors_in(list(call.inputs))
+    is_unchanged = all(torch.equal(x, y) for x, y in zip(inputs_before, inputs_after, strict=True))
     yield Finding.of(
-        "inputs", same, "left as they were", "changed in place: let the node clone the input"
+        "inputs",
+        is_unchanged,
+        "left as they were",
+        "changed in place: let the node clone the input",
     )
-    finite = all(bool(x.isfinite().all()) for x in _floating(first))
+    is_finite = all(bool(x.isfinite().all()) for x in _floating(result))
     yield Finding.of(
-        "finite", finite, "no NaN, no infinity", "the result has NaN or infinite values"
+        "finite", is_finite, "no NaN, no infinity", "the result has NaN or infinite values"
     )
-    again = all(
+    is_repeated = all(
+        # tolerances 0, and NaN equal to NaN
         torch.allclose(x, y, 0.0, 0.0, True)
-        for x, y in zip(tensors_in(first), tensors_in(second), strict=True)
+        for x, y in zip(tensors_in(result), tensors_in(second_result), strict=True)
     )
     yield Finding.of(
-        "same twice", again, "the same bits", "two calls differ: draw from the argument rng"
+        "same twice", is_repeated, "the same bits", "two calls differ: draw from the argument rng"
     )
-    kind = call.node.hints.get("return", Any)
-    is_kind = fits(first, kind)
+    annotated_type = call.node.hints.get("return", Any)
+    is_kind = fits(result, annotated_type)
     text = (
-        f"as annotated: {getattr(kind, '__name__', kind)}"
+        f"as annotated: {getattr(annotated_type, '__name__', annotated_type)}"
         if is_kind
-        else f"a {type(first).__name__}, not {kind}"
+        else f"a {type(result).__name__}, not {annotated_type}"
     )
     yield Finding("type", is_kind, text)
 
@@ -199,36 +217,37 @@ def check_reference(call: Call) -> Iterator[Finding]:
         return  # factors of a cheaper form, of which many have the same product
     rng = {"rng": torch.Generator().manual_seed(_SEED)} if node.random else {}
     results = tensors_in(call.result())
-    slow = tensors_in(node.hooks.reference(*call.inputs, **call.params, **rng))
-    if [x.shape for x in results] != [x.shape for x in slow]:
-        shapes = [_shapes(tensors) or "no tensor" for tensors in (results, slow)]
+    reference_results = tensors_in(node.hooks.reference(*call.inputs, **call.params, **rng))
+    if [x.shape for x in results] != [x.shape for x in reference_results]:
+        shapes = [_shapes(tensors) or "no tensor" for tensors in (results, reference_results)]
         yield Finding("reference", False, f"the result is {shapes[0]}, the reference {shapes[1]}")
         return
-    error = max(map(off_by, results, slow), default=0.0)
-    ok = error <= node.rtol
+    error = max(map(off_by, results, reference_results), default=0.0)
+    is_within = error <= node.rtol
     yield Finding(
-        "reference", ok, f"off by {error:.2g} of the largest value; rtol = {node.rtol:.2g}"
+        "reference", is_within, f"off by {error:.2g} of the largest value; rtol = {node.rtol:.2g}"
     )
 
 
 def check_gradient(call: Call) -> Iterator[Finding]:
     """Find whether each gradient is that of finite differences in float64."""
     lines = (inspect.getdoc(call.node.fn) or "").splitlines()
-    stated = [line for line in lines if line.startswith("Gradient:")]
-    if stated:
-        yield Finding("gradient", None, f"not compared: {stated[0]}")
+    gradient_lines = [line for line in lines if line.startswith("Gradient:")]
+    if gradient_lines:
+        yield Finding("gradient", None, f"not compared: {gradient_lines[0]}")
         return
-    followed = []
+    # inputs with a slope
+    names_followed = []
     for name, function, zero in _followed(call):
         if fault := _slope_fault(function, zero):
             yield Finding("gradient", False, f"with respect to {name}: {fault}")
             return
-        followed.append(name)
-    if followed:
+        names_followed.append(name)
+    if names_followed:
         yield Finding(
             "gradient",
             True,
-            f"as finite differences, with respect to {', '.join(dict.fromkeys(followed))}",
+            f"as finite differences, with respect to {', '.join(dict.fromkeys(names_followed))}",
         )
 
 
@@ -239,46 +258,50 @@ def _followed(
     result as a function of a change of the tensor, and no change.
     """
     inputs = [_double(value) for value in call.inputs]
-    scales = [_largest(y) for y in _floating(call.result(inputs))]
+    # each result is compared relative to its largest value
+    largest_values = [_largest(y) for y in _floating(call.result(inputs))]
     for i, name in enumerate(call.node.inputs):
         for j, x in enumerate(tensors_in([inputs[i]])):
             if not x.is_floating_point() or x.numel() == 0:
                 continue
-            function = partial(_scaled, call, inputs, i, j, scales)
+            result_of_change = partial(_scaled, call, inputs, i, j, largest_values)
             zero = torch.zeros_like(x, requires_grad=True)
             with warnings.catch_warnings():
                 # a node may read a number of a tensor without a slope
                 warnings.simplefilter("ignore")
-                follows = any(y.requires_grad for y in function(zero))
-            if follows:
-                yield name, function, zero
+                has_slope = any(y.requires_grad for y in result_of_change(zero))
+            if has_slope:
+                yield name, result_of_change, zero
 
 
 def _slope_fault(function: Callable[[Tensor], tuple[Tensor, ...]], zero: Tensor) -> str:
     """Return what is wrong with the slopes of a function at ``zero``; no text if they are those
     of differences.
     """
-    follow = [y.requires_grad for y in function(zero)]
+    slopes = [y.requires_grad for y in function(zero)]
 
     # gradcheck pairs results wrongly where one of them has no slope
     def followed(x: Tensor) -> tuple[Tensor, ...]:
-        return tuple(y for y, has_slope in zip(function(x), follow, strict=True) if has_slope)
+        return tuple(y for y, has_slope in zip(function(x), slopes, strict=True) if has_slope)
 
     results = followed(zero)
+    # the gradient of the sum of all results
     slope = torch.autograd.grad(results, zero, [torch.ones_like(y) for y in results])[0]
-    if bad := int((~slope.isfinite()).sum()):
+    if bad_values := int((~slope.isfinite()).sum()):
         return (
-            f"NaN or infinite for {bad} of {slope.numel()} values: see where a root, a logarithm or"
-            " a quotient is 0"
+            f"NaN or infinite for {bad_values} of {slope.numel()} values: see where a root,"
+            " a logarithm or a quotient is 0"
         )
     try:
+        # fast mode: along one drawn direction in place of each element
         gradcheck(followed, (zero,), eps=_STEP, atol=_ATOL, rtol=_RTOL, fast_mode=True)
     except GradcheckError as error:
-        both = _SLOPES.search(str(error))
-        if both is None:
+        slope_texts = _SLOPES.search(str(error))
+        if slope_texts is None:
             return " ".join(str(error).split())
         return (
-            f"along a drawn direction the slope is {both[2]}, but by finite differences {both[1]}"
+            f"along a drawn direction the slope is {slope_texts[2]},"
+            f" but by finite differences {slope_texts[1]}"
         )
     return ""
 
@@ -294,10 +317,12 @@ def check_bands(call: Call) -> Iterator[Finding]:
         _first_band(value, axes[name]) if name in axes else value
         for name, value in zip(call.node.inputs, call.inputs, strict=True)
     ]
-    of_stack = tensors_in(_first_band(call.result(), axes["return"]))
-    alone = tensors_in(call.result(first_bands))
-    same = all(torch.equal(x, y) for x, y in zip(of_stack, alone, strict=True))
-    yield Finding("bands", same, f"the first band alone has {'the same' if same else 'other'} bits")
+    band_of_stack = tensors_in(_first_band(call.result(), axes["return"]))
+    band_alone = tensors_in(call.result(first_bands))
+    is_same = all(torch.equal(x, y) for x, y in zip(band_of_stack, band_alone, strict=True))
+    yield Finding(
+        "bands", is_same, f"the first band alone has {'the same' if is_same else 'other'} bits"
+    )
 
 
 def check_skip_bound(call: Call) -> Iterator[Finding]:
@@ -308,20 +333,24 @@ def check_skip_bound(call: Call) -> Iterator[Finding]:
     result = call.result()
     if not isinstance(result, Tensor) or not isinstance(call.inputs[0], Tensor):
         return
-    without = call.inputs[0]
-    stats = [TensorStats.of(value) for value in call.inputs]
-    bound = float(hook(*stats, **call.params))
-    if without.shape != result.shape or math.isnan(bound):
+    replacement = call.inputs[0]
+    input_stats = [TensorStats.of(value) for value in call.inputs]
+    bound = float(hook(*input_stats, **call.params))
+    # a result of another shape cannot be compared
+    if replacement.shape != result.shape or math.isnan(bound):
         return
-    scale = float(without.abs().max())
-    if (of := call.node.hooks.skip_scale) is not None:
-        scale = min(scale, float(of(stats[0], **call.params)))
-    change = _size(result - without, call.node.random) / (scale or 1.0)
+    scale = float(replacement.abs().max())
+    if (skip_scale := call.node.hooks.skip_scale) is not None:
+        scale = min(scale, float(skip_scale(input_stats[0], **call.params)))
+    change = _size(result - replacement, call.node.random) / (scale or 1.0)
+    # five standard deviations
     # of a root mean square over few numbers
-    spread = 5 / math.sqrt(result.numel()) if call.node.random else 1e-9
-    ok = change <= bound * (1 + spread) + 1e-12
+    margin = 5 / math.sqrt(result.numel()) if call.node.random else 1e-9
+    is_within = change <= bound * (1 + margin) + 1e-12
     yield Finding(
-        "skip bound", ok, f"left out, the result changes by {change:.3g}; the bound is {bound:.3g}"
+        "skip bound",
+        is_within,
+        f"left out, the result changes by {change:.3g}; the bound is {bound:.3g}",
     )
 
 
@@ -341,10 +370,10 @@ def check_shape(call: Call) -> Iterator[Finding]:
         each_tensor(lambda x: x.to("meta") if x.numel() > _FEW else x, value)
         for value in call.inputs
     ]
-    stated = _every_tensor(hook(*inputs, **call.params))
-    actual = _every_tensor(call.result())
-    same = [tuple(x.shape) for x in stated] == [tuple(x.shape) for x in actual]
-    yield Finding("shape", same, f"told {_shapes(stated)}, is {_shapes(actual)}")
+    stated_tensors = _every_tensor(hook(*inputs, **call.params))
+    actual_tensors = _every_tensor(call.result())
+    is_same = [tuple(x.shape) for x in stated_tensors] == [tuple(x.shape) for x in actual_tensors]
+    yield Finding("shape", is_same, f"told {_shapes(stated_tensors)}, is {_shapes(actual_tensors)}")
 
 
 def _every_tensor(value: Any) -> list[Tensor]:
@@ -370,13 +399,17 @@ def _scaled(
     """Return the floating tensors of the result over ``scales``, with a scaled ``change`` of
     tensor j in input i.
     """
-    number = itertools.count()
+    tensor_numbers = itertools.count()
 
     def changed(x: Tensor) -> Tensor:
-        return x + _largest(x) * change if next(number) == j else x
+        # the tensors of an input are numbered in the order in which they are met
+        return x + _largest(x) * change if next(tensor_numbers) == j else x
 
     result = call.result(
-        [each_tensor(changed, value) if n == i else value for n, value in enumerate(inputs)]
+        [
+            each_tensor(changed, value) if input_index == i else value
+            for input_index, value in enumerate(inputs)
+        ]
     )
     return tuple(y / scale for y, scale in zip(_floating(result), scales, strict=True))
 
@@ -387,10 +420,12 @@ def _largest(x: Tensor) -> float:
 
 
 def _floating(result: Any) -> list[Tensor]:
+    """Return the tensors of a result that have floating-point or complex numbers."""
     return [y for y in tensors_in(result) if y.is_floating_point() or y.is_complex()]
 
 
 def _double(value: Any) -> Any:
+    """Return a value with its floating-point tensors in float64."""
     return each_tensor(lambda x: x.double() if x.is_floating_point() else x, value)
 
 
@@ -401,20 +436,21 @@ def _first_band(value: Any, axis: int) -> Any:
     if isinstance(value, Tensor):
         return value.narrow(axis, 0, 1)
     fields = {name: getattr(value, name) for name in band_names(value)}
-    cut = {name: x.narrow(axis, 0, 1) for name, x in fields.items() if x is not None}
-    return value._replace(**cut) if cut else value
+    first_bands = {name: x.narrow(axis, 0, 1) for name, x in fields.items() if x is not None}
+    return value._replace(**first_bands) if first_bands else value
 
 
 def off_by(actual: Tensor, expected: Tensor) -> float:
     """Return the largest difference of two tensors relative to the largest wanted value."""
     if actual.numel() == 0:
         return 0.0
-    wide = torch.complex128 if expected.is_complex() else torch.float64
-    scale = float(expected.to(wide).abs().max())
-    return float((actual.to(wide) - expected.to(wide)).abs().max()) / (scale or 1.0)
+    double_type = torch.complex128 if expected.is_complex() else torch.float64
+    scale = float(expected.to(double_type).abs().max())
+    return float((actual.to(double_type) - expected.to(double_type)).abs().max()) / (scale or 1.0)
 
 
 def _shapes(tensors: Sequence[Tensor]) -> str:
+    """Return the shapes of tensors as text, such as ``3 x 32 x 32``."""
     return ", ".join(" x ".join(map(str, x.shape)) or "number" for x in tensors)
 
 
@@ -475,7 +511,10 @@ def difference(actual: Outcome, expected: Outcome, rtol: float) -> Difference | 
     if actual.names() != expected.names():
         return Difference("the result has other parts, or in another order")
     pairs = zip(actual.parts, expected.parts, strict=True)
-    deviations = [_of_part(name, own, other, rtol) for (name, own), (_, other) in pairs]
+    deviations = [
+        _of_part(name, actual_part, expected_part, rtol)
+        for (name, actual_part), (_, expected_part) in pairs
+    ]
     differing = [deviation for deviation in deviations if deviation]
     return max(differing, key=lambda deviation: deviation.size, default=None)
 
@@ -491,12 +530,14 @@ def _of_failures(actual: Outcome, expected: Outcome) -> Difference | None:
 def _of_part(name: str, actual: Any, expected: Any, rtol: float) -> Difference | None:
     """Return how one part of a result differs; None if it does not."""
     subject = f"the result{name}"
+    # numbers, texts and other values without a norm
     if not isinstance(actual, Tensor) or not isinstance(expected, Tensor):
         if _same_value(actual, expected):
             return None
         return Difference(f"{subject} is {_short(actual)} and not {_short(expected)}")
     if actual.shape != expected.shape or actual.dtype != expected.dtype:
         return Difference(f"{subject} is {_kind(actual)} and not {_kind(expected)}")
+    # tolerances 0, and NaN equal to NaN
     if torch.allclose(actual, expected, 0.0, 0.0, True):
         return None
     size = off_by(actual, expected)
@@ -506,6 +547,7 @@ def _of_part(name: str, actual: Any, expected: Any, rtol: float) -> Difference |
         f"{subject} differs by {size:.2g} of its largest value",
         "",
         size,
+        # True: rounding explains it
         size <= max(rtol, _EPS * _last_digit(expected)),
     )
 
@@ -514,6 +556,7 @@ def _same_value(actual: Any, expected: Any) -> bool:
     """Return True for equal values of one type, and for two NaN."""
     if type(actual) is not type(expected):
         return False
+    # NaN is not equal to itself
     return bool(actual == expected or (actual != actual and expected != expected))
 
 
@@ -571,9 +614,11 @@ def _place(error: BaseException, module: str) -> str:
 
 
 def _short(value: Any) -> str:
+    """Return a value as a text of at most 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _kind(x: Tensor) -> str:
+    """Return the shape and type of a tensor as text."""
     return f"{' x '.join(map(str, x.shape)) or 'number'} {str(x.dtype).removeprefix('torch.')}"

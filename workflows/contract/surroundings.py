@@ -213,6 +213,7 @@ class Others:
         """
         variables = dict[str, str | None]()
         if VARIABLES in changes:
+            # None: left out
             variables |= dict.fromkeys(name for name in self.variables if name not in declared)
         if ZONE in changes:
             variables["TZ"] = ZONE_ELSEWHERE
@@ -234,6 +235,9 @@ class Others:
         )
 
     def _can_change(self, surrounding: Surrounding) -> bool:
+        """Return True if this machine has another locale, or this process variables, so that the
+        surrounding can be changed.
+        """
         if surrounding is LOCALE:
             return bool(self.locale)
         return surrounding is not VARIABLES or bool(self.variables)
@@ -241,17 +245,20 @@ class Others:
 
 def others(environ: Mapping[str, str]) -> Others:
     """Return other surroundings than those of a process with the environment ``environ``."""
-    seed = environ.get("PYTHONHASHSEED", "")
+    seed_text = environ.get("PYTHONHASHSEED", "")
     threads = environ.get("OMP_NUM_THREADS", "")
-    here = int(threads) if threads.isdecimal() else _processors()
-    hash_seed = int(seed) if seed.isdecimal() else 0
-    other_threads = 3 if here == 1 else 1
-    now = next((environ[name] for name in ("LC_ALL", "LC_CTYPE", "LANG") if environ.get(name)), "C")
+    threads_here = int(threads) if threads.isdecimal() else _processors()
+    hash_seed = int(seed_text) if seed_text.isdecimal() else 0
+    # fewer, or more than the one of a single processor
+    other_threads = 3 if threads_here == 1 else 1
+    locale_here = next(
+        (environ[name] for name in ("LC_ALL", "LC_CTYPE", "LANG") if environ.get(name)), "C"
+    )
     return Others(
         hash_seed=hash_seed,
         threads=other_threads,
-        threads_here=here,
-        locale=other_locale(now, installed_locales(environ), environ),
+        threads_here=threads_here,
+        locale=other_locale(locale_here, installed_locales(environ), environ),
         variables=tuple(sorted(name for name in environ if not is_known(name))),
     )
 
@@ -259,14 +266,14 @@ def others(environ: Mapping[str, str]) -> Others:
 def installed_locales(environ: Mapping[str, str]) -> list[str]:
     """Return the names of the locales of this machine; none where it cannot say them."""
     try:
-        done = subprocess.run(
+        finished = subprocess.run(
             ["locale", "-a"], capture_output=True, text=True, check=False, errors="replace"
         )
-        names = done.stdout.split()
+        names = finished.stdout.split()
     except OSError:
         names = []
-    own = [Path(folder) for folder in environ.get("LOCPATH", "").split(":") if folder]
-    for folder in own:
+    own_folders = [Path(folder) for folder in environ.get("LOCPATH", "").split(":") if folder]
+    for folder in own_folders:
         if folder.is_dir():
             names += sorted(path.name for path in folder.iterdir())
     return names
@@ -280,20 +287,23 @@ def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> 
     """
 
     def rank(name: str) -> tuple[int, bool, str]:
-        language = next(
+        language_rank = next(
             (number for number, prefix in enumerate(_LANGUAGES) if name.startswith(prefix)),
             len(_LANGUAGES),
         )
-        return language, _is_utf8(name), name
+        # False before True: other letters than UTF-8 first
+        return language_rank, _is_utf8(name), name
 
-    plain = ("C", "POSIX")
+    plain_locales = ("C", "POSIX")
     candidates = sorted(
-        (n for n in names if n.split(".")[0] not in plain and _same(n) != _same(now)), key=rank
+        (n for n in names if n.split(".")[0] not in plain_locales and _same(n) != _same(now)),
+        key=rank,
     )
     if candidates:
         return candidates[0]
+    # texts are ASCII here already, so that C is no other locale
     is_ascii = (
-        now in plain
+        now in plain_locales
         and environ.get("PYTHONUTF8") == "0"
         and environ.get("PYTHONCOERCECLOCALE") == "0"
     )
@@ -301,14 +311,17 @@ def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> 
 
 
 def _processors() -> int:
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _same(name: str) -> str:
+    """Return the name of a locale in the form in which equal names are equal."""
     return name.lower().replace("-", "")
 
 
 def _is_utf8(name: str) -> bool:
+    """Return True for a locale whose texts are UTF-8."""
     return "utf8" in _same(name)
 
 
@@ -337,6 +350,7 @@ class Elsewhere:
     """
 
     def __init__(self, others: Others, changes: frozenset[Surrounding]) -> None:
+        # what only a new process can have; forks change the others
         self.others, self._fresh = others, changes & FRESH
         self.folder = tempfile.TemporaryDirectory(prefix="neusee-check-")
         try:
@@ -363,26 +377,27 @@ class Elsewhere:
 
     def _start(self) -> None:
         """Start the process in a group of its own, with which its forks end."""
-        self._pipe, theirs = Pipe()
+        self._pipe, other_end = Pipe()
         self._is_ready = False
-        path = [os.path.abspath(entry) for entry in sys.path]
-        quiet = subprocess.DEVNULL
-        with theirs:
+        search_path = [os.path.abspath(entry) for entry in sys.path]
+        no_stream = subprocess.DEVNULL
+        with other_end:
             self._process = subprocess.Popen(
                 [
                     sys.executable,
+                    # -P: the working folder is no place of modules; -O as in this process
                     "-P",
                     *["-O"] * sys.flags.optimize,
                     "-c",
                     _SCRIPT,
-                    str(theirs.fileno()),
-                    *path,
+                    str(other_end.fileno()),
+                    *search_path,
                 ],
-                stdin=quiet,
-                stdout=quiet,
-                stderr=quiet,
+                stdin=no_stream,
+                stdout=no_stream,
+                stderr=no_stream,
                 env=self.others.environment(self._fresh, os.environ),
-                pass_fds=[theirs.fileno()],
+                pass_fds=[other_end.fileno()],
                 process_group=0,
             )
 
@@ -397,6 +412,7 @@ class Elsewhere:
         """Return the outcomes of the calls up to the first that ends its process or has no end."""
         try:
             if not self._is_ready:
+                # the word with which the process says that it has imported all
                 self._pipe.recv_bytes()
                 self._is_ready = True
             self._pipe.send_bytes(pickle.dumps(asked))  # `send` would share the memory of a tensor
@@ -406,6 +422,9 @@ class Elsewhere:
             raise NotStartedError(f"a process of Python ended, {_words(code)}") from None
 
     def _received(self, asked: Asked) -> list[Outcome]:
+        """Return the outcomes that arrive, and one for a call that ends its process or takes too
+        long.
+        """
         outcomes: list[Outcome] = []
         while True:
             if not self._pipe.poll(LONGEST):
@@ -413,6 +432,7 @@ class Elsewhere:
                 self._start()
                 return [*outcomes, _ended(f"does not end within {LONGEST:.0f} s")]
             answer = pickle.loads(self._pipe.recv_bytes())
+            # the exit code: no more outcomes come from this fork
             if isinstance(answer, int):
                 has_all = len(outcomes) == len(asked.calls)
                 return (
@@ -431,13 +451,13 @@ def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
     The process starts with the ``with`` block if ``early``, so that it imports torch beside this
     process.
     """
-    begun = list[Elsewhere]()
+    processes = list[Elsewhere]()
 
     def process() -> Elsewhere:
-        if not begun:
-            settings = others(os.environ)
-            begun.append(Elsewhere(settings, frozenset(settings.changed())))
-        return begun[0]
+        if not processes:
+            other_surroundings = others(os.environ)
+            processes.append(Elsewhere(other_surroundings, frozenset(other_surroundings.changed())))
+        return processes[0]
 
     try:
         if early:
@@ -445,11 +465,12 @@ def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
                 process()
         yield process
     finally:
-        for started in begun:
-            started.close()
+        for begun_process in processes:
+            begun_process.close()
 
 
 def _ended(failure: str) -> Outcome:
+    """Return the outcome of a call without a result."""
     from neusee.workflows.contract.node_rules import Outcome
 
     return Outcome(failure=failure, is_end=True)

@@ -127,7 +127,10 @@ def guess() -> Law:
 
 
 def _law(law: Mapping[str, Any]) -> Law:
+    """Return the law that one entry of ``node_costs.json`` describes."""
+    # least and largest multiple of the law: of the memory first, then of the seconds
     spread = (Range(*law["spread"][0]), Range(*law["spread"][1])) if "spread" in law else EXACT
+    # the names of the libraries, then the bytes and the seconds that they cost
     loads = Loading(tuple(law["loads"][0]), *law["loads"][1:]) if "loads" in law else None
     return Law(tuple(law["memory"]), tuple(law["seconds"]), spread, loads, law.get("most", 0.0))
 
@@ -173,8 +176,10 @@ class Sized(NamedTuple):
             or below != self.below
         ):
             return False
-        same = len(inputs) == len(self.inputs) and all(map(is_same, inputs, self.inputs))
-        return same and (step.params is self.step.params or _equal(step.params, self.step.params))
+        same_inputs = len(inputs) == len(self.inputs) and all(map(is_same, inputs, self.inputs))
+        return same_inputs and (
+            step.params is self.step.params or _equal(step.params, self.step.params)
+        )
 
 
 def _equal(params: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
@@ -209,29 +214,43 @@ def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
 
 
 def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, Size]:
+    """Return the size of each step in ``order``.
+
+    A result of unknown shape counts at least ``smallest`` bytes. The sizes of the recipe before
+    are taken again where a step is unchanged.
+    """
     forms: dict[str, Form] = {}
     sizes: dict[str, Size] = {}
     for name in order:
         step = recipe.steps[name]
         inputs = inputs_of(step, forms)
-        below = [sizes[source] for source in dict.fromkeys(step.sources)]
+        source_sizes = [sizes[source] for source in dict.fromkeys(step.sources)]
         remembered = _sized.get(name)
-        if remembered is not None and remembered.holds(step, inputs, below, smallest):
+        if remembered is not None and remembered.holds(step, inputs, source_sizes, smallest):
             forms[name], sizes[name] = remembered.form, remembered.size
             continue
         try:
             forms[name] = form_of(step.node, inputs, step.params)
         except OverflowError:
+            # more bytes than an address has: no machine can hold it, and the plan refuses it
             sizes[name] = Size(0.0, math.inf, math.inf, math.inf)
             continue
-        sizes[name] = _size(step, inputs, forms[name], below, smallest)
+        sizes[name] = _size(step, inputs, forms[name], source_sizes, smallest)
         if forms[name] is None and not sizes[name].known:
             forms[name] = _guessed_form(inputs)
         if remembered is not None and alike(forms[name], remembered.form):
             # the same object, so that later steps have the size that they had
             forms[name] = remembered.form
         _remember(
-            Sized(step, inputs, below, smallest, forms[name], sizes[name], has_path(step.params))
+            Sized(
+                step,
+                inputs,
+                source_sizes,
+                smallest,
+                forms[name],
+                sizes[name],
+                has_path(step.params),
+            )
         )
     return sizes
 
@@ -246,29 +265,38 @@ def _guessed_form(inputs: Sequence[Form]) -> Form:
 def _size(
     step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size], smallest: float
 ) -> Size:
+    """Return the size of a step, from the ``form`` of its result or, where that is not known,
+    from the sizes ``below`` of its inputs.
+
+    ``smallest`` is the number of bytes that a result of unknown shape has at least.
+    """
     is_known = all(size.known for size in below)
     if form is not None and complete(step.node, inputs):
         return size_of(step.node, inputs, step.params, form)._replace(known=is_known)
-    read = sum(size.result for size in below)
+    input_bytes = sum(size.result for size in below)
     law = shipped().get(step.node.path)
     if form is not None:
-        result = bytes_of(form)
+        result_bytes = bytes_of(form)
     elif law and law.most:
-        result = law.most
+        result_bytes = law.most
     else:
-        result, is_known = max(read, smallest), False
-    return Size(read, result, 0.0, (read + result) / 4, 0, is_known)
+        result_bytes, is_known = max(input_bytes, smallest), False
+    # without a rule for the work: one operation for each number of 4 bytes
+    return Size(input_bytes, result_bytes, 0.0, (input_bytes + result_bytes) / 4, 0, is_known)
 
 
 def size_of(node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result: Any) -> Size:
     """Return the size of a step from its inputs and its result, which may be values or forms
     without values.
     """
-    read, written = bytes_of(list(inputs)), bytes_of(result)
-    work, operations = 0.0, (read + written) / 4
+    input_bytes, result_bytes = bytes_of(list(inputs)), bytes_of(result)
+    # without a rule of the node: one operation for each number of 4 bytes
+    work_bytes, operations = 0.0, (input_bytes + result_bytes) / 4
     if node.hooks.work is not None:
-        work, operations = node.hooks.work(result, *inputs, **params)
-    return Size(read, written, float(work), float(operations), bands_in(node, inputs))
+        work_bytes, operations = node.hooks.work(result, *inputs, **params)
+    return Size(
+        input_bytes, result_bytes, float(work_bytes), float(operations), bands_in(node, inputs)
+    )
 
 
 def measured_size(
@@ -352,20 +380,20 @@ class Costs:
         `cost_model.sizes_of`.
         """
         self._sizes = sizes
-        self._steps: dict[str, list[Row]] = {}
-        self._nodes: dict[str, list[Row]] = {}
-        self._ratio = {"cpu": 1.0}
+        self._steps: dict[str, list[Row]] = {}  # rows by "step node"
+        self._nodes: dict[str, list[Row]] = {}  # rows by node, whatever the step is called
+        self._ratio = {"cpu": 1.0}  # speed by kind of device, relative to the CPU
         self.learn(rows)
 
     def learn(self, rows: Iterable[Row]) -> None:
         """Add measured costs of later runs; of each step and node only the newest are kept."""
-        others = False
+        has_other_kinds = False
         for row in rows:
             if row.get("node") and row.get("step") and _is_measured(row):
                 _append(self._steps.setdefault(f"{row['step']} {row['node']}", []), row)
                 _append(self._nodes.setdefault(row["node"], []), row)
-                others |= _kind(row) != "cpu"
-        if others:
+                has_other_kinds |= _kind(row) != "cpu"
+        if has_other_kinds:
             self._ratio = {"cpu": 1.0, **self._measured_ratios()}
 
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
@@ -373,10 +401,13 @@ class Costs:
         the same result.
         """
         size = self._sizes.get(step.name)
+        # the same result was computed before
         if exact and _is_measured(exact):
             return self._repeated([exact], kinds, size)
+        # its size is known: runs of the node at this size, or its law
         if size is not None and size.known:
             return self._predicted(step.node.path, kinds, size)
+        # of unknown size: earlier runs of this very step, or a guess
         rows = self._steps.get(f"{step.name} {step.node.path}", [])[-_NEWEST:]
         return (
             self._repeated(rows, kinds, None) if rows else self._guess(step.node.path, kinds, size)
@@ -391,16 +422,19 @@ class Costs:
         Args: steps: a key, the step, and the measured costs of the same result or None. Returns:
                 the costs by key.
         """
-        estimates, loaded = dict[str, Estimate](), set[str]()
+        estimates, loaded_libraries = dict[str, Estimate](), set[str]()
         for key, step, exact in steps:
             estimates[key] = self.of(step, kinds, exact)
             law = shipped().get(step.node.path)
             if (
                 law
                 and law.loads
-                and not all(name in loaded or name in sys.modules for name in law.loads.libraries)
+                and not all(
+                    name in loaded_libraries or name in sys.modules for name in law.loads.libraries
+                )
             ):
-                loaded.update(law.loads.libraries)
+                loaded_libraries.update(law.loads.libraries)
+                # measured times of earlier runs contain that of loading
                 if not self._measured(step, exact):
                     estimates[key] = _loading(estimates[key], law.loads)
         return estimates
@@ -433,35 +467,46 @@ class Costs:
         """Predict a step from runs at the same size, or from the law of its node, scaled by runs
         on this machine.
         """
-        law, past = shipped().get(path), self._nodes.get(path, [])
-        same = list(itertools.islice(_of_size(reversed(past), size), _NEWEST))
-        if same:
-            return self._repeated(same[::-1], kinds, size, law)
-        rows = [row for row in past if _size_of_work(row)]
-        if law is None and _FARTHEST * _largest_extent(rows) < _extent(size):
-            return self._guess(path, kinds, size, rows[-_NEWEST:])
-        base = law or guess()
-        factors = _scales(base, rows[-_NEWEST:], self._faster)
-        peak = max(size.result, factors[0] * base.peak(size))
-        on_cpu = factors[1] * base.time(size)
-        seconds = {kind: on_cpu / self._faster(kind) for kind in kinds}
-        return Estimate(seconds, size.result, peak - size.result, True, base.spread, size.bands)
+        law, past_runs = shipped().get(path), self._nodes.get(path, [])
+        # the newest runs come last in the journal
+        runs_of_size = list(itertools.islice(_of_size(reversed(past_runs), size), _NEWEST))
+        if runs_of_size:
+            # back in the order of time
+            return self._repeated(runs_of_size[::-1], kinds, size, law)
+        runs_with_size = [row for row in past_runs if _size_of_work(row)]
+        # a run at a far smaller size says little about this one
+        if law is None and _FARTHEST * _largest_extent(runs_with_size) < _extent(size):
+            return self._guess(path, kinds, size, runs_with_size[-_NEWEST:])
+        law_or_guess = law or guess()
+        # how much more than the law the newest runs took here
+        memory_and_time_factors = _scales(law_or_guess, runs_with_size[-_NEWEST:], self._faster)
+        peak = max(size.result, memory_and_time_factors[0] * law_or_guess.peak(size))
+        cpu_seconds = memory_and_time_factors[1] * law_or_guess.time(size)
+        seconds = {kind: cpu_seconds / self._faster(kind) for kind in kinds}
+        # `Estimate.work` is what the peak holds beside the result
+        return Estimate(
+            seconds, size.result, peak - size.result, True, law_or_guess.spread, size.bands
+        )
 
     def _repeated(
         self, rows: Sequence[Row], kinds: Sequence[str], size: Size | None, law: Law | None = None
     ) -> Estimate:
         """Predict a step by the median of earlier runs of the same size."""
-        result = size.result if size else float(median(row["bytes"] for row in rows))
+        # measured rows have one size, so that the median is the size of each of them
+        result_bytes = size.result if size else float(median(row["bytes"] for row in rows))
         peaks = _measured_peaks(rows)
         lower_bound = law.peak(size) * law.spread[0].least if law and size else 0.0
-        peak = max(median(peaks) if peaks else 0.0, result, lower_bound)
+        peak = max(median(peaks) if peaks else 0.0, result_bytes, lower_bound)
         seconds = {kind: self._seconds(rows, kind) for kind in kinds}
-        usual = law.spread if law else EXACT
+        usual_spread = law.spread if law else EXACT
+        # of the memory about its prediction, of the time about its median
         spread = (
-            _range(peaks, peak, usual[0]),
-            _range([row["seconds"] for row in rows], None, usual[1]),
+            _range(peaks, peak, usual_spread[0]),
+            _range([row["seconds"] for row in rows], None, usual_spread[1]),
         )
-        return Estimate(seconds, result, peak - result, True, spread, size.bands if size else 0)
+        return Estimate(
+            seconds, result_bytes, peak - result_bytes, True, spread, size.bands if size else 0
+        )
 
     def _guess(
         self, path: str, kinds: Sequence[str], size: Size | None, rows: Sequence[Row] = ()
@@ -473,25 +518,31 @@ class Costs:
         says takes more here.
         """
         size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path) or guess()
-        factors = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
-        on_cpu, peak = (
-            factors[1] * law.spread[1].most * law.time(size),
-            factors[0] * law.spread[0].most * law.peak(size),
+        # never below the law, because a guess is an upper end
+        memory_and_time_factors = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
+        cpu_seconds, peak = (
+            memory_and_time_factors[1] * law.spread[1].most * law.time(size),
+            memory_and_time_factors[0] * law.spread[0].most * law.peak(size),
         )
-        seconds = {kind: on_cpu / self._faster(kind) for kind in kinds}
+        seconds = {kind: cpu_seconds / self._faster(kind) for kind in kinds}
+        # the guess is the largest value; the memory is at least that of the result
         spread = (Range(size.result / peak if peak else 0.0, 1.0), Range(0.0, 1.0))
         return Estimate(
             seconds, size.result, peak - size.result, False, spread, size.bands, size.known
         )
 
     def _seconds(self, rows: Sequence[Row], kind: str) -> float:
-        here = [row for row in rows if _kind(row) == kind]
-        if here:
-            return float(median(row["seconds"] for row in here))
-        on_cpu = median(row["seconds"] * self._faster(_kind(row)) for row in rows)
-        return float(on_cpu / self._faster(kind))
+        """Return the median time (s) of runs on a kind of device; without runs there, that of
+        other kinds, scaled by the ratio of their speeds.
+        """
+        runs_on_kind = [row for row in rows if _kind(row) == kind]
+        if runs_on_kind:
+            return float(median(row["seconds"] for row in runs_on_kind))
+        cpu_seconds = median(row["seconds"] * self._faster(_kind(row)) for row in rows)
+        return float(cpu_seconds / self._faster(kind))
 
     def _faster(self, kind: str) -> float:
+        """Return the speed of a kind of device relative to the CPU."""
         return self._ratio.get(kind, _FASTER)
 
     def _measured_ratios(self) -> dict[str, float]:
@@ -500,13 +551,13 @@ class Costs:
         """
         ratios_by_kind: dict[str, list[float]] = {}
         for rows in self._steps.values():
-            by_kind: dict[str, list[float]] = {}
+            seconds_by_kind: dict[str, list[float]] = {}
             for row in rows:
-                by_kind.setdefault(_kind(row), []).append(row["seconds"])
-            cpu = median(by_kind.pop("cpu", [0.0]))
-            for kind, seconds in by_kind.items():
-                if cpu > 0 and median(seconds) > 0:
-                    ratios_by_kind.setdefault(kind, []).append(cpu / median(seconds))
+                seconds_by_kind.setdefault(_kind(row), []).append(row["seconds"])
+            cpu_seconds = median(seconds_by_kind.pop("cpu", [0.0]))
+            for kind, seconds in seconds_by_kind.items():
+                if cpu_seconds > 0 and median(seconds) > 0:
+                    ratios_by_kind.setdefault(kind, []).append(cpu_seconds / median(seconds))
         return {kind: median(ratios) for kind, ratios in ratios_by_kind.items()}
 
 
@@ -537,6 +588,7 @@ def _is_measured(row: Row) -> bool:
     """Return True for a journal line with a time, a size and a peak of memory that this machine
     can have.
     """
+    # a peak above the memory of this machine is damage, or of another machine
     fits = _kind(row) != "cpu" or (row.get("peak") or 0) <= machine_memory()
     return fits and row.get("seconds") is not None and row.get("bytes") is not None
 
@@ -547,14 +599,16 @@ def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:
 
     Small steps are left out, because allocators and overheads hide what they need.
     """
-    peaks, times = [], []
+    peak_ratios, time_ratios = [], []
     for row in rows:
         size = _size_of_work(row)
         if row.get("peak") and law.peak(size) > _LEAST_COST and _kind(row) == "cpu":
-            peaks.append(row["peak"] / law.peak(size))
+            peak_ratios.append(row["peak"] / law.peak(size))
         if law.time(size) > _SHORT:
-            times.append(row["seconds"] * faster(_kind(row)) / law.time(size))
-    return (median(peaks) if peaks else 1.0), (median(times) if times else 1.0)
+            time_ratios.append(row["seconds"] * faster(_kind(row)) / law.time(size))
+    return (median(peak_ratios) if peak_ratios else 1.0), (
+        median(time_ratios) if time_ratios else 1.0
+    )
 
 
 def _size_of_work(row: Row) -> Any:
@@ -569,14 +623,17 @@ def _size_of_work(row: Row) -> Any:
 
 
 def _extent(size: Size) -> float:
+    """Return the bytes of inputs and result of a step."""
     return size.inputs + size.result
 
 
 def _alike(size: Size, other: Size) -> bool:
+    """Return True if two sizes agree in bytes, work and operations, but for rounding."""
     return size[:4] == other[:4] or all(
         abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(size[:4], other[:4], strict=True)
     )
 
 
 def _kind(row: Row) -> str:
+    """Return the kind of device of a journal line; the CPU where none is named."""
     return device_kind(str(row.get("device") or "cpu"))

@@ -59,12 +59,12 @@ class SlurmOptions:
         """
         options = cls()
         for word in words:
-            name, sign, value = word.partition("=")
-            current = {field.name: getattr(options, field.name) for field in fields(cls)}
-            if not sign or name not in current:
-                hint = nearest(name, current) or f"write one of {', '.join(current)}"
+            name, equals_sign, value = word.partition("=")
+            values_so_far = {field.name: getattr(options, field.name) for field in fields(cls)}
+            if not equals_sign or name not in values_so_far:
+                hint = nearest(name, values_so_far) or f"write one of {', '.join(values_so_far)}"
                 raise ValueError(f"{word}: write NAME=VALUE, such as queue=gpu; {hint}")
-            options = replace(options, **{name: _value(name, value, current[name])})
+            options = replace(options, **{name: _value(name, value, values_so_far[name])})
         return options
 
 
@@ -75,14 +75,17 @@ def missing_command() -> str:
 
 def _value(name: str, text: str, before: Any) -> Any:
     """Return the value of an option; raise ValueError for one that SLURM cannot read."""
+    # an option that may be given several times
     if isinstance(before, tuple):
         return (*before, text)
     try:
         if name == "memory":
             parse_size(text)
+        # each option has the type of its default
         if isinstance(before, int):
             return _at_least_one(int(text))
         if isinstance(before, float):
+            # the check is in seconds, the option in minutes
             return _at_least_one(float(text.removesuffix("min").strip()) * 60) / 60
     except ValueError:
         raise ValueError(f"{name}={text}: must be {_KINDS[name]}") from None
@@ -131,30 +134,35 @@ class SlurmJobs:
         process = await asyncio.create_subprocess_exec(
             *shlex.split(command), script, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
-        out, error = (text.decode(errors="replace") for text in await process.communicate())
-        number = next((word for word in out.replace(";", " ").split() if word.isdecimal()), "")
-        if process.returncode or not number:
-            said = " ".join(
-                (error.strip() or out.strip() or f"exit code {process.returncode}").split()
+        printed, error_text = (
+            text.decode(errors="replace") for text in await process.communicate()
+        )
+        # sbatch prints "Submitted batch job 17", or "17;cluster"
+        job_number = next(
+            (word for word in printed.replace(";", " ").split() if word.isdecimal()), ""
+        )
+        if process.returncode or not job_number:
+            refusal = " ".join(
+                (error_text.strip() or printed.strip() or f"exit code {process.returncode}").split()
             )
-            said = said.removeprefix("sbatch: error: ")
-            self.refused.append(said)
-            raise ClusterLost(said)
-        self.ids.append(number)
-        return out
+            refusal = refusal.removeprefix("sbatch: error: ")
+            self.refused.append(refusal)
+            raise ClusterLost(refusal)
+        self.ids.append(job_number)
+        return printed
 
     def queue(self) -> str:
         """Return what squeue says of the jobs, such as ``2 PENDING (Resources)``; an empty text
         if none is left.
         """
         try:
-            words = ["squeue", "--noheader", "--jobs", ",".join(self.ids), "--format", "%T (%r)"]
-            done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+            command = ["squeue", "--noheader", "--jobs", ",".join(self.ids), "--format", "%T (%r)"]
+            finished = subprocess.run(command, capture_output=True, text=True, timeout=60)
         except (OSError, subprocess.TimeoutExpired) as error:
             return f"nothing: {error}"
-        lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
-        if done.returncode and "invalid job id" not in done.stderr.lower():
-            return f"nothing: {' '.join(done.stderr.split())}"
+        lines = [line.strip() for line in finished.stdout.splitlines() if line.strip()]
+        if finished.returncode and "invalid job id" not in finished.stderr.lower():
+            return f"nothing: {' '.join(finished.stderr.split())}"
         return ", ".join(f"{lines.count(line)} {line}" for line in dict.fromkeys(lines))
 
     def cancel(self) -> None:
@@ -186,26 +194,28 @@ def wait_for_job(
     """Wait until a worker of the jobs is connected; raise `ClusterLost` if sbatch refuses, or if
     none comes in time.
     """
-    began = looked = time.monotonic()
-    announced = False
+    began = last_look = time.monotonic()
+    is_announced = False
     while not client.nthreads():
-        now = time.monotonic()
+        present_time = time.monotonic()
         if jobs.refused:
             raise ClusterLost(f"sbatch refused a job: {jobs.refused[0]}")
-        if jobs.ids and not announced:
-            announced = True
+        # said once, as soon as a job has a number
+        if jobs.ids and not is_announced:
+            is_announced = True
             say(
                 f"jobs     {', '.join(jobs.ids)}: waiting up to {options.wait:g} min for the first"
                 " worker"
             )
-        if now - looked > _LOOK and jobs.ids:
-            looked = now
+        if present_time - last_look > _LOOK and jobs.ids:
+            last_look = present_time
+            # no job is left in the queue
             if not (queue := jobs.queue()):
                 raise ClusterLost(
                     f"the jobs {', '.join(jobs.ids)} ended before a worker came: see"
                     f" {options.logs}/"
                 )
-            if now - began > 60 * options.wait:
+            if present_time - began > 60 * options.wait:
                 raise ClusterLost(
                     f"no worker came within {options.wait:g} min; squeue says: {queue}"
                 )
@@ -216,11 +226,12 @@ def _dask_jobqueue() -> tuple[type[Any], type[Any]]:
     """Return the classes of a cluster and of a job; leave Ctrl-C as it is, for which the package
     exits with 0.
     """
-    before = signal.getsignal(signal.SIGINT)
+    interrupt_handler = signal.getsignal(signal.SIGINT)
     from dask_jobqueue.slurm import SLURMCluster, SLURMJob
 
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, before)
+        # Python lets only the main thread set a handler
+        signal.signal(signal.SIGINT, interrupt_handler)
     return SLURMCluster, SLURMJob
 
 
@@ -237,7 +248,7 @@ def _settings(options: SlurmOptions) -> dict[str, Any]:
     """Return the arguments of a cluster; what is not stated is left to the configuration of the
     site.
     """
-    stated = {
+    site_options = {
         name: getattr(options, name)
         for name in ("queue", "account", "walltime", "interface", "python")
     }
@@ -253,7 +264,7 @@ def _settings(options: SlurmOptions) -> dict[str, Any]:
         "job_script_prologue": list(options.prologue),
         "scheduler_options": {"dashboard_address": ":0", "dashboard": False},
         "silence_logs": False,
-        **{name: value for name, value in stated.items() if value},
+        **{name: value for name, value in site_options.items() if value},
     }
 
 
@@ -283,18 +294,19 @@ def cluster(
     Raises `ClusterLost` if no scheduler or no worker comes.
     """
     silence_logs()
-    kind, _, count = where.partition(":")
-    with ExitStack() as open_now:
+    kind, _, worker_count = where.partition(":")
+    with ExitStack() as clusters:
+        # 0: a worker computes with as many threads as this process
         threads, address = 0, where
         if kind == "dask":
-            address = open_now.enter_context(_local(count))
+            address = clusters.enter_context(_local(worker_count))
         if kind == "slurm":
             options = SlurmOptions.read(job)
-            jobs = open_now.enter_context(slurm_cluster(int(count or 1), options))
+            jobs = clusters.enter_context(slurm_cluster(int(worker_count or 1), options))
             address, threads = jobs.cluster, options.cores or 0
         client = connected(address)
         executor = Dask(client, store, threads, warn)
-        open_now.callback(executor.link.close)
+        clusters.callback(executor.link.close)
         if kind == "slurm":
             wait_for_job(jobs, client, options, say)
         yield executor
@@ -305,15 +317,15 @@ def _local(count: str) -> Iterator[Any]:
     """Yield a cluster of worker processes on this machine, or one of this process alone."""
     from distributed import LocalCluster
 
-    here = count == "here"
-    workers = 1 if here or not count else int(count)
-    quiet = {} if here else {"env": _QUIET}
+    in_this_process = count == "here"
+    worker_count = 1 if in_this_process or not count else int(count)
+    log_settings = {} if in_this_process else {"env": _QUIET}
     with LocalCluster(
-        n_workers=workers,
+        n_workers=worker_count,
         threads_per_worker=1,
-        processes=not here,
+        processes=not in_this_process,
         dashboard_address=":0",
         silence_logs=50,
-        **quiet,
+        **log_settings,
     ) as local:
         yield local

@@ -100,11 +100,11 @@ class SchedulerLink:
             threads = self.client.sync(
                 self.client.scheduler.ncores, workers=None, callback_timeout=_ANSWER
             )
-        self._asked = now = time.monotonic()
+        self._asked = present_time = time.monotonic()
         self.newest = threads or {}
         if threads or threads is None:
-            self._workers_seen = now
-        elif now - self._workers_seen > PATIENCE:
+            self._workers_seen = present_time
+        elif present_time - self._workers_seen > PATIENCE:
             raise ClusterLost(
                 f"the scheduler {self.address} has had no worker for {PATIENCE:.0f} s"
             )
@@ -131,6 +131,7 @@ class SchedulerLink:
             f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it"
             " to return"
         )
+        # kept, because futures of lost tasks still name it
         self._lost.append(self.client)
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
@@ -160,8 +161,10 @@ def silence_logs() -> None:
     """
     import distributed  # noqa: F401  makes its loggers, each with a handler of its own
 
-    made = [name for name in logging.root.manager.loggerDict if name.startswith(f"{_LOGGERS[0]}.")]
-    for name in (*_LOGGERS, *made):
+    dask_loggers = [
+        name for name in logging.root.manager.loggerDict if name.startswith(f"{_LOGGERS[0]}.")
+    ]
+    for name in (*_LOGGERS, *dask_loggers):
         logger = logging.getLogger(name)
         logger.handlers[:] = [logging.NullHandler()]
         logger.propagate = False
@@ -186,9 +189,11 @@ class _Here:
 
     def __init__(self, where: str, room: float) -> None:
         self.store = open_store(where)
+        # by the modules that the caller had imported; None: those here
         self._codes: dict[frozenset[str] | None, Code] = {None: Code(self.store.code_memo)}
         self._own = own_modules()
         self.values: OrderedDict[Key, Any] = OrderedDict()
+        # bytes that values may have, and that they have
         self.room, self.held = room, 0
 
     def look_again(self) -> None:
@@ -206,11 +211,12 @@ class _Here:
         count: this worker imports those that it lacks, and leaves out those that steps of other
         recipes imported here.
         """
-        for loaded in (None, work.own.followed if work.own else frozenset[str]()):
-            for module in sorted(loaded or ()):
+        # first by the modules that are imported here, then by those of the caller
+        for imported_modules in (None, work.own.followed if work.own else frozenset[str]()):
+            for module in sorted(imported_modules or ()):
                 imported(module)
-            code = self._codes.get(loaded) or self._codes.setdefault(
-                loaded, Code(self.store.code_memo, loaded)
+            code = self._codes.get(imported_modules) or self._codes.setdefault(
+                imported_modules, Code(self.store.code_memo, imported_modules)
             )
             if code_of(work.step, code) == work.origin["code"]:
                 return code
@@ -232,6 +238,7 @@ class _Here:
         self.held += _size(value) - _size(self.values.get(key))
         self.values[key] = value
         self.values.move_to_end(key)
+        # those used longest ago are forgotten; the newest stays whatever its size
         while self.held > self.room and len(self.values) > 1:
             self.held -= _size(self.values.popitem(last=False)[1])
 
@@ -288,20 +295,25 @@ def work_here(
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     _chance_of_its_own()
-    here = _here.get(where) or _here.setdefault(where, _Here(where, room))
-    here.look_again()
+    worker = _here.get(where) or _here.setdefault(where, _Here(where, room))
+    worker.look_again()
     outcomes: list[Outcome] = []
     refetch = chain[0].refetch_seconds
-    for work in chain:
-        outcome = _one_here(replace(work, refetch_seconds=refetch), here)
+    for job in chain:
+        outcome = _one_here(replace(job, refetch_seconds=refetch), worker)
         outcomes.append(outcome)
+        # the later jobs of a chain need this result
         if outcome.held or outcome.error or outcome.lost:
             break
+        # what is not stored must be computed again, with what it needed
         refetch = 0.0 if outcome.kept else outcome.seconds + refetch
     return [_light(outcome) for outcome in outcomes]
 
 
 def _same_secret(signed: str) -> bool:
+    """Return True if a signature of the caller is right by the secret of this process, or
+    neither has one.
+    """
     try:
         check_signature(signed, "worker", "", b"")
     except Unsigned:
@@ -310,6 +322,9 @@ def _same_secret(signed: str) -> bool:
 
 
 def _one_here(work: StepJob, here: _Here) -> Outcome:
+    """Compute one job on this worker; return its outcome, or the error of a worker that cannot
+    compute it as the caller would.
+    """
     if is_private(work.key):
         text = (
             "the loaded code is not that of its file, so no other process can use the result:"
@@ -343,16 +358,17 @@ def kinds_of(work: StepJob) -> dict[Key, Any]:
     nodes are imported.
     """
     node, kinds = work.step.node, dict[Key, Any]()
-    for name, read in zip(node.inputs, work.reads, strict=True):
+    for name, input_keys in zip(node.inputs, work.reads, strict=True):
         kind = node.hints.get(name, Any)
-        if isinstance(read, tuple):
-            lists = [
+        if isinstance(input_keys, tuple):
+            # such as list[Tensor], or list[Tensor] | None
+            list_types = [
                 candidate for candidate in (kind, *get_args(kind)) if get_origin(candidate) is list
             ]
-            kind = get_args(lists[0])[0] if lists else Any
+            kind = get_args(list_types[0])[0] if list_types else Any
         if kind is Any:
             list(all_nodes())
-        kinds |= dict.fromkeys(keys_in(read), kind)
+        kinds |= dict.fromkeys(keys_in(input_keys), kind)
     return kinds
 
 
@@ -367,6 +383,7 @@ def _light(outcome: Outcome) -> Outcome:
 
 
 def _size(value: Any) -> int:
+    """Return the bytes of the tensors in a value."""
     return 0 if value is None else sum(t.nbytes for t in tensors_in(value))
 
 
@@ -407,9 +424,9 @@ class Dask:
         # as many as here give the same round-off as here
         self.threads = threads or torch.get_num_threads()
         self._lanes: dict[str, Lane] = {}
-        self._looked = -_LOOK
-        self._running: dict[Any, tuple[StepJob, ...]] = {}
-        self._tries: dict[Key, int] = {}
+        self._looked = -_LOOK  # time (s) of the last query for workers; none yet
+        self._running: dict[Any, tuple[StepJob, ...]] = {}  # chain of jobs of each future
+        self._tries: dict[Key, int] = {}  # how often a chain was sent, by its first key
         self._bound = set[Any]()  # futures of chains that are meant for one worker
 
     @property
@@ -430,9 +447,11 @@ class Dask:
         """Send a chain of jobs to the assigned worker, or to another worker if the assigned
         worker is gone.
         """
-        lane = work[0].lane
+        worker_address = work[0].lane
         assignment = (
-            {"workers": [lane], "allow_other_workers": True} if lane in self.link.newest else {}
+            {"workers": [worker_address], "allow_other_workers": True}
+            if worker_address in self.link.newest
+            else {}
         )
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
@@ -440,8 +459,10 @@ class Dask:
             tuple(work),
             self.where,
             self.threads,
-            _SHARE * min((lane.memory for lane in self._lanes.values()), default=0.0),
+            _SHARE
+            * min((worker_address.memory for worker_address in self._lanes.values()), default=0.0),
             signature("worker", "", b""),
+            # another name at each attempt: dask gives the result of an equal name again
             key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",
             pure=False,
             retries=_TRIES,
@@ -458,15 +479,15 @@ class Dask:
         """
         end = time.monotonic() + (float("inf") if seconds is None else seconds)
         while self._running:
-            left = end - time.monotonic()
-            self._rest(max(0.0, min(left, _LOOK)))
+            seconds_left = end - time.monotonic()
+            self._rest(max(0.0, min(seconds_left, _LOOK)))
             if self.link.renewed():
                 self.link.workers()
                 self._submit_again(self._running)
             self._free_of_lost_workers()
             ended = [future for future in self._running if future.status != "pending"]
             outcomes = [*chain.from_iterable(map(self._taken, ended))]
-            if outcomes or left <= 0:
+            if outcomes or seconds_left <= 0:
                 return outcomes
         return []
 
@@ -513,6 +534,7 @@ class Dask:
                 for outcome in outcomes:  # another worker may have computed the chain
                     outcome.work = replace(outcome.work, lane=chain[0].lane)
                 return outcomes
+        # any other status is that of a lost or cancelled task
         cause = future.exception() if future.status == "error" else None
         # the task was lost with its worker or its scheduler
         if cause is None and self._tries[chain[0].key] < _TRIES:
@@ -524,16 +546,28 @@ class Dask:
         """Update the list of connected workers and their devices; wait until a worker is
         connected.
         """
-        present = self.link.workers()
-        if present is None and self._lanes:  # a cut, which may end
+        present_workers = self.link.workers()
+        if present_workers is None and self._lanes:  # a cut, which may end
             return
-        present = present or self.link.wait_for_workers()
-        new = [address for address in present if address not in self._lanes]
-        answers: dict[str, Any] = {}
+        present_workers = present_workers or self.link.wait_for_workers()
+        new_addresses = [address for address in present_workers if address not in self._lanes]
+        device_and_memory: dict[str, Any] = {}
         with suppress(OSError):
-            answers = self.client.run(lane_here, workers=new, on_error="ignore") if new else {}
-        lanes = {**self._lanes, **{address: Lane(*about) for address, about in answers.items()}}
-        self._lanes = {address: lanes[address] for address in sorted(present) if address in lanes}
+            device_and_memory = (
+                self.client.run(lane_here, workers=new_addresses, on_error="ignore")
+                if new_addresses
+                else {}
+            )
+        lanes = {
+            **self._lanes,
+            **{
+                address: Lane(*device_and_bytes)
+                for address, device_and_bytes in device_and_memory.items()
+            },
+        }
+        self._lanes = {
+            address: lanes[address] for address in sorted(present_workers) if address in lanes
+        }
         self._looked = time.monotonic()
 
 

@@ -69,22 +69,36 @@ def as_function(
     `call` for all steps computed at a call.
     """
     names = recipe.outputs if outputs is None else tuple(outputs)
-    replaced, tuned = _read(recipe, free)
-    recipe = with_substitutions(recipe, names, replaced | tuned.keys())
+    replaced_steps, tuned_params = _read(recipe, free)
+    recipe = with_substitutions(recipe, names, replaced_steps | tuned_params.keys())
+    # a step whose result the caller gives needs nothing
     sources = {
-        name: () if name in replaced else step.sources for name, step in recipe.steps.items()
+        name: () if name in replaced_steps else step.sources for name, step in recipe.steps.items()
     }
     order = in_order(sources, names)
-    if idle := sorted((replaced | tuned.keys()) - set(order)):
-        raise ValueError(f"no output depends on {', '.join(idle)}")
-    live = _from_roots(order, sources, {*replaced, *tuned, *redraw})
-    border = set(names).union(*(sources[step] for step in live))
-    fixed = run(recipe, store, sorted(border - live.keys()), device=device)
-    left_out = {
-        name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"
+    if unused_names := sorted((replaced_steps | tuned_params.keys()) - set(order)):
+        raise ValueError(f"no output depends on {', '.join(unused_names)}")
+    # computed at every call; all others once, here
+    live_steps = _from_roots(order, sources, {*replaced_steps, *tuned_params, *redraw})
+    # what the live steps read, and the outputs
+    steps_read_live = set(names).union(*(sources[step] for step in live_steps))
+    fixed_results = run(recipe, store, sorted(steps_read_live - live_steps.keys()), device=device)
+    bounds_of_skipped = {
+        name: record.bound or 0.0
+        for name, record in fixed_results.done.items()
+        if record.state == "left out"
     }
     return _Function(
-        recipe, free, names, replaced, tuned, list(live), fixed.values, left_out, device, caller
+        recipe,
+        free,
+        names,
+        replaced_steps,
+        tuned_params,
+        list(live_steps),
+        fixed_results.values,
+        bounds_of_skipped,
+        device,
+        caller,
     )
 
 
@@ -92,11 +106,12 @@ def _from_roots(
     order: Iterable[str], sources: Mapping[str, Iterable[str]], roots: Collection[str]
 ) -> dict[str, None]:
     """Return the steps ``roots`` and those that depend on them, in running order."""
-    live = dict[str, None]()
+    # as an ordered set
+    dependent_steps = dict[str, None]()
     for name in order:
-        if name in roots or not live.keys().isdisjoint(sources[name]):
-            live[name] = None
-    return live
+        if name in roots or not dependent_steps.keys().isdisjoint(sources[name]):
+            dependent_steps[name] = None
+    return dependent_steps
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
@@ -140,9 +155,10 @@ class _Function:
     def __post_init__(self) -> None:
         self._facts: dict[str, TensorStats | None] = {}
         self._spent = _spent(self.recipe, self.fixed, self.left_out)
-        live = [name for name in self.live if name not in self.given]
+        computed_steps = [name for name in self.live if name not in self.given]
+        # by step, the last live step that reads its result
         self._last: dict[str, str] = {}
-        for name in live:
+        for name in computed_steps:
             self._last.update(dict.fromkeys(self.recipe.steps[name].sources, name))
 
     def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
@@ -174,9 +190,15 @@ class _Function:
     def _evaluate(
         self, step: Step, values: dict[str, Any], theta: Theta, ledger: ErrorBudget, seed: int
     ) -> Any:
+        """Return the result of one live step, from the values so far and the parameters in
+        ``theta``; name the step in an error of torch.
+        """
         params = {
             **step.params,
-            **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()},
+            **{
+                param: theta[full_name]
+                for param, full_name in self.tuned.get(step.name, {}).items()
+            },
         }
         inputs = [gathered(step.wires.get(name), values.__getitem__) for name in step.node.inputs]
         try:
@@ -200,12 +222,14 @@ class _Function:
             with torch.no_grad():
                 verdict = ledger.verdict(step, params, lambda name: self._facts_of(name, values))
             if verdict.left_out:
+                # the input takes the place of the result
                 return values[verdict.instead]
         else:
             ledger.pass_on(step)
         return self.caller(step, inputs, params, seed, place(step, self.device))
 
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
+        """Return the statistics of a value; those of fixed values are computed once."""
         if name not in self.fixed:
             value = values[name]
             return (
@@ -222,21 +246,25 @@ def _told(error: Exception, step: Step, inputs: list[Any], exact: bool) -> Excep
     """Return an error that names the step and the transform of `torch.func` that it does not
     pass, or ``error``.
     """
+    # the transform of `torch.func` under way, if there is one
     interpreter = peek_interpreter_stack()
     if interpreter is None:
         return error
     cause = error.cause if isinstance(error, RunError) else error
-    said = " ".join(str(cause).split())
-    name = {"Vmap": "vmap", "Jvp": "jvp", "Grad": "vjp"}.get(interpreter.key().name, "")
-    if not name or not any(mark in said for mark in _MARKS[name]):
+    error_text = " ".join(str(cause).split())
+    transform = {"Vmap": "vmap", "Jvp": "jvp", "Grad": "vjp"}.get(interpreter.key().name, "")
+    if not transform or not any(mark in error_text for mark in _MARKS[transform]):
         return error
-    way = (
-        "call the function for one tensor after another" if name == "vmap" else "use torch.autograd"
+    advice = (
+        "call the function for one tensor after another"
+        if transform == "vmap"
+        else "use torch.autograd"
     )
-    other = "" if exact and name == "vmap" else _OTHERWISE[name]
+    # an exact recipe is no way out where the recipe is exact
+    alternative = "" if exact and transform == "vmap" else _OTHERWISE[transform]
     text = (
-        f"torch.func.{name} does not pass {step.node.path} ({said[:120]} ...): {way}{other};"
-        f" {_PAGE}"
+        f"torch.func.{transform} does not pass {step.node.path} ({error_text[:120]} ...):"
+        f" {advice}{alternative}; {_PAGE}"
     )
     return RunError(step, inputs, NotImplementedError(text))
 

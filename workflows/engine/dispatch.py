@@ -33,12 +33,14 @@ class Loop:
         room: MemoryProfile,
     ) -> None:
         self.executor, self.begin, self.room = executor, begin, room
-        self.busy: dict[str, Chain] = {}
+        self.busy: dict[str, Chain] = {}  # by device or worker: the chain that it computes
         self._chain_of: dict[Key, int] = {}
         for i, chain in enumerate(chains):
-            self._chain_of.update({work.key: i for work in chain})
+            self._chain_of.update({job.key: i for job in chain})
         self._chains = list(chains)
+        # by chain: the values of other chains that it waits for
         self._missing = [self._outside(chain) for chain in chains]
+        # by value: the chains that wait for it
         self._after: dict[Key, list[int]] = {}
         for i, missing in enumerate(self._missing):
             for key in missing:
@@ -47,7 +49,7 @@ class Loop:
         self._ready.reverse()  # the next chain is the last item, which a list can remove fastest
         # chain -> time of the next attempt, and the wait after it
         self._held: dict[int, tuple[float, float]] = {}
-        self._open = len(chains)
+        self._open = len(chains)  # chains that are not done
 
     def outcomes(self) -> Iterator[Outcome]:
         """Yield the outcome of each job, with the error of a failed job, when it arrives, until
@@ -64,6 +66,7 @@ class Loop:
                 raise RuntimeError(f"no device or worker is left to compute {name}")
             for outcome in self.executor.wait(self._patience()):
                 self._settle(outcome)
+                # computed by another process: it is tried again later, and yields then
                 if not outcome.held:
                     yield outcome
 
@@ -71,23 +74,24 @@ class Loop:
         """Return the keys of the values that a chain of jobs reads from other chains of the same
         run.
         """
-        own = {work.key for work in chain}
-        read = set[Key]().union(*(work.sources for work in chain))
-        return {key for key in read if key in self._chain_of and key not in own}
+        own_keys = {job.key for job in chain}
+        read_keys = set[Key]().union(*(job.sources for job in chain))
+        return {key for key in read_keys if key in self._chain_of and key not in own_keys}
 
     def _hand_out(self) -> None:
         """Submit to every idle device or worker the first ready chain of jobs that may run
         there.
         """
         self._look_again()
-        for lane, where in self.executor.lanes.items():
+        for lane, lane_state in self.executor.lanes.items():
             if lane in self.busy or not self._ready:
                 continue
-            place = self._first_for(lane, where.device)
-            if place is not None:
-                chain = self._chains[self._ready.pop(place)]
+            ready_index = self._first_for(lane, lane_state.device)
+            if ready_index is not None:
+                chain = self._chains[self._ready.pop(ready_index)]
+                # it was planned for another device or worker
                 if chain[0].lane != lane:
-                    chain = tuple(_moved(work, lane, where.device) for work in chain)
+                    chain = tuple(_moved(job, lane, lane_state.device) for job in chain)
                 chain = self.busy[lane] = (self.begin(chain[0]), *chain[1:])
                 self.executor.submit(chain)
 
@@ -99,30 +103,40 @@ class Loop:
         """
         running = list(itertools.chain.from_iterable(self.busy.values()))
         lanes = self.executor.lanes
-        for place in range(len(self._ready) - 1, -1, -1):
-            chain = self._chains[self._ready[place]]
-            own = chain[0].lane
-            moved = (own in self.busy or own not in lanes) and device_kind(
+        # the first chain is the last of the list
+        for ready_index in range(len(self._ready) - 1, -1, -1):
+            chain = self._chains[self._ready[ready_index]]
+            planned_lane = chain[0].lane
+            # a device of the same kind may compute it, if its own is busy or lost
+            may_move = (planned_lane in self.busy or planned_lane not in lanes) and device_kind(
                 chain[0].device
             ) == device_kind(device)
-            if (own == lane or moved) and (not running or self.room(chain[0], running)):
-                return place
+            if (planned_lane == lane or may_move) and (not running or self.room(chain[0], running)):
+                return ready_index
         return None
 
     def _look_again(self) -> None:
-        now = time.monotonic()
-        for i in [i for i, (when, _) in self._held.items() if when <= now]:
-            self._ready.append(i)
-            self._held[i] = (float("inf"), self._held[i][1])
+        """Make the chains ready whose wait for another process is over."""
+        present_time = time.monotonic()
+        for chain_index in [
+            chain_index
+            for chain_index, (attempt_time, _) in self._held.items()
+            if attempt_time <= present_time
+        ]:
+            self._ready.append(chain_index)
+            # no second attempt until this one has its outcome; the wait is kept to double it
+            self._held[chain_index] = (float("inf"), self._held[chain_index][1])
 
     def _patience(self) -> float | None:
         """Return the time (s) to wait for running jobs; if only other processes compute, first
         sleep for this time.
         """
-        waits = [when for when, _ in self._held.values() if when < float("inf")]
-        if not waits:
+        attempt_times = [
+            attempt_time for attempt_time, _ in self._held.values() if attempt_time < float("inf")
+        ]
+        if not attempt_times:
             return None
-        pause = max(0.0, min(waits) - time.monotonic())
+        pause = max(0.0, min(attempt_times) - time.monotonic())
         if not self.busy:
             time.sleep(pause)
         return pause
@@ -132,26 +146,28 @@ class Loop:
         result as ready.
         """
         key = outcome.work.key
-        i = self._chain_of[key]
-        last = key == self._chains[i][-1].key
-        if outcome.held or last or outcome.error or outcome.lost:
+        chain_index = self._chain_of[key]
+        is_last = key == self._chains[chain_index][-1].key
+        # after any of these the rest of the chain does not run on the device
+        if outcome.held or is_last or outcome.error or outcome.lost:
             self.busy.pop(outcome.work.lane, None)
         if outcome.held:
-            self._hold(i, key)
+            self._hold(chain_index, key)
             return
-        if last:
+        if is_last:
             self._open -= 1
-            self._held.pop(i, None)
+            self._held.pop(chain_index, None)
         self._free_waiting(key)
 
     def _free_waiting(self, key: Key) -> None:
         """Mark the chains that waited only for a result as ready."""
-        waiting = self._after.pop(key, ())
-        for i in waiting:
+        waiting_chains = self._after.pop(key, ())
+        for i in waiting_chains:
             self._missing[i].discard(key)
-        freed = [i for i in waiting if not self._missing[i]]
-        self._ready += freed
-        if len(self.executor.lanes) > 1 or freed:
+        freed_chains = [i for i in waiting_chains if not self._missing[i]]
+        self._ready += freed_chains
+        if len(self.executor.lanes) > 1 or freed_chains:
+            # the first chain is the last of the list
             self._ready.sort(reverse=True)
 
     def _hold(self, i: int, key: Key) -> None:
@@ -159,9 +175,11 @@ class Loop:
         computes.
         """
         chain = self._chains[i]
+        # the first pause is `_FIRST_LOOK`: twice the half of it
         pause = min(_LONGEST, 2 * self._held.get(i, (0.0, _FIRST_LOOK / 2))[1])
         self._held[i] = (time.monotonic() + pause, pause)
-        self._chains[i] = chain[[work.key for work in chain].index(key) :]
+        # the jobs before this one are done
+        self._chains[i] = chain[[job.key for job in chain].index(key) :]
 
 
 def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
@@ -169,27 +187,29 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
     only the next job.
     """
     if not fused:
-        return [(work,) for work in works]
-    readers = Counter(itertools.chain.from_iterable(set(work.sources) for work in works))
-    planned = {work.key for work in works}
+        return [(job,) for job in works]
+    readers = Counter(itertools.chain.from_iterable(set(job.sources) for job in works))
+    planned = {job.key for job in works}
     chains: dict[Key, list[StepJob]] = {}  # by the key of the last job
-    for work in works:
-        above = list(planned.intersection(work.sources))
-        is_alone = len(above) == 1 and readers[above[0]] == 1
-        chain = chains.get(above[0]) if is_alone else None
-        if chain and _continues(chain, work):
-            del chains[above[0]]
-            chains[work.key] = [*chain, work]
+    for job in works:
+        # a job joins a chain if it reads one planned result, which nobody else reads
+        planned_sources = list(planned.intersection(job.sources))
+        is_only_reader = len(planned_sources) == 1 and readers[planned_sources[0]] == 1
+        chain = chains.get(planned_sources[0]) if is_only_reader else None
+        if chain and _continues(chain, job):
+            del chains[planned_sources[0]]
+            chains[job.key] = [*chain, job]
         else:
-            chains[work.key] = [work]
+            chains[job.key] = [job]
     return _in_order_of_first_jobs(chains.values(), works)
 
 
 def _in_order_of_first_jobs(
     chains: Iterable[list[StepJob]], works: Sequence[StepJob]
 ) -> list[Chain]:
-    place = {work.key: i for i, work in enumerate(works)}
-    return sorted(map(tuple, chains), key=lambda chain: place[chain[0].key])
+    """Return the chains in the order in which the list of jobs has their first jobs."""
+    position = {job.key: i for i, job in enumerate(works)}
+    return sorted(map(tuple, chains), key=lambda chain: position[chain[0].key])
 
 
 def _continues(chain: Sequence[StepJob], work: StepJob) -> bool:

@@ -87,8 +87,8 @@ class RunSeries:
         The next run computes private results again, which may differ then.
         """
         public = [key for key in keys if not is_private(key)]
-        known = ((key, facts.get(key)) for key in public)
-        self.facts = {key: stats for key, stats in known if stats is not None}
+        keys_and_stats = ((key, facts.get(key)) for key in public)
+        self.facts = {key: stats for key, stats in keys_and_stats if stats is not None}
 
 
 # --- values in memory -----------------------------------------------------------------------------
@@ -215,7 +215,7 @@ class Execution:
         self.executor = executor or self.own
         self.series = series or RunSeries.begun(store)
         self.code, self.began = self.series.known_keys.code, time.time()
-        self._carried = carried or {}
+        self._carried = carried or {}  # outcomes of an attempt before this one, by step
         self._anew = set[Key]()  # of steps that are computed although the store has their results
         self._asked_anew = dependents(recipe, anew) if anew else frozenset[str]()
         self.keys: dict[str, Key] = {}
@@ -241,6 +241,7 @@ class Execution:
         for name in order:
             step = self.recipe.steps[name]
             if step.node.hooks.skip_bound is not None:
+                # a step that may be left out: its result is that of the step in its place
                 verdict = self.verdicts[name] = self.ledger.verdict(
                     step, step.params, self._facts_of
                 )
@@ -251,35 +252,44 @@ class Execution:
                     )
                     continue
             else:
+                # the error bounds of its inputs become that of its result
                 self.ledger.pass_on(step)
             try:
+                # a key depends on the kind of device where the step draws random numbers
                 device = places(step, self.devices)[0]
                 key, origin = self.series.known_keys.of(step, self.keys, self.recipe.seed, device)
             except (OSError, LookupError, TypeError) as error:
                 raise RunError(step, [], error) from error
             self.keys[name] = key
+            # computed although the store may have its result
             if name in self._asked_anew:
                 self._anew.add(key)
+            # of steps with one key the first computes the value
             if key not in self.makers:
                 self.makers[key], self.origins[key] = step, origin
+                # its value may be there from an attempt before this one
                 self._take_over(name, key, origin)
 
     def _take_over(self, name: str, key: Key, origin: dict[str, Any]) -> None:
         """Use the value that an attempt before this one computed and could not store, if its
         inputs are the same.
         """
-        before = self._carried.get(name)
-        if before is None or before.value is None:  # a worker sends no value
+        earlier_outcome = self._carried.get(name)
+        if earlier_outcome is None or earlier_outcome.value is None:  # a worker sends no value
             return
         if any(
-            before.work.origin[origin_part] != origin[origin_part]
+            # the code may differ: only its taint has changed it
+            earlier_outcome.work.origin[origin_part] != origin[origin_part]
             for origin_part in ("params", "inputs")
         ):
             return
-        outcome = replace(before, work=replace(before.work, key=key, origin=origin))
+        outcome = replace(
+            earlier_outcome, work=replace(earlier_outcome.work, key=key, origin=origin)
+        )
         self.values.add(outcome)
         self.facts[key] = outcome.facts
         self.again[key] = outcome.seconds + outcome.work.refetch_seconds
+        # as a step that ran in this run
         self._finish(ran(outcome, "not stored", self._bound(name), self.began, None))
 
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
@@ -289,12 +299,14 @@ class Execution:
         is not stored.
         """
         while True:
-            below = Upstream(self.known, self.sources)
-            order = in_order(below, targets)
+            upstream = Upstream(self.known, self.sources)
+            order = in_order(upstream, targets)
             try:
-                plan = [key for key in order if key in below.missing]
-                uses = uses_of(plan, [*targets, *later], below.knows, self.sources)
+                plan = [key for key in order if key in upstream.missing]
+                # how often each value is still to be read
+                uses = uses_of(plan, [*targets, *later], upstream.knows, self.sources)
                 return self._execute(plan, targets, keep, uses, asked=not (keep or later))
+            # a stored value was damaged or removed: it counts as missing in the next plan
             except InputMissing:
                 continue
 
@@ -304,6 +316,7 @@ class Execution:
         """
         self.series.keep(self.facts, self.makers)
         self.code.save()
+        # finishes the writes too
         self.own.cancel()
         self.values.clear()
         del self.own, self.executor
@@ -316,16 +329,17 @@ class Execution:
             if name in self.done:
                 continue
             key = self.keys[name]
-            twin = self.done.get(self.makers[key].name)
-            if twin is None or twin.state == "not needed":
+            record_of_key = self.done.get(self.makers[key].name)
+            # neither this step nor one with its key had to run
+            if record_of_key is None or record_of_key.state == "not needed":
                 self._finish(self.asleep(name))
             else:
                 self._finish(
                     replace(
-                        twin,
+                        record_of_key,
                         step=name,
                         state="cached",
-                        why=f"the same key as {twin.step}",
+                        why=f"the same key as {record_of_key.step}",
                         seconds=0.0,
                     )
                 )
@@ -335,20 +349,23 @@ class Execution:
         """Return the record of a step whose value no other step needed."""
         if name not in self._asleep:
             key = self.keys[name]
-            about = (
+            metadata = (
                 self.store.about(key)
                 if self.recipe.steps[name].node.hooks.approximation_error
                 else None
             )
-            self._asleep[name] = unneeded(name, key, about, self._bound(name))
+            self._asleep[name] = unneeded(name, key, metadata, self._bound(name))
         return self._asleep[name]
 
     def missing(self, names: Iterable[str]) -> set[Key]:
         """Return the cache keys of all values that must be computed to obtain the results of the
         steps ``names``.
         """
-        in_order(below := Upstream(self.known, self.sources), [self.keys[name] for name in names])
-        return set(below.missing)
+        # the walk asks `upstream` for every value, which notes the missing ones
+        in_order(
+            upstream := Upstream(self.known, self.sources), [self.keys[name] for name in names]
+        )
+        return set(upstream.missing)
 
     def sources(self, key: Key) -> list[Key]:
         return [self.keys[name] for name in self.makers[key].sources]
@@ -359,18 +376,20 @@ class Execution:
         """
         if key in self.values:
             return True
-        about = None if key in self._anew else self.store.about(key)
-        if about is None or about.get("kept", True):
-            return about is not None
-        self.receipts[key] = about
+        metadata = None if key in self._anew else self.store.about(key)
+        # without "kept" the value is stored
+        if metadata is None or metadata.get("kept", True):
+            return metadata is not None
+        self.receipts[key] = metadata
         return False
 
     def _reading(self, key: Key) -> float:
         """Return the predicted time (s) for reading a stored value, or infinity if the value is
         not stored.
         """
-        about = self.store.about(key)
-        return self.store.read_seconds(about.get("bytes") or 0) if about else float("inf")
+        metadata = self.store.about(key)
+        # metadata without a number of bytes are those of an evicted value
+        return self.store.read_seconds(metadata.get("bytes") or 0) if metadata else float("inf")
 
     def _execute(
         self,
@@ -380,11 +399,17 @@ class Execution:
         uses: Counter[Key],
         asked: bool,
     ) -> None:
+        """Compute the values with the keys ``plan``, and then load the ``targets``.
+
+        ``uses`` counts the reads that are still to come of each value; a value without one is
+        deleted. ``asked``: the targets are what the user asked for.
+        """
         self.values.free(list(self.values), uses, keep)
         for keys, executor in self._by_executor(plan):
-            elsewhere = [key for key in plan if key not in keys]
-            read = set[Key]().union(*map(self.sources, elsewhere))
-            for outcome in self._outcomes(keys, {*targets, *read}, asked, executor):
+            keys_of_others = [key for key in plan if key not in keys]
+            # what steps in another process or after these read must be kept for them
+            read_by_others = set[Key]().union(*map(self.sources, keys_of_others))
+            for outcome in self._outcomes(keys, {*targets, *read_by_others}, asked, executor):
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
                     self.values.add(outcome)
@@ -400,6 +425,7 @@ class Execution:
         """
         private = [key for key in plan if self.executor is not self.own and is_private(key)]
         public = [key for key in plan if key not in private]
+        # an executor without steps is left out
         return [group for group in ((public, self.executor), (private, self.own)) if group[0]]
 
     def _outcomes(
@@ -414,15 +440,17 @@ class Execution:
         """
         prepared = self._prepared(plan, targets, asked, executor)
         self.schedule = joined(self.schedule, prepared.schedule)
+        # on a cluster a chain of steps goes to one worker
         chains = chains_of(prepared.works, fused=not executor.shares)
         if not executor.shares:  # values for other chains must be in the store
             chains = [(*chain[:-1], replace(chain[-1], wanted=True)) for chain in chains]
         self.expected = prepared.expected
-        room = room_for(prepared.expected, executor, self.values)
+        has_room = room_for(prepared.expected, executor, self.values)
         try:
-            for outcome in Loop(chains, executor, self._begin, room).outcomes():
+            for outcome in Loop(chains, executor, self._begin, has_room).outcomes():
                 self._note(outcome)
                 yield outcome
+        # also Ctrl-C: no job is left running
         except BaseException:
             executor.cancel()
             raise
@@ -437,27 +465,32 @@ class Execution:
             self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted))
         )
         # a small one stays in memory until it is read
+        # what the user asked for is kept whatever its size
         threshold = 0.0 if asked else small_result(executor)
         large_targets = {
             key for key in targets if self.costs.size_of(self.makers[key].name) >= threshold
         }
-        works = [self._work(key, key in large_targets, executor) for key in plan]
+        jobs = [self._work(key, key in large_targets, executor) for key in plan]
         try:
-            return prepare(works, self.costs, self.receipts, executor.lanes, targets, self.values)
+            return prepare(jobs, self.costs, self.receipts, executor.lanes, targets, self.values)
         except TooLarge as error:
             raise RunError(self.recipe.steps[error.task], [], error) from error
 
     def _work(self, key: Key, target: bool, executor: Executor) -> StepJob:
+        """Return the job of the step that makes the value ``key``; ``target`` says that its
+        result is kept whatever its cost.
+        """
         step = self.makers[key]
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], executor.lanes
+        # several lanes: the plan decides
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
         is_requested, name, seed = (
             target or step.name in self.wanted,
             self.recipe.name,
             self.recipe.seed,
         )
-        work = StepJob(
+        job = StepJob(
             step,
             key,
             self.origins[key],
@@ -469,9 +502,10 @@ class Execution:
             is_requested,
             recompute=key in self._anew,
         )
-        return replace(work, own=own_code(step, self.code))
+        return replace(job, own=own_code(step, self.code))
 
     def _read(self, wire: Wire) -> Read:
+        """Return the key of the value behind a wire, the keys of a list of values, or None."""
         return (
             self.keys[wire]
             if isinstance(wire, str)
@@ -483,25 +517,30 @@ class Execution:
         inputs again.
         """
         self.watch(Event(work.step.name, None))
+        # s; a value of this run may have to be computed again, others are read
         refetch = sum(
             self.again[key] if key in self.again else self._reading(key)
             for key in set(work.sources)
         )
         return replace(
-            work, refetch_seconds=refetch, unlocked=self._probable_seconds(work) < _QUICK
+            # a quick step needs no lease: to compute it twice costs less
+            work,
+            refetch_seconds=refetch,
+            unlocked=self._probable_seconds(work) < _QUICK,
         )
 
     def _probable_seconds(self, work: StepJob) -> float:
         """Return the time of a job as this run measured its node, or as it is predicted."""
-        path, expected = work.step.node.path, self.expected[work.key]
+        path, estimate = work.step.node.path, self.expected[work.key]
         if path in self.took:
             return self.took[path]
-        return expected.seconds["cpu"] if expected.known else _QUICK
+        return estimate.seconds["cpu"] if estimate.known else _QUICK
 
     def _note(self, outcome: Outcome) -> None:
         """Record the outcome of a step, or raise the error in this outcome."""
-        work, step, key = outcome.work, outcome.work.step, outcome.work.key
+        job, step, key = outcome.work, outcome.work.step, outcome.work.key
         if outcome.lost:
+            # `make` plans anew, without the lost values
             raise InputMissing(*outcome.lost)
         if outcome.error is not None:
             raise (
@@ -517,8 +556,11 @@ class Execution:
         self.facts[key] = outcome.facts
         path = step.node.path
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
-        computing = outcome.seconds + work.refetch_seconds
-        self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else computing
+        compute_seconds = outcome.seconds + job.refetch_seconds
+        # to obtain the value again: read it, or compute it with its inputs
+        self.again[key] = (
+            self.store.read_seconds(outcome.bytes) if outcome.kept else compute_seconds
+        )
         self._finish(
             ran(
                 outcome,
@@ -541,16 +583,18 @@ class Execution:
                 )
             except KeyError:
                 raise InputMissing(key) from None
+            # loaded, and not computed in this run
             if self.makers[key].name not in self.done:
                 self._finish(self._cached(key, seconds=time.perf_counter() - began))
         return self.values[key]
 
     def _cached(self, key: Key, why: str = "", seconds: float = 0.0) -> StepRecord:
-        about = self.store.about(key)
-        if about is None:
+        """Return the record of a step whose result is stored; raise `InputMissing` if it is not."""
+        metadata = self.store.about(key)
+        if metadata is None:
             raise InputMissing(key)
         name = self.makers[key].name
-        return loaded(name, key, about, self._bound(name), why, seconds)
+        return loaded(name, key, metadata, self._bound(name), why, seconds)
 
     def _facts_of(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step; compute the result if no statistics are
@@ -567,18 +611,25 @@ class Execution:
         if (
             key not in self.facts
             and key not in self._anew
-            and (about := self.store.about(key)) is not None
+            and (metadata := self.store.about(key)) is not None
         ):
-            self.facts[key] = facts_in(about)
+            self.facts[key] = facts_in(metadata)
         return self.facts.get(key)
 
     def _why(self, name: str, key: Key) -> str:
-        why = "faster to compute than to store" if key in self.receipts else "not in the store"
-        return f"{why}; {self.verdicts[name].why}" if name in self.verdicts else why
+        """Return why a step ran: its result was not stored, and the reason why it was not left
+        out.
+        """
+        reason = "faster to compute than to store" if key in self.receipts else "not in the store"
+        return f"{reason}; {self.verdicts[name].why}" if name in self.verdicts else reason
 
     def _bound(self, name: str) -> float | None:
+        """Return the error bound of leaving a step out, or None for a step that is never left
+        out.
+        """
         return self.verdicts[name].bound if name in self.verdicts else None
 
     def _finish(self, done: StepRecord) -> None:
+        """Keep the record of a step, and report it."""
         self.done[done.step] = done
         self.watch(Event(done.step, done))

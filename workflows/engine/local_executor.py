@@ -30,19 +30,24 @@ def check_devices(text: str) -> None:
     names = dict[tuple[str, int], str]()
     for name in text.split(","):
         try:
-            place = torch.empty(0, device=name).device
+            torch_device = torch.empty(0, device=name).device
         except (RuntimeError, AssertionError) as error:
             raise ValueError(f"{name}: {_reason(str(error))}") from error
-        if place.type == "meta":
+        if torch_device.type == "meta":
             raise ValueError(f"{name}: a tensor there has a shape and no values: write cpu or cuda")
-        lane = place.type, torch.device(name).index or place.index or 0
-        if lane in names:
-            again = name if name == names[lane] else f"{names[lane]} and {name} are one device"
+        # "cuda" is the device that torch makes its tensors on
+        kind_and_index = torch_device.type, torch.device(name).index or torch_device.index or 0
+        if kind_and_index in names:
+            devices = (
+                name
+                if name == names[kind_and_index]
+                else f"{names[kind_and_index]} and {name} are one device"
+            )
             raise ValueError(
-                f"{text}: names a device twice ({again}): name each device once; cpu:0,cpu:1 are"
+                f"{text}: names a device twice ({devices}): name each device once; cpu:0,cpu:1 are"
                 " two lanes"
             )
-        names[lane] = name
+        names[kind_and_index] = name
 
 
 def _reason(text: str) -> str:
@@ -82,13 +87,16 @@ def lanes_of(
     pools = [pool_of(device) for device in devices]
     lanes = {}
     for device in devices:
-        held = program_memory(nodes) if pool_of(device) == "cpu" else 0
+        # libraries and data of the program are not in the memory of a GPU
+        program_bytes = program_memory(nodes) if pool_of(device) == "cpu" else 0
         limit = (
             memory_limit(memory)
             if pool_of(device) == "cpu"
             else memory or _SHARE * there_is(device)
         )
-        lanes[device] = Lane(device, (limit - held) / pools.count(pool_of(device)), held)
+        lanes[device] = Lane(
+            device, (limit - program_bytes) / pools.count(pool_of(device)), program_bytes
+        )
     return lanes
 
 
@@ -125,10 +133,10 @@ class Local:
     ) -> None:
         self.lanes = lanes_of(devices, memory, nodes)
         self._store, self._fetch = store, fetch
-        self._queue: deque[StepJob] = deque()
+        self._queue: deque[StepJob] = deque()  # jobs of a single device, computed in `wait`
         self.later = WriteBehind()
-        self._pools: dict[str, ThreadPoolExecutor] = {}
-        self._running: set[Future[Outcome]] = set()
+        self._pools: dict[str, ThreadPoolExecutor] = {}  # one thread for each of several devices
+        self._running: set[Future[Outcome]] = set()  # jobs in these threads
 
     def submit(self, work: Sequence[StepJob]) -> None:
         """Add the jobs to the queue, or start the jobs in the threads of their devices."""
@@ -150,8 +158,8 @@ class Local:
             return [carry_out(self._queue.popleft(), self._fetch, self._store, self.later)]
         if not self._running:
             return []
-        done, self._running = wait(self._running, seconds, FIRST_COMPLETED)
-        return [future.result() for future in done]
+        ended, self._running = wait(self._running, seconds, FIRST_COMPLETED)
+        return [future.result() for future in ended]
 
     def cancel(self) -> None:
         """Drop the jobs that have not begun, wait for the running jobs, and finish the writes of
@@ -172,9 +180,9 @@ class Local:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Run a block of code with a single PyTorch thread, which is faster for small tensors."""
-    before = torch.get_num_threads()
+    threads_before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(threads_before)

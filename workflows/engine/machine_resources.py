@@ -25,13 +25,22 @@ def free_processors() -> int | None:
     moment must be busy.
     """
     try:
-        mine, all_of_them = len(os.sched_getaffinity(0)), os.cpu_count() or 1
+        own_processors, all_of_them = len(os.sched_getaffinity(0)), os.cpu_count() or 1
         with open("/proc/loadavg", encoding="ascii") as file:
-            words = file.read().split()
-        minute, now = float(words[0]), int(words[3].partition("/")[0]) - 1  # less this process
+            # such as "0.52 0.58 0.59 2/743 12345": load of a minute first, running/all processes
+            # fourth
+            load_fields = file.read().split()
+        # running processes of all, less this one
+        load_of_minute, running_now = (
+            float(load_fields[0]),
+            int(load_fields[3].partition("/")[0]) - 1,
+        )
     except (OSError, AttributeError, ValueError, IndexError):  # not Linux
         return None
-    return threads_for(mine, min(minute, now) * mine / all_of_them)
+    # the load of the machine, in the share of its processors that this process may use
+    return threads_for(
+        own_processors, min(load_of_minute, running_now) * own_processors / all_of_them
+    )
 
 
 def threads_for(processors: int, load: float) -> int:
@@ -108,6 +117,7 @@ def _peak_reset() -> bool:
     _highest = max(_highest, resident("VmHWM:") or 0)
     try:
         with open("/proc/self/clear_refs", "w") as file:
+            # 5: reset the peak resident memory, by proc(5)
             file.write("5")
     except OSError:
         return False
@@ -121,6 +131,7 @@ def resident(field: str) -> int | None:
     with suppress(OSError), open("/proc/self/status") as file:
         for line in file:
             if line.startswith(field):
+                # the system writes kB
                 return int(line.split()[1]) * 1024
     return None
 
@@ -131,6 +142,7 @@ def process_memory() -> int:
     """
     # a fifth of the time of /proc/self/status
     with suppress(OSError), open("/proc/self/statm") as file:
+        # the second number of statm is the resident memory in pages
         return int(file.read().split()[1]) * _PAGE
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
@@ -164,13 +176,16 @@ def free_memory() -> int:
     A number that is younger than `FRESH` seconds is told again, because short runs ask more often
     than it changes.
     """
-    now = time.monotonic()
-    if not _told[0] <= now < _told[0] + FRESH:
-        _told[:] = [now, _free_memory()]
+    present_time = time.monotonic()
+    if not _told[0] <= present_time < _told[0] + FRESH:
+        _told[:] = [present_time, _free_memory()]
     return int(_told[1])
 
 
 def _free_memory() -> int:
+    """Return the bytes that this process can still use: the least of what the machine, its
+    control group and the limits leave; at least 0.
+    """
     free = there_is("cpu") - process_memory()
     with suppress(OSError, ValueError, StopIteration), open("/proc/meminfo") as file:
         free = min(
@@ -179,8 +194,8 @@ def _free_memory() -> int:
         )
     for limit, usage_file in zip(_CGROUPS, _USED, strict=True):
         with suppress(OSError, ValueError):
-            taken = int(Path(usage_file).read_text()) - _reclaimable(Path(usage_file).parent)
-            free = min(free, int(Path(limit).read_text()) - taken)
+            used_bytes = int(Path(usage_file).read_text()) - _reclaimable(Path(usage_file).parent)
+            free = min(free, int(Path(limit).read_text()) - used_bytes)
     return max(free, 0)
 
 

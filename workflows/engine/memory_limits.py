@@ -96,12 +96,12 @@ def guarded() -> Iterator[None]:
     """Raise `MemoryLimit` in the ``with`` block when the process exceeds its limit; do nothing
     without a limit.
     """
-    here = threading.get_ident()
-    if not _limits or here in _inside:  # the block outside is told
+    thread_id = threading.get_ident()
+    if not _limits or thread_id in _inside:  # the block outside is told
         yield
         return
     with _guard:
-        _inside[here] = False
+        _inside[thread_id] = False
         if not _thread:
             _thread.append(threading.Thread(target=_look, name="neusee memory", daemon=True))
             _thread[0].start()
@@ -110,9 +110,9 @@ def guarded() -> Iterator[None]:
         yield
     finally:
         try:
-            stopped = _leave(here)
+            stopped = _leave(thread_id)
         except MemoryLimit:  # told at the last moment, and delivered only now
-            stopped = _leave(here)
+            stopped = _leave(thread_id)
     if stopped:
         raise MemoryLimit
 
@@ -137,6 +137,7 @@ def _deliver(here: int) -> None:
     try:
         # in the place of one that is on its way
         _raise_in(ctypes.c_ulong(here), ctypes.py_object(MemoryLimit))
+        # until the exception arrives
         while True:
             pass
     except MemoryLimit:
@@ -144,6 +145,9 @@ def _deliver(here: int) -> None:
 
 
 def _look() -> None:
+    """Watch the memory in an endless loop, in a thread of its own; stop the watched threads when
+    it exceeds the limit.
+    """
     while True:
         _wake.wait()
         with _guard:
@@ -151,13 +155,17 @@ def _look() -> None:
                 _wake.clear()
             limit = min(_limits, default=float("inf"))
             if process_memory() > _NEAR * limit:
+                # freed memory that the library of C still holds
                 give_back()
-            if (now := process_memory()) > limit:
-                _stop(now, limit)
+            if (held_bytes := process_memory()) > limit:
+                _stop(held_bytes, limit)
         threading.Event().wait(_PAUSE)
 
 
 def _stop(now: float, limit: float) -> None:
+    """Raise `MemoryLimit` in each watched thread that was not told yet; ``now`` and ``limit``
+    are bytes.
+    """
     for thread, stopped in _inside.items():
         if not stopped:
             _last[:] = [now, limit]
@@ -204,17 +212,19 @@ def refusing_allocations(active: bool) -> Iterator[None]:
 
     Raises `MemoryLimit` in the place of the error that such an allocation gives.
     """
-    limit, mapped = limit_now(), resident("VmData:")
-    if not active or limit is None or mapped is None:
+    limit, mapped_bytes = limit_now(), resident("VmData:")
+    if not active or limit is None or mapped_bytes is None:
         yield
         return
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    allowed = int(mapped + max(0.0, SLACK * limit - process_memory()))
+    old_limits = resource.getrlimit(resource.RLIMIT_DATA)
+    # private memory that is mapped now, and what the process may grow by
+    allowed_bytes = int(mapped_bytes + max(0.0, SLACK * limit - process_memory()))
+    # the limit that holds already is as strict:
     # of the user, or of an own node beside this one
-    if before[0] != resource.RLIM_INFINITY and before[0] <= allowed:
+    if old_limits[0] != resource.RLIM_INFINITY and old_limits[0] <= allowed_bytes:
         yield
         return
-    resource.setrlimit(resource.RLIMIT_DATA, (allowed, before[1]))
+    resource.setrlimit(resource.RLIMIT_DATA, (allowed_bytes, old_limits[1]))
     try:
         yield
     except Exception as error:
@@ -227,7 +237,7 @@ def refusing_allocations(active: bool) -> Iterator[None]:
         raise MemoryLimit(f"{text}, the limit is {format_size(int(limit))}") from error
     finally:
         with suppress(ValueError, OSError):
-            resource.setrlimit(resource.RLIMIT_DATA, before)
+            resource.setrlimit(resource.RLIMIT_DATA, old_limits)
 
 
 def _is_refused(error: BaseException) -> bool:

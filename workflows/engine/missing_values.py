@@ -48,8 +48,9 @@ def uses_of(
     """Return how often each value is read while the values with the keys ``plan`` and
     ``targets`` are computed.
     """
-    below, uses = Upstream(is_known, sources), Counter(targets)
-    in_order(below, targets)
-    for key in below.missing.union(plan):
+    upstream, uses = Upstream(is_known, sources), Counter(targets)
+    # the walk notes the missing values
+    in_order(upstream, targets)
+    for key in upstream.missing.union(plan):
         uses.update(sources(key))
     return uses

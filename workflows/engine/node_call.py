@@ -37,19 +37,20 @@ def call(
     """Call the node of a step and return its result with gradients, in the memory layout that
     stored results have.
     """
-    moved = [to_device(value, device) for value in inputs]
+    moved_inputs = [to_device(value, device) for value in inputs]
     rng = (
         {"rng": torch.Generator(device).manual_seed(stream_seed(seed, step.name))}
         if step.node.random
         else {}
     )
-    tensors = tensors_in(moved)
-    before = [x._version for x in tensors]
+    tensors = tensors_in(moved_inputs)
+    # torch counts the changes in place of each tensor
+    versions_before = [x._version for x in tensors]
     try:
-        value = settle(step.node(*moved, **params, **rng))
+        value = settle(step.node(*moved_inputs, **params, **rng))
     except Exception as error:
         raise RunError(step, inputs, error) from error
-    if before != [x._version for x in tensors]:
+    if versions_before != [x._version for x in tensors]:
         raise RunError(
             step,
             inputs,
@@ -57,12 +58,13 @@ def call(
         )
     for x in tensors:
         forget_attributes(x)
-    kind = step.node.hints.get("return", Any)
-    if not fits_type(value, kind):  # stored, such a value would count as damaged
-        name = getattr(kind, "__name__", kind)
+    annotated_type = step.node.hints.get("return", Any)
+    # as the annotation says
+    if not fits_type(value, annotated_type):  # stored, such a value would count as damaged
+        type_name = getattr(annotated_type, "__name__", annotated_type)
         text = (
             f"the node returned a value of the type {type(value).__name__}, but its annotation says"
-            f" {name}"
+            f" {type_name}"
         )
         raise RunError(step, inputs, TypeError(text))
     return value
@@ -94,9 +96,13 @@ def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
     hint = step.device or step.node.device
     if hint == "cpu":
         return ("cpu",)
-    allowed = [d for d in devices if fits(d, device_kind(d), hint)] or list(devices)
+    fitting = [
+        device_name for device_name in devices if fits(device_name, device_kind(device_name), hint)
+    ] or list(devices)
     return tuple(
-        d for d in allowed if not step.node.random or device_kind(d) == device_kind(allowed[0])
+        device_name
+        for device_name in fitting
+        if not step.node.random or device_kind(device_name) == device_kind(fitting[0])
     )
 
 
@@ -147,15 +153,19 @@ def call_by_band(
     keys = band_keys(step, inputs, code)
     fields = range(_fields(step))
     for _ in range(_TRIES):
-        missing = [
+        missing_bands = [
             i for i, key in enumerate(keys) if not all(blobs.has(f"{key}.{n}") for n in fields)
         ]
-        if len(missing) == count and parts == 1:
+        # nothing to reuse: the whole result in one call
+        if len(missing_bands) == count and parts == 1:
             break
         try:
-            return _gathered(step, inputs, evaluate, keys, missing, ceil(count / parts), blobs)
+            return _gathered(
+                step, inputs, evaluate, keys, missing_bands, ceil(count / parts), blobs
+            )
         except Damaged:  # the next attempt finds the damaged band missing
             continue
+    # bands were damaged again and again, or nothing is stored: all in one call
     return _stacked(step, evaluate(inputs), keys)
 
 
@@ -176,14 +186,16 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
     """Return the number of bands that a step computes independently of each other; 0 if the step
     has no such bands.
     """
-    named = zip(step.node.inputs, inputs, strict=False)
-    axes = [(_axis(step, name, value), value) for name, value in named]
-    banded = [(axis, value) for axis, value in axes if axis is not None]
-    if not all(_is_cut_by_band(value) for _, value in banded):
+    names_and_inputs = zip(step.node.inputs, inputs, strict=False)
+    axes = [(_axis(step, name, value), value) for name, value in names_and_inputs]
+    axes_and_inputs = [(axis, value) for axis, value in axes if axis is not None]
+    # of each banded input
+    if not all(_is_cut_by_band(value) for _, value in axes_and_inputs):
         return 0  # a low-rank cube has no slice of one band
     counts = set[int]()
-    for axis, value in banded:
+    for axis, value in axes_and_inputs:
         counts.update(x.shape[axis] for x in band_tensors(value) if _has(x, axis))
+    # inputs that disagree have no common bands
     return counts.pop() if len(counts) == 1 else 0
 
 
@@ -203,20 +215,24 @@ def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
     band of the inputs.
     """
     params = {name: plain(value) for name, value in step.params.items()}
-    same: list[Any] = [
+    shared_parts: list[Any] = [
         "band",
         step.node.path,
         code,
         params,
-        *([said] if (said := written(step)) else []),
+        *([text_of_step] if (text_of_step := written(step)) else []),
     ]
-    hashes: list[list[str]] = []
+    band_digests: list[list[str]] = []
     for name, value in zip(step.node.inputs, inputs, strict=False):
         axis = _axis(step, name, value)
-        same.append([name, axis, content(value if axis is None else _without_bands(value))])
+        # what does not belong to a single band decides about all bands
+        shared_parts.append([name, axis, content(value if axis is None else _without_bands(value))])
         if axis is not None:
-            hashes += [[_hashed(band) for band in x.unbind(axis)] for x in band_tensors(value)]
-    return [digest(same, list(band)) for band in zip(*hashes, strict=True)]
+            band_digests += [
+                [_hashed(band) for band in x.unbind(axis)] for x in band_tensors(value)
+            ]
+    # one digest of each input belongs to one band
+    return [digest(shared_parts, list(band)) for band in zip(*band_digests, strict=True)]
 
 
 def content(value: Any) -> list[Any]:
@@ -232,6 +248,9 @@ def _hashed(x: Tensor) -> str:
 
 
 def _axis(step: Step, name: str, value: Any) -> int | None:
+    """Return the axis of the bands of an input, or None for an absent input or one without
+    bands.
+    """
     return None if value is None or step.node.bands is None else step.node.bands.get(name)
 
 
@@ -252,6 +271,7 @@ def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
 
 
 def _without_bands(value: Any) -> Any:
+    """Return what of a value does not belong to single bands: None for a tensor."""
     return (
         None
         if isinstance(value, Tensor)
@@ -260,6 +280,7 @@ def _without_bands(value: Any) -> Any:
 
 
 def _has(x: Tensor, axis: int) -> bool:
+    """Return True if a tensor has the axis."""
     return -x.dim() <= axis < x.dim()
 
 
@@ -279,6 +300,7 @@ def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
     """Return the bands of a tensor with the indices ``which``, as a view if the memory layout
     allows.
     """
+    # adjacent bands
     if which == list(range(which[0], which[0] + len(which))):
         view = x.narrow(axis, which[0], len(which))
         if view.is_contiguous() and view.data_ptr() % _ALIGN == 0:
@@ -293,6 +315,7 @@ def _fields(step: Step) -> int:
 
 
 def _rebuilt(step: Step, items: list[Any]) -> Any:
+    """Return the result of a step from its tensors: a named tuple, or the tensor alone."""
     kind = step.node.hints["return"]
     return kind._make(items) if kind in BAND_FIELDS else items[0]
 
@@ -302,8 +325,8 @@ def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
     unchanged.
     """
     tensors = band_tensors(value)
-    leading = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
-    if not leading or sum(x.nbytes for x in tensors) < LEAST:
+    is_band_first = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
+    if not is_band_first or sum(x.nbytes for x in tensors) < LEAST:
         return value
     items = [Stacked(x, tuple(f"{key}.{n}" for key in keys)) for n, x in enumerate(tensors)]
     return _rebuilt(step, items)
@@ -332,13 +355,15 @@ def _gathered(
     """
     assert step.node.bands is not None
     axis = step.node.bands["return"]
+    # one for each tensor of the result
     stacks = [_Stack(axis, [f"{key}.{n}" for key in keys], blobs) for n in range(_fields(step))]
+    # groups of `size` bands, for less memory
     for start in range(0, len(missing), size):
-        which = missing[start : start + size]
+        band_indices = missing[start : start + size]
         for stack, x in zip(
-            stacks, band_tensors(evaluate(taken(step, inputs, which))), strict=True
+            stacks, band_tensors(evaluate(taken(step, inputs, band_indices))), strict=True
         ):
-            stack.add(which, x)
+            stack.add(band_indices, x)
     return _rebuilt(step, [stack.whole() for stack in stacks])
 
 
@@ -356,11 +381,13 @@ class _Stack:
         """Add the computed wavelength bands ``x`` with the indices ``which`` to the tensor."""
         axis = self.axis % x.dim()
         slices = x.unbind(axis)
+        # only then a band is contiguous, and can be a file
         if axis == 0:
             with suppress(OSError):
                 self.blobs.write_all([self.names[i] for i in which], slices)
                 return
         if self.held is None:
+            # the whole tensor in memory, where no file could be written
             self.held = x.new_empty(*x.shape[:axis], len(self.names), *x.shape[axis + 1 :])
         for i, band in zip(which, slices, strict=True):
             self.held.select(axis, i).copy_(band)
@@ -370,11 +397,12 @@ class _Stack:
         """Return all wavelength bands as one tensor; raise `Damaged` if a stored band is
         damaged.
         """
-        blob = self.blobs.about(self.names[0]) if self.held is None else None
-        if blob is not None:
-            shape = (len(self.names), *blob.shape)
-            return Stacked(self.blobs.read(self.names, shape, blob.dtype), tuple(self.names))
+        first_blob = self.blobs.about(self.names[0]) if self.held is None else None
+        if first_blob is not None:
+            shape = (len(self.names), *first_blob.shape)
+            return Stacked(self.blobs.read(self.names, shape, first_blob.dtype), tuple(self.names))
         assert self.held is not None
+        # bands that were in the store before
         for i in set(range(len(self.names))) - self.inside:
             band = self.held.select(self.axis, i)
             band.copy_(self.blobs.read([self.names[i]], (1, *band.shape), band.dtype)[0])

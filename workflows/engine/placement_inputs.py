@@ -61,14 +61,15 @@ def prepare(
     """
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
     expected = costs.in_turn(((w.key, w.step, abouts.get(w.key)) for w in works), kinds)
-    read: dict[Key, float] = {}
-    for work in works:
-        for name, key in zip(work.step.sources, work.sources, strict=True):
+    read_bytes: dict[Key, float] = {}
+    for job in works:
+        for name, key in zip(job.step.sources, job.sources, strict=True):
             if key not in expected:
-                read[key] = 0.0 if key in in_memory else costs.size_of(name)
+                read_bytes[key] = 0.0 if key in in_memory else costs.size_of(name)
     try:
-        return _scheduled(works, expected, lanes, keep, read)
+        return _scheduled(works, expected, lanes, keep, read_bytes)
     except TooLarge as error:
+        # the message counts what the program itself holds
         raise error.with_program(lanes[error.device].held) from error
 
 
@@ -82,15 +83,16 @@ def _scheduled(
     """Return the jobs on their devices; ``read`` has the bytes of each value that is read from
     the store.
     """
-    only, lane = next(iter(lanes.items()))
-    for work in works:
-        if expected[work.key].peak == math.inf:
-            raise TooLarge(work.step.name, only, math.inf, lane.memory)
+    first_lane, lane = next(iter(lanes.items()))
+    for job in works:
+        if expected[job.key].peak == math.inf:
+            raise TooLarge(job.step.name, first_lane, math.inf, lane.memory)
+    # one device needs no placement, unless steps must be cut into parts
     if len(lanes) == 1:
-        plain = _one_after_another(works, expected, only, keep, read)
-        if plain.peak[only] <= lane.memory:
-            jobs = [work if work.lane else replace(work, lane=only) for work in works]
-            return Prepared(jobs, expected, plain)
+        sequential = _one_after_another(works, expected, first_lane, keep, read)
+        if sequential.peak[first_lane] <= lane.memory:
+            jobs = [job if job.lane else replace(job, lane=first_lane) for job in works]
+            return Prepared(jobs, expected, sequential)
     return _shared_out(works, expected, lanes, keep, read)
 
 
@@ -102,14 +104,14 @@ def _shared_out(
     read: Mapping[Key, float],
 ) -> Prepared:
     """Return the jobs on the devices where they end soonest within the memory."""
-    planned = {w.step.name: w for w in works}
-    names = {w.key: w.step.name for w in works}
-    tasks = [_task(w, expected[w.key], lanes, names, read) for w in works]
+    job_of_step = {job.step.name: job for job in works}
+    names = {job.key: job.step.name for job in works}
+    tasks = [_task(job, expected[job.key], lanes, names, read) for job in works]
     cluster = Cluster(tuple(Device(name, lane.kind, lane.memory) for name, lane in lanes.items()))
     schedule = heft(tasks, cluster, [names[key] for key in keep if key in names])
     slots = sorted(schedule.slots, key=lambda slot: (slot.start, slot.end))
     return Prepared(
-        [_placed(planned[slot.task], slot, lanes) for slot in slots], expected, schedule
+        [_placed(job_of_step[slot.task], slot, lanes) for slot in slots], expected, schedule
     )
 
 
@@ -122,14 +124,15 @@ def room_for(
 
     def room(work: StepJob, running: Sequence[StepJob]) -> bool:
         pool = pool_of(work.device)
-        beside = [w for w in running if pool_of(w.device) == pool]
-        if not beside or not executor.shares:
+        beside_jobs = [w for w in running if pool_of(w.device) == pool]
+        # on a cluster each worker has its own memory
+        if not beside_jobs or not executor.shares:
             return True
-        held = sum(
+        held_bytes = sum(
             t.nbytes for t in tensors_in(list(values.values())) if pool_of(str(t.device)) == pool
         )
-        need = sum(expected[w.key].peak for w in (work, *beside))
-        return held + need <= sum(
+        needed_bytes = sum(expected[w.key].peak for w in (work, *beside_jobs))
+        return held_bytes + needed_bytes <= sum(
             lane.memory for lane in executor.lanes.values() if pool_of(lane.device) == pool
         )
 
@@ -151,10 +154,10 @@ def running_peak(schedule: Schedule | None, lanes: Mapping[str, Lane]) -> float:
     """Return the predicted peak memory of this process in bytes while the steps run, over all
     lanes on the CPU.
     """
-    cpu = {name: lane for name, lane in lanes.items() if lane.kind == "cpu"}
+    cpu_lanes = {name: lane for name, lane in lanes.items() if lane.kind == "cpu"}
     peaks = schedule.peak if schedule else {}
-    return max((lane.held for lane in cpu.values()), default=0.0) + sum(
-        peaks.get(name, 0.0) for name in cpu
+    return max((lane.held for lane in cpu_lanes.values()), default=0.0) + sum(
+        peaks.get(name, 0.0) for name in cpu_lanes
     )
 
 
@@ -162,20 +165,25 @@ def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
     """Join two schedules: the schedule ``then`` begins when the schedule ``first`` ends."""
     if first is None or then is None:
         return first or then
-    by = first.makespan
-    slots = (replace(slot, start=slot.start + by, end=slot.end + by) for slot in then.slots)
-    moves = (replace(m, start=m.start + by, end=m.end + by, until=m.until + by) for m in then.moves)
+    delay = first.makespan
+    # all times of the second schedule are later by this delay
+    slots = (replace(slot, start=slot.start + delay, end=slot.end + delay) for slot in then.slots)
+    moves = (
+        replace(m, start=m.start + delay, end=m.end + delay, until=m.until + delay)
+        for m in then.moves
+    )
     peak = {
         name: max(first.peak.get(name, 0.0), then.peak.get(name, 0.0))
         for name in {**first.peak, **then.peak}
     }
     transferred = first.transferred + then.transferred
     return Schedule(
-        (*first.slots, *slots), by + then.makespan, peak, transferred, (*first.moves, *moves)
+        (*first.slots, *slots), delay + then.makespan, peak, transferred, (*first.moves, *moves)
     )
 
 
 def _placed(work: StepJob, slot: Slot, lanes: Mapping[str, Lane]) -> StepJob:
+    """Return a job on the device and in the number of parts that the plan gives it."""
     device = "cpu" if _cpu_only(work) else lanes[slot.device].device
     return replace(work, lane=slot.device, device=device, parts=slot.parts)
 
@@ -187,11 +195,20 @@ def _task(
     names: Mapping[Key, str],
     read: Mapping[Key, float],
 ) -> Task:
+    """Return a job as the plan sees it: its name, sources, seconds by device, bytes of the
+    result and beside it, and parts.
+    """
     seconds = _seconds_by_lane(work, estimate, lanes)
     sources = tuple(dict.fromkeys(names[key] for key in work.sources if key in names))
-    beside = estimate.work + sum(read[key] for key in set(work.sources) if key in read)
+    # and inputs that are read from the store
+    working_bytes = estimate.work + sum(read[key] for key in set(work.sources) if key in read)
     return Task(
-        work.step.name, sources, seconds, estimate.bytes, beside, parts_of(work.step, estimate)
+        work.step.name,
+        sources,
+        seconds,
+        estimate.bytes,
+        working_bytes,
+        parts_of(work.step, estimate),
     )
 
 
@@ -200,11 +217,12 @@ def _seconds_by_lane(
 ) -> dict[str, float]:
     """Return the predicted time (s) of a job on each device that may compute it."""
     if _cpu_only(work):
-        on_cpu = [name for name, lane in lanes.items() if lane.kind == "cpu"]
-        return dict.fromkeys(on_cpu or lanes, estimate.seconds["cpu"])
+        cpu_lanes = [name for name, lane in lanes.items() if lane.kind == "cpu"]
+        # without a lane on the CPU, the thread of a GPU computes on the CPU
+        return dict.fromkeys(cpu_lanes or lanes, estimate.seconds["cpu"])
     allowed = places(work.step, [lane.device for lane in lanes.values()])
-    here = {name: lane for name, lane in lanes.items() if lane.device in allowed}
-    return {name: estimate.seconds[lane.kind] for name, lane in here.items()}
+    allowed_lanes = {name: lane for name, lane in lanes.items() if lane.device in allowed}
+    return {name: estimate.seconds[lane.kind] for name, lane in allowed_lanes.items()}
 
 
 def parts_of(step: Step, estimate: Estimate) -> int:
@@ -232,27 +250,29 @@ def _one_after_another(
     """
     sizes = {**read, **{key: cost.bytes for key, cost in expected.items()}}
     in_memory = set[Key]()
-    last: dict[Key, Key] = {}
-    for work in works:
-        last.update(dict.fromkeys(work.sources, work.key))
-    now, held, peak, slots = 0.0, 0.0, 0.0, []
-    for work in works:
-        cost = expected[work.key]
-        new = {*work.sources, work.key} - in_memory
-        in_memory |= new
-        held += sum(sizes[key] for key in new)
-        peak = max(peak, held + cost.work)
-        ended = {
+    last_reader: dict[Key, Key] = {}
+    for job in works:
+        last_reader.update(dict.fromkeys(job.sources, job.key))
+    start, held_bytes, peak_bytes, slots = 0.0, 0.0, 0.0, []
+    for job in works:
+        cost = expected[job.key]
+        new_keys = {*job.sources, job.key} - in_memory
+        in_memory |= new_keys
+        # inputs that are loaded now, and the result
+        held_bytes += sum(sizes[key] for key in new_keys)
+        peak_bytes = max(peak_bytes, held_bytes + cost.work)
+        ended_keys = {
             key
-            for key in (*work.sources, work.key)
-            if last.get(key, work.key) == work.key and key not in keep
+            for key in (*job.sources, job.key)
+            # a value that no job reads ends with its own job
+            if last_reader.get(key, job.key) == job.key and key not in keep
         }
-        held -= sum(sizes[key] for key in ended)
+        held_bytes -= sum(sizes[key] for key in ended_keys)
         slots.append(
-            Slot(work.step.name, lane, now, now + cost.seconds[device_kind(work.device)], 1)
+            Slot(job.step.name, lane, start, start + cost.seconds[device_kind(job.device)], 1)
         )
-        now = slots[-1].end
-    return Schedule(tuple(slots), now, {lane: peak}, 0.0)
+        start = slots[-1].end
+    return Schedule(tuple(slots), start, {lane: peak_bytes}, 0.0)
 
 
 def past_costs(store: Store, sizes: Mapping[str, Size]) -> Costs:
@@ -263,10 +283,11 @@ def past_costs(store: Store, sizes: Mapping[str, Size]) -> Costs:
     runs before it.
     """
     rows = store.journal.latest()
-    read, count, costs = _read.get(store.journal, (rows, 0, Costs([])))
-    if read is not rows or count > len(rows):  # the journal began anew
-        count, costs = 0, Costs([])
-    costs.learn(rows[count:])
+    rows_read, learned, costs = _read.get(store.journal, (rows, 0, Costs([])))
+    if rows_read is not rows or learned > len(rows):  # the journal began anew
+        learned, costs = 0, Costs([])
+    # the lines that came since the last call
+    costs.learn(rows[learned:])
     _read[store.journal] = rows, len(rows), costs
     return costs.with_sizes(sizes)
 

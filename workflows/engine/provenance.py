@@ -78,7 +78,7 @@ def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
 
 def checks_in(about: Mapping[str, Any] | None) -> tuple[Check, ...]:
     """Return the checks in the metadata of a stored result, as they were when it was computed."""
-    return tuple(Check(text, ok) for text, ok in (about or {}).get("checks") or ())
+    return tuple(Check(text, passed) for text, passed in (about or {}).get("checks") or ())
 
 
 def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
@@ -98,8 +98,8 @@ def unneeded(
     """Return the record of a step whose value no other step needed; its checks are those of the
     stored result.
     """
-    why, checks, error = "nothing needed it", checks_in(about), error_in(about)
-    return StepRecord(name, "not needed", why, 0.0, key, checks=checks, bound=bound, error=error)
+    reason, checks, error = "nothing needed it", checks_in(about), error_in(about)
+    return StepRecord(name, "not needed", reason, 0.0, key, checks=checks, bound=bound, error=error)
 
 
 def loaded(
@@ -107,7 +107,7 @@ def loaded(
 ) -> StepRecord:
     """Return the record of a step whose stored result was read in ``seconds``."""
     why = why or f"computed {about.get('date')} in {about.get('seconds') or 0.0:.3g} s"
-    size, error = about.get("bytes") or 0, error_in(about)
+    result_bytes, error = about.get("bytes") or 0, error_in(about)
     return StepRecord(
         name,
         "cached",
@@ -117,7 +117,7 @@ def loaded(
         facts_in(about),
         checks_in(about),
         "cpu",
-        size,
+        result_bytes,
         bound,
         error=error,
     )
@@ -129,22 +129,24 @@ def ran(
     """Return the record of a step that was computed in the run that started at the time
     ``began``.
     """
-    work = outcome.work
+    job = outcome.work
     return StepRecord(
-        work.step.name,
+        job.step.name,
         "run",
         why,
         outcome.seconds,
-        work.key,
+        job.key,
         outcome.facts,
         outcome.checks,
-        work.device,
+        job.device,
         outcome.bytes,
         bound,
+        # s after the start of the run
         outcome.began - began,
-        work.lane,
+        job.lane,
         outcome.peak,
-        expected.seconds[device_kind(work.device)] if expected and expected.known else None,
+        # a guess is no prediction
+        expected.seconds[device_kind(job.device)] if expected and expected.known else None,
         outcome.deviation,
         expected.peak if expected and expected.known else None,
         outcome.kept,
@@ -157,7 +159,7 @@ def state_counts(records: Iterable[StepRecord]) -> str:
     A step whose result no other step had to load counts as cached.
     """
     counts = Counter(
-        "cached" if done.state == "not needed" else str(done.state) for done in records
+        "cached" if record.state == "not needed" else str(record.state) for record in records
     )
     return (
         ", ".join(

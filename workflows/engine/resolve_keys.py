@@ -41,16 +41,19 @@ def resolve(
         if step.node.hooks.skip_bound is not None:
             try:
                 resolved.verdicts[name] = ledger.verdict(step, step.params, facts_of)
+            # statistics are missing: only a run can decide
             except RunError:
                 resolved.verdicts[name] = None
         else:
             ledger.pass_on(step)
+        # None for a step that is never left out
         verdict = resolved.verdicts.get(name)
         if verdict is not None and verdict.left_out:
             resolved.keys[name] = resolved.keys[verdict.instead]
             continue
         key, origin = key_of(step, resolved.keys, recipe.seed, code, place(step, device))
         resolved.keys[name], resolved.origins[key] = key, origin
+        # of steps with one key the first computes the value
         resolved.makers.setdefault(key, name)
     code.save()
     return resolved

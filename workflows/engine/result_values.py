@@ -32,7 +32,11 @@ def numbers_of(step: str, result: Any) -> list[list[Any]]:
     for field, tensor in tensor_fields(result):
         if tensor.numel() <= _MOST and not tensor.is_complex():
             numbers = tensor.detach().double().flatten().tolist()
-            rows += [[step, field, i if len(numbers) > 1 else "", n] for i, n in enumerate(numbers)]
+            # a single number has no index
+            rows += [
+                [step, field, i if len(numbers) > 1 else "", number]
+                for i, number in enumerate(numbers)
+            ]
     return rows
 
 
@@ -59,8 +63,9 @@ def figures_of_merit(values: Mapping[str, Any]) -> dict[str, float | list[float]
 def arrays_of(value: Any) -> Any:
     """Replace every tensor in a nested value by a NumPy array; bfloat16 becomes float32."""
     if isinstance(value, Tensor):
-        here = value.detach().cpu()
-        return (here.float() if here.dtype == torch.bfloat16 else here).numpy()
+        on_cpu = value.detach().cpu()
+        # NumPy has no bfloat16
+        return (on_cpu.float() if on_cpu.dtype == torch.bfloat16 else on_cpu).numpy()
     if isinstance(value, tuple):
         items = [arrays_of(item) for item in value]
         return value._make(items) if hasattr(value, "_make") else tuple(items)

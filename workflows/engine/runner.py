@@ -70,10 +70,10 @@ def shortest_first(
     """
     longest: dict[str, float] = {}
     for name in order:
-        below = (longest[source] for source in recipe.steps[name].sources)
-        longest[name] = max(seconds.get(name, 0.0), max(below, default=0.0))
-    limit = max((longest[name] for name in first), default=0.0)
-    names = dict.fromkeys([*first, *(name for name in others if longest[name] < limit)])
+        source_times = (longest[source] for source in recipe.steps[name].sources)
+        longest[name] = max(seconds.get(name, 0.0), max(source_times, default=0.0))
+    longest_of_first = max((longest[name] for name in first), default=0.0)
+    names = dict.fromkeys([*first, *(name for name in others if longest[name] < longest_of_first)])
     return sorted(names, key=longest.__getitem__)
 
 
@@ -130,6 +130,7 @@ class Result:
         A figure with a value for each band is a list. A figure that this run did not need is read
         from the store or computed.
         """
+        # figures count in the recipe as it was written
         recipe = self.recipe.unsubstituted or self.recipe
         names = metrics_of(recipe, {*self.keys, *wanted(recipe)})
         values = values_of(self, recipe, names)
@@ -149,8 +150,8 @@ class Result:
 def values_of(result: Result, recipe: Recipe, steps: Iterable[str]) -> Mapping[str, Any]:
     """Return the values of a run, and those of other ``steps``, which ``recipe`` computes."""
     absent = [name for name in steps if name not in result.values]
-    again = run(recipe, result.store, absent, device=result.device).values if absent else {}
-    return {**again, **result.values}
+    computed = run(recipe, result.store, absent, device=result.device).values if absent else {}
+    return {**computed, **result.values}
 
 
 def run(
@@ -178,13 +179,13 @@ def run(
     began = time.perf_counter()
     check_devices(device)
     names = _outputs_of(recipe, outputs)
-    again = copies_of(recipe, anew)
+    recomputed = copies_of(recipe, anew)
     recipe = with_substitutions(recipe, names)
     store = store or open_store()
     series = series or RunSeries.begun(store)
-    attempt, carried = 1, dict[str, Outcome]()
+    attempt_number, carried_outcomes = 1, dict[str, Outcome]()
     while True:
-        work = Execution(
+        execution = Execution(
             recipe,
             store,
             device.split(","),
@@ -194,21 +195,29 @@ def run(
             memory,
             show=show or (lambda *_: None),
             series=series,
-            carried=carried,
-            anew=again,
+            carried=carried_outcomes,
+            anew=recomputed,
         )
         try:
             with limited(memory_limit(memory)):
-                return replace(_attempt(work, names, began, show is not None), attempts=attempt)
-        except TaintedRun as seen:
-            carried[seen.outcome.work.step.name] = seen.outcome
+                return replace(
+                    _attempt(execution, names, began, show is not None), attempts=attempt_number
+                )
+        # the run begins again; the value that was computed is taken over
+        except TaintedRun as tainted:
+            carried_outcomes[tainted.outcome.work.step.name] = tainted.outcome
+            # keys of tainted code are private from now on
             series.read_code_again(store)
-        except ToleranceNotProven as failed:
+        except ToleranceNotProven as failure:
+            # the next attempt is stricter, and
             # a third attempt is exact
-            scale = stricter_scale(recipe, failed.over) if attempt == 1 else 0.0
-            attempt, recipe = attempt + 1, _stricter(recipe, scale, work, names)
+            tolerance_scale = stricter_scale(recipe, failure.over) if attempt_number == 1 else 0.0
+            attempt_number, recipe = (
+                attempt_number + 1,
+                _stricter(recipe, tolerance_scale, execution, names),
+            )
         finally:
-            work.close()
+            execution.close()
             give_back()
 
 
@@ -225,12 +234,12 @@ def _stricter(recipe: Recipe, scale: float, work: Execution, outputs: tuple[str,
     """Return the recipe of the next attempt, with the tolerance ``scale``: an exact one if that is
     0 or if a stricter one would fail as well.
     """
-    unchanged = recipe.unsubstituted or recipe
+    original_recipe = recipe.unsubstituted or recipe
     stricter = with_substitutions(
-        replace(unchanged, tolerance_scale=scale, exact=scale == 0.0), outputs
+        replace(original_recipe, tolerance_scale=scale, exact=scale == 0.0), outputs
     )
     if not stricter.exact and _futile(stricter, work, outputs):
-        return replace(unchanged, tolerance_scale=0.0, exact=True)
+        return replace(original_recipe, tolerance_scale=0.0, exact=True)
     return stricter
 
 
@@ -241,16 +250,20 @@ def _futile(stricter: Recipe, work: Execution, outputs: tuple[str, ...]) -> bool
     Cheaper steps with smaller limits, as the recipe ``stricter`` has them, keep the rounding of
     their sums.
     """
+    # of the tolerance, which omitted steps may use
     share = skip_share(stricter)
 
     def at_best(name: str) -> StepRecord:
-        done = work.done.get(name) or work.asleep(name)
-        if done.state == "left out" and (done.bound or 0.0) > stricter.allowed(name) * share:
-            return replace(done, state="run")
-        if not done.error or done.error[0] <= _ROUNDING:
-            return done
-        return replace(done, error=(_ROUNDING, done.error[1] * _ROUNDING / done.error[0]))
+        record = work.done.get(name) or work.asleep(name)
+        # with the smaller limit this step would run, without an error
+        if record.state == "left out" and (record.bound or 0.0) > stricter.allowed(name) * share:
+            return replace(record, state="run")
+        if not record.error or record.error[0] <= _ROUNDING:
+            return record
+        # the second number is proportional to the first
+        return replace(record, error=(_ROUNDING, record.error[1] * _ROUNDING / record.error[0]))
 
+    # as in `_attempt`: what the judged steps need
     order = needed(
         work.recipe, tolerance_frontier(work.recipe, needed(work.recipe, outputs), outputs)
     )
@@ -265,16 +278,23 @@ def _attempt(work: Execution, outputs: tuple[str, ...], began: float, shows: boo
     order = needed(recipe, outputs)
     with torch.no_grad():
         work.resolve(order)
-        first = tolerance_frontier(recipe, order, outputs)
-        missing = work.missing(outputs) if first else set()
-        _make_early(work, order, first, outputs, missing, shows)
-        lead = order if first and not missing else needed(recipe, first)
-        proved = proof(recipe, lead, outputs, partial(_record_so_far, work), work.known_facts)
-        over = proved.over(recipe)
-        if over > 1.0 and not recipe.exact:
-            raise ToleranceNotProven(over)
+        # the steps whose errors must meet the tolerance
+        judged_steps = tolerance_frontier(recipe, order, outputs)
+        # the values that must be computed for the outputs
+        missing = work.missing(outputs) if judged_steps else set()
+        _make_early(work, order, judged_steps, outputs, missing, shows)
+        # with nothing to compute all records are known: then the proof covers every step
+        steps_to_prove = order if judged_steps and not missing else needed(recipe, judged_steps)
+        error_bounds = proof(
+            recipe, steps_to_prove, outputs, partial(_record_so_far, work), work.known_facts
+        )
+        error_in_tolerances = error_bounds.over(recipe)
+        if error_in_tolerances > 1.0 and not recipe.exact:
+            raise ToleranceNotProven(error_in_tolerances)
+        # what is left to compute or to load
         work.make([work.keys[name] for name in outputs], keep=False)
-    return _result_of(work, outputs, began, None if missing else proved)
+    # a proof before the steps ran does not cover them
+    return _result_of(work, outputs, began, None if missing else error_bounds)
 
 
 def _make_early(
@@ -291,12 +311,12 @@ def _make_early(
     With ``shows``, outputs that need only shorter steps are computed as well; a sweep shows
     nothing.
     """
-    early = [name for name in first if work.keys[name] in missing]
-    if early and shows:
-        early = _targets_first(work, order, early, outputs, missing)
-    if early:
+    early_steps = [name for name in first if work.keys[name] in missing]
+    if early_steps and shows:
+        early_steps = _targets_first(work, order, early_steps, outputs, missing)
+    if early_steps:
         later = [work.keys[name] for name in outputs]
-        work.make([work.keys[name] for name in early], keep=False, later=later)
+        work.make([work.keys[name] for name in early_steps], keep=False, later=later)
 
 
 def _result_of(
@@ -306,14 +326,15 @@ def _result_of(
     recipe, store = work.recipe, work.store
     values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in outputs}
     order = needed(recipe, outputs)
-    done = work.account(order)
+    # also of steps that did not run
+    records = work.account(order)
     peak = process_peak()
     seconds = time.perf_counter() - began
     if proved is None:
-        proved = proof(recipe, order, outputs, done.__getitem__, work.known_facts)
+        proved = proof(recipe, order, outputs, records.__getitem__, work.known_facts)
     return Result(
         values=values,
-        done=done,
+        done=records,
         keys=work.keys,
         seconds=seconds,
         peak_memory=peak,
@@ -345,9 +366,12 @@ def _targets_first(
     first.
     """
     work.costs = work.costs or past_costs(work.store, sizes_of(work.recipe, order))
-    steps = [(name, work.recipe.steps[name], None) for name in order if work.keys[name] in missing]
+    missing_steps = [
+        (name, work.recipe.steps[name], None) for name in order if work.keys[name] in missing
+    ]
     seconds = {
-        name: cost.seconds["cpu"] for name, cost in work.costs.in_turn(steps, ["cpu"]).items()
+        name: cost.seconds["cpu"]
+        for name, cost in work.costs.in_turn(missing_steps, ["cpu"]).items()
     }
-    others = [name for name in outputs if work.keys[name] in missing]
-    return shortest_first(work.recipe, order, early, others, seconds)
+    missing_outputs = [name for name in outputs if work.keys[name] in missing]
+    return shortest_first(work.recipe, order, early, missing_outputs, seconds)

@@ -57,7 +57,8 @@ class WriteBehind:
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
-        self._sizes: dict[Key, int] = {}
+        self._sizes: dict[Key, int] = {}  # bytes of each write that has not ended
+        # each write since the last `finish`, for its error
         self._writes: dict[Key, Future[Any]] = {}
         self._guard = threading.Lock()
 
@@ -74,6 +75,7 @@ class WriteBehind:
                 return_when=FIRST_COMPLETED,
             )
         with self._guard:
+            # one thread: one write at a time
             self._pool = self._pool or ThreadPoolExecutor(1, "neusee store", _lower_priority)
             self._sizes[key] = size
             self._writes[key] = self._pool.submit(self._write, key, write)
@@ -99,9 +101,11 @@ def _lower_priority() -> None:
     """Lower the priority of the writing thread, so that the computing threads run first."""
     if sys.platform == "linux":  # on other systems the call would affect the whole process
         with suppress(OSError):
-            thread = threading.get_native_id()
+            thread_id = threading.get_native_id()
             os.setpriority(
-                os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19)
+                os.PRIO_PROCESS,
+                thread_id,
+                min(os.getpriority(os.PRIO_PROCESS, thread_id) + _NICE, 19),
             )
 
 
@@ -160,8 +164,8 @@ class StepJob:
     def sources(self) -> tuple[Key, ...]:
         """Return the cache keys of all values that the job reads."""
         keys: list[Key] = []
-        for read in self.reads:
-            keys += keys_in(read)
+        for input_keys in self.reads:
+            keys += keys_in(input_keys)
         return tuple(keys)
 
 
@@ -238,6 +242,7 @@ def carry_out(
     """Compute one step and store its result if storing saves time; return an error as part of
     the outcome.
     """
+    # nobody else needs this result, or computing it twice costs less than the lease
     if work.unlocked or is_private(work.key):
         return _carried_out(work, fetch, store, None, Lease())
     lease = store.claim(work.key)
@@ -245,6 +250,7 @@ def carry_out(
         return Outcome(work, held=True)
     outcome = Outcome(work)
     try:
+        # another process stored it before the lease was free
         if not work.recompute and store.has(work.key):
             return Outcome(work, kept=True, found=True)
         outcome = _carried_out(work, fetch, store, later, lease)
@@ -257,8 +263,11 @@ def carry_out(
 def _carried_out(
     work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None, lease: Lease
 ) -> Outcome:
+    """Fetch the inputs of a job, compute it and store its result; return an error as part of the
+    outcome.
+    """
     try:
-        inputs = [gathered(read, fetch) for read in work.reads]
+        inputs = [gathered(input_keys, fetch) for input_keys in work.reads]
     except InputMissing as error:
         return Outcome(work, lost=error.args)
     try:
@@ -280,32 +289,39 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     """Compute a step and return its value with statistics, checks and costs."""
     step, hooks = work.step, work.step.node.hooks
     observations = _Seen()
-    stamps = file_stamps(step.params)
-    began, clock = time.time(), time.perf_counter()
-    size = sum(t.nbytes for t in tensors_in(inputs))
-    watched = size >= _WATCHED or not work.unlocked
-    own_here = work.own is not None and work.device.startswith("cpu") and not _is_apart(work)
+    file_stamps_before = file_stamps(step.params)
+    began, clock_start = time.time(), time.perf_counter()
+    input_bytes = sum(t.nbytes for t in tensors_in(inputs))
+    # a small and quick step is not worth the measurement
+    is_watched = input_bytes >= _WATCHED or not work.unlocked
+    # own code in this process: only then the system limits its allocations
+    own_in_process = work.own is not None and work.device.startswith("cpu") and not _is_apart(work)
     with (
-        PeakMemory(work.device, watched) as peak,
+        PeakMemory(work.device, is_watched) as peak,
         torch.no_grad(),
         guarded(),
-        refusing_allocations(own_here),
+        refusing_allocations(own_in_process),
     ):
         value = _value(work, inputs, store, observations)
-        bare = plain_of(value)
-        checks = _observing(examine, work, observations)(step, bare, inputs) if hooks.check else ()
-    seconds = time.perf_counter() - clock
-    _refuse_changed_files(work, stamps)
+        plain_value = plain_of(value)
+        checks = (
+            _observing(examine, work, observations)(step, plain_value, inputs)
+            if hooks.check
+            else ()
+        )
+    seconds = time.perf_counter() - clock_start
+    _refuse_changed_files(work, file_stamps_before)
     return Outcome(
         work,
         value,
-        bytes=sum(t.nbytes for t in tensors_in(bare)),
-        size=measured_size(step.node, inputs, step.params, bare),
-        deviation=hooks.approximation_error(bare) if hooks.approximation_error else None,
-        facts=TensorStats.of(bare),
+        bytes=sum(t.nbytes for t in tensors_in(plain_value)),
+        size=measured_size(step.node, inputs, step.params, plain_value),
+        deviation=hooks.approximation_error(plain_value) if hooks.approximation_error else None,
+        facts=TensorStats.of(plain_value),
         checks=checks,
         began=began,
         seconds=seconds,
+        # a fork counts its memory itself
         peak=None if peak.bytes is None else peak.bytes + observations.peak,
         taints=tuple(dict.fromkeys(observations.taints)),
     )
@@ -319,6 +335,7 @@ def _value(work: StepJob, inputs: list[Any], store: Store, observations: _Seen) 
         work,
         observations,
     )
+    # on a GPU only where the memory asks for it
     if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
         return call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
     return evaluate(inputs)
@@ -327,8 +344,10 @@ def _value(work: StepJob, inputs: list[Any], store: Store, observations: _Seen) 
 def _refuse_changed_files(work: StepJob, stamps: Any) -> None:
     """Raise `RunError` if an input file is not what it was when the step began."""
     params = work.step.params
-    same = stamps == file_stamps(params)
-    if not same or work.origin["params"] != {name: plain(param) for name, param in params.items()}:
+    is_unchanged = stamps == file_stamps(params)
+    if not is_unchanged or work.origin["params"] != {
+        name: plain(param) for name, param in params.items()
+    }:
         raise RunError(work.step, [], OSError("an input file changed while it was read: run again"))
 
 
@@ -344,20 +363,21 @@ def _observing(function: Callable[..., T], work: StepJob, observations: _Seen) -
     """Return a function that is observed where the code is not of neusee, and that adds what it
     finds to ``observations``.
     """
-    own = work.own
-    if own is None:
+    own_code = work.own
+    if own_code is None:
         return function
 
     def watched(*args: Any, **named: Any) -> T:
         try:
             value, taints = _called_observed(
-                partial(function, *args, **named), own, _is_apart(work), observations
+                partial(function, *args, **named), own_code, _is_apart(work), observations
             )
         except ProcessEnded as error:
             raise RunError(work.step, [], error) from error
         observations.taints.extend(taints)
         if taints:
-            hold_back(tainted_modules(own, taints))
+            # until the run knows of the taints, nothing of these modules is stored
+            hold_back(tainted_modules(own_code, taints))
         return value
 
     return watched
@@ -381,16 +401,21 @@ def _called_observed(
     """Call a function of own code, in a process of its own if ``apart`` and its value can be
     sent.
     """
+    # None: no fork, or a value that cannot be sent
     returned = call_in_fork(partial(call_observed, function, own), own.variables) if apart else None
     if returned is None:
         return call_observed(function, own)
     observations.peak = max(observations.peak, returned.peak or 0)
     value, taints = returned.value
-    home, lost = min(own.modules), [taint for taint in taints if taint.kind == "memory"]
-    say_lost(home, lost)
-    say_hidden(home, returned.asked, own.free)
+    first_module, memory_taints = (
+        min(own.modules),
+        [taint for taint in taints if taint.kind == "memory"],
+    )
+    # what the fork changed in memory is gone with it, so that this taints nothing
+    say_lost(first_module, memory_taints)
+    say_hidden(first_module, returned.asked, own.free)
     return value, [
-        *(taint for taint in taints if taint not in lost),
+        *(taint for taint in taints if taint not in memory_taints),
         *undeclared(own, returned.asked),
     ]
 
@@ -399,8 +424,12 @@ def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Leas
     """Store the metadata of a result, and also its value if reading is faster than computing the
     result again.
     """
-    own = outcome.work.own
-    if is_private(outcome.work.key) or outcome.taints or (own and not may_be_stored(own.modules)):
+    own_code = outcome.work.own
+    if (
+        is_private(outcome.work.key)
+        or outcome.taints
+        or (own_code and not may_be_stored(own_code.modules))
+    ):
         outcome.value = plain_of(outcome.value)
         return outcome
     try:
@@ -415,22 +444,24 @@ def _store(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lea
     """Store a result as it pays: its metadata alone, with a small value, or with a file that may
     be written later.
     """
-    work, value, about = outcome.work, outcome.value, _about(outcome)
-    small = outcome.bytes <= INLINE
-    not_worth = not (work.wanted or small or _pays(outcome, store, outcome.bytes))
-    if work.unlocked and (not_worth or (small and not _pays(outcome, store, 0))):
-        outcome.kept = store.put_small(work.key, value, about)
-    elif not_worth:
-        store.put_receipt(work.key, about)
+    job, value, metadata = outcome.work, outcome.value, _about(outcome)
+    is_inline = outcome.bytes <= INLINE
+    not_worth_it = not (job.wanted or is_inline or _pays(outcome, store, outcome.bytes))
+    # without a lease: no file of its own where a record beside others will do
+    if job.unlocked and (not_worth_it or (is_inline and not _pays(outcome, store, 0))):
+        outcome.kept = store.put_small(job.key, value, metadata)
+    elif not_worth_it:
+        store.put_receipt(job.key, metadata)
     elif later is not None and outcome.bytes >= LARGE:
         pack(value)  # a value that cannot be stored raises here, where the step is known
-        later.add(work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease))
+        later.add(job.key, outcome.bytes, lambda: _written(store, job.key, value, metadata, lease))
         outcome.kept = outcome.waits = True
     else:
-        outcome.kept = store.put(work.key, value, about)
+        outcome.kept = store.put(job.key, value, metadata)
 
 
 def _written(store: Store, key: Key, value: Any, about: dict[str, Any], lease: Lease) -> None:
+    """Write a result and release its lease."""
     with lease:
         store.put(key, value, about)
 
@@ -445,11 +476,12 @@ def _pays(outcome: Outcome, store: Store, size: int) -> bool:
 
 
 def _about(outcome: Outcome) -> dict[str, Any]:
-    work = outcome.work
+    """Return the metadata of a result."""
+    job = outcome.work
     return {
-        "step": work.step.name,
-        "recipe": work.recipe,
-        "origin": dict(work.origin),
+        "step": job.step.name,
+        "recipe": job.recipe,
+        "origin": dict(job.origin),
         "facts": outcome.facts and {name: getattr(outcome.facts, name) for name in _STATS},
         "checks": [[check.text, check.ok] for check in outcome.checks],
         "seconds": outcome.seconds,
@@ -457,7 +489,7 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "peak": outcome.peak,
         "size": outcome.size,
         "error": outcome.deviation,
-        "device": work.device,
+        "device": job.device,
         "versions": versions(),
         "date": timestamp(),
     }

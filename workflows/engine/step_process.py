@@ -80,30 +80,34 @@ def call_in_fork(function: Callable[[], T], variables: frozenset[str]) -> Return
 
 
 def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
+    """Do what `call_in_fork` says, while no other step runs."""
     limit, parent = limit_now(), os.getpid()
     with open(os.memfd_create("neusee step"), "rb") as file, watched_in_fork() as begin_watch:
         try:
             child = _forked()
         except OSError:  # no memory or no permission for one more process
             return None
+        # this is the fork, which does not return from here
         if not child:
             _answer(begin_watch, partial(_sent, function, variables, limit), file.fileno(), parent)
-        code = _waited(child)
-        if code == _UNSENT:
+        exit_code = _waited(child)
+        if exit_code == _UNSENT:
             return None
-        if code:
-            raise ProcessEnded(_reason(code))
-        sent: _Sent = torch.load(f"/proc/self/fd/{file.fileno()}", mmap=True, weights_only=False)
-    for name, text in sent.printed.items():
+        if exit_code:
+            raise ProcessEnded(_reason(exit_code))
+        # the file is in memory and has no other path
+        answer: _Sent = torch.load(f"/proc/self/fd/{file.fileno()}", mmap=True, weights_only=False)
+    for name, text in answer.printed.items():
         getattr(sys, name).write(text)
-    for warning in sent.said:
+    for warning in answer.said:
         warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-    if sent.error is not None:
-        raise sent.error
-    return sent.returned
+    if answer.error is not None:
+        raise answer.error
+    return answer.returned
 
 
 def _is_a_file(stream: Any) -> bool:
+    """Return True for a stream with a file descriptor, or for none."""
     try:
         return stream is None or stream.fileno() >= 0
     except (OSError, ValueError, AttributeError):
@@ -115,6 +119,7 @@ def _is_a_file(stream: Any) -> bool:
 
 def _forked() -> int:
     # or the fork would print what still waits here once more
+    """Fork; return the number of the child, and 0 in the child."""
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
             stream.flush()
@@ -130,9 +135,10 @@ def _waited(child: int) -> int:
     try:
         with _descriptor(child) as descriptors:
             while True:
-                ended, status = os.waitpid(child, os.WNOHANG)
-                if ended:
+                ended_process, status = os.waitpid(child, os.WNOHANG)
+                if ended_process:
                     return os.waitstatus_to_exitcode(status)
+                # wakes at the end of the child, or after the time
                 select.select(descriptors, [], [], _LOOK if descriptors else _LOOK / 50)
     except BaseException:
         with suppress(ProcessLookupError, ChildProcessError):
@@ -156,15 +162,16 @@ def _descriptor(child: int) -> Iterator[list[int]]:
 
 
 def _reason(code: int) -> str:
+    """Return why a process ended, from its exit code, which is negative for a signal."""
     if code > 0:
         return f"the process of the step ended with the exit code {code}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    kinds = {
+    known_causes = {
         "SIGKILL": "killed, as by a system that has too little memory",
         "SIGSEGV": "a library crashed",
     }
     return f"the process of the step was ended by {name}" + (
-        f": {kinds[name]}" if name in kinds else ""
+        f": {known_causes[name]}" if name in known_causes else ""
     )
 
 
@@ -175,22 +182,25 @@ def _answer(
     begin_watch: Callable[[], None], work: Callable[[], _Sent], file: int, parent: int
 ) -> None:
     """Do the work, write what it gives to a file, and end this process, whatever happens."""
-    code, collected = 1, _collected()
+    exit_code, texts_by_stream = 1, _collected()
     try:
         ignore_interrupts()
+        # False: the parent has ended already, and nobody waits
         if end_with(parent):
             begin_watch()
             _print_as_parent()
-            sent = work()
-            code = _write(
-                sent._replace(printed={name: text.getvalue() for name, text in collected.items()}),
+            answer = work()
+            exit_code = _write(
+                answer._replace(
+                    printed={name: text.getvalue() for name, text in texts_by_stream.items()}
+                ),
                 file,
             )
     finally:
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):
                 stream.flush()
-        os._exit(code)
+        os._exit(exit_code)
 
 
 def _collected() -> dict[str, io.StringIO]:
@@ -216,39 +226,44 @@ def _print_as_parent() -> None:
         and not isinstance(sys.stdout, io.StringIO)
         and sys.stdout.fileno() == 2
     ):
+        # 1 is stdout of C, 2 is stderr
         os.dup2(2, 1)
 
 
 def _sent(function: Callable[[], Any], variables: frozenset[str], limit: float | None) -> _Sent:
-    with warnings.catch_warnings(record=True) as said:
+    """Return what the function gave or raised in the fork, with the warnings that it gave."""
+    with warnings.catch_warnings(record=True) as caught_warnings:
         try:
-            return _Sent(_returned(function, variables, limit), None, said, {})
+            return _Sent(_returned(function, variables, limit), None, caught_warnings, {})
         except BaseException as error:
-            return _Sent(None, error, said, {})
+            return _Sent(None, error, caught_warnings, {})
 
 
 def _returned(
     function: Callable[[], Any], variables: frozenset[str], limit: float | None
 ) -> Returned[Any]:
+    """Call the function under the limits of memory; return its value, peak bytes and the
+    variables that it asked for in vain.
+    """
     with ExitStack() as stack:
         if limit is not None:
             stack.enter_context(limited(limit))
         stack.enter_context(guarded())
         stack.enter_context(refusing_allocations(True))
-        asked = hide_for_good(variables)
-        before = resident("VmRSS:")
+        asked_variables = hide_for_good(variables)
+        bytes_before = resident("VmRSS:")
         value = function()
-        highest = resident("VmHWM:")  # a fork begins to count anew
-    peak = None if before is None or highest is None else max(0, highest - before)
-    return Returned(value, peak, asked)
+        peak_bytes = resident("VmHWM:")  # a fork begins to count anew
+    peak = None if bytes_before is None or peak_bytes is None else max(0, peak_bytes - bytes_before)
+    return Returned(value, peak, asked_variables)
 
 
 def _write(sent: _Sent, file: int) -> int:
     """Write what the parent reads; return the exit code of the fork."""
-    plain = [_plain_warning(warning) for warning in sent.said]
+    plain_warnings = [_plain_warning(warning) for warning in sent.said]
     try:
         with open(file, "wb", closefd=False) as binary:
-            torch.save(sent._replace(said=plain), binary)
+            torch.save(sent._replace(said=plain_warnings), binary)
     except (
         Exception
     ):  # of the class of any value: it cannot be pickled, or does not fit into memory once more

@@ -55,12 +55,14 @@ def wanted(recipe: Recipe) -> tuple[str, ...]:
     all its inputs. The rival of a mask counts if the outputs tell how the mask protects and how the
     restored picture looks.
     """
-    asked = _asked(recipe)
+    needed_steps = _asked(recipe)
     errors = (
-        name for name in spectral_steps(recipe) if asked.issuperset(recipe.steps[name].sources)
+        name
+        for name in spectral_steps(recipe)
+        if needed_steps.issuperset(recipe.steps[name].sources)
     )
     numbers = (e.step for e in compared(recipe)[0])
-    return tuple(dict.fromkeys([*recipe.outputs, *numbers, *errors, *_rival(recipe, asked)]))
+    return tuple(dict.fromkeys([*recipe.outputs, *numbers, *errors, *_rival(recipe, needed_steps)]))
 
 
 def _rival(recipe: Recipe, asked: set[str]) -> Iterable[str]:
@@ -74,19 +76,20 @@ def _rival(recipe: Recipe, asked: set[str]) -> Iterable[str]:
 
 def shade_of(recipe: Recipe) -> str | None:
     """Return the step of the grey filter, stop or notch in the arm of the mask, or None."""
-    pupil = recipe.steps.get("pupil[mask]")
-    shade = pupil.wires.get("shade") if pupil else None
-    return shade if isinstance(shade, str) else None
+    pupil_step = recipe.steps.get("pupil[mask]")
+    source_step = pupil_step.wires.get("shade") if pupil_step else None
+    return source_step if isinstance(source_step, str) else None
 
 
 def compared(recipe: Recipe) -> tuple[list[Expectation], list[Expectation]]:
     """Return the expected numbers that a run compares, and the others, whose steps no output of
     the recipe needs.
     """
-    asked = _asked(recipe)
+    needed_steps = _asked(recipe)
     numbers: tuple[list[Expectation], list[Expectation]] = ([], [])
     for number in recipe.expect:
-        numbers[number.step not in asked].append(number)
+        # False is 0, the list of those that are compared; True is 1
+        numbers[number.step not in needed_steps].append(number)
     return numbers
 
 

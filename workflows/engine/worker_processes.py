@@ -40,11 +40,11 @@ def deaf_fork() -> Iterator[None]:
     """Hold Ctrl-C back while the ``with`` block forks, so that it reaches the fork only after
     `ignore_interrupts`.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    signals_before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, signals_before)
 
 
 def ignore_interrupts() -> None:
@@ -103,14 +103,15 @@ def shared_in_order(work: Callable[[int], T], count: int, workers: int) -> Itera
     """Yield ``work(number)`` for each number below ``count``, in order; this process does what
     no worker finished.
     """
-    done, due = dict[int, tuple[T] | None](), 0
+    results, next_number = dict[int, tuple[T] | None](), 0
     with closing(shared(work, range(count), workers)) as ended:
         for number, value in ended:
-            done[number] = value
-            while due in done:
-                ready = done.pop(due)
-                yield ready[0] if ready else work(due)
-                due += 1
+            results[number] = value
+            # results wait until all before them are there
+            while next_number in results:
+                result = results.pop(next_number)
+                yield result[0] if result else work(next_number)
+                next_number += 1
 
 
 class _Team(Generic[T]):
@@ -120,8 +121,13 @@ class _Team(Generic[T]):
         self, work: Callable[[int], T], order: Sequence[int], workers: int, apart: bool
     ) -> None:
         self._work = work
-        runs, size = workers if apart else 1, len(order)
-        self._left = [deque(order[i * size // runs : (i + 1) * size // runs]) for i in range(runs)]
+        run_count, piece_count = workers if apart else 1, len(order)
+        # equal runs of neighbours
+        # pieces that nobody has: a common list, or one for each worker
+        self._left = [
+            deque(order[i * piece_count // run_count : (i + 1) * piece_count // run_count])
+            for i in range(run_count)
+        ]
         self._lost = deque[int]()  # pieces for the caller
         # by pipe: the worker's index, and the piece that it has
         self._now: dict[Connection, tuple[int, int]] = {}
@@ -134,6 +140,7 @@ class _Team(Generic[T]):
         while self._now or self._lost or any(self._left):
             while self._lost:
                 yield self._lost.popleft(), None
+            # the workers that have an answer
             for pipe in wait(list(self._now)) if self._now else ():
                 assert isinstance(pipe, Connection)
                 yield self._result(pipe)
@@ -145,6 +152,7 @@ class _Team(Generic[T]):
         """Return the piece of work that a worker had and its result, and hand it the next one."""
         index, number = self._now.pop(pipe)
         answer = self._answer(pipe)
+        # the worker has ended: its piece is left to the caller
         if answer is None:
             return number, None
         self._hand(index, pipe)
@@ -155,15 +163,18 @@ class _Team(Generic[T]):
         for pipe in self._pipes:
             pipe.close()
         for process in self._processes:
+            # idle workers end by themselves when their pipe closes
             process.join(0.0 if self._now else 0.5)
             if process.is_alive():
                 process.kill()
                 process.join()
 
     def _begin(self, index: int) -> None:
+        """Start a worker and hand it its first piece; without memory for it, nothing happens."""
         context = multiprocessing.get_context("fork")
-        mine, theirs = context.Pipe()
-        arguments = (theirs, [*self._pipes, mine], self._work, os.getpid())
+        own_end, worker_end = context.Pipe()
+        # with the ends of this process, which the worker closes
+        arguments = (worker_end, [*self._pipes, own_end], self._work, os.getpid())
         process = context.Process(
             target=_serve, args=arguments, name=f"neusee worker {index}", daemon=True
         )
@@ -173,39 +184,42 @@ class _Team(Generic[T]):
                 warnings.simplefilter("ignore", DeprecationWarning)
                 process.start()
         except OSError:  # no memory or no permission: the others do the work, or this process
-            mine.close()
+            own_end.close()
             return
         finally:
-            theirs.close()
+            worker_end.close()
         self._processes.append(process)
-        self._pipes.append(mine)
-        self._hand(index, mine)
+        self._pipes.append(own_end)
+        self._hand(index, own_end)
 
     def _hand(self, index: int, pipe: Connection) -> None:
         """Give a worker the next piece of its own run, or the last piece of the longest other
         run.
         """
-        own = self._left[min(index, len(self._left) - 1)]
-        run = own or max(self._left, key=len)
+        # one common run if they are not apart
+        own_run = self._left[min(index, len(self._left) - 1)]
+        run = own_run or max(self._left, key=len)
         if run:
-            number = run.popleft() if run is own else run.pop()
+            # from another's run the last piece, which is the farthest from its present one
+            piece = run.popleft() if run is own_run else run.pop()
             try:
-                pipe.send(number)
+                pipe.send(piece)
             except OSError:
-                self._lost.append(number)
+                self._lost.append(piece)
             else:
-                self._now[pipe] = index, number
+                self._now[pipe] = index, piece
 
     def _answer(self, pipe: Connection) -> tuple[tuple[T] | None] | None:
         """Return the answer of a worker, with None in it for a piece that failed; None if the
         worker has ended.
         """
         try:
-            value, said = pickle.loads(pipe.recv_bytes())
+            value, given_warnings = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError, pickle.UnpicklingError):
             return None
-        for text, category in said:
+        for text, category in given_warnings:
             warnings.warn(text, category, stacklevel=2)
+        # in a tuple, because the value may be None
         return (value,)
 
 
@@ -213,8 +227,8 @@ def _serve(
     pipe: Connection, others: Sequence[Connection], work: Callable[[int], T], parent: int
 ) -> None:
     """Do the pieces of work that the pipe names, until its other end closes."""
-    for other in others:
-        other.close()  # else the pipes of a killed process stay open
+    for other_pipe in others:
+        other_pipe.close()  # else the pipes of a killed process stay open
     ignore_interrupts()
     if not end_with(parent):
         return
@@ -229,13 +243,13 @@ def _done(work: Callable[[int], T], number: int) -> bytes:
     """Return a pickled piece of work with the warnings that it gave, or None in its place if it
     failed.
     """
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as given_warnings:
         warnings.simplefilter("default")
         try:
             value: tuple[T] | None = (work(number),)
         except BaseException:  # the parent does this piece, and meets the error again
             value = None
-    messages = [(str(warning.message), warning.category) for warning in said]
+    messages = [(str(warning.message), warning.category) for warning in given_warnings]
     try:
         return pickle.dumps((value, messages if value else []), protocol=5)
     except Exception:  # a result that cannot be sent

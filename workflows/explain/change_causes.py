@@ -37,19 +37,20 @@ def edits(root: Path, old: str, new: str) -> list[str]:
     """Return one text clause for each definition that differs between two versions of code; []
     if no record exists.
     """
-    before, after = read_parts(root, old), read_parts(root, new)
-    if not before or not after:
+    old_parts, new_parts = read_parts(root, old), read_parts(root, new)
+    if not old_parts or not new_parts:
         return []
-    source = _edited_modules(before, after)
-    beside: list[str] = []
-    for name in dict.fromkeys([*after, *before]):
+    source_clauses = _edited_modules(old_parts, new_parts)
+    other_clauses: list[str] = []
+    for name in dict.fromkeys([*new_parts, *old_parts]):
         if not _is_module(name) and not name.startswith(_STATE):
-            beside += _beside(name, before.get(name, {}), after.get(name, {}))
-    return source + beside or [
+            other_clauses += _beside(name, old_parts.get(name, {}), new_parts.get(name, {}))
+    # a changed value is told only where nothing else explains it
+    return source_clauses + other_clauses or [
         f"a value that {_file(name.removeprefix(_STATE))} holds was changed while the program ran:"
         " a constant, a table, a default or a function"
-        for name in after
-        if name.startswith(_STATE) and before.get(name, after[name]) != after[name]
+        for name in new_parts
+        if name.startswith(_STATE) and old_parts.get(name, new_parts[name]) != new_parts[name]
     ]
 
 
@@ -59,17 +60,27 @@ def _edited_modules(
     """Return one text clause for each definition that differs, and for each module that is imported
     now, or no longer.
     """
-    now, then = list(filter(_is_module, after)), list(filter(_is_module, before))
-    inside: list[str] = []
-    for name in now:
+    new_modules, old_modules = list(filter(_is_module, after)), list(filter(_is_module, before))
+    definition_clauses: list[str] = []
+    for name in new_modules:
         if name in before:
-            inside += _inside(name, before[name], after[name])
-    came = [f"{_file(name)} is imported now" for name in now if name not in before]
-    removed = [f"{_file(name)} is no longer imported" for name in then if name not in after]
-    return sorted(inside, key=lambda text: text.startswith("the ")) + came + removed
+            definition_clauses += _inside(name, before[name], after[name])
+    import_clauses = [
+        f"{_file(name)} is imported now" for name in new_modules if name not in before
+    ]
+    removal_clauses = [
+        f"{_file(name)} is no longer imported" for name in old_modules if name not in after
+    ]
+    # named functions and constants before "the imports" and "the other statements"
+    return (
+        sorted(definition_clauses, key=lambda text: text.startswith("the "))
+        + import_clauses
+        + removal_clauses
+    )
 
 
 def _is_module(name: str) -> bool:
+    """Return True if a part of a digest is that of a module, by its name."""
     return all(word.isidentifier() for word in name.split(".")) and name not in _OTHER
 
 
@@ -86,8 +97,10 @@ def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
 
 
 def _other_setting(label: str, old: dict[str, str], new: dict[str, str]) -> str:
-    before, after = old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label))
-    return f"{label} {before} -> {after}, a setting of this process"
+    """Return the text clause for a setting of the process that differs."""
+    # a setting that is not recorded has its usual value
+    old_value, new_value = old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label))
+    return f"{label} {old_value} -> {new_value}, a setting of this process"
 
 
 def _other_cause(name: str, old: dict[str, str], new: dict[str, str]) -> str:
@@ -115,15 +128,20 @@ def _other_version(name: str, before: str | None, after: str | None) -> str:
 def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     """Return one text clause for each changed, added or removed definition of a module."""
     file = _file(module)
-    differ = [label for label in new if label in old and old[label] != new[label]]
-    lines = _lines(module) if differ else {}
-    changed = [_changed_definition(label, file, lines.get(label)) for label in differ]
-    added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
-    removed = [f"{_named(label)} was removed from {file}" for label in old if label not in new]
-    return changed + added + removed
+    changed_labels = [label for label in new if label in old and old[label] != new[label]]
+    lines = _lines(module) if changed_labels else {}
+    change_clauses = [
+        _changed_definition(label, file, lines.get(label)) for label in changed_labels
+    ]
+    addition_clauses = [f"{_named(label)} was added to {file}" for label in new if label not in old]
+    removal_clauses = [
+        f"{_named(label)} was removed from {file}" for label in old if label not in new
+    ]
+    return change_clauses + addition_clauses + removal_clauses
 
 
 def _changed_definition(label: str, file: str, line: int | None) -> str:
+    """Return the text clause for a definition that changed, with its line."""
     definition = f"code of {label}" if label.endswith("()") else _named(label)
     return f"{definition} in {file} changed{f' (line {line})' if line is not None else ''}"
 
@@ -149,6 +167,7 @@ def _labels_of(item: ast.stmt) -> list[str]:
         return [f"class {item.name}"]
     if isinstance(item, ast.FunctionDef):
         hooks = [ast.unparse(decorator) for decorator in item.decorator_list]
+        # a hook is a function `_` with a decorator such as `@psf.check`
         return [f"{name}()" for name in (hooks if item.name == "_" and hooks else [item.name])]
     targets = item.targets if isinstance(item, ast.Assign) else []
     return [f"constant {target.id}" for target in targets if isinstance(target, ast.Name)]
@@ -164,9 +183,10 @@ def _named(label: str) -> str:
 
 
 def _file(module: str) -> str:
+    """Return the path of the file of a module, such as ``neusee/nodes/optics/psf.py``."""
     path = source_file(module)
-    package = path is not None and path.name == "__init__.py"
-    return module.replace(".", "/") + ("/__init__.py" if package else ".py")
+    is_package = path is not None and path.name == "__init__.py"
+    return module.replace(".", "/") + ("/__init__.py" if is_package else ".py")
 
 
 # --- change wording -------------------------------------------------------------------------------
@@ -191,8 +211,11 @@ class Wording:
         ``label``.
         """
         step = self._recipe.steps.get(label) if self._recipe else None
-        names = [n for n in dict.fromkeys([*old, *new]) if old.get(n) != new.get(n)]
-        return [self._param(step, n, old.get(n, _ABSENT), new.get(n, _ABSENT)) for n in names]
+        names = [name for name in dict.fromkeys([*old, *new]) if old.get(name) != new.get(name)]
+        return [
+            self._param(step, name, old.get(name, _ABSENT), new.get(name, _ABSENT))
+            for name in names
+        ]
 
     def source(self, *path: str) -> str:
         """Return the location of a value in the recipe, such as `` (recipe.yaml:3:7)``, or an
@@ -202,19 +225,20 @@ class Wording:
         return f" ({setting.source})" if setting else ""
 
     def _param(self, step: Step | None, name: str, old: Any, new: Any) -> str:
+        """Return the text clause for one parameter that differs."""
         if new is _ABSENT:
             return f"{name} is no longer a parameter"
         setting, source = self._setting(step, name)
         path = ".".join(map(str, setting.path)) if setting else name
-        where = f" ({source})" if source else ""
+        place = f" ({source})" if source else ""
         if isinstance(new, Mapping) and "file" in new:
-            inside = f" ({path}{f', {source}' if source else ''})" if setting else where
-            return f"file {_file_wording(step, name)}: {_other_file(old, new)}{inside}"
-        written = _written_value(setting)
+            place_of_value = f" ({path}{f', {source}' if source else ''})" if setting else place
+            return f"file {_file_wording(step, name)}: {_other_file(old, new)}{place_of_value}"
+        written_value = _written_value(setting)
         if old is _ABSENT:
-            return f"{path} is new: {_as_written(written, new)}{where}"
-        before, after = _both(written, old, new)
-        return f"{path} {before} -> {after}{where}"
+            return f"{path} is new: {_as_written(written_value, new)}{place}"
+        old_text, new_text = _both(written_value, old, new)
+        return f"{path} {old_text} -> {new_text}{place}"
 
     def _setting(self, step: Step | None, name: str) -> tuple[Setting | None, str]:
         """Return the recipe setting that gives a parameter its value, or None, and the location
@@ -240,10 +264,11 @@ class Wording:
 
 def _setting_of(marked: list[Setting], step: Step, name: str) -> Setting | None:
     """Return which of the settings at one location gives the parameter ``name`` its value."""
-    here = ("steps", step.name.partition("[")[0], "with", name)
-    of_step = [setting for setting in marked if setting.path == here]
-    named = of_step or [setting for setting in marked if setting.path[-1:] == (name,)]
-    return (named or marked)[0] if named or len(marked) == 1 else None
+    recipe_path = ("steps", step.name.partition("[")[0], "with", name)
+    of_step = [setting for setting in marked if setting.path == recipe_path]
+    candidates = of_step or [setting for setting in marked if setting.path[-1:] == (name,)]
+    # a single setting at the place gives the value, whatever its name
+    return (candidates or marked)[0] if candidates or len(marked) == 1 else None
 
 
 def _written_value(setting: Setting | None) -> Any:
@@ -254,11 +279,13 @@ def _written_value(setting: Setting | None) -> Any:
 
 
 def _file_wording(step: Step | None, name: str) -> str:
+    """Return the name of the file in a parameter, or the name of the parameter."""
     value = step.params.get(name) if step else None
     return value.name if isinstance(value, Path) else name
 
 
 def _other_file(old: Any, new: Mapping[str, Any]) -> str:
+    """Return how a parameter with a file differs from before."""
     if not isinstance(old, Mapping) or "file" not in old:
         return "is given now"
     return (
@@ -270,31 +297,44 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
     """Return the old and the new value of a parameter as text, both in the unit of the new
     value.
     """
-    after = _as_written(written, new)
+    new_text = _as_written(written, new)
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        return _parts_in_units_of(written, new, old), after
+        return _parts_in_units_of(written, new, old), new_text
     if isinstance(old, Mapping) and isinstance(new, Mapping):
+        # the entries that differ, of mappings
         return _items(old, new)
-    unit = _unit(written, new)
-    before = spoken(unit[0](old)) if unit and _is_number(old) else spoken(old)
+    # (function from SI units, name of the unit)
+    conversion_and_unit = _unit(written, new)
+    old_text = (
+        spoken(conversion_and_unit[0](old))
+        if conversion_and_unit and _is_number(old)
+        else spoken(old)
+    )
     # the values differ by less than the shown digits
-    if before in (spoken(new), after.partition(" ")[0]):
+    if old_text in (spoken(new), new_text.partition(" ")[0]):
         return repr(old), repr(new)
-    return before, after
+    return old_text, new_text
 
 
 def _parts_in_units_of(written: Any, new: list[Any], old: list[Any]) -> str:
-    is_alike = isinstance(written, list) and len(written) == len(old)
-    parts = written if is_alike else [None] * len(old)
-    return f"[{', '.join(map(_in_unit_of, parts, new, old))}]"
+    """Return the old list as text, each item in the unit in which the new one was written."""
+    has_all_items = isinstance(written, list) and len(written) == len(old)
+    written_items = written if has_all_items else [None] * len(old)
+    return f"[{', '.join(map(_in_unit_of, written_items, new, old))}]"
 
 
 def _in_unit_of(written: Any, new: Any, old: Any) -> str:
-    unit = _unit(written, new)
-    return f"{spoken(unit[0](old))} {unit[1]}" if unit and _is_number(old) else spoken(old)
+    """Return an old value as text in the unit in which the new one was written."""
+    conversion_and_unit = _unit(written, new)
+    return (
+        f"{spoken(conversion_and_unit[0](old))} {conversion_and_unit[1]}"
+        if conversion_and_unit and _is_number(old)
+        else spoken(old)
+    )
 
 
 def _is_number(value: Any) -> bool:
+    """Return True for a number that is no truth value."""
     return isinstance(value, float | int) and not isinstance(value, bool)
 
 
@@ -302,11 +342,19 @@ def _items(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
     """Return two texts: the entries that only the old mapping has, and the entries that only the
     new mapping has.
     """
-    pairs = [[(str(key), value) for key, value in m.get("items", ())] for m in (old, new)]
-    only = [
-        [f"{k}: {spoken(v)}" for k, v in pairs[i] if (k, v) not in pairs[1 - i]] for i in (0, 1)
+    old_and_new_pairs = [
+        [(str(key), value) for key, value in mapping.get("items", ())] for mapping in (old, new)
     ]
-    return f"{{{', '.join(only[0])}}}", f"{{{', '.join(only[1])}}}"
+    # 0 is the old mapping, 1 the new one
+    only_in_one = [
+        [
+            f"{k}: {spoken(v)}"
+            for k, v in old_and_new_pairs[i]
+            if (k, v) not in old_and_new_pairs[1 - i]
+        ]
+        for i in (0, 1)
+    ]
+    return f"{{{', '.join(only_in_one[0])}}}", f"{{{', '.join(only_in_one[1])}}}"
 
 
 def _as_written(written: Any, new: Any) -> str:
@@ -325,10 +373,13 @@ def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None
     match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
     if match is None or not _is_number(new):
         return None
+    # a gain is stored as its inverse
     if match[2].strip() == "e-/DN":
         return (lambda si: 1.0 / si if si else math.inf), match[2]
+    # the written number tells the factor of its unit
     if new and float(match[1]):
         return _times(float(match[1]) / new), match[2]
+    # of a value 0, the unit alone tells it
     for si in ("m", "s", "rad", "K", "e-", "waves", "DN/e-"):
         with suppress(ValueError):
             return _times(1.0 / read_quantity(f"1 {match[2]}", si)), match[2]
@@ -336,6 +387,7 @@ def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None
 
 
 def _times(factor: float) -> Callable[[float], float]:
+    """Return a function that multiplies by a factor."""
     return lambda si: si * factor
 
 
@@ -389,15 +441,16 @@ class Roots:
         """Return the names of the steps from the compared step to the step with the cause
         ``text``.
         """
-        way: list[str] = []
+        labels: list[str] = []
         pair: Pair | None = self.found[text]
         while pair is not None:
-            way.append(pair.label)
+            labels.append(pair.label)
             pair = self.above[pair]
-        return way[::-1]
+        return labels[::-1]
 
 
 def _only_in(names: Iterable[str], others: Container[str]) -> list[str]:
+    """Return the names that are not among the others."""
     return [name for name in names if name not in others]
 
 
@@ -427,20 +480,23 @@ class Comparison:
         """Return the root causes of the change of a result, or None if there are more than
         ``limit`` causes.
         """
-        above: dict[Pair, Pair | None] = {start: None}
-        pairs: dict[str, Pair] = {}
-        todo = [start]
-        for pair in todo:  # the list grows during the loop, so that the nearest pairs come first
-            texts, below = self.compare(pair)
+        pair_above: dict[Pair, Pair | None] = {start: None}
+        pair_of_cause: dict[str, Pair] = {}
+        pairs_to_compare = [start]
+        for pair in (
+            pairs_to_compare
+        ):  # the list grows during the loop, so that the nearest pairs come first
+            texts, input_pairs = self.compare(pair)
             for text in texts:
-                pairs.setdefault(text, pair)
-            if len(pairs) > limit:
+                pair_of_cause.setdefault(text, pair)
+            # too many: another earlier result is nearer
+            if len(pair_of_cause) > limit:
                 return None
-            for other in below:
-                if other not in above:
-                    above[other] = pair
-                    todo.append(other)
-        return Roots(pairs, above)
+            for input_pair in input_pairs:
+                if input_pair not in pair_above:
+                    pair_above[input_pair] = pair
+                    pairs_to_compare.append(input_pair)
+        return Roots(pair_of_cause, pair_above)
 
     def compare(self, pair: Pair) -> Found:
         """Return the differences between two results of a step, and the pairs of their inputs
@@ -455,22 +511,23 @@ class Comparison:
         random stream.
         """
         if old["node"] != new["node"]:
-            where = self.wording.source("steps", label.partition("[")[0], "node")
-            return [f"{old['node']} -> {new['node']}{where}"]
-        texts = self.wording.params(label, old["params"], new["params"])
-        if not texts and old.get("written") != new.get("written"):
-            texts = ["a file of a parameter has another name, or a mapping another order"]
+            place = self.wording.source("steps", label.partition("[")[0], "node")
+            return [f"{old['node']} -> {new['node']}{place}"]
+        clauses = self.wording.params(label, old["params"], new["params"])
+        # names of files and the order of mappings count for nodes of users
+        if not clauses and old.get("written") != new.get("written"):
+            clauses = ["a file of a parameter has another name, or a mapping another order"]
         if old["code"] != new["code"]:
             private = [
                 f"the loaded code of {new['node']} is not that of its file any more: restart Python"
             ]
-            texts += (
+            clauses += (
                 private
                 if is_private(new["code"])
                 else self._edited(old["code"], new["code"])
                 or [f"the code of {new['node']} changed"]
             )
-        return texts + self._stream(old.get("stream"), new.get("stream"))
+        return clauses + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:
         """Return the parts of a cache key, from the recipe or from the store, or None if the key
@@ -485,29 +542,36 @@ class Comparison:
         return self.resolved.makers.get(key) or (self.about(key) or {}).get("step")
 
     def _compare(self, pair: Pair) -> Found:
-        old, new = self.origin(pair.old), self.origin(pair.new)
-        if old is None or new is None:
+        """Return what `compare` returns, from the parts of both keys."""
+        old_origin, new_origin = self.origin(pair.old), self.origin(pair.new)
+        if old_origin is None or new_origin is None:
             return [
-                f"the {'earlier origin' if old is None else 'origin'} of {pair.label} is no longer"
-                " known"
+                f"the {'earlier origin' if old_origin is None else 'origin'} of {pair.label}"
+                " is no longer known"
             ], []
-        texts = self.own(pair.label, old, new)
-        if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
-            return texts, []
-        pairs: list[Pair] = []
-        for (path, labels), after, before in zip(
-            self._labels(pair, new), new["inputs"], old["inputs"], strict=True
+        causes = self.own(pair.label, old_origin, new_origin)
+        # inputs of different nodes cannot be compared one by one
+        if old_origin["node"] != new_origin["node"] or len(old_origin["inputs"]) != len(
+            new_origin["inputs"]
         ):
-            if after != before:
-                input_texts, behind = self._input(path, labels, _listed(after), _listed(before))
-                texts, pairs = texts + input_texts, pairs + behind
-        return texts, pairs
+            return causes, []
+        input_pairs: list[Pair] = []
+        for (path, labels), new_keys, old_keys in zip(
+            self._labels(pair, new_origin), new_origin["inputs"], old_origin["inputs"], strict=True
+        ):
+            if new_keys != old_keys:
+                input_texts, pairs_of_input = self._input(
+                    path, labels, _listed(new_keys), _listed(old_keys)
+                )
+                causes, input_pairs = causes + input_texts, input_pairs + pairs_of_input
+        return causes, input_pairs
 
     def _labels(self, pair: Pair, origin: Origin) -> list[tuple[tuple[str, ...], list[str]]]:
         """Return the path of each input in the recipe, and the names of the steps that this
         input reads.
         """
         step = self.recipe.steps.get(pair.label) if self.recipe else None
+        # a stored result of another recipe: its own record names the steps
         if step is None or self.resolved.keys.get(pair.label) != pair.new:
             return [
                 ((), [self.step(key) or "a step" for key in _listed(keys)])
@@ -516,8 +580,8 @@ class Comparison:
         path = ("steps", pair.label.partition("[")[0], "from")
         wires = [(name, _listed(step.wires.get(name))) for name in step.node.inputs]
         return [
-            ((*path, name), [self.resolved.stands_for(wire) for wire in wired])
-            for name, wired in wires
+            ((*path, name), [self.resolved.stands_for(wire) for wire in wired_steps])
+            for name, wired_steps in wires
         ]
 
     def _input(
@@ -526,13 +590,20 @@ class Comparison:
         """Return the differences between the new and the earlier steps that one input reads."""
         if len(new) == 1 and len(old) == 1:
             return self._source(path, labels[0], new[0], old[0])
-        then = dict(zip([self.step(key) or key for key in old], old, strict=True))
-        now = dict(zip(labels, new, strict=True))
-        has_names = len(then) == len(old) and not then.keys().isdisjoint(now)
+        old_key_of_step = dict(zip([self.step(key) or key for key in old], old, strict=True))
+        new_key_of_step = dict(zip(labels, new, strict=True))
+        # the earlier steps have different names, some of them known today
+        has_names = len(old_key_of_step) == len(old) and not old_key_of_step.keys().isdisjoint(
+            new_key_of_step
+        )
         if len(old) == len(new) and not has_names:
             return self._one_by_one(path, labels, new, old)
-        texts = self._joined(path, _only_in(now, then), _only_in(then, now))
-        pairs = _changed_pairs(now, then)
+        texts = self._joined(
+            path,
+            _only_in(new_key_of_step, old_key_of_step),
+            _only_in(old_key_of_step, new_key_of_step),
+        )
+        pairs = _changed_pairs(new_key_of_step, old_key_of_step)
         return texts or ([] if pairs else ["the order of its sources changed"]), pairs
 
     def _one_by_one(
@@ -541,9 +612,9 @@ class Comparison:
         """Return the differences of steps whose order tells which was which."""
         texts, pairs = list[str](), list[Pair]()
         for label, key, earlier in zip(labels, new, old, strict=True):
-            of_source = self._source(path, label, key, earlier)
-            texts += of_source[0]
-            pairs += of_source[1]
+            causes_and_pairs = self._source(path, label, key, earlier)
+            texts += causes_and_pairs[0]
+            pairs += causes_and_pairs[1]
         return texts, pairs
 
     def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
@@ -552,32 +623,41 @@ class Comparison:
         """
         if new == old:
             return [], []
-        was = self.step(old)
-        if was in (None, label, self.step(new)):
+        old_step = self.step(old)
+        if old_step in (None, label, self.step(new)):
             return [], [Pair(label, new, old)]
-        exchanged = f"reads {label}, not {was}{self._wired(path)}"
-        between, key = self._between(new, (was,))
+        exchange_clause = f"reads {label}, not {old_step}{self._wired(path)}"
+        # the earlier step is still upstream: steps were added in between
+        steps_between, key = self._between(new, (old_step,))
         if key is not None:
-            texts = _each_once(map(self._came, between), exchanged)
-            return texts, [Pair(str(was), key, old)] if key != old else []
-        between, key = self._between(old, (label, self.step(new)))
+            texts = _each_once(map(self._came, steps_between), exchange_clause)
+            return texts, [Pair(str(old_step), key, old)] if key != old else []
+        # the present step was upstream before: steps were removed in between
+        steps_between, key = self._between(old, (label, self.step(new)))
         if key is not None:
-            texts = _each_once(map(self._went, between), exchanged)
+            texts = _each_once(map(self._went, steps_between), exchange_clause)
             return texts, [Pair(label, new, key)] if key != new else []
-        before, after = self.origin(old), self.origin(new)
-        if before and after and before["node"] == after["node"]:
+        old_origin, new_origin = self.origin(old), self.origin(new)
+        # a step of the same node under another name
+        if old_origin and new_origin and old_origin["node"] == new_origin["node"]:
             return [], [Pair(label, new, old)]
-        return [exchanged], []
+        return [exchange_clause], []
 
     def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
         """Return one text clause for the added and one for the removed steps that an input
         reads.
         """
-        where = self._wired(path) if any("[" not in name for name in came) else ""
-        texts = [f"reads {_few(came)} now{where}"] if came else []
-        null = self.recipe.absent.get(went[0].partition("[")[0]) if went and self.recipe else None
+        # an item such as psf[mask] is not wired by hand
+        place_of_wire = self._wired(path) if any("[" not in name for name in came) else ""
+        texts = [f"reads {_few(came)} now{place_of_wire}"] if came else []
+        reason_absent = (
+            self.recipe.absent.get(went[0].partition("[")[0]) if went and self.recipe else None
+        )
         return (
-            [*texts, f"reads {_few(went)} no more{f': it is {null}' if null else ''}"]
+            [
+                *texts,
+                f"reads {_few(went)} no more{f': it is {reason_absent}' if reason_absent else ''}",
+            ]
             if went
             else texts
         )
@@ -588,22 +668,25 @@ class Comparison:
         """
         passed: list[str] = []
         for _ in range(_FAR):
-            first = next(iter((self.origin(key) or {}).get("inputs", ())), None)
-            if not isinstance(first, str):
+            first_input = next(iter((self.origin(key) or {}).get("inputs", ())), None)
+            if not isinstance(first_input, str):
                 break
+            # one step further upstream
             passed.append(self.step(key) or "a step")
-            key = first
+            key = first_input
             if self.step(key) in steps:
                 return passed, key
         return [], None
 
     def _came(self, name: str) -> str:
+        """Return why a step is no longer left out, or an empty text for one that never is."""
         if name not in self.resolved.verdicts:
             return ""
         verdict = self.resolved.verdicts[name]
         return f"{name} is no longer left out: {verdict.why if verdict else 'its inputs decide'}"
 
     def _went(self, name: str) -> str:
+        """Return why a step is left out now, or an empty text."""
         verdict = self.resolved.verdicts.get(name)
         return f"{name} is left out now: {verdict.why}" if verdict and verdict.left_out else ""
 
@@ -622,12 +705,15 @@ class Comparison:
                 else ["it draws noise now" if new else "it draws no noise any more"]
             )
         texts = (
+            # a stream is (seed, step, kind of device)
             f"seed {old[0]} -> {new[0]}{self.wording.source('seed')}",
             f"its noise uses the stream of {new[1]}, not of {old[1]}",
             f"its noise is drawn on {new[2]}, not on {old[2]}",
         )
         return [
-            text for text, before, after in zip(texts, old, new, strict=True) if before != after
+            text
+            for text, old_item, new_item in zip(texts, old, new, strict=True)
+            if old_item != new_item
         ]
 
 
@@ -638,6 +724,7 @@ def _few(names: list[str]) -> str:
 
 
 def _listed(value: Any) -> list[Any]:
+    """Return a value or a list of values as a list; None is an empty one."""
     if value is None:
         return []
     return [value] if isinstance(value, str) else list(value)

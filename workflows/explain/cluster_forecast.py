@@ -26,27 +26,38 @@ def cluster_lines(
     The seconds on a device are the measured seconds on the CPU, divided by the relative speed of
     the device.
     """
-    devices, alone = len(machines.devices), sum(cost.seconds["cpu"] for cost in estimates.values())
+    # s on the machine where the steps were measured
+    device_count, sequential_seconds = (
+        len(machines.devices),
+        sum(cost.seconds["cpu"] for cost in estimates.values()),
+    )
     head = (
-        f"{_count(len(estimates), 'step')} on {_count(devices, 'device')}:"
+        f"{_count(len(estimates), 'step')} on {_count(device_count, 'device')}:"
         f" {machines.title or 'no title'}"
     )
     try:
         schedule = simulated(recipe, estimates, machines)
     except TooLarge as error:
         return [head, f"refused: {error}", *_guesses(estimates)]
-    faster = f": {alone / schedule.makespan:.3g} times as long" if schedule.makespan else ""
-    sent = f"{format_size(schedule.transferred)} in {_count(len(schedule.moves), 'copy', 'copies')}"
-    cut = ", ".join(f"{slot.task} ({slot.parts})" for slot in schedule.slots if slot.parts > 1)
+    ratio_text = (
+        f": {sequential_seconds / schedule.makespan:.3g} times as long" if schedule.makespan else ""
+    )
+    transfer_text = (
+        f"{format_size(schedule.transferred)} in {_count(len(schedule.moves), 'copy', 'copies')}"
+    )
+    # steps that are computed band by band, with the number of parts
+    parts_text = ", ".join(
+        f"{slot.task} ({slot.parts})" for slot in schedule.slots if slot.parts > 1
+    )
     return [
         head,
         "",
         (
             f"makespan     {_time(schedule.makespan)}; where they were measured, one after another,"
-            f" {_time(alone)}{faster}"
+            f" {_time(sequential_seconds)}{ratio_text}"
         ),
-        f"transferred  {sent}",
-        *([f"in parts     {cut}"] if cut else []),
+        f"transferred  {transfer_text}",
+        *([f"in parts     {parts_text}"] if parts_text else []),
         "",
         *_devices(schedule, machines),
         "",
@@ -70,12 +81,18 @@ def simulated(recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machi
 
 
 def _task(step: Step, cost: Estimate, among: Mapping[str, Estimate], machines: Machines) -> Task:
+    """Return a step as the schedule sees it: its sources, seconds on each device that may run
+    it, and bytes.
+    """
     hint = step.device or step.node.device
     allowed = [
-        d for d in machines.devices if fits(d.name.rpartition("/")[2], d.kind, hint)
+        device
+        for device in machines.devices
+        if fits(device.name.rpartition("/")[2], device.kind, hint)
     ] or machines.devices
     seconds = {
-        d.name: cost.seconds["cpu"] / machines.speed(d.name, step.node.path) for d in allowed
+        device.name: cost.seconds["cpu"] / machines.speed(device.name, step.node.path)
+        for device in allowed
     }
     sources = tuple(dict.fromkeys(name for name in step.sources if name in among))
     return Task(step.name, sources, seconds, cost.bytes, cost.work, parts_of(step, cost))
@@ -85,39 +102,49 @@ def _devices(schedule: Schedule, machines: Machines) -> list[str]:
     """Return one text line for each device: busy fraction of the makespan, number of steps and
     peak memory.
     """
-    shares, steps = schedule.utilisation(), Counter(slot.device for slot in schedule.slots)
+    busy_shares, step_counts = (
+        schedule.utilisation(),
+        Counter(slot.device for slot in schedule.slots),
+    )
     rows = [
         [
-            d.name,
-            f"{shares[d.name]:.0%}",
-            str(steps[d.name]),
-            format_size(schedule.peak[d.name]),
-            format_size(d.memory),
+            device.name,
+            f"{busy_shares[device.name]:.0%}",
+            str(step_counts[device.name]),
+            format_size(schedule.peak[device.name]),
+            format_size(device.memory),
         ]
-        for d in machines.devices
+        for device in machines.devices
     ]
-    mean = sum(shares.values()) / len(shares)
+    # over all devices
+    mean_share = sum(busy_shares.values()) / len(busy_shares)
     table = columns([["device", "busy", "steps", "memory", "of"], *rows], ">")
-    return [*table, f"the devices are busy {mean:.0%} of the time on average"]
+    return [*table, f"the devices are busy {mean_share:.0%} of the time on average"]
 
 
 def _path(schedule: Schedule) -> list[str]:
     """Return a table of the critical path, shortened in the middle if the path is long."""
     path = schedule.critical_path()
-    busy = sum(slot.end - slot.start for slot in path)
+    busy_seconds = sum(slot.end - slot.start for slot in path)
     wait = f" of {_time(schedule.makespan)}; the rest is waiting for data or memory"
-    share = wait if busy < 0.999 * schedule.makespan else ""
-    times = [
+    wait_text = wait if busy_seconds < 0.999 * schedule.makespan else ""
+    row_of_slot = [
         [slot.task, slot.device, _time(slot.start), _time(slot.end - slot.start)] for slot in path
     ]
-    rows = [["critical path", "device", "at", "takes"], *times]
+    rows = [["critical path", "device", "at", "takes"], *row_of_slot]
     if len(path) > _SHOWN:
-        half = _SHOWN // 2
-        rows = [*rows[: half + 1], [f"… {len(path) - _SHOWN} more …", "", "", ""], *rows[-half:]]
-    return [*columns(rows), f"{_count(len(path), 'step')} on it, {_time(busy)}{share}"]
+        half_count = _SHOWN // 2
+        # one more at the front: the head of the table
+        rows = [
+            *rows[: half_count + 1],
+            [f"… {len(path) - _SHOWN} more …", "", "", ""],
+            *rows[-half_count:],
+        ]
+    return [*columns(rows), f"{_count(len(path), 'step')} on it, {_time(busy_seconds)}{wait_text}"]
 
 
 def _guesses(estimates: Mapping[str, Estimate]) -> list[str]:
+    """Return lines with the steps whose costs are guesses; none if all were measured."""
     names = [name for name, cost in estimates.items() if not cost.known]
     if not names:
         return []
@@ -126,8 +153,10 @@ def _guesses(estimates: Mapping[str, Estimate]) -> list[str]:
 
 
 def _time(seconds: float) -> str:
+    """Return a time as text in s or ms."""
     return f"{seconds:.3g} s" if seconds >= 1 or seconds == 0 else f"{seconds * 1e3:.3g} ms"
 
 
 def _count(number: int, singular: str, many: str = "") -> str:
+    """Return a number with its noun as text, such as ``3 steps``."""
     return f"{number} {singular if number == 1 else many or singular + 's'}"

@@ -54,7 +54,8 @@ def forecast_rows(plan: Plan, store: Store) -> list[Row]:
 
 
 def _row(name: str, plan: Plan, store: Store) -> Row:
-    step, about = plan.recipe.steps[name], store.about(plan.keys[name])
+    """Return what is expected of one step, as `forecast_rows` does."""
+    step, metadata = plan.recipe.steps[name], store.about(plan.keys[name])
     row: Row = {
         "step": name,
         "node": step.node.path,
@@ -67,27 +68,33 @@ def _row(name: str, plan: Plan, store: Store) -> Row:
     if plan.left_out.get(name):
         return row | {"state": "left out"}
     if name in plan.expected:
-        where = plan.lanes.get(name, "?")
-        return row | {"state": "run", "where": where, **_costs(plan.expected[name], where)}
+        # "?": not placed, because the memory is too small
+        lane = plan.lanes.get(name, "?")
+        return row | {"state": "run", "where": lane, **_costs(plan.expected[name], lane)}
     state = "run" if name in plan.awake else "not needed"
     if store.has(plan.keys[name]):
         state = "stored"
-    measured = (
-        {"seconds": _ranged(about["seconds"], Range()), "bytes": about["bytes"]} if about else {}
+    measured_costs = (
+        {"seconds": _ranged(metadata["seconds"], Range()), "bytes": metadata["bytes"]}
+        if metadata
+        else {}
     )
-    return row | {"state": state, **measured}
+    return row | {"state": state, **measured_costs}
 
 
 def _costs(cost: Estimate, where: str) -> Row:
+    """Return seconds, bytes and memory of a step that will run, with their ranges."""
     seconds = cost.seconds.get(device_kind(where), cost.seconds["cpu"])
-    memory, time = cost.spread
-    peak = _ranged(cost.peak, memory)
+    memory_range, time_range = cost.spread
+    peak = _ranged(cost.peak, memory_range)
+    # the result itself must fit
     peak["least"] = max(peak["least"], cost.bytes)
-    fields = {"seconds": _ranged(seconds, time), "bytes": cost.bytes, "memory": peak}
-    return fields | {"guess": not cost.known, "bytes_guessed": not cost.sized}
+    cost_fields = {"seconds": _ranged(seconds, time_range), "bytes": cost.bytes, "memory": peak}
+    return cost_fields | {"guess": not cost.known, "bytes_guessed": not cost.sized}
 
 
 def _ranged(expected: float, around: Range) -> dict[str, float]:
+    """Return an expected value with the least and the largest one."""
     return {"expected": expected, "least": expected * around.least, "most": expected * around.most}
 
 
@@ -102,10 +109,12 @@ def table_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
+    """Return one step as a row of the table."""
     state = row["where"] or row["state"]
     seconds, memory = row["seconds"], row["memory"]
     size = "" if row["bytes"] is None else format_size(row["bytes"])
     if row["guess"]:
+        # the upper end of each guess
         size = f"guess <{size}" if row["bytes_guessed"] else size
         return [
             row["step"],
@@ -135,6 +144,7 @@ def memory_text(cost: Mapping[str, float]) -> str:
     if cost["expected"] < _SMALL:
         return f"<{format_size(_SMALL)}"
     text = format_size(cost["expected"])
+    # the range is in the unit of the text
     return text if cost["expected"] < _SURE else f"{text}{_between(cost, UNITS[text.split()[1]])}"
 
 
@@ -188,11 +198,16 @@ def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
     files. ``limit`` is the memory (bytes) that the process may use; with 0 no file is made beside
     the run.
     """
-    large, room, largest_shown = min(LARGE, limit / 32), min(ROOM, limit / 16), limit / 16
+    # bytes: of a result that waits with others, of all that wait, of a result that waits alone
+    largest_small, room_for_small, largest_shown = (
+        min(LARGE, limit / 32),
+        min(ROOM, limit / 16),
+        limit / 16,
+    )
     sizes = [costs.size_of(name) for name in shown_steps(recipe) if name not in wanted(recipe)]
-    small = sum(size for size in sizes if size <= large)
-    return min(small, room) + max(
-        (size for size in sizes if large < size <= largest_shown), default=0.0
+    small_bytes = sum(size for size in sizes if size <= largest_small)
+    return min(small_bytes, room_for_small) + max(
+        (size for size in sizes if largest_small < size <= largest_shown), default=0.0
     )
 
 
@@ -211,10 +226,15 @@ def report_peak(
     running: the predicted peak memory of this process while the steps run.
     """
     schedule = prepare(works, costs, {}, lanes, list(keys.values())).schedule if works else None
-    made = max(schedule.peak.values(), default=0.0) if schedule else 0.0
-    held = max((lane.held for lane in lanes.values()), default=0.0) or program_memory()
-    shown = COPIES * shown_at_once(recipe, costs)
-    return held + DRAWING + HELD_BACK * max(0.0, running - held) + max(made, shown)
+    making_peak = max(schedule.peak.values(), default=0.0) if schedule else 0.0
+    program_bytes = max((lane.held for lane in lanes.values()), default=0.0) or program_memory()
+    shown_bytes = COPIES * shown_at_once(recipe, costs)
+    return (
+        program_bytes
+        + DRAWING
+        + HELD_BACK * max(0.0, running - program_bytes)
+        + max(making_peak, shown_bytes)
+    )
 
 
 def shown_at_once(recipe: Recipe, costs: Costs) -> float:
@@ -226,24 +246,30 @@ def shown_at_once(recipe: Recipe, costs: Costs) -> float:
     """
     largest = 0.0
     for groups in _jobs(recipe):
-        uses, in_memory = Counter(chain.from_iterable(groups)), set(recipe.outputs)
+        uses_left, in_memory = Counter(chain.from_iterable(groups)), set(recipe.outputs)
         for group in groups:
             in_memory.update(group)
             largest = max(
                 largest, sum(costs.size_of(name) for name in in_memory if name in recipe.steps)
             )
-            uses.subtract(group)
-            in_memory = {name for name in in_memory if uses[name] > 0 or name in recipe.outputs}
+            uses_left.subtract(group)
+            # what no later picture shows is freed
+            in_memory = {
+                name for name in in_memory if uses_left[name] > 0 or name in recipe.outputs
+            }
     return largest
 
 
 def _jobs(recipe: Recipe) -> tuple[Sequence[Sequence[str]], ...]:
     """Return the steps that each picture shows, and the steps that each data file shows."""
-    pictures = [list(_found(recipe, figure.needs)) for figure in FIGURES]
-    return pictures, [list(_found(recipe, needs)) for _, needs in files_of(recipe).values()]
+    steps_of_pictures = [list(_found(recipe, figure.needs)) for figure in FIGURES]
+    return steps_of_pictures, [
+        list(_found(recipe, needs)) for _, needs in files_of(recipe).values()
+    ]
 
 
 def _found(recipe: Recipe, needs: Mapping[str, str]) -> Iterator[str]:
+    """Yield the steps that the needs of a picture or file name; ``*`` stands for any item."""
     for match in filter(None, map(_NEED.match, needs.values())):
         pattern = re.escape(match["step"]).replace(r"\*", "[^,]*")
         yield from (name for name in recipe.steps if re.fullmatch(pattern, name))
@@ -277,8 +303,8 @@ def lanes_for(recipe: Recipe, device: str, memory: int | None) -> dict[str, Lane
     """Return the lanes of a run on the devices ``device``, with the libraries that its steps
     load in the program.
     """
-    cheaper = with_substitutions(recipe, wanted(recipe))
-    return lanes_of(device.split(","), memory, nodes_of(cheaper, wanted(recipe)))
+    cheaper_recipe = with_substitutions(recipe, wanted(recipe))
+    return lanes_of(device.split(","), memory, nodes_of(cheaper_recipe, wanted(recipe)))
 
 
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: float = 0.0) -> Plan:
@@ -294,27 +320,41 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: flo
     code = Code(store.code_memo)
     resolved = resolve(recipe, order, store, ",".join(devices), code)
     keys, left_out = resolved.keys, {name: resolved.left_out(name) for name in order}
-    awake, loaded = _awake(recipe, keys, store, wanted(recipe))
-    makers = _first_of_each_key(_running(order, awake, left_out), keys)
-    works = [_work(recipe, name, keys, devices) for name in makers]
-    costs = past_costs(store, sizes_of(recipe, order)) if works else Costs([])
-    abouts = _metadata_of(works, store)
+    awake_steps, loaded = _awake(recipe, keys, store, wanted(recipe))
+    # of steps with one key, the first computes the value
+    makers = _first_of_each_key(_running(order, awake_steps, left_out), keys)
+    jobs = [_work(recipe, name, keys, devices) for name in makers]
+    costs = past_costs(store, sizes_of(recipe, order)) if jobs else Costs([])
+    metadata_by_key = _metadata_of(jobs, store)
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
-    expected = costs.in_turn(((w.step.name, w.step, abouts.get(w.key)) for w in works), kinds)
-    empty = Plan(recipe, order, keys, left_out, awake, loaded, expected, {}, None)
+    # also where no schedule fits
+    expected = costs.in_turn(
+        ((job.step.name, job.step, metadata_by_key.get(job.key)) for job in jobs), kinds
+    )
+    plan_without_lanes = Plan(
+        recipe, order, keys, left_out, awake_steps, loaded, expected, {}, None
+    )
     try:
-        prepared = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
+        prepared = prepare(
+            jobs, costs, metadata_by_key, lanes, [keys[name] for name in wanted(recipe)]
+        )
     except TooLarge as error:
-        return replace(empty, refused=str(error))
-    where = {w.step.name: w.lane for w in prepared.works}
-    running = running_peak(prepared.schedule, lanes)
-    if works:
-        running += held_beside(recipe, costs, beside)
-    plan = replace(empty, lanes=where, schedule=prepared.schedule, running=running)
+        return replace(plan_without_lanes, refused=str(error))
+    lane_of_step = {job.step.name: job.lane for job in prepared.works}
+    peak_while_running = running_peak(prepared.schedule, lanes)
+    if jobs:
+        peak_while_running += held_beside(recipe, costs, beside)
+    plan = replace(
+        plan_without_lanes,
+        lanes=lane_of_step,
+        schedule=prepared.schedule,
+        running=peak_while_running,
+    )
     return _with_report(plan, store, costs, lanes, code)
 
 
 def _devices_of(lanes: Mapping[str, Lane]) -> list[str]:
+    """Return the device of each lane."""
     return [lane.device for lane in lanes.values()]
 
 
@@ -340,8 +380,8 @@ def _first_of_each_key(names: Iterable[str], keys: Mapping[str, Key]) -> list[st
 
 def _metadata_of(works: Iterable[StepJob], store: Store) -> dict[Key, Metadata]:
     """Return the metadata of the results that the store knows, by key."""
-    abouts = ((work.key, store.about(work.key)) for work in works)
-    return {key: about for key, about in abouts if about}
+    keys_and_metadata = ((job.key, store.about(job.key)) for job in works)
+    return {key: metadata for key, metadata in keys_and_metadata if metadata}
 
 
 def _with_report(
@@ -350,31 +390,38 @@ def _with_report(
     """Return the plan with the memory of the report, and with the reason if the limit is too
     small for the report.
     """
-    cpu = [lane for lane in lanes.values() if lane.kind == "cpu"]
-    shown, devices = shown_steps(plan.recipe), _devices_of(lanes)
-    order = needed(plan.recipe, shown)
+    cpu_lanes = [lane for lane in lanes.values() if lane.kind == "cpu"]
+    steps_shown, devices = shown_steps(plan.recipe), _devices_of(lanes)
+    order = needed(plan.recipe, steps_shown)
     keys = resolve(plan.recipe, order, store, ",".join(devices), code).keys
-    of_run = {plan.keys[name] for name in plan.order}
-    awake = _awake(plan.recipe, keys, store, shown, of_run)[0]
-    makers = set(_first_of_each_key(awake, keys))
-    works = [_work(plan.recipe, name, keys, devices) for name in order if name in makers]
+    # what the run has computed is in memory or stored
+    keys_of_run = {plan.keys[name] for name in plan.order}
+    awake_steps = _awake(plan.recipe, keys, store, steps_shown, keys_of_run)[0]
+    makers = set(_first_of_each_key(awake_steps, keys))
+    jobs = [_work(plan.recipe, name, keys, devices) for name in order if name in makers]
+    # also of steps that only the report needs
     costs = costs.with_sizes(sizes_of(plan.recipe, order))
     try:
         peak = report_peak(
-            works, plan.recipe, {name: keys[name] for name in shown}, costs, lanes, plan.running
+            jobs,
+            plan.recipe,
+            {name: keys[name] for name in steps_shown},
+            costs,
+            lanes,
+            plan.running,
         )
     except TooLarge as error:
         return replace(plan, refused=f"for the report, {error}")
-    limit = _memory_of(cpu)
+    limit = _memory_of(cpu_lanes)
     plan = replace(plan, reporting=peak)
-    if not cpu or peak <= limit:
+    if not cpu_lanes or peak <= limit:
         return plan
-    why = (
+    reason = (
         f"the report needs {format_size(peak)} to show the results, and the limit is"
         f" {format_size(limit)}"
     )
     return replace(
-        plan, refused=f"{why}: give more memory, or choose a smaller picture or number of bands"
+        plan, refused=f"{reason}: give more memory, or choose a smaller picture or number of bands"
     )
 
 
@@ -408,12 +455,12 @@ def _totals(plan: Plan) -> dict[str, Any]:
     """Return the totals of a forecast over all steps as values for JSON: seconds with their
     range, bytes and memory.
     """
-    took = plan.schedule.makespan if plan.schedule else None
-    ranged = _range_of(took, plan.expected.values()) if took else {}
+    makespan = plan.schedule.makespan if plan.schedule else None
+    least_and_most = _range_of(makespan, plan.expected.values()) if makespan else {}
     return {
         "steps": len(plan.expected),
         "guesses": sum(not cost.known for cost in plan.expected.values()),
-        "seconds": took and {"expected": took, **ranged},
+        "seconds": makespan and {"expected": makespan, **least_and_most},
         "bytes": sum(cost.bytes for cost in plan.expected.values()),
         "memory_of_steps": plan.running or None,
         "memory_of_report": plan.reporting or None,
@@ -424,13 +471,14 @@ def _range_of(took: float, costs: Collection[Estimate]) -> dict[str, float]:
     """Return the least and the most seconds of a run that is expected to take ``took``; none if
     all its steps take no time.
     """
-    times = [(cost.seconds["cpu"], cost.spread[1]) for cost in costs]
-    alone = sum(seconds for seconds, _ in times)
-    if not alone:
+    seconds_and_spreads = [(cost.seconds["cpu"], cost.spread[1]) for cost in costs]
+    total_seconds = sum(seconds for seconds, _ in seconds_and_spreads)
+    if not total_seconds:
         return {}
-    least = sum(seconds * around.least for seconds, around in times)
-    most = sum(seconds * around.most for seconds, around in times)
-    return {"least": took * least / alone, "most": took * most / alone}
+    least_total = sum(seconds * spread.least for seconds, spread in seconds_and_spreads)
+    most_total = sum(seconds * spread.most for seconds, spread in seconds_and_spreads)
+    # the makespan varies as the sum of the times of all steps
+    return {"least": took * least_total / total_seconds, "most": took * most_total / total_seconds}
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
@@ -453,24 +501,29 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
     may be left out.
     """
     lines = []
-    if unsure := [name for name, decision in plan.left_out.items() if decision is None]:
+    if undecided := [name for name, decision in plan.left_out.items() if decision is None]:
         lines += _wrapped(
-            f"left out or not, depending on the values of the inputs: {', '.join(unsure)}"
+            f"left out or not, depending on the values of the inputs: {', '.join(undecided)}"
         )
-    took = _took_text(totals["seconds"])
-    guessed = f", {totals['guesses']} of them guessed at the upper end, because never measured"
-    read, new = format_size(sum(plan.loaded.values())), format_size(int(totals["bytes"]))
-    would = (
-        f"{totals['steps']} of {len(plan.order)} steps would"
-        f" run{guessed if totals['guesses'] else ''}"
+    time_text = _took_text(totals["seconds"])
+    # said only if there are guesses
+    guess_text = f", {totals['guesses']} of them guessed at the upper end, because never measured"
+    bytes_read, bytes_new = (
+        format_size(sum(plan.loaded.values())),
+        format_size(int(totals["bytes"])),
     )
-    lines += _wrapped(f"{would}: {took}, {new} new, {read} to load")
+    run_text = (
+        f"{totals['steps']} of {len(plan.order)} steps would"
+        f" run{guess_text if totals['guesses'] else ''}"
+    )
+    lines += _wrapped(f"{run_text}: {time_text}, {bytes_new} new, {bytes_read} to load")
     if plan.expected:
         lines += _memory_lines(plan, lanes)
     return [*lines, *(_wrapped(f"refused: {plan.refused}") if plan.refused else [])]
 
 
 def _took_text(seconds: Mapping[str, float] | float | None) -> str:
+    """Return the time of a run with its range as text."""
     if seconds is None:
         return "no schedule"
     return f"about {seconds_text(seconds)} s" if isinstance(seconds, Mapping) else "no time"
@@ -484,11 +537,11 @@ def _memory_lines(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
             peak = format_size(plan.schedule.peak.get(name, 0.0))
             lines.append(f"memory  {name}: {peak} at most, of {format_size(max(lane.memory, 0.0))}")
     if plan.running:
-        held = format_size(max(lane.held for lane in lanes.values()))
+        program_bytes = format_size(max(lane.held for lane in lanes.values()))
         lines += _wrapped(
             f"memory  process: {format_size(plan.running)} while the steps run, of which the"
-            f" program itself holds {held}; {format_size(plan.reporting)} while the report is"
-            " written"
+            f" program itself holds {program_bytes}; {format_size(plan.reporting)} while the report"
+            " is written"
         )
     return lines
 
@@ -499,10 +552,12 @@ def _wrapped(text: str) -> list[str]:
 
 
 def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> StepJob:
+    """Return the job of a step, as far as a forecast needs it."""
     step = recipe.steps[name]
     reads = tuple(
-        tuple(keys[s] for s in ((w,) if isinstance(w, str) else w or ()))
-        for w in step.wires.values()
+        # a wire is a name, several names or nothing
+        tuple(keys[source] for source in ((wire,) if isinstance(wire, str) else wire or ()))
+        for wire in step.wires.values()
     )
     return StepJob(
         step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], ""
@@ -521,15 +576,16 @@ def _awake(
 
     Results with the keys ``in_memory`` are known and need no step.
     """
-    awake, loaded, todo = set[str](), dict[str, int](), [*targets]
-    while todo:
-        name = todo.pop()
-        if name in awake or name in loaded or keys[name] in in_memory:
+    awake_steps, loaded_bytes, names_left = set[str](), dict[str, int](), [*targets]
+    while names_left:
+        name = names_left.pop()
+        if name in awake_steps or name in loaded_bytes or keys[name] in in_memory:
             continue
         if store.has(keys[name]):
-            about: dict[str, Any] = store.about(keys[name]) or {}
-            loaded[name] = about.get("bytes", 0)
+            metadata: dict[str, Any] = store.about(keys[name]) or {}
+            loaded_bytes[name] = metadata.get("bytes", 0)
         else:
-            awake.add(name)
-            todo += recipe.steps[name].sources
-    return awake, loaded
+            awake_steps.add(name)
+            # what a missing result needs
+            names_left += recipe.steps[name].sources
+    return awake_steps, loaded_bytes

@@ -27,27 +27,35 @@ def why_key_lines(store: Store, prefix: str) -> list[str]:
     keys = sorted(
         dict.fromkeys(row["key"] for row in rows_of(store) if row["key"].startswith(prefix))
     )
+    # the beginning of no key, or of several
     if len(keys) != 1:
-        some = f"; there are {', '.join(key[:12] for key in keys[:5])}" if keys else ""
+        candidates_text = f"; there are {', '.join(key[:12] for key in keys[:5])}" if keys else ""
         raise LookupError(
-            f"{len(keys) or 'no'} results have a key that begins with {prefix!r}{some}"
+            f"{len(keys) or 'no'} results have a key that begins with {prefix!r}{candidates_text}"
         )
-    key, about = keys[0], store.about(keys[0])
-    if about is None:
+    key, metadata = keys[0], store.about(keys[0])
+    if metadata is None:
         raise LookupError(f"the result {keys[0]} is no longer in the store")
     comparison = Comparison(store)
-    head = f"{about['step']} of {about.get('recipe') or 'a recipe'}: {state_of(about)}, key {key}"
-    return [head, *_made_of(comparison, key), *because(comparison, about["step"], key, about)]
+    head_line = (
+        f"{metadata['step']} of {metadata.get('recipe') or 'a recipe'}: {state_of(metadata)},"
+        f" key {key}"
+    )
+    return [
+        head_line,
+        *_made_of(comparison, key),
+        *because(comparison, metadata["step"], key, metadata),
+    ]
 
 
 def state_of(about: Mapping[str, Any] | None) -> str:
     if about is None:
         return "not stored, so it would run where it is needed"
-    made = f"{_date(about)}, computed in {about.get('seconds', 0.0):.3g} s"
+    when_and_how_long = f"{_date(about)}, computed in {about.get('seconds', 0.0):.3g} s"
     return (
-        f"stored since {made}"
+        f"stored since {when_and_how_long}"
         if about.get("kept", True)
-        else f"ran {made}, but its value was not kept"
+        else f"ran {when_and_how_long}, but its value was not kept"
     )
 
 
@@ -57,25 +65,29 @@ def because(
     """Yield lines with the differences of a result from the most similar earlier result."""
     rows = rows_of(comparison.store, label) or rows_of(comparison.store, maker or label)
     keys = keys_in(rows)
+    # results before this one; all of them if it is not stored
     earlier = keys[: keys.index(key)] if key in keys else keys
-    nearest = _nearest(comparison, label, key, earlier)
-    if nearest is None:
+    key_and_roots = _nearest(comparison, label, key, earlier)
+    if key_and_roots is None:
         yield (
             f"  no earlier result to compare with: {'the first' if key in keys else 'no'} result of"
             " this step"
         )
         return
-    old, roots = nearest
+    earlier_key, roots = key_and_roots
     for text in list(roots.found)[:_SHOWN]:
         yield f"  {_chain(roots.chain(text))}: {text}"
     if len(roots.found) > _SHOWN:
         yield f"  and {len(roots.found) - _SHOWN} more"
-    which = (
+    compared_text = (
         "the earlier result"
         if len(earlier) == 1
         else f"the nearest of {len(earlier)} earlier results"
     )
-    yield f"  compared with {which}, {old[:8]} of {_date(comparison.about(old) or {})}"
+    yield (
+        f"  compared with {compared_text}, {earlier_key[:8]} of"
+        f" {_date(comparison.about(earlier_key) or {})}"
+    )
 
 
 def _nearest(
@@ -84,16 +96,19 @@ def _nearest(
     """Return the earlier result with the fewest differences, and these differences; prefer the
     newest result.
     """
-    best: tuple[Key, Roots] | None = None
-    for old in earlier[: -_CANDIDATES - 1 : -1]:
-        if comparison.origin(old) is None:
+    best_match: tuple[Key, Roots] | None = None
+    # the newest first
+    for earlier_key in earlier[: -_CANDIDATES - 1 : -1]:
+        if comparison.origin(earlier_key) is None:
             continue
-        limit = len(best[1].found) - 1 if best else float("inf")
-        roots = comparison.roots(Pair(label, key, old), limit)
-        best = (old, roots) if roots is not None else best
-        if best and (len(best[1].found) <= 1 or len(comparison.seen) > _PAIRS):
+        # only fewer differences than the best so far are of interest
+        limit = len(best_match[1].found) - 1 if best_match else float("inf")
+        roots = comparison.roots(Pair(label, key, earlier_key), limit)
+        best_match = (earlier_key, roots) if roots is not None else best_match
+        # a single cause is as near as it can be
+        if best_match and (len(best_match[1].found) <= 1 or len(comparison.seen) > _PAIRS):
             break
-    return best
+    return best_match
 
 
 def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
@@ -103,6 +118,7 @@ def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
     origin = comparison.origin(key)
     if origin is None:
         return
+    # keys are shown by their first 8 letters
     yield f"  node    {origin['node']}, code {origin['code'][:8]}"
     for name, value in origin["params"].items():
         yield f"  with    {name} = {spoken(value)}"
@@ -118,6 +134,7 @@ def _chain(names: list[str]) -> str:
     chain is long.
     """
     if len(names) > _LINKS:
+        # the first ones, the number of those between, and the last one
         names = [*names[: _LINKS - 2], f"({len(names) - _LINKS + 1} more)", names[-1]]
     return " <- ".join(names)
 
@@ -127,6 +144,7 @@ def keys_in(rows: Iterable[dict[str, Any]]) -> list[Key]:
 
 
 def _date(about: Mapping[str, Any]) -> str:
+    """Return the date and time of a result, without the zone."""
     return str(about.get("date", "an unknown day"))[:19].replace("T", " ")
 
 

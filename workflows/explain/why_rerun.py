@@ -46,17 +46,20 @@ def explained(
     ``watch``.
     """
     comparison = Comparison(store, recipe)
-    before: dict[str, list[Key]] = {}
+    earlier_keys: dict[str, list[Key]] = {}
 
     def tell(event: Event) -> None:
-        done = event.done
-        if done is None:
-            before[event.step] = keys_in(
+        record = event.done
+        if record is None:
+            # before the step adds its own line to the journal
+            earlier_keys[event.step] = keys_in(
                 row for row in store.journal.latest() if row["step"] == event.step
             )
-        elif done.state == "run":
-            why = _at_once(comparison, recipe.steps[done.step], done.key, before.pop(done.step, []))
-            event = Event(event.step, replace(done, why=why))
+        elif record.state == "run":
+            reason = _at_once(
+                comparison, recipe.steps[record.step], record.key, earlier_keys.pop(record.step, [])
+            )
+            event = Event(event.step, replace(record, why=reason))
         watch(event)
 
     return tell
@@ -67,34 +70,43 @@ def _step_lines(
 ) -> list[str]:
     """Return lines with the state of one step and its differences from earlier results."""
     key, verdict = resolved.keys[step.name], resolved.verdicts.get(step.name)
-    head = f"{step.name} ({step.node.path})"
+    head_text = f"{step.name} ({step.node.path})"
     if verdict is not None and verdict.left_out:
-        return [f"{head}: left out and replaced by {verdict.instead}: {verdict.why}"]
-    about = comparison.store.about(key)
-    lines = [f"{head}: {state_of(about)}, key {key[:8]}"]
+        return [f"{head_text}: left out and replaced by {verdict.instead}: {verdict.why}"]
+    metadata = comparison.store.about(key)
+    lines = [f"{head_text}: {state_of(metadata)}, key {key[:8]}"]
     maker = resolved.makers[key]
     if maker != step.name:
         lines.append(f"  same key as {maker}")
-    if unsure := [name for name in needed(recipe, [step.name]) if resolved.left_out(name) is None]:
+    # None: only the values of its inputs can decide
+    if undecided := [
+        name for name in needed(recipe, [step.name]) if resolved.left_out(name) is None
+    ]:
         lines.append(
             "  left out or not, depending on the values of the inputs:"
-            f" {', '.join(unsure[:_SHOWN])}"
+            f" {', '.join(undecided[:_SHOWN])}"
         )
-    return [*lines, *because(comparison, step.name, key, about, maker)]
+    return [*lines, *because(comparison, step.name, key, metadata, maker)]
 
 
 def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -> str:
     """Return the reason why a step ran, or an empty string if there is no earlier result."""
     if key in earlier:
         return "computed before, but its value is not stored"
-    best: list[str] = []
-    for old in earlier[: -_AT_ONCE - 1 : -1]:
-        before, now = comparison.origin(old), comparison.origin(key)
-        differences = _direct(comparison, step, before, now) if before and now else []
-        best = min(filter(None, (best, differences)), key=len, default=[])
-        if len(best) == 1:
+    fewest_differences: list[str] = []
+    # the newest first
+    for earlier_key in earlier[: -_AT_ONCE - 1 : -1]:
+        old_origin, new_origin = comparison.origin(earlier_key), comparison.origin(key)
+        differences = (
+            _direct(comparison, step, old_origin, new_origin) if old_origin and new_origin else []
+        )
+        # an empty list is no comparison
+        fewest_differences = min(
+            filter(None, (fewest_differences, differences)), key=len, default=[]
+        )
+        if len(fewest_differences) == 1:
             break
-    return best[0] if best else ""
+    return fewest_differences[0] if fewest_differences else ""
 
 
 def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
@@ -104,8 +116,10 @@ def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> lis
     texts = comparison.own(step.name, old, new)
     if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
         return texts
-    for name, before, after in zip(step.node.inputs, old["inputs"], new["inputs"], strict=True):
-        if before != after:
+    for name, old_keys, new_keys in zip(
+        step.node.inputs, old["inputs"], new["inputs"], strict=True
+    ):
+        if old_keys != new_keys:
             wire = step.wires.get(name)
             texts.append(f"after {wire if isinstance(wire, str) else name}")
     return texts or ["nothing changed"]

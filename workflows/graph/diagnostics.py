@@ -64,19 +64,26 @@ def _of_values_once(diagnostics: set[Diagnostic]) -> Iterator[Diagnostic]:
     """Yield mistakes, without that of a setting where a step says the same of its value: `a`
     beside `a = -1 m`.
     """
-    of_steps = {
+    mistakes_of_steps = {
         (mistake.mark, mistake.path.partition(" = ")[0])
         for mistake in diagnostics
         if " = " in mistake.path
     }
-    yield from (mistake for mistake in diagnostics if (mistake.mark, mistake.path) not in of_steps)
+    yield from (
+        mistake for mistake in diagnostics if (mistake.mark, mistake.path) not in mistakes_of_steps
+    )
 
 
 def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
-    left = max((len(str(d.mark)) for d in diagnostics), default=0)
-    middle = min(max((len(d.path) for d in diagnostics), default=0), 40)
-    shown = zip(diagnostics, _lists_once(d.message for d in diagnostics), strict=True)
-    return "\n".join(f"{d.mark!s:<{left}}   {d.path:<{middle}}   {message}" for d, message in shown)
+    """Return mistakes as lines with aligned columns: place, path, message."""
+    mark_width = max((len(str(mistake.mark)) for mistake in diagnostics), default=0)
+    # a long path does not push all messages to the right
+    path_width = min(max((len(mistake.path) for mistake in diagnostics), default=0), 40)
+    rows = zip(diagnostics, _lists_once(mistake.message for mistake in diagnostics), strict=True)
+    return "\n".join(
+        f"{mistake.mark!s:<{mark_width}}   {mistake.path:<{path_width}}   {message}"
+        for mistake, message in rows
+    )
 
 
 def _lists_once(messages: Iterable[str]) -> Iterator[str]:
@@ -85,9 +92,9 @@ def _lists_once(messages: Iterable[str]) -> Iterator[str]:
     """
     told_names = set[str]()
     for message in messages:
-        before, separator, names = message.partition(_KNOWN)
+        text_before, separator, names = message.partition(_KNOWN)
         yield (
-            f"{before}see the names above"
+            f"{text_before}see the names above"
             if separator and "," in names and names in told_names
             else message
         )
@@ -99,9 +106,10 @@ def nearest(name: str, among: Iterable[str]) -> str:
     if none is similar.
     """
     names = sorted(set(map(str, among)))
-    close = difflib.get_close_matches(str(name), names, 1, 0.6)
-    if close:
-        return f"did you mean {close[0]}?"
+    # the best one, if 0.6 of its letters agree
+    similar_names = difflib.get_close_matches(str(name), names, 1, 0.6)
+    if similar_names:
+        return f"did you mean {similar_names[0]}?"
     return (
         f"{_KNOWN}{', '.join(names[:12])}{', …' if len(names) > 12 else ''}"
         if names

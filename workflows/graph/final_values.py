@@ -51,13 +51,13 @@ class Config:
         """
         tree: dict[str | int, Any] = {}
         for setting in self.settings.values():
-            *parents, last = setting.path
+            *parents, key_of_value = setting.path
             branch = tree
             for key in parents:
                 if not isinstance(branch.get(key), dict):  # only defaults follow after `with: {}`
                     branch[key] = {}
                 branch = branch[key]
-            branch[last] = setting
+            branch[key_of_value] = setting
         return "".join(f"{line}\n" for line in _lines(tree, 0))
 
 
@@ -65,27 +65,33 @@ def changes(base: Config, other: Config, apart: str) -> list[str]:
     """Return the overrides that turn the values of one recipe into those of another, but for the
     block ``apart``.
     """
-    own, was = _given_values(other, apart), _given_values(base, apart)
-    overrides = [f"~{path}" for path in was if path not in own]
-    for path, value in own.items():
-        if path not in was:
+    new_values, old_values = _given_values(other, apart), _given_values(base, apart)
+    overrides = [f"~{path}" for path in old_values if path not in new_values]
+    for path, value in new_values.items():
+        if path not in old_values:
             overrides.append(f"+{path}={flow(value)}")
-        elif was[path] != value:
+        elif old_values[path] != value:
             overrides.append(f"{path}={flow(value)}")
     return overrides
 
 
 def _given_values(config: Config, apart: str) -> dict[str, Any]:
     """Return the values of a recipe that are no defaults, but for those of the block ``apart``."""
-    given = {path: s for path, s in config.settings.items() if not s.default}
-    return {path: setting.value for path, setting in given.items() if setting.path[0] != apart}
+    settings_given = {path: s for path, s in config.settings.items() if not s.default}
+    return {
+        path: setting.value for path, setting in settings_given.items() if setting.path[0] != apart
+    }
 
 
 def _lines(tree: Mapping[str | int, Any], depth: int) -> Iterator[str]:
+    """Yield the lines of YAML for a tree of settings, with the source of each value in a
+    comment.
+    """
     indent = "  " * depth
     for key, value in tree.items():
         if isinstance(value, Setting):
             text = f"{_scalar(key)}: {flow(value.value)}"
+            # comments begin at column 46, behind the longest usual value
             yield (
                 f"{indent}{'# ' if value.default else ''}{text:<{44 - len(indent)}} #"
                 f" {value.source}"
@@ -105,6 +111,7 @@ def flow(value: Any) -> str:
 
 
 def _scalar(value: Any) -> str:
+    """Return a single value as YAML; a text in quotes where it needs them."""
     if isinstance(value, float) and math.isnan(value):
         return ".nan"
     if isinstance(value, float) and math.isinf(value):
@@ -112,11 +119,12 @@ def _scalar(value: Any) -> str:
     if value is None or isinstance(value, bool | int | float):
         return json.dumps(value)
     text = str(value)
-    bare = _BARE.fullmatch(text) and text.lower() not in _WORDS
-    return text if bare else f'"{"".join(map(_escaped, text))}"'
+    needs_no_quotes = _BARE.fullmatch(text) and text.lower() not in _WORDS
+    return text if needs_no_quotes else f'"{"".join(map(_escaped, text))}"'
 
 
 def _escaped(char: str) -> str:
+    """Return a character as it stands in a text in quotes."""
     if char in '"\\':
         return "\\" + char
     return char if char.isprintable() else f"\\U{ord(char):08X}"

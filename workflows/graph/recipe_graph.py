@@ -213,10 +213,10 @@ def copies_of(recipe: Recipe, names: Iterable[str]) -> set[str]:
     """
     copies = set[str]()
     for name in names:
-        own = {step for step in recipe.steps if name in (step, step.partition("[")[0])}
-        if not own:
+        copies_of_name = {step for step in recipe.steps if name in (step, step.partition("[")[0])}
+        if not copies_of_name:
             raise ValueError(unknown_step(name, recipe.steps))
-        copies |= own
+        copies |= copies_of_name
     return copies
 
 
@@ -250,6 +250,7 @@ def ordered(sources: Mapping[str, tuple[str, ...]], names: Iterable[str]) -> lis
 def _ordered(
     steps: tuple[str, ...], sources: tuple[tuple[str, ...], ...], names: tuple[str, ...]
 ) -> tuple[str, ...]:
+    """Return what `ordered` returns, for arguments that can be kept in a cache."""
     return tuple(in_order(dict(zip(steps, sources, strict=True)), names))
 
 
@@ -278,13 +279,15 @@ def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list
     """Return the steps ``names`` and all steps that they depend on, in topological order; the
     graph has no cycle.
     """
+    # as an ordered set
     order: dict[str, None] = {}
+    # by depth: a step, and its sources that were not looked at yet
     stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
         name, sources_left = stack[-1]
-        below = next((s for s in sources_left if s not in order), None)
-        if below is not None:
-            stack.append((below, iter(sources[below])))
+        next_source = next((source for source in sources_left if source not in order), None)
+        if next_source is not None:
+            stack.append((next_source, iter(sources[next_source])))
             continue
         order.setdefault(name)
         stack.pop()
@@ -355,6 +358,7 @@ def with_copies(
 
 
 def _told(wire: Wire, copied: Collection[str]) -> Wire:
+    """Return a wire that reads the copies of the steps that have one."""
     if isinstance(wire, str):
         return TOLD + wire if wire in copied else wire
     return None if wire is None else tuple(TOLD + name if name in copied else name for name in wire)

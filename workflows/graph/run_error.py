@@ -26,10 +26,11 @@ class RunError(RuntimeError):
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        plain = type(self.cause).__module__ == "builtins" and all(
+        # another process can make such an error from its texts
+        can_be_sent = type(self.cause).__module__ == "builtins" and all(
             isinstance(argument, str) for argument in self.cause.args
         )
-        return _unpickled, (self.step, str(self), self.cause if plain else repr(self.cause))
+        return _unpickled, (self.step, str(self), self.cause if can_be_sent else repr(self.cause))
 
 
 def _unpickled(step: str, text: str, cause: BaseException | str) -> RunError:
@@ -46,8 +47,9 @@ def _unpickled(step: str, text: str, cause: BaseException | str) -> RunError:
 
 
 def _shape(value: Any) -> str:
+    """Return the shape and type of an input as text."""
     if isinstance(value, Tensor):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
     if isinstance(value, list | tuple):
-        return f"{type(value).__name__}[{', '.join(_shape(v) for v in value)}]"
+        return f"{type(value).__name__}[{', '.join(_shape(item) for item in value)}]"
     return "absent" if value is None else type(value).__name__

@@ -40,7 +40,10 @@ def inputs_of(step: Step, forms: Mapping[str, Form]) -> list[Form]:
     """
     wires = (step.wires.get(name) for name in step.node.inputs)
     return [
-        w and (forms.get(w) if isinstance(w, str) else [forms.get(n) for n in w]) for w in wires
+        # None for no wire, one form, or one for each step of a list
+        wire
+        and (forms.get(wire) if isinstance(wire, str) else [forms.get(source) for source in wire])
+        for wire in wires
     ]
 
 
@@ -84,8 +87,8 @@ def complete(node: Node, inputs: Sequence[Form]) -> bool:
     """Return True if the shape of every input that a node needs is known, and of every item of a
     list.
     """
-    named = zip(inputs, node.inputs, strict=False)
-    if any(x is None and name not in node.optional for x, name in named):
+    forms_and_names = zip(inputs, node.inputs, strict=False)
+    if any(x is None and name not in node.optional for x, name in forms_and_names):
         return False
     lists = (x for x in inputs if type(x) is list)
     return not any(item is None for item in chain.from_iterable(lists))
@@ -132,8 +135,8 @@ def alike(form: Form, other: Form) -> bool:
     if type(form) is not type(other):
         return False
     if isinstance(form, Tensor):
-        looks = (form.shape, form.dtype, form.device)
-        if looks != (other.shape, other.dtype, other.device):
+        shape_type_device = (form.shape, form.dtype, form.device)
+        if shape_type_device != (other.shape, other.dtype, other.device):
             return False
         return form.device.type == "meta" or equal(form, other)
     if isinstance(form, list | tuple):

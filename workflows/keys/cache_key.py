@@ -83,14 +83,17 @@ def written(step: Step) -> dict[str, Any]:
     Of a node of neusee only the order of a mapping counts, where the node says so.
     """
     notes: dict[str, Any] = {}
-    own = is_own(step.node.fn.__module__)
+    is_of_user = is_own(step.node.fn.__module__)
     for name, value in step.params.items():
-        if not own and (step.node.path, name) not in _ORDERED:
+        if not is_of_user and (step.node.path, name) not in _ORDERED:
             continue
-        marks = [mark for mark in (step.param_marks.get(name), step.mark) if mark is not None]
-        said = _said(value, [os.path.abspath(mark.folder) for mark in marks])
-        if said is not None:
-            notes[name] = said
+        # where the recipe writes the parameter, and where the step
+        places_in_recipe = [
+            location for location in (step.param_marks.get(name), step.mark) if location is not None
+        ]
+        note = _said(value, [os.path.abspath(location.folder) for location in places_in_recipe])
+        if note is not None:
+            notes[name] = note
     return notes
 
 
@@ -101,8 +104,8 @@ def _said(value: Any, folders: list[str]) -> Any:
     if isinstance(value, Mapping):
         return _said_in_order(value, folders)
     if isinstance(value, tuple | list):
-        said = [_said(item, folders) for item in value]
-        return said if any(item is not None for item in said) else None
+        notes = [_said(item, folders) for item in value]
+        return notes if any(item is not None for item in notes) else None
     return None
 
 
@@ -110,27 +113,32 @@ def _said_in_order(mapping: Mapping[Any, Any], folders: list[str]) -> Any:
     """Return the keys of a mapping in their order with what their values say, or None for a single
     key whose value says nothing.
     """
-    parts = [[str(key), _said(item, folders)] for key, item in mapping.items()]
-    return parts if len(parts) > 1 or any(item is not None for _, item in parts) else None
+    keys_and_notes = [[str(key), _said(item, folders)] for key, item in mapping.items()]
+    return (
+        keys_and_notes
+        if len(keys_and_notes) > 1 or any(item is not None for _, item in keys_and_notes)
+        else None
+    )
 
 
 def _name(path: Path, folders: list[str]) -> list[str]:
     """Return the path of a file as a recipe in one of some folders writes it, and the name that
     links lead to.
     """
-    full = os.path.abspath(path)
-    real = os.path.realpath(full)
-    name = full
-    target, target_without_links = os.path.basename(real), os.path.basename(full)
-    folder = next((candidate for candidate in folders if _is_in(full, candidate)), None)
+    absolute_path = os.path.abspath(path)
+    real_path = os.path.realpath(absolute_path)
+    written_path = absolute_path
+    target_path, path_without_links = os.path.basename(real_path), os.path.basename(absolute_path)
+    folder = next((candidate for candidate in folders if _is_in(absolute_path, candidate)), None)
     if folder is not None:
-        name, top = os.path.relpath(full, folder), os.path.realpath(folder)
-        if _is_in(real, top):
-            target, target_without_links = os.path.relpath(real, top), name
-    return [name] if target == target_without_links else [name, target]
+        written_path, real_folder = os.path.relpath(absolute_path, folder), os.path.realpath(folder)
+        if _is_in(real_path, real_folder):
+            target_path, path_without_links = os.path.relpath(real_path, real_folder), written_path
+    return [written_path] if target_path == path_without_links else [written_path, target_path]
 
 
 def _is_in(path: str, folder: str) -> bool:
+    """Return True if a path is below a folder."""
     return path.startswith(folder.rstrip(os.sep) + os.sep)
 
 
@@ -161,11 +169,12 @@ def file_digest(path: Path) -> str:
         if stamp in _files:
             return _files[stamp]
         with opened(path) as file:
-            digits = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest()
+            hex_digest = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest()
         if file_stamp(path) == stamp:
+            # the last two numbers of a stamp are its times
             if time.time_ns() - max(stamp[-2:]) > _SETTLED:
-                _files[stamp] = digits
-            return digits
+                _files[stamp] = hex_digest
+            return hex_digest
     raise OSError(f"{path} changes while it is read: wait until it is written, and run again")
 
 
@@ -231,20 +240,21 @@ def key_of(
     ``keys`` are the cache keys of the steps whose results are inputs of ``step``.
     """
     node = step.node
-    parts: dict[str, Any] = {
+    key_parts: dict[str, Any] = {
         "node": node.path,
         "code": code_of(step, code),
         "params": {name: plain(value) for name, value in step.params.items()},
         "inputs": [_keys_of(step.wires.get(name), keys) for name in node.inputs],
     }
-    if said := written(step):
-        parts["written"] = said
+    if notes := written(step):
+        key_parts["written"] = notes
     if node.random:
-        parts["stream"] = [seed, step.name, device_kind(device)]
-    private = not step.cached or any(
-        map(is_private, [parts["code"], *(keys[name] for name in step.sources)])
+        key_parts["stream"] = [seed, step.name, device_kind(device)]
+    is_private_key = not step.cached or any(
+        map(is_private, [key_parts["code"], *(keys[name] for name in step.sources)])
     )
-    return (PRIVATE + digest(parts)[:24] if private else digest(parts)), parts
+    # shorter by the first letters, so that all keys have 32
+    return (PRIVATE + digest(key_parts)[:24] if is_private_key else digest(key_parts)), key_parts
 
 
 def code_of(step: Step, code: Code) -> str:
@@ -280,6 +290,7 @@ def stream_seed(seed: int, step: str) -> int:
     """Return the seed of the random numbers of a step, which depends only on the recipe's seed
     and the step's name.
     """
+    # 60 bits, which fit into the seed of torch
     return int(digest(seed, step)[:15], 16)
 
 
@@ -289,6 +300,7 @@ def device_kind(device: str) -> str:
 
 
 def _keys_of(wire: Wire, keys: Mapping[str, Key]) -> Any:
+    """Return the key behind a wire, or those of a list of wires; None for no wire."""
     if wire is None or isinstance(wire, str):
         return wire and keys[wire]
     return [keys[name] for name in wire]
@@ -298,16 +310,21 @@ def plain(value: Any) -> Any:
     """Return a step's parameter as JSON that is the same in every process; a file becomes the
     digest of its content.
     """
+    # as JSON has them
     if isinstance(value, bool | int | str | None):
         return value
     if isinstance(value, float):
+        # of a class that is derived from float
         return float(value)
     if isinstance(value, Path):
         return {"file": file_digest(value), "suffix": value.suffix.lower()}
     if isinstance(value, Mapping):
-        return {"items": sorted(([plain(k), plain(v)] for k, v in value.items()), key=repr)}
+        return {
+            # in an order that does not depend on that of the mapping
+            "items": sorted(([plain(key), plain(item)] for key, item in value.items()), key=repr)
+        }
     if isinstance(value, tuple | list):
-        return [plain(v) for v in value]
+        return [plain(item) for item in value]
     if network := _network_of(value):
         return {"class": f"{network.__module__}.{network.__qualname__}"}
     if isinstance(value, complex):

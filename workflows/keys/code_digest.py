@@ -117,9 +117,10 @@ class Imports:
         Raises `LookupError` if the package of all nodes is used as a whole.
         """
         names_by_module: dict[str, set[str]] = {}
-        for item in summary.imports:
-            for module, name in self._imported(item):
+        for statement in summary.imports:
+            for module, name in self._imported(statement):
                 names_by_module.setdefault(module, set()).add(name)
+        # uses such as `package.module.name`
         for use in summary.uses:
             modules = self._used(use)
             if modules is None and self._module.startswith(ROOT):
@@ -142,8 +143,9 @@ class Imports:
         base = absolute(level, base, self._package)
         if name and name != "*" and self._is_module(base, name):
             yield f"{base}.{name}", ""
-            inner = self._summary_of(base)
-            if inner is None or name not in inner[1].binds:
+            file_and_summary = self._summary_of(base)
+            # the name may be both a submodule and something that the package itself imports
+            if file_and_summary is None or name not in file_and_summary[1].binds:
                 return
         yield base, name
 
@@ -152,14 +154,15 @@ class Imports:
         `neusee.nodes`.
         """
         level, base, name, chain, _ = use
-        first = ".".join(filter(None, (absolute(level, base, self._package), name)))
-        modules, attributes = [first], chain.split(".") if chain else []
+        full_name = ".".join(filter(None, (absolute(level, base, self._package), name)))
+        modules, attributes = [full_name], chain.split(".") if chain else []
         while attributes and self._is_module(modules[-1], attributes[0]):
             modules.append(f"{modules[-1]}.{attributes.pop(0)}")
-        uses_all = modules[-1] in ("neusee", ROOT) and (
+        uses_all_nodes = modules[-1] in ("neusee", ROOT) and (
             not attributes or attributes[0].startswith("__")
         )
-        return None if uses_all else modules[1:]
+        # the first is the import itself, which counts anyway
+        return None if uses_all_nodes else modules[1:]
 
     def _is_module(self, package: str, name: str) -> bool:
         """Return True if a package, whose source is followed or which is a folder, has a module
@@ -168,10 +171,11 @@ class Imports:
         module = f"{package}.{name}"
         if module == ROOT:
             return True
-        inside = package == ROOT or self._kind_of(package) in ("source", "folder")
+        may_hold_modules = package == ROOT or self._kind_of(package) in ("source", "folder")
+        # a loaded module that is no package
         if package in sys.modules and "__path__" not in contents(package):
             return False
-        return inside and module_path(module) is not None
+        return may_hold_modules and module_path(module) is not None
 
 
 def absolute(level: int, base: str, package: str) -> str:
@@ -180,8 +184,9 @@ def absolute(level: int, base: str, package: str) -> str:
     """
     if not level:
         return base
-    above = package.split(".")
-    return ".".join([*above[: len(above) - level + 1], *filter(None, [base])])
+    package_parts = package.split(".")
+    # one dot is the package itself, each further one the package above
+    return ".".join([*package_parts[: len(package_parts) - level + 1], *filter(None, [base])])
 
 
 # --- engine digest --------------------------------------------------------------------------------
@@ -206,9 +211,9 @@ def engine(*modules: str) -> str:
     module count. Raises `LookupError` for a module without a source file.
     """
     digests: dict[str, str] = {}
-    todo = list(modules or ("engine.runner",))
-    while todo:
-        name = todo.pop()
+    modules_left = list(modules or ("engine.runner",))
+    while modules_left:
+        name = modules_left.pop()
         if name in digests:
             continue
         path = _source(name)
@@ -217,7 +222,7 @@ def engine(*modules: str) -> str:
                 f"{_ROOT}.{name} has no source file below {_HERE}, so its results have no cache key"
             )
         digests[name], imports = outline(path.read_bytes())
-        todo += imported_by_engine(imports)
+        modules_left += imported_by_engine(imports)
     return digest(digests)
 
 
@@ -239,17 +244,20 @@ def imported_by_engine(statements: Iterable[tuple[str, list[str]]]) -> Iterator[
         if not base:
             yield from (_below(name) for name in names if name.startswith(f"{_ROOT}."))
         elif f"{base}.".startswith(f"{_ROOT}."):
-            below = _below(base)
+            inner_name = _below(base)
             for name in names:
-                module = f"{below}.{name}".lstrip(".")
-                yield module if _source(module) is not None or not below else below
+                module = f"{inner_name}.{name}".lstrip(".")
+                # `from a import b`: b is a module, or a name of the module a
+                yield module if _source(module) is not None or not inner_name else inner_name
 
 
 def _below(module: str) -> str:
+    """Return the name of a module below neusee.workflows, such as ``engine.runner``."""
     return module.removeprefix(_ROOT).lstrip(".")
 
 
 def _source(name: str) -> Path | None:
+    """Return the source file of a module below neusee.workflows, or None."""
     return module_file(_HERE, name.split("."))
 
 
@@ -289,8 +297,8 @@ class Code:
         look_again()
         self._memo, self._loaded = memo, loaded
         self._summaries: dict[str, Summary] = read_memo(memo)
-        self._new = False
-        self._wholes: dict[str, Whole] = {}
+        self._new = False  # True if a summary is not in the memo yet
+        self._wholes: dict[str, Whole] = {}  # digest of each module with all that it imports
         self._looks: dict[tuple[str, frozenset[str], bool], Look | None] = {}
         self._followed: dict[frozenset[str], Callable[[str], bool]] = {}
         self._origins: dict[tuple[str, frozenset[str]], Origin] = {}
@@ -312,10 +320,13 @@ class Code:
         code = self._codes[id(node)][1]
         for module, name in classes:
             closure = self._whole(module)
+            # by the name of the outermost class
             self._refuse(closure, module, node, {name.partition(".")[0]})
-            parts = {**self._whole(node.fn.__module__).parts, **closure.parts}
+            covered_parts = {**self._whole(node.fn.__module__).parts, **closure.parts}
             code = self._named(
-                digest(code, closure.code), parts, is_private(code) or is_private(closure.code)
+                digest(code, closure.code),
+                covered_parts,
+                is_private(code) or is_private(closure.code),
             )
         return self._beside(code, node, [node.fn.__module__, *(module for module, _ in classes)])
 
@@ -327,12 +338,13 @@ class Code:
         if not wholes:
             return code
         for name, closure in wholes.items():
+            # "_": what the module runs when it is imported
             self._refuse(closure, name, node, {"_"})
-        parts = dict(self.parts.get(code, {}))
+        covered_parts = dict(self.parts.get(code, {}))
         for closure in wholes.values():
-            parts |= closure.parts
+            covered_parts |= closure.parts
         codes = [closure.code for closure in wholes.values()]
-        return self._named(digest(code, codes), parts, any(map(is_private, [code, *codes])))
+        return self._named(digest(code, codes), covered_parts, any(map(is_private, [code, *codes])))
 
     def digest(self, module: str) -> str:
         """Return the digest of a module and of all that it imports, directly or not.
@@ -357,25 +369,36 @@ class Code:
         self._parts = {}
 
     def _of(self, node: Node) -> str:
+        """Return the digest of the code of a node without the modules of a user beside it."""
         module = node.fn.__module__
+        # the module with all that it imports
         code, closure = self.digest(module), self._whole(module)
         self._refuse(closure, module, node, {node.fn.__name__, "_"})
-        plain = getattr(sys.modules.get(module), node.fn.__name__, None) is node
-        if plain and not node.depends:
+        # else it was made in a function, whose variables decide what it computes
+        is_as_in_module = getattr(sys.modules.get(module), node.fn.__name__, None) is node
+        if is_as_in_module and not node.depends:
             return code
         source = closure.looks[module].path or Path(module)
+        # what the node itself declares, beside its module
         declared = resolve(node.depends, module, source, node.environment, _is_a_module)
-        parts, private = dict(declared.parts), is_private(code)
+        added_parts, is_private_code = dict(declared.parts), is_private(code)
         for name in declared.modules:
-            below = self._whole(name)
-            parts, private = {**parts, **parts_of(below.looks)}, private or is_private(below.code)
+            declared_closure = self._whole(name)
+            added_parts, is_private_code = (
+                {**added_parts, **parts_of(declared_closure.looks)},
+                is_private_code or is_private(declared_closure.code),
+            )
+        # the process computes with what the file said before
         if declared.changed:
-            private = True
+            is_private_code = True
             _say_changed(module, source, declared.changed[0])
-        if not plain:
-            parts["closure"], inner = self._held_around(node, closure, source)
-            private = private or any(map(is_private, inner))
-        return self._named(digest(code, parts), {**closure.parts, **parts}, private)
+        # a node that another function makes
+        if not is_as_in_module:
+            added_parts["closure"], inner = self._held_around(node, closure, source)
+            is_private_code = is_private_code or any(map(is_private, inner))
+        return self._named(
+            digest(code, added_parts), {**closure.parts, **added_parts}, is_private_code
+        )
 
     def _held_around(
         self, node: Node, closure: Whole, source: Path
@@ -385,14 +408,14 @@ class Code:
         """
         module = node.fn.__module__
         state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
-        parts = {node.path: state.digest({"function": node.fn})}
+        held_parts = {node.path: state.digest({"function": node.fn})}
         if state.changing and f"{FREE}function" not in node.depends:
             raise UnfollowedCode(changing_refusal("function", state.changing["function"], source))
-        inner = [
+        inner_codes = [
             self._whole(name).code for name in sorted(state.modules.keys() - closure.looks.keys())
         ]
-        parts.update({f"module {n}": inner_code for n, inner_code in enumerate(inner)})
-        return parts, inner
+        held_parts.update({f"module {n}": inner_code for n, inner_code in enumerate(inner_codes)})
+        return held_parts, inner_codes
 
     def _whole(self, module: str) -> Whole:
         """Return the digest of a module with the modules that it leads to."""
@@ -401,13 +424,20 @@ class Code:
         looks, names = self._led_to(module)
         if module not in looks or looks[module].summary is None:
             raise UnfollowedCode(_NO_FILE.format(module))
-        documents = any(look.summary.documents for look in looks.values() if look.summary)
-        state = {name: digest_of(look, documents) for name, look in looks.items()}
-        now = settings() | (own_settings(reads_time(looks)) if is_own(module) else {})
-        code = digest(_PYTHON, now, state)
-        parts = {"Python": {"version": _PYTHON}, "settings": now, **parts_of(looks)}
-        code = self._named(code, parts, any(look.private for look in looks.values()))
-        self._wholes[module] = Whole(code, looks, names, parts)
+        # docstrings count if any of the modules reads some
+        reads_docstrings = any(look.summary.documents for look in looks.values() if look.summary)
+        # what each module adds, its docstrings only where they are read
+        state = {name: digest_of(look, reads_docstrings) for name, look in looks.items()}
+        # code of users reads more settings than that of neusee
+        process_settings = settings() | (own_settings(reads_time(looks)) if is_own(module) else {})
+        code = digest(_PYTHON, process_settings, state)
+        covered_parts = {
+            "Python": {"version": _PYTHON},
+            "settings": process_settings,
+            **parts_of(looks),
+        }
+        code = self._named(code, covered_parts, any(look.private for look in looks.values()))
+        self._wholes[module] = Whole(code, looks, names, covered_parts)
         return self._wholes[module]
 
     def _led_to(self, module: str) -> tuple[dict[str, Look], Names]:
@@ -416,16 +446,18 @@ class Code:
         """
         looks: dict[str, Look] = {}
         names: Names = {module: set()}
-        todo, packages = [module], _packages(module)
-        while todo:
-            name = todo.pop()
+        modules_left, packages = [module], _packages(module)
+        while modules_left:
+            name = modules_left.pop()
+            # each module once; None for one that decides nothing
             look = self._look(name, packages, name == module) if name not in looks else None
             if look is None:
                 continue
             looks[name] = look
-            for other, used_names in look.imports.items():
-                names.setdefault(other, set()).update(used_names)
-                todo.append(other)
+            for imported_module, used_names in look.imports.items():
+                # which names others use decides what is refused
+                names.setdefault(imported_module, set()).update(used_names)
+                modules_left.append(imported_module)
         return looks, names
 
     def _named(self, code: str, parts: Parts, private: bool) -> str:
@@ -442,17 +474,26 @@ class Code:
         that ``own`` reaches.
         """
         for name, look in closure.looks.items():
+            # counts by its version
             if look.summary is None or look.path is None:
                 continue
             if not look.summary.constructs and not look.changing:
                 continue
+            # the empty name: all of the module
             used_names = own if name == module else closure.names.get(name) or {""}
-            free = [*look.summary.depends, *node.depends]
+            declared_entries = [*look.summary.depends, *node.depends]
             if look.changing:
-                _refuse_changing(look.changing, look.summary, look.path, used_names, free)
-            _refuse_constructs(look.summary, look.path, used_names, free)
+                _refuse_changing(
+                    look.changing, look.summary, look.path, used_names, declared_entries
+                )
+            _refuse_constructs(look.summary, look.path, used_names, declared_entries)
 
     def _look(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
+        """Return what a module adds to a digest, computed once; None for one that decides no
+        result.
+
+        ``root``: it is the module of the node itself.
+        """
         key = (module, packages, root)
         if key not in self._looks:
             self._looks[key] = (
@@ -461,6 +502,9 @@ class Code:
         return self._looks[key]
 
     def _looked(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
+        """Return what a module adds to a digest, by its origin: all of the workflows, its
+        version, its bytes or its source.
+        """
         if f"{module}.".startswith(f"{_WORKFLOWS}."):
             return Look({_WORKFLOWS: {"files": workflows_digest()}}, {})
         origin = self._origin(module, packages)
@@ -481,26 +525,31 @@ class Code:
         is_imported = imported(module)
         summary = self._summary(module, path)
         follows = self._follows(packages)
-        free = {entry.removeprefix(FREE) for entry in summary.depends if entry.startswith(FREE)}
-        imports = self._imports(module, path, summary, packages, free)
-        state, private, parts = "", holds_here_alone(module), {module: summary.definitions}
+        free_names = {
+            entry.removeprefix(FREE) for entry in summary.depends if entry.startswith(FREE)
+        }
+        imports = self._imports(module, path, summary, packages, free_names)
+        # state: the digest of the values that the loaded module holds
+        state, is_private_code, parts = "", holds_here_alone(module), {module: summary.definitions}
         changing: Mapping[str, str] = {}
         if is_imported:
-            loaded, state = self._loaded_state(module, summary, follows, free, root)
-            parts[f"state of {module}"], changing = {"values": state}, loaded.changing
-            for name in sorted(loaded.modules):
-                imports.setdefault(name, set()).update(loaded.modules[name])
-            if loaded.replaced and not private:
-                private = True
-                _say_replaced(module, path, loaded.replaced[0])
+            module_state, state = self._loaded_state(module, summary, follows, free_names, root)
+            parts[f"state of {module}"], changing = {"values": state}, module_state.changing
+            # modules of values that the source does not name
+            for name in sorted(module_state.modules):
+                imports.setdefault(name, set()).update(module_state.modules[name])
+            # another code than that of the file
+            if module_state.replaced and not is_private_code:
+                is_private_code = True
+                _say_replaced(module, path, module_state.replaced[0])
         if summary.depends:
-            declared = resolve(summary.depends, module, path, {}, _is_a_module)
-            parts.update(declared.parts)
-            imports.update({name: {""} for name in declared.modules})
-            if declared.changed:
-                private = True
-                _say_changed(module, path, declared.changed[0])
-        return Look(parts, imports, summary, path, state, changing, private)
+            declarations = resolve(summary.depends, module, path, {}, _is_a_module)
+            parts.update(declarations.parts)
+            imports.update({name: {""} for name in declarations.modules})
+            if declarations.changed:
+                is_private_code = True
+                _say_changed(module, path, declarations.changed[0])
+        return Look(parts, imports, summary, path, state, changing, is_private_code)
 
     def _imports(
         self,
@@ -513,14 +562,19 @@ class Code:
         """Return the modules that a module imports and does not declare ``free``, with the names
         that are used.
         """
-        inner = Imports(
+        # also of names that are not found in the file itself
+        module_imports = Imports(
             module,
             path,
             lambda name: self._summary_of(name, packages),
             lambda name: self._origin(name, packages).kind,
         )
-        names = inner.names(summary)
-        return {name: used for name, used in names.items() if name.partition(".")[0] not in free}
+        names_by_module = module_imports.names(summary)
+        return {
+            name: used_names
+            for name, used_names in names_by_module.items()
+            if name.partition(".")[0] not in free
+        }
 
     def _loaded_state(
         self,
@@ -531,12 +585,14 @@ class Code:
         root: bool,
     ) -> tuple[LoadedState, str]:
         """Return the state of a loaded module, and its digest."""
+        # otherwise the byte code never equals that of the file
         functions = summary.functions if compiled_as_written(module) else ()
         loaded = LoadedState(sys.modules[module], functions, follows)
         values = counted_values(sys.modules[module], summary, free, root)
-        if (only := self._loaded) is not None:
+        # of the modules that hang on a package, those that the caller had imported count
+        if (kept_modules := self._loaded) is not None:
             values = without_modules(
-                module, values, lambda name: follows(name) and name not in only
+                module, values, lambda name: follows(name) and name not in kept_modules
             )
         return loaded, loaded.digest(values)
 
@@ -549,12 +605,18 @@ class Code:
         return self._followed[packages]
 
     def _is_followed(self, module: str, packages: frozenset[str]) -> bool:
-        outside = _decides_nothing(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
+        """Return True for a module whose source counts, not its version."""
+        is_not_followed = _decides_nothing(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
         # the module of the methods of a tuple
-        nowhere = module.startswith("namedtuple_") and module not in sys.modules
-        return not outside and not nowhere and self._origin(module, packages).kind == "source"
+        is_of_tuple = module.startswith("namedtuple_") and module not in sys.modules
+        return (
+            not is_not_followed
+            and not is_of_tuple
+            and self._origin(module, packages).kind == "source"
+        )
 
     def _origin(self, module: str, packages: frozenset[str]) -> Origin:
+        """Return where a module comes from, found once."""
         key = (module, packages)
         if key not in self._origins:
             self._origins[key] = origin_of(module, packages)
@@ -568,15 +630,17 @@ class Code:
         return origin.path, self._summary(module, origin.path)
 
     def _summary(self, module: str, path: Path) -> Summary:
-        (source, content_digest), own = source_of(module, path), is_own(module)
-        name = f"{PYTHON}:{EDITION}:{content_digest}{':own' * own}"
-        if name not in self._summaries:
+        """Return the summary of a source file, from the memo where an equal source is in it."""
+        (source, content_digest), is_of_user = source_of(module, path), is_own(module)
+        # another Python, or another code that summarises, gives another summary
+        memo_key = f"{PYTHON}:{EDITION}:{content_digest}{':own' * is_of_user}"
+        if memo_key not in self._summaries:
             try:
-                self._summaries[name] = _summarised(source, own)
+                self._summaries[memo_key] = _summarised(source, is_of_user)
             except (SyntaxError, ValueError) as error:
                 raise UnfollowedCode(f"{path}: {error}") from error
             self._new = True
-        return self._summaries[name]
+        return self._summaries[memo_key]
 
 
 #: several stores in one process parse a source once
@@ -584,6 +648,7 @@ _summarised = functools.lru_cache(1000)(summarise)
 
 
 def _is_a_module(name: str) -> bool:
+    """Return True if a name is that of a module that can be found."""
     return module_path(name) is not None
 
 
@@ -608,23 +673,25 @@ def _refuse_changing(
     """Raise `LookupError` for an object that changes while a process runs, is read and is not
     declared.
     """
+    # no names: all of the module
     names = set[str]() if used_names & {"", "*"} else used_names
-    read = read_names(summary.statements, names)
-    for held, kind_of_object in changing.items():
-        if held in read and f"{FREE}{held}" not in free:
-            raise UnfollowedCode(changing_refusal(held, kind_of_object, path))
+    names_read = read_names(summary.statements, names)
+    for object_name, kind_of_object in changing.items():
+        if object_name in names_read and f"{FREE}{object_name}" not in free:
+            raise UnfollowedCode(changing_refusal(object_name, kind_of_object, path))
 
 
 def _refuse_constructs(
     summary: Summary, path: Path, used_names: set[str], free: Sequence[str]
 ) -> None:
     """Raise `LookupError` for the first construct that the used names reach and no entry covers."""
-    names = None if "" in used_names else used_names
-    lines = frozenset(chain.from_iterable(reached(summary.statements, names)))
-    met = [item for item in summary.constructs if item.line in lines]
-    left = uncovered(met, free)
-    if left is not None:
-        raise UnfollowedCode(refusal(left, path))
+    # the empty name stands for the whole module
+    names_or_all = None if "" in used_names else used_names
+    lines = frozenset(chain.from_iterable(reached(summary.statements, names_or_all)))
+    reached_constructs = [item for item in summary.constructs if item.line in lines]
+    first_uncovered = uncovered(reached_constructs, free)
+    if first_uncovered is not None:
+        raise UnfollowedCode(refusal(first_uncovered, path))
 
 
 def _decides_nothing(module: str) -> bool:
@@ -675,15 +742,21 @@ class KnownKeys:
         """Return the cache key of ``step`` and the data from which the key is computed, as
         `key_of` does.
         """
-        beside = (seed, device_kind(device), *(keys[name] for name in step.sources))
+        seed_device_inputs = (seed, device_kind(device), *(keys[name] for name in step.sources))
         newest = self._newest.get(step.name)
-        if newest is not None and newest.beside == beside and _is_same(step, newest.step):
+        if (
+            newest is not None
+            and newest.beside == seed_device_inputs
+            and _is_same(step, newest.step)
+        ):
             return newest.key, newest.origin
         key, origin = key_of(step, keys, seed, self.code, device)
         if newest is not None and newest.key == key:
             key = newest.key  # the same object: many points of a sweep keep their keys
+        # a file may change without a change of its name
         if not has_path(step.params):
-            self._newest[step.name] = _Known(step, beside, key, origin)
+            # a file is read again each time, so its step is not kept
+            self._newest[step.name] = _Known(step, seed_device_inputs, key, origin)
         return key, origin
 
 
@@ -693,9 +766,11 @@ def _is_same(step: Step, other: Step) -> bool:
     """
     if step is other:
         return True
-    same = step.node is other.node and step.wires == other.wires and step.cached == other.cached
-    same = same and step.params.keys() == other.params.keys()
-    return same and all(_is_equal(value, other.params[name]) for name, value in step.params.items())
+    is_equal = step.node is other.node and step.wires == other.wires and step.cached == other.cached
+    is_equal = is_equal and step.params.keys() == other.params.keys()
+    return is_equal and all(
+        _is_equal(value, other.params[name]) for name, value in step.params.items()
+    )
 
 
 def _is_equal(value: Any, other: Any) -> bool:

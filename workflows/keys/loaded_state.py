@@ -111,9 +111,10 @@ class _Hows(dict[type, str]):
     """How values of a type are described, by type."""
 
     def __missing__(self, kind: type) -> str:
-        other = "changing" if hasattr(kind, "__next__") else "object"
+        # an iterator changes whenever it is read
+        default_kind = "changing" if hasattr(kind, "__next__") else "object"
         self[kind] = next(
-            (description for description, kinds in _KINDS if issubclass(kind, kinds)), other
+            (description for description, kinds in _KINDS if issubclass(kind, kinds)), default_kind
         )
         return self[kind]
 
@@ -155,14 +156,15 @@ class LoadedState:
         """Return the digest of named values of the module; names such as ``__file__`` do not
         count.
         """
-        state: list[Any] = []
+        described_values: list[Any] = []
         for name in sorted(values):
             if name == "__getattr__" or not (name.startswith("__") and name.endswith("__")):
-                state.append((name, self._shallow(values[name])))
+                described_values.append((name, self._shallow(values[name])))
+                # noted while the value was described
                 if self._changes:
                     self.changing[name] = self._changes[0]
                     self._changes = []
-        return xxhash.xxh3_128_hexdigest(repr(state).encode(errors="surrogatepass"))
+        return xxhash.xxh3_128_hexdigest(repr(described_values).encode(errors="surrogatepass"))
 
     def _shallow(self, value: Any) -> Any:
         """Return a value as text and tuples, or its type if it holds itself, or much, one in the
@@ -180,23 +182,29 @@ class LoadedState:
         if value is None:
             return _NOTHING
         kind = _HOW[type(value)]
-        numbers, name, before = self._seen, id(value), len(self._changes)
+        number_of_object, object_id, changes_before = self._seen, id(value), len(self._changes)
         try:
+            # short: written out each time
             if kind in _ATOMS:
                 return _DESCRIBED[kind](self, value)
-            if name in numbers:
-                self._changes += self._holds.get(name, ())
-                return "again", numbers[name]
-            numbers[name] = len(numbers)
+            if object_id in number_of_object:
+                # what changes in it counts under this name too
+                self._changes += self._holds.get(object_id, ())
+                return "again", number_of_object[object_id]
+            number_of_object[object_id] = len(number_of_object)
+            # as long as it lives, no other object gets its id
             self._kept.append(value)
-            text = _DESCRIBED[kind](self, value)
+            description = _DESCRIBED[kind](self, value)
         except RecursionError:
             raise  # where it ends depends on the calls around it
         except Exception as error:  # the methods of a class may do anything
-            text = self._unread(value, f"could not be read ({type(error).__name__}: {error})")
-        if len(self._changes) > before:
-            self._holds[name] = self._changes[before:]
-        return text
+            description = self._unread(
+                value, f"could not be read ({type(error).__name__}: {error})"
+            )
+        if len(self._changes) > changes_before:
+            # for the next time that the object is met
+            self._holds[object_id] = self._changes[changes_before:]
+        return description
 
     def _unread(self, value: Any, why: str) -> str:
         """Return the type of a value whose parts cannot be told; note it if the parts of such a
@@ -220,15 +228,23 @@ class LoadedState:
         return type(value).__name__, self._noted(value.__name__)
 
     def _array(self, value: Any) -> Any:
+        """Describe a tensor or an array by its type, shape and the digest of its elements."""
         if not isinstance(value, np.ndarray):
             return type(value).__name__, *_array(value)
-        plain = np.ndarray.view(value, np.ndarray)  # a class of arrays may refuse to be read
-        if plain.dtype.hasobject:
-            return type(value).__name__, str(plain.dtype), plain.shape, self._of(plain.tolist())
+        base_array = np.ndarray.view(value, np.ndarray)  # a class of arrays may refuse to be read
+        # its bytes are addresses
+        if base_array.dtype.hasobject:
+            return (
+                type(value).__name__,
+                str(base_array.dtype),
+                base_array.shape,
+                self._of(base_array.tolist()),
+            )
+        # the masked elements of an array count too
         mask = np.ma.getmask(value) if isinstance(value, np.ma.MaskedArray) else np.ma.nomask
         return (
             type(value).__name__,
-            *_array(plain),
+            *_array(base_array),
             *(_array(mask) if isinstance(mask, np.ndarray) else ()),
         )
 
@@ -243,10 +259,11 @@ class LoadedState:
         return self._typed(value), self._pairs(list(value.items()))
 
     def _pairs(self, pairs: Iterable[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
-        texts = []
+        """Return keys and values as texts, in their order."""
+        descriptions = []
         for key, item in pairs:
-            texts.append((self._of(key), self._of(item)))
-        return texts
+            descriptions.append((self._of(key), self._of(item)))
+        return descriptions
 
     def _list(self, value: Any) -> Any:
         return self._typed(value), [self._of(item) for item in value]
@@ -290,23 +307,31 @@ class LoadedState:
             return self._typed(value), [
                 (name, self._of(attribute)) for name, attribute in attributes
             ]
-        inner = _wrapped(value, kind)
-        return self._typed(value), self._of(inner) if callable(inner) else ""
+        wrapped = _wrapped(value, kind)
+        return self._typed(value), self._of(wrapped) if callable(wrapped) else ""
 
     def _function(self, function: FunctionType) -> Any:
         """Return a function by module and name, with its defaults and closure if it is local."""
-        home, code = str(function.__globals__.get("__name__")), function.__code__
+        module_name, code = str(function.__globals__.get("__name__")), function.__code__
+        # its closure holds a cache
         if code is _DISPATCH:
             return "singledispatch", self._pairs(_implementations(function))
-        own = self._noted_function(function, home)
-        if not own and _found(home, function):
-            return "function", home, code.co_qualname, "", []
-        exact = function_code(code) if not own and self._followed(home) else ""
-        held = (function.__defaults__, function.__kwdefaults__, function.__closure__)
-        described = [item and self._of(item) for item in held]
-        if own and is_own(home):
+        is_of_file = self._noted_function(function, module_name)
+        # the source of its own module decides it
+        if not is_of_file and _found(module_name, function):
+            return "function", module_name, code.co_qualname, "", []
+        # a function of another module by its byte code, if that module is followed
+        code_digest = function_code(code) if not is_of_file and self._followed(module_name) else ""
+        defaults_and_closure = (
+            function.__defaults__,
+            function.__kwdefaults__,
+            function.__closure__,
+        )
+        described = [item and self._of(item) for item in defaults_and_closure]
+        if is_of_file and is_own(module_name):
+            # a function of a user may hold what a call left
             described += self._left_in(function)
-        return "function", home, code.co_qualname, exact, described
+        return "function", module_name, code.co_qualname, code_digest, described
 
     def _left_in(self, function: FunctionType) -> list[tuple[str, Any]]:
         """Return the attributes of a function, which may hold what a call left in it."""
@@ -321,28 +346,31 @@ class LoadedState:
         return True for a function of the file of this module.
         """
         code = function.__code__
-        own = home == self._name and code.co_filename == self._file
+        is_of_file = home == self._name and code.co_filename == self._file
         if home != self._name:
             self._noted(home, function.__qualname__)
-        if own and self._functions and function_code(code) not in self._functions:
+        if is_of_file and self._functions and function_code(code) not in self._functions:
             self.replaced.append(function.__qualname__)
-        return own
+        return is_of_file
 
     def _class(self, kind: type) -> Any:
+        """Describe a class by its name, and one of this module by its bases and attributes too."""
         name = ("class", self._noted(_home(kind), kind.__qualname__), kind.__qualname__)
         if kind.__module__ != self._name:
             return name
+        # without the class itself
         bases = [(base.__module__, base.__qualname__) for base in kind.__mro__[1:]]
         for base in kind.__mro__[1:]:
             self._noted(base.__module__, base.__qualname__)
-        parts = [
+        class_attributes = [
             (name, attribute)
             for name, attribute in vars(kind).items()
             if not _SKIPPED.fullmatch(name) or _is_method(attribute)
         ]
-        return name, bases, [(name, self._of(attribute)) for name, attribute in parts]
+        return name, bases, [(name, self._of(attribute)) for name, attribute in class_attributes]
 
     def _typed(self, value: Any) -> str:
+        """Return the full name of the type of a value, and note its module."""
         kind = type(value)
         return f"{self._noted(_home(kind), kind.__qualname__)}.{kind.__qualname__}"
 
@@ -376,16 +404,21 @@ def counted_values(
     nodes reach.
     """
     values = {name: value for name, value in vars(module).items() if name not in free}
-    nodes = _names_of_nodes(values) if root else []
-    if nodes:
-        classes = [name for name, value in values.items() if _is_network(value)]
-        counted = values.keys() & read_names(summary.statements, [*nodes, *classes, "_"])
+    node_names = _names_of_nodes(values) if root else []
+    if node_names:
+        networks = [name for name, value in values.items() if _is_network(value)]
+        # "_": statements that run at import
+        counted_names = values.keys() & read_names(
+            summary.statements, [*node_names, *networks, "_"]
+        )
     else:
-        counted = values.keys() - written_only(summary.statements)
-    return {name: value for name, value in values.items() if name in counted}
+        # without logs, which nothing reads
+        counted_names = values.keys() - written_only(summary.statements)
+    return {name: value for name, value in values.items() if name in counted_names}
 
 
 def _names_of_nodes(values: Mapping[str, Any]) -> list[str]:
+    """Return the names under which a module holds nodes."""
     return [name for name, value in values.items() if issubclass(type(value), Node)]
 
 
@@ -395,17 +428,18 @@ def without_modules(
     """Return the values of a package without those of its own modules whose names are
     ``left_out``.
     """
-    inside = {
+    own_submodules = {
         name for name, value in values.items() if value is sys.modules.get(f"{package}.{name}")
     }
     return {
         name: value
         for name, value in values.items()
-        if name not in inside or not left_out(f"{package}.{name}")
+        if name not in own_submodules or not left_out(f"{package}.{name}")
     }
 
 
 def _hooks(node: Node) -> Iterator[Any]:
+    """Yield the hooks of a node that may decide a result, and its other forms."""
     for name in node.hooks.__slots__:
         if name not in _FORETELLING:
             yield getattr(node.hooks, name)
@@ -415,17 +449,20 @@ def _hooks(node: Node) -> Iterator[Any]:
 def _array(value: Any) -> tuple[Any, ...]:
     """Return type, shape and digest of a tensor or an array."""
     if isinstance(value, torch.Tensor):
+        # without values that could be read
         if value.device.type == "meta" or value.layout != torch.strided:
             return str(value.dtype), tuple(value.shape)
-        flat = value.detach().cpu().contiguous().reshape(-1)
-        raw: Any = b""
-        if flat.numel():
-            raw = flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().data
+        elements = value.detach().cpu().contiguous().reshape(-1)
+        element_bytes: Any = b""
+        if elements.numel():
+            # torch may only note that a tensor is conjugated or negative
+            element_bytes = elements.resolve_conj().resolve_neg().view(torch.uint8).numpy().data
+    # booleans, integers, floats and complex numbers
     elif value.flags.c_contiguous and value.dtype.kind in "biufc":
-        raw = value.data  # without a copy
+        element_bytes = value.data  # without a copy
     else:
-        raw = value.tobytes()
-    return str(value.dtype), tuple(value.shape), xxhash.xxh3_128_hexdigest(raw)
+        element_bytes = value.tobytes()
+    return str(value.dtype), tuple(value.shape), xxhash.xxh3_128_hexdigest(element_bytes)
 
 
 def _attributes(value: Any) -> list[tuple[str, Any]]:
@@ -433,12 +470,12 @@ def _attributes(value: Any) -> list[tuple[str, Any]]:
     slots = set[str]()
     for base in type(value).__mro__:
         slots.update(_slot_names(vars(base).get("__slots__", ())))
-    in_slots = {
+    slot_values = {
         slot: getattr(value, slot)
         for slot in sorted(slots)
         if not slot.startswith("__") and hasattr(value, slot)
     }
-    return list({**in_slots, **getattr(value, "__dict__", {})}.items())
+    return list({**slot_values, **getattr(value, "__dict__", {})}.items())
 
 
 def _home(kind: type) -> str:
@@ -447,6 +484,7 @@ def _home(kind: type) -> str:
 
 
 def _is_network(value: Any) -> bool:
+    """Return True for a class of network."""
     return issubclass(type(value), type) and issubclass(value, nn.Module)
 
 
@@ -456,10 +494,12 @@ def _is_lazy(kind: type, name: str) -> bool:
 
 
 def _slot_names(slots: Any) -> tuple[str, ...]:
+    """Return the names in ``__slots__``, which may be a single text."""
     return (slots,) if isinstance(slots, str) else tuple(slots)
 
 
 def _content(cell: CellType) -> Any:
+    """Return what a cell of a closure holds; None for an empty one."""
     try:
         return cell.cell_contents
     except ValueError:
@@ -527,7 +567,7 @@ torch.get_default_device()
 
 def settings() -> dict[str, str]:
     """Return the settings of torch and Python that differ from those of a new process."""
-    now = {
+    present_settings = {
         "default dtype": str(torch.get_default_dtype()),
         "default device": str(torch.get_default_device()),
         "matmul precision": torch.get_float32_matmul_precision(),
@@ -540,12 +580,13 @@ def settings() -> dict[str, str]:
             )
             or "off"
         ),
+        # the product is 0 where small numbers are flushed to 0
         "numbers below 1e-308": "kept" if _SMALLEST * _HALF else "0",
         "assert statements": (
             f"left out by -{'O' * sys.flags.optimize}" if sys.flags.optimize else "run"
         ),
     }
-    return {name: value for name, value in now.items() if value != USUAL[name]}
+    return {name: value for name, value in present_settings.items() if value != USUAL[name]}
 
 
 def own_settings(reads_time: bool) -> dict[str, str]:
@@ -554,25 +595,27 @@ def own_settings(reads_time: bool) -> dict[str, str]:
 
     With ``reads_time`` the code may read the time zone.
     """
-    now = {
+    present_settings = {
         "floating-point errors": _errors(),
         "printed numbers": _printing(),
         "encoding of texts": _encoding(),
     }
-    now["code at the start of Python"] = _code_at_start()
+    present_settings["code at the start of Python"] = _code_at_start()
     if reads_time:
-        now["time zone"] = _time_zone()
-    return {name: value for name, value in now.items() if value != USUAL[name]}
+        present_settings["time zone"] = _time_zone()
+    return {name: value for name, value in present_settings.items() if value != USUAL[name]}
 
 
 def _errors() -> str:
     """Return which floating-point errors of NumPy end a calculation or call a function; warnings
     decide nothing.
     """
-    kinds = [
-        f"{name} {does}" for name, does in np.geterr().items() if does in ("raise", "call", "log")
+    error_actions = [
+        f"{name} {action}"
+        for name, action in np.geterr().items()
+        if action in ("raise", "call", "log")
     ]
-    return ", ".join(kinds) or OWN_USUAL["floating-point errors"]
+    return ", ".join(error_actions) or OWN_USUAL["floating-point errors"]
 
 
 def _printing() -> str:
@@ -581,11 +624,13 @@ def _printing() -> str:
     The option ``legacy`` does not count: colour-science sets it, and whether it is loaded decides
     no result.
     """
-    now: Mapping[str, object] = {**np.get_printoptions()}
-    other = [
-        f"{name}={now[name]}" for name, value in _PRINTED.items() if now.get(name, value) != value
+    print_options: Mapping[str, object] = {**np.get_printoptions()}
+    changed_options = [
+        f"{name}={print_options[name]}"
+        for name, value in _PRINTED.items()
+        if print_options.get(name, value) != value
     ]
-    return ", ".join(other) or OWN_USUAL["printed numbers"]
+    return ", ".join(changed_options) or OWN_USUAL["printed numbers"]
 
 
 def _encoding() -> str:
@@ -597,20 +642,23 @@ def _code_at_start() -> str:
     """Return a digest of the modules with which a user or a system changes Python when it
     starts.
     """
-    files = [
+    start_files = [
         getattr(sys.modules.get(name), "__file__", None)
         for name in ("sitecustomize", "usercustomize")
     ]
-    texts = [bytes_of(file) for file in files if file is not None and Path(file).is_file()]
-    if not texts:
+    file_contents = [
+        bytes_of(file) for file in start_files if file is not None and Path(file).is_file()
+    ]
+    if not file_contents:
         return OWN_USUAL["code at the start of Python"]
-    return hashlib.blake2b(b"\0".join(texts), digest_size=4).hexdigest()
+    return hashlib.blake2b(b"\0".join(file_contents), digest_size=4).hexdigest()
 
 
 def _time_zone() -> str:
     """Return the names of the time zone and a digest of its offsets from UTC in each week from
     1970 to 2040.
     """
+    # s since 1970: up to 2040, week by week
     weeks = range(0, 2_208_988_800, 7 * 86_400)
     offsets = [time.localtime(week).tm_gmtoff for week in weeks]
     if not any(offsets):
@@ -627,7 +675,7 @@ def workflows_digest() -> str:
     of them.
     """
     folder = Path(__file__).parents[1]
-    text = hashlib.blake2b(digest_size=16)
+    hasher = hashlib.blake2b(digest_size=16)
     for path in sorted(folder.rglob("*.py")):
-        text.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
-    return text.hexdigest()
+        hasher.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    return hasher.hexdigest()

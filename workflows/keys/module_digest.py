@@ -114,9 +114,10 @@ def _read(name: str, raw: bytes, signed_by: tuple[bytes, ...]) -> tuple[_Known, 
     """Return what a memo says; the same bytes are read once in a process, for each list of
     secrets.
     """
-    seal, _, content = raw.partition(b"\n")
-    memory, text = unseal_file("sources", name, seal, content).split(b"\n", 1)
-    return _KNOWN.validate_json(memory), _SUMMARIES.validate_json(text)
+    # three lines: the seal, notes of packages and of the program, summaries
+    seal_line, _, content = raw.partition(b"\n")
+    notes_json, summaries_json = unseal_file("sources", name, seal_line, content).split(b"\n", 1)
+    return _KNOWN.validate_json(notes_json), _SUMMARIES.validate_json(summaries_json)
 
 
 def is_complete(memo: Path) -> bool:
@@ -128,12 +129,14 @@ def is_complete(memo: Path) -> bool:
 
 def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
     """Save the newest summaries of source files; do nothing if the folder cannot be written."""
-    newest = dict(list(outlines.items())[-_KEPT:])
-    packages = dict(list(known_contents.items())[-_KEPT:])
+    newest_outlines = dict(list(outlines.items())[-_KEPT:])
+    newest_contents = dict(list(known_contents.items())[-_KEPT:])
     _saved[memo] = len(outlines) + len(known_contents)
-    memory = _KNOWN.dump_json(_Known(distributions_of, newest, packages))
-    text = json.dumps(dict(list(summaries.items())[-_KEPT:])).encode()
-    content = b"\n".join([memory, text])
+    outlines_and_contents = _KNOWN.dump_json(
+        _Known(distributions_of, newest_outlines, newest_contents)
+    )
+    summaries_json = json.dumps(dict(list(summaries.items())[-_KEPT:])).encode()
+    content = b"\n".join([outlines_and_contents, summaries_json])
     _write(
         memo, b"\n".join([seal_file("sources", memo.name, content), content]), memo.parent / "tmp"
     )
@@ -157,6 +160,7 @@ def write_parts(root: Path, code: str, parts: Parts) -> None:
     path = root / "code" / f"{code}.json"
     with suppress(OSError):
         stamp = file_stamp(path)
+        # an undamaged record is there
         if _right.get(path) == stamp or read_parts(root, code):
             _right[path] = stamp
             return
@@ -169,6 +173,7 @@ def _write(path: Path, content: bytes, folder: Path) -> None:
     ``folder`` is that of temporary files, in the root of the store.
     """
     root = str(folder.parent)
+    # one temporary file for each process and thread
     partial = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
     with suppress(OSError):
         make_folders(str(folder), root)
@@ -256,11 +261,11 @@ def counted(module: str, version: str) -> Counted:
 
     ``version`` is what the module counts by if neusee declares its package.
     """
-    top = module.partition(".")[0]
-    names = module_origin.distributions_with(top)
-    if not names or BY_VERSION.issuperset(map(module_origin.plain, names)):
-        return Counted({f"package {top}": {"version": version}}, "")
-    return _counted(top, version)
+    top_package = module.partition(".")[0]
+    distributions = module_origin.distributions_with(top_package)
+    if not distributions or BY_VERSION.issuperset(map(module_origin.plain, distributions)):
+        return Counted({f"package {top_package}": {"version": version}}, "")
+    return _counted(top_package, version)
 
 
 @functools.cache
@@ -268,20 +273,26 @@ def _counted(top: str, version: str) -> Counted:
     """Return what a top-level module of a package adds that neusee does not declare, as it was
     when first asked.
     """
-    own = [module_origin.plain(name) for name in module_origin.distributions_with(top)]
-    contents = {name: _content(name, top) for name in own}
-    parts = {f"package {top}": {"version": version, "content": _joined(contents.values())}}
-    newest = max(content.changed for content in contents.values())
-    edited = top if top in sys.modules and newest > import_time(top) else ""
-    for name in sorted(_required(own)):
-        about = {"version": module_origin.released(name)}
+    own_distributions = [
+        module_origin.plain(name) for name in module_origin.distributions_with(top)
+    ]
+    content_of = {name: _content(name, top) for name in own_distributions}
+    package_parts = {
+        f"package {top}": {"version": version, "content": _joined(content_of.values())}
+    }
+    newest_change = max(content.changed for content in content_of.values())
+    # the process computes with the files that it imported
+    edited_package = top if top in sys.modules and newest_change > import_time(top) else ""
+    for name in sorted(_required(own_distributions)):
+        version_and_content = {"version": module_origin.released(name)}
         if name not in BY_VERSION:
-            about["content"] = _content(name, name).digest
-        parts.setdefault(f"package {name}", about)
-    return Counted(parts, edited)
+            version_and_content["content"] = _content(name, name).digest
+        package_parts.setdefault(f"package {name}", version_and_content)
+    return Counted(package_parts, edited_package)
 
 
 def _joined(contents: Iterable[Content]) -> str:
+    """Return the digests of some distributions as one text."""
     return " ".join(content.digest for content in contents)
 
 
@@ -292,15 +303,16 @@ def _required(names: Iterable[str]) -> set[str]:
     What a package that neusee declares requires does not count, as it does not where a node imports
     that package.
     """
-    first = set(names)
-    distributions, todo = set(first), [*first]
-    while todo:
-        text = (
-            module_origin.metadata_text(todo.pop(), "METADATA")
+    given_names = set(names)
+    distributions, names_left = set(given_names), [*given_names]
+    while names_left:
+        # the description follows the first empty line
+        metadata_head = (
+            module_origin.metadata_text(names_left.pop(), "METADATA")
             .decode(errors="replace")
             .partition("\n\n")[0]
         )
-        for name, marker in _REQUIRED.findall(text):
+        for name, marker in _REQUIRED.findall(metadata_head):
             requirement = module_origin.plain(name)
             if (
                 requirement in distributions
@@ -311,8 +323,8 @@ def _required(names: Iterable[str]) -> set[str]:
                 continue
             distributions.add(requirement)
             if requirement not in BY_VERSION:
-                todo.append(requirement)
-    return distributions - first
+                names_left.append(requirement)
+    return distributions - given_names
 
 
 def _content(name: str, top: str) -> Content:
@@ -323,16 +335,18 @@ def _content(name: str, top: str) -> Content:
     """
     files = sorted(_files(name, top).items())
     stamps = [(path, _content_stamp(file)) for path, file in files]
-    changed = max((max(stamp[-2:]) for _, stamp in stamps if stamp), default=0)
-    mark = xxhash.xxh3_128_hexdigest(repr([name, stamps]).encode(errors="replace"))
-    if mark in known_contents:
-        return Content(known_contents[mark], changed)
-    text = xxhash.xxh3_128()
+    # the last two numbers of a stamp are its times in ns
+    newest_change = max((max(stamp[-2:]) for _, stamp in stamps if stamp), default=0)
+    stamp_digest = xxhash.xxh3_128_hexdigest(repr([name, stamps]).encode(errors="replace"))
+    if stamp_digest in known_contents:
+        return Content(known_contents[stamp_digest], newest_change)
+    hasher = xxhash.xxh3_128()
     for path, file in files:
-        text.update(path.encode(errors="replace") + b"\0" + _digest_of(file) + b"\n")
-    if time.time_ns() - changed > _SETTLED:
-        known_contents[mark] = text.hexdigest()
-    return Content(text.hexdigest(), changed)
+        hasher.update(path.encode(errors="replace") + b"\0" + _digest_of(file) + b"\n")
+    # a file that has just changed may change again within its stamp
+    if time.time_ns() - newest_change > _SETTLED:
+        known_contents[stamp_digest] = hasher.hexdigest()
+    return Content(hasher.hexdigest(), newest_change)
 
 
 def _files(name: str, top: str) -> dict[str, str]:
@@ -342,15 +356,15 @@ def _files(name: str, top: str) -> dict[str, str]:
     The files are those of the record of its installation, and modules that stand in its packages
     without a record.
     """
-    site = os.path.dirname(module_origin.metadata_folder(name))
-    record = module_origin.metadata_text(name, "RECORD").decode(errors="replace")
-    recorded = list(_recorded(record))
-    if recorded:
-        paths = [*recorded, *_modules_in_packages(site, recorded)]
+    package_folder = os.path.dirname(module_origin.metadata_folder(name))
+    record_text = module_origin.metadata_text(name, "RECORD").decode(errors="replace")
+    recorded_paths = list(_recorded(record_text))
+    if recorded_paths:
+        paths = [*recorded_paths, *_modules_in_packages(package_folder, recorded_paths)]
     else:
-        modules = [entry for entry in os.listdir(site) if entry.partition(".")[0] == top]
-        paths = [*filter(_is_module, modules), *_below(site, top)]
-    return {path: os.path.join(site, path) for path in paths}
+        modules = [entry for entry in os.listdir(package_folder) if entry.partition(".")[0] == top]
+        paths = [*filter(_is_module, modules), *_below(package_folder, top)]
+    return {path: os.path.join(package_folder, path) for path in paths}
 
 
 def _modules_in_packages(site: str, recorded: Iterable[str]) -> Iterator[str]:
@@ -366,23 +380,26 @@ def _recorded(record: str) -> Iterator[str]:
     packages.
     """
     for line in record.splitlines():
+        # "path,hash,size", where the path may have commas
         path = line.rsplit(",", 2)[0].strip('"').replace("\\", "/")
-        outside = path.startswith(("..", "/")) or path.partition("/")[0].endswith(
+        is_no_code = path.startswith(("..", "/")) or path.partition("/")[0].endswith(
             (".dist-info", ".data")
         )
-        if path and not outside and not path.endswith(_LEFT_OUT):
+        if path and not is_no_code and not path.endswith(_LEFT_OUT):
             yield path
 
 
 def _below(site: str, package: str) -> Iterator[str]:
     """Yield the files in the folder of a package, as a record names them."""
-    for folder, inside, files in os.walk(os.path.join(site, package)):
-        inside[:] = [subfolder for subfolder in inside if subfolder != "__pycache__"]
-        where = os.path.relpath(folder, site)
-        yield from (f"{where}/{file}" for file in files if not file.endswith(_LEFT_OUT))
+    for folder, subfolders, files in os.walk(os.path.join(site, package)):
+        # in place, so that os.walk leaves them out
+        subfolders[:] = [subfolder for subfolder in subfolders if subfolder != "__pycache__"]
+        relative_folder = os.path.relpath(folder, site)
+        yield from (f"{relative_folder}/{file}" for file in files if not file.endswith(_LEFT_OUT))
 
 
 def _is_module(file: str) -> bool:
+    """Return True for a file of Python source or a compiled module."""
     return file.endswith((".py", ".so", ".pyd"))
 
 
@@ -397,6 +414,7 @@ def _content_stamp(file: str) -> Stamp:
 
 
 def _digest_of(file: str) -> bytes:
+    """Return the digest of a file, or a word for a missing one."""
     try:
         with opened(file) as content:
             return hashlib.file_digest(content, xxhash.xxh3_128).digest()
@@ -425,11 +443,13 @@ def source_of(module: str, path: Path) -> tuple[bytes, str]:
     Warn if the source was edited after the import of the module.
     """
     spec = getattr(sys.modules.get(module), "__spec__", None)
+    # the module was not loaded anew
     if module in _frozen and _frozen[module][0] is spec and spec is not None:
         return _frozen[module][1:]
     source = path.read_bytes()
     source_and_digest = source, xxhash.xxh3_128_hexdigest(source)
     _edited_since.discard(module)
+    # loaded: what Python runs is what was read first
     if spec is not None:
         _frozen[module] = (spec, *source_and_digest)
         if _edited(module, spec, path):
@@ -473,19 +493,24 @@ def _edited(module: str, spec: Any, path: Path) -> bool:
     """Return True if a source file was changed after the import began, or after Python wrote the
     byte code.
     """
-    stat = os.stat(path)
-    if stat.st_ctime_ns > import_time(module):
+    file_status = os.stat(path)
+    # changed after the import
+    if file_status.st_ctime_ns > import_time(module):
         return True
     try:
         with open(spec.cached or "", "rb") as file:
-            head = file.read(16)
+            # the head of byte code: magic number, flags, time and size of the source
+            byte_code_head = file.read(16)
         writable = os.access(os.path.dirname(spec.cached), os.W_OK) and not sys.dont_write_bytecode
     except OSError:
         return False
-    stamp = b"".join(
-        (int(n) & 0xFFFFFFFF).to_bytes(4, "little") for n in (stat.st_mtime, stat.st_size)
+    # as byte code has it: time and size of the source, 4 bytes each
+    source_stamp = b"".join(
+        (int(n) & 0xFFFFFFFF).to_bytes(4, "little")
+        for n in (file_status.st_mtime, file_status.st_size)
     )
-    return writable and head[4:8] == bytes(4) and head[8:] != stamp
+    # bytes 4 to 8 are 0: the byte code names its source by a stamp and not by a digest
+    return writable and byte_code_head[4:8] == bytes(4) and byte_code_head[8:] != source_stamp
 
 
 # --- module look ----------------------------------------------------------------------------------
@@ -531,13 +556,13 @@ def digest_of(look: Look, documents: bool) -> list[Any]:
     """Return what a module adds to the digest of a node."""
     if look.summary is None:
         return [look.parts]
-    source = look.summary.whole if documents else look.summary.tree
-    other = {
+    syntax_digest = look.summary.whole if documents else look.summary.tree
+    declared_parts = {
         name: content
         for name, content in look.parts.items()
         if name.startswith(("file ", "environment "))
     }
-    return [source, look.state, other]
+    return [syntax_digest, look.state, declared_parts]
 
 
 def installed_look(module: str, version: str, packages: frozenset[str]) -> Look:

@@ -43,26 +43,28 @@ def origin_of(module: str, packages: frozenset[str]) -> Origin:
     """Return the origin of a module without importing it; the source of each of ``packages``
     counts if installed.
     """
-    top = module.partition(".")[0]
-    counts_by_source = top in packages
-    if top in _fixed and not counts_by_source:
-        return _fixed[top]
-    if _is_of_python(top):
-        return _fixed.setdefault(top, Origin("python"))
-    if module != top and not counts_by_source:
-        package = origin_of(top, packages)
+    top_package = module.partition(".")[0]
+    counts_by_source = top_package in packages
+    # an installed package, or Python itself
+    if top_package in _fixed and not counts_by_source:
+        return _fixed[top_package]
+    if _is_of_python(top_package):
+        return _fixed.setdefault(top_package, Origin("python"))
+    if module != top_package and not counts_by_source:
+        package = origin_of(top_package, packages)
         if package.kind == "distribution":
             return package
-    file = _stated_or_searched(module, top)
+    file = _stated_or_searched(module, top_package)
     if file is None:
-        return _without_file(module, top, counts_by_source)
-    version = "" if counts_by_source else _version_at(file, top)
+        return _without_file(module, top_package, counts_by_source)
+    version = "" if counts_by_source else _version_at(file, top_package)
     if version:
-        return _fixed.setdefault(top, Origin("distribution", None, version))
+        return _fixed.setdefault(top_package, Origin("distribution", None, version))
     return _of_file(Path(file))
 
 
 def _is_of_python(top: str) -> bool:
+    """Return True for a module of the standard library that no file of somebody else hides."""
     if top in ("builtins", "__future__"):
         return True
     return top in sys.stdlib_module_names and not _shadowed(top)
@@ -83,6 +85,7 @@ def _version_at(file: str, top: str) -> str:
 
 
 def _of_file(path: Path) -> Origin:
+    """Return the origin of a module with a file of its own: source or compiled."""
     return Origin("source", path) if path.suffix == ".py" else Origin("binary", path)
 
 
@@ -93,12 +96,14 @@ def _is_installed(file: str) -> bool:
     return any(
         _holds_distributions(str(folder))
         for folder in Path(file).parents
+        # a folder in which imports are searched
         if str(folder) in sys.path
     ) or (not _INSTALLED.isdisjoint(Path(file).parts))
 
 
 @functools.cache
 def _holds_distributions(folder: str) -> bool:
+    """Return True for a folder of installed packages."""
     if not _INSTALLED.isdisjoint(Path(folder).parts):
         return True
     return os.path.isdir(folder) and any(name.endswith(".dist-info") for name in os.listdir(folder))
@@ -117,6 +122,7 @@ def module_path(module: str) -> str | None:
         if spec is None or not spec.has_location or not os.path.isfile(spec.origin or ""):
             return None
         return spec.origin
+    # the first folder that has it
     return next(filter(None, (_file_in(folder, name) for folder in _folders_above(module))), None)
 
 
@@ -185,6 +191,7 @@ def _releases() -> dict[str, tuple[str, str]]:
     """
     releases: dict[str, tuple[str, str]] = {}
     for folder in _metadata():
+        # the folder "name-version.dist-info"
         name, _, version = os.path.basename(folder).removesuffix(".dist-info").partition("-")
         releases.setdefault(plain(name), (version, folder))
     return releases
@@ -203,10 +210,11 @@ def _metadata() -> Iterator[str]:
 
 def _distributions(top: str) -> list[str]:
     """Return the names of the distributions that contain a top-level module."""
-    inside = re.compile(
+    # a line of RECORD for a file in the package, or for the module as one file
+    line_of_module = re.compile(
         rb'^"?%s(/|\.py,|\.[^/,]*(so|pyd),)' % re.escape(top.encode()), re.MULTILINE
     )
-    folders = [folder for folder in _metadata() if _contains(folder, top, inside)]
+    folders = [folder for folder in _metadata() if _contains(folder, top, line_of_module)]
     names = (
         re.search(
             r"^Name: *(.*?)\s*$", _text(folder, "METADATA").decode(errors="replace"), re.MULTILINE
@@ -225,6 +233,7 @@ def _contains(folder: str, top: str, inside: re.Pattern[bytes]) -> bool:
 
 
 def _text(folder: str, name: str) -> bytes:
+    """Return a file of a folder, or nothing if it cannot be read."""
     try:
         with open(os.path.join(folder, name), "rb") as file:
             return file.read()
@@ -255,8 +264,11 @@ def _without_file(module: str, top: str, counts_by_source: bool) -> Origin:
 
 
 def _loaded_without_file(module: str, top: str, counts_by_source: bool) -> Origin:
-    inside = contents(module)
-    if inside.get("__path__") is not None and not inside.get("__file__"):
+    """Return the origin of a loaded module without a file: a folder of modules, or something
+    that a package made at run time.
+    """
+    module_attributes = contents(module)
+    if module_attributes.get("__path__") is not None and not module_attributes.get("__file__"):
         return Origin("folder")
     version = "" if counts_by_source or module == top else version_of(top)
     return Origin("distribution", None, version) if version else Origin("nowhere")
@@ -279,6 +291,7 @@ def _folders(package: str) -> list[str]:
 
 
 def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
+    """Return what the import finds for a top-level module, or None."""
     try:
         return importlib.util.find_spec(top)
     except (ValueError, ImportError):
@@ -294,6 +307,7 @@ def _file_in(folder: str, name: str) -> str | None:
         file = module_file(folder, [name])
         if file is not None:
             return str(file)
+    # also compiled modules
     return next(
         (os.path.join(folder, name + end) for end in _ENDS if name + end in _listed[folder]), None
     )

@@ -46,6 +46,7 @@ def refuse_other_than_file(path: Path | str) -> None:
 
 
 def _refuse(path: Path | str, mode: int) -> None:
+    """Raise `NotRegular` for the mode of anything but a regular file."""
     if not stat.S_ISREG(mode):
         kind = next((kind for fits, kind in _KINDS if fits(mode)), "a device")
         raise NotRegular(f"{path} is not a regular file but {kind}: give the path of a file")
@@ -56,13 +57,14 @@ def opened(path: Path | str) -> BufferedReader:
     else.
     """
     refuse_other_than_file(path)  # some devices do something when they are opened
-    number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _refuse(path, os.fstat(number).st_mode)
+        # it may have been replaced since the first look
+        _refuse(path, os.fstat(descriptor).st_mode)
     except NotRegular:
-        os.close(number)
+        os.close(descriptor)
         raise
-    return os.fdopen(number, "rb")
+    return os.fdopen(descriptor, "rb")
 
 
 def bytes_of(path: Path | str, max_bytes: int = MOST) -> bytes:
@@ -116,6 +118,7 @@ def make_folders(folder: str, root: str) -> None:
     make_folders(os.path.dirname(folder), root)
     with suppress(FileExistsError):
         os.mkdir(folder)
+        # all permissions, with those that set group and sticky bit
         inherit(folder, root, 0o7777)
         if os.stat(folder).st_gid != os.getegid():
             # what is made in it has its group
@@ -126,14 +129,14 @@ def inherit(path: str, root: str, mask: int) -> None:
     """Give a file or folder the group of ``root``, and those of its permissions that are in
     ``mask``.
     """
-    top, own = os.stat(root), os.stat(path)
+    root_status, own_status = os.stat(root), os.stat(path)
     with suppress(OSError):  # of a group of which this user is no member
-        if own.st_gid != top.st_gid:
-            os.chown(path, -1, top.st_gid)
-    due = top.st_mode & mask
-    if due & ~own.st_mode:
+        if own_status.st_gid != root_status.st_gid:
+            os.chown(path, -1, root_status.st_gid)
+    wanted_mode = root_status.st_mode & mask
+    if wanted_mode & ~own_status.st_mode:
         with suppress(OSError):
-            os.chmod(path, (own.st_mode | due) & 0o7777)
+            os.chmod(path, (own_status.st_mode | wanted_mode) & 0o7777)
 
 
 # --- seal -----------------------------------------------------------------------------------------
@@ -196,6 +199,7 @@ def secrets() -> tuple[bytes, ...]:
 
 @functools.lru_cache(8)
 def _split(text: str) -> tuple[bytes, ...]:
+    """Return the secrets in a text, which commas separate."""
     return tuple(secret.strip().encode() for secret in text.split(",") if secret.strip())
 
 
@@ -220,13 +224,16 @@ def check_signature(sign: str, kind: Kind, key: str, sha256: bytes) -> None:
 
 
 def _signed_by(secret: bytes, kind: Kind, key: str, sha256: bytes) -> str:
-    text = b"neusee cache %d\n%s\n%s\n%s" % (
+    """Return the signature of a content by one secret: HMAC-SHA256 of format, kind, key and
+    digest.
+    """
+    signed_text = b"neusee cache %d\n%s\n%s\n%s" % (
         FORMAT,
         kind.encode(),
         key.encode(errors="replace"),
         sha256,
     )
-    return hmac.digest(secret, text, "sha256").hex()
+    return hmac.digest(secret, signed_text, "sha256").hex()
 
 
 def seal_record(kind: Kind, record: Mapping[str, Any]) -> bytes:
@@ -235,14 +242,15 @@ def seal_record(kind: Kind, record: Mapping[str, Any]) -> bytes:
     The record may have a field ``key``. The signature covers it and the kind of the file that the
     record is written to.
     """
+    # without the brace at the end, behind which seal and signature come
     body = _encode({**record, "format": FORMAT})[:-1].encode()
-    raw = body + _SEAL + xxhash.xxh3_128_hexdigest(body).encode()
+    sealed = body + _SEAL + xxhash.xxh3_128_hexdigest(body).encode()
     if secrets():
-        raw += (
+        sealed += (
             _SIGN
             + signature(kind, str(record.get("key", "")), hashlib.sha256(body).digest()).encode()
         )
-    return raw + _END
+    return sealed + _END
 
 
 def unseal_record(kind: Kind, raw: bytes) -> dict[str, Any]:
@@ -293,6 +301,7 @@ def checked_body(raw: bytes) -> tuple[bytes, str]:
     Raises `ValueError` for a checksum that does not match.
     """
     unsigned, sign = raw[: -len(_END)], b""
+    # the signature is the last field, where there is one
     if unsigned[-_SIGNED:].startswith(_SIGN):
         unsigned, sign = unsigned[:-_SIGNED], unsigned[-_SIGNED + len(_SIGN) :]
     body = unsigned[:-_SEALED]
@@ -303,6 +312,7 @@ def checked_body(raw: bytes) -> tuple[bytes, str]:
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
+    """Return the dict in a JSON text; raise `ValueError` for anything else."""
     try:
         record = json.loads(text)
     except RecursionError:

@@ -57,7 +57,7 @@ _SHORT = 12  #: digits of the digest of a code object
 def functions_of(source: bytes) -> list[str]:
     """Return the digest of each function in a source file, at any depth, in alphabetical order."""
     code = compile(source, "source", "exec", dont_inherit=True)
-    return sorted({function_code(inner) for inner in _inner(code)})
+    return sorted({function_code(inner_code) for inner_code in _inner(code)})
 
 
 def function_code(code: CodeType) -> str:
@@ -73,22 +73,27 @@ def function_code(code: CodeType) -> str:
 
 
 def _digest_of(code: CodeType) -> str:
-    consts = tuple(
+    """Return the digest of a code object: byte code, constants, names and numbers of arguments,
+    without lines and file.
+    """
+    constants = tuple(
         function_code(item) if isinstance(item, CodeType) else item for item in code.co_consts
     )
     names = (code.co_qualname, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
     sizes = (code.co_flags, code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
-    raw = marshal.dumps((code.co_code, consts, names, sizes, code.co_exceptiontable), 2)
-    return xxhash.xxh3_64_hexdigest(raw)[:_SHORT]
+    # format 2 has no references, which differ between equal objects
+    marshalled = marshal.dumps((code.co_code, constants, names, sizes, code.co_exceptiontable), 2)
+    return xxhash.xxh3_64_hexdigest(marshalled)[:_SHORT]
 
 
 def _inner(code: CodeType) -> Iterator[CodeType]:
-    todo = [code]
-    while todo:
-        for item in todo.pop().co_consts:
+    """Yield the code objects of all functions and classes in a code object, at any depth."""
+    code_left = [code]
+    while code_left:
+        for item in code_left.pop().co_consts:
             if isinstance(item, CodeType):
                 yield item
-                todo.append(item)
+                code_left.append(item)
 
 
 # --- reachable code -------------------------------------------------------------------------------
@@ -121,28 +126,29 @@ def reached(parts: Sequence[Statement], names: Collection[str] | None) -> list[r
     """Return the lines of the statements that the use of some names, or None for all names, may
     run.
     """
-    run = parts
+    statements_run = parts
     if names is not None and "*" not in names:
-        run = _run_by(parts, _led_to(parts, set(names)))
-    return [range(statement.first, statement.last + 1) for statement in run]
+        statements_run = _run_by(parts, _led_to(parts, set(names)))
+    return [range(statement.first, statement.last + 1) for statement in statements_run]
 
 
 def read_names(parts: Sequence[Statement], names: Collection[str]) -> set[str]:
     """Return the names that the statements read which the use of some names, or of all if none
     is given, may run.
     """
-    first = set(names) or set(chain.from_iterable(statement.binds for statement in parts))
-    return _led_to(parts, first)
+    given_names = set(names) or set(chain.from_iterable(statement.binds for statement in parts))
+    return _led_to(parts, given_names)
 
 
 def _led_to(parts: Sequence[Statement], names: set[str]) -> set[str]:
     """Return some names with all that is read by the statements that their use may run."""
+    # until no name is added
     while True:
-        run = _run_by(parts, names)
-        longer = names.union(*(statement.refers for statement in run))
-        if longer == names:
+        statements_run = _run_by(parts, names)
+        names_with_read = names.union(*(statement.refers for statement in statements_run))
+        if names_with_read == names:
             return names
-        names = longer
+        names = names_with_read
 
 
 def _run_by(parts: Sequence[Statement], names: set[str]) -> list[Statement]:
@@ -163,14 +169,22 @@ def written_only(parts: Sequence[Statement]) -> set[str]:
 
 
 def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
-    marks = getattr(item, "decorator_list", ())
-    first = min([item.lineno, *(mark.lineno for mark in marks)])
-    written = {id(name) for name in _noted(kinds)}
-    loads = [name for name in each(kinds, ast.Name) if isinstance(name.ctx, ast.Load)]
-    refers = {name.id for name in loads if id(name) not in written}
-    writes = {name.id for name in loads if id(name) in written}
+    """Return a statement at the top level with its lines and the names that it binds, reads and
+    writes.
+    """
+    decorators = getattr(item, "decorator_list", ())
+    # decorators stand above the definition
+    first_line = min([item.lineno, *(decorator.lineno for decorator in decorators)])
+    ids_of_written = {id(name) for name in _noted(kinds)}
+    names_loaded = [name for name in each(kinds, ast.Name) if isinstance(name.ctx, ast.Load)]
+    refers = {name.id for name in names_loaded if id(name) not in ids_of_written}
+    writes = {name.id for name in names_loaded if id(name) in ids_of_written}
     return Statement(
-        first, item.end_lineno or item.lineno, sorted(_binds(item)), sorted(refers), sorted(writes)
+        first_line,
+        item.end_lineno or item.lineno,
+        sorted(_binds(item)),
+        sorted(refers),
+        sorted(writes),
     )
 
 
@@ -179,9 +193,9 @@ def _noted(kinds: Kinds) -> Iterator[ast.AST]:
     not read it.
     """
     for item in each(kinds, ast.Expr):
-        called = item.value.func if isinstance(item.value, ast.Call) else None
-        if isinstance(called, ast.Attribute) and called.attr in _WRITERS:
-            yield called.value
+        method = item.value.func if isinstance(item.value, ast.Call) else None
+        if isinstance(method, ast.Attribute) and method.attr in _WRITERS:
+            yield method.value
     for item in each(kinds, ast.Assign):
         yield from (target.value for target in item.targets if isinstance(target, ast.Subscript))
 
@@ -189,10 +203,11 @@ def _noted(kinds: Kinds) -> Iterator[ast.AST]:
 def _binds(item: ast.stmt) -> Iterable[str]:
     """Return the names that a statement defines; none if the statement also does something else."""
     if isinstance(item, _DEFINITION):
-        quiet = all(ast.unparse(mark).startswith(_QUIET) for mark in item.decorator_list)
-        return {item.name} if quiet else set()
+        is_quiet = all(ast.unparse(mark).startswith(_QUIET) for mark in item.decorator_list)
+        return {item.name} if is_quiet else set()
     targets = _targets(item)
     names = {target.id for target in targets if isinstance(target, ast.Name)}
+    # another target, such as an attribute, is an effect
     return names if len(names) == len(targets) else set()
 
 
@@ -357,16 +372,20 @@ def reach_of(tree: ast.Module, bound: Mapping[str, str]) -> Reach:
     """Return what a module reaches; ``bound`` has the full name of each imported name, relative
     ones with a dot.
     """
-    walk = _Pass(bound)
-    walk.visit_all(tree.body, NameScope(tree, None))
-    unused = {full for name, full in bound.items() if name not in walk.named and not is_calm(full)}
+    code_pass = _Pass(bound)
+    code_pass.visit_all(tree.body, NameScope(tree, None))
+    unnamed_imports = {
+        full_name
+        for name, full_name in bound.items()
+        if name not in code_pass.named and not is_calm(full_name)
+    }
     return Reach(
-        sorted(walk.outward),
-        sorted(walk.passed),
-        sorted(unused),
-        walk.inward,
-        walk.changes_arguments,
-        walk.seeks,
+        sorted(code_pass.outward),
+        sorted(code_pass.passed),
+        sorted(unnamed_imports),
+        code_pass.inward,
+        code_pass.changes_arguments,
+        code_pass.seeks,
     )
 
 
@@ -385,6 +404,7 @@ class _Pass:
 
     def __init__(self, bound: Mapping[str, str]) -> None:
         self._bound = bound
+        # what it changes elsewhere, what it gives to functions, names that occur
         self.outward, self.passed, self.named = set[str](), set[str](), set[str]()
         self.inward = self.changes_arguments = self.seeks = False
 
@@ -393,8 +413,10 @@ class _Pass:
             self._visit(item, scope)
 
     def _visit(self, item: ast.AST, scope: NameScope) -> None:
+        """Note what a part of the code may change, and then visit its own parts."""
         if isinstance(item, _DEFINITIONS):
             self._definition(item, scope)
+            # the parts of a definition are in its own scope
             scope = NameScope(item, scope)
         elif isinstance(item, ast.Call):
             self._call(item, scope, bare=False)
@@ -425,13 +447,18 @@ class _Pass:
             elif root.kind == "argument":
                 self.changes_arguments = True
             else:
+                # at the top level of a module it sets up its own names
                 self.inward |= root.kind == "class" or not scope.is_module
 
     # --- calls ------------------------------------------------------------------------------------
 
     def _call(self, call: ast.Call, scope: NameScope, bare: bool) -> None:
-        last = last_name(call.func)
-        if last in ("setattr", "delattr", "__setattr__", "__delattr__"):
+        """Note what a call may change; ``bare``: nobody uses its value, so it is there to change
+        something.
+        """
+        function_name = last_name(call.func)
+        if function_name in ("setattr", "delattr", "__setattr__", "__delattr__"):
+            # the object whose attribute is set
             for argument in call.args[:1]:
                 self._changed(argument, scope)
         for root in roots(call.func, scope, self._bound):
@@ -440,22 +467,24 @@ class _Pass:
             elif isinstance(call.func, ast.Name):
                 self.passed |= self._given(call, scope)
             elif root.kind in ("own", "class") and not scope.is_module:
-                self.inward |= bare or _changes(last)
+                self.inward |= bare or _changes(function_name)
 
     def _imported_call(self, call: ast.Call, full: str, scope: NameScope, bare: bool) -> None:
         """Note the call of a function of another module, if it may change something."""
-        last = last_name(call.func)
-        name = full if last in full.split(".") else f"{full}.{last}"
+        function_name = last_name(call.func)
+        # a method of what another call returned
+        full_name = full if function_name in full.split(".") else f"{full}.{function_name}"
         passed_names = self._given(call, scope)
-        if _is_quiet(name, call):
+        if _is_quiet(full_name, call):
             return
         if is_calm(full):
-            if bare or last.endswith("_"):
+            # by the convention of torch, such a function changes its argument
+            if bare or function_name.endswith("_"):
                 self.outward.update(filterfalse(is_calm, passed_names))
         else:
             self.passed |= passed_names
-        if _changes_package(name, last, bare):
-            self.outward.add(name)
+        if _changes_package(full_name, function_name, bare):
+            self.outward.add(full_name)
 
     def _given(self, call: ast.Call, scope: NameScope) -> set[str]:
         """Return the names of what other modules hold and a call is given, not of what their
@@ -465,9 +494,11 @@ class _Pass:
         for argument in [*call.args, *(word.value for word in call.keywords)]:
             if not isinstance(argument, ast.Call):
                 names |= self._imports(argument, scope)
+        # "()": the result of a call
         return {name for name in names if "()" not in name}
 
     def _imports(self, item: ast.expr, scope: NameScope) -> set[str]:
+        """Return the full names of what an expression is part of in other modules."""
         return {root.name for root in roots(item, scope, self._bound) if root.kind == "import"}
 
     # --- definitions ------------------------------------------------------------------------------
@@ -481,6 +512,7 @@ class _Pass:
             imports = self._imports(decorator, scope)
             self.outward.update(filterfalse(_is_quiet_decorator, imports))
         if isinstance(item, ast.ClassDef):
+            # also the metaclass, which is a keyword
             for base in [*item.bases, *(word.value for word in item.keywords)]:
                 imports = self._imports(base, scope)
                 self.outward.update(filterfalse(_is_quiet_base, imports))
@@ -501,6 +533,7 @@ def _changes_package(name: str, method: str, bare: bool) -> bool:
 
 
 def _is_setter(method: str) -> bool:
+    """Return True for the name of a function that sets, registers or adds something."""
     return bool(_SETTER.match(method) or _CHANGER.match(method))
 
 
@@ -526,12 +559,13 @@ def _is_quiet_base(name: str) -> bool:
 def _is_quiet(name: str, call: ast.Call) -> bool:
     """Return True for a function that decides no result, such as one that ignores warnings."""
     if name in ("warnings.filterwarnings", "warnings.simplefilter"):
-        first = call.args[0] if call.args else None
-        return isinstance(first, ast.Constant) and first.value in ("ignore", "once", "default")
+        action = call.args[0] if call.args else None
+        return isinstance(action, ast.Constant) and action.value in ("ignore", "once", "default")
     return _starts(name, _QUIET_CALLS)
 
 
 def _starts(name: str, entries: tuple[str, ...]) -> bool:
+    """Return True if a full name is one of the entries, or is in one of them."""
     return any(f"{name}.".startswith(f"{entry}.") for entry in entries)
 
 
@@ -579,27 +613,35 @@ def summarise(source: bytes, own: bool = False) -> Summary:
 
     What only matters in code of a user is looked for if the file is the user's ``own``.
     """
+    # one thread at a time
     with _parsing:
-        parsed = ast.parse(source)
+        syntax_tree = ast.parse(source)
         functions = functions_of(source)
-    tree = Syntax(parsed)
-    text = _digest_of_syntax(tree)
-    imports, bound = _imports(tree.all)
-    names = _full_names(bound)
-    unfollowed, reach = constructs(tree, names), NOWHERE
+    tree = Syntax(syntax_tree)
+    syntax_digest = _digest_of_syntax(tree)
+    imports, imports_by_name = _imports(tree.all)
+    names = _full_names(imports_by_name)
+    unfollowed_constructs, reach = constructs(tree, names), NOWHERE
+    # what only matters in code of a user
     if own:
-        unfollowed = _with_constructs_of_users(unfollowed, parsed, tree, names)
-        reach = reach_of(parsed, {name: _full(ways) for name, ways in bound.items()})
+        unfollowed_constructs = _with_constructs_of_users(
+            unfollowed_constructs, syntax_tree, tree, names
+        )
+        reach = reach_of(
+            syntax_tree,
+            {name: _full(import_forms) for name, import_forms in imports_by_name.items()},
+        )
     return Summary(
-        tree=text,
-        whole=digest(text, tree.documents),
+        tree=syntax_digest,
+        # docstrings count where any code reads one
+        whole=digest(syntax_digest, tree.documents),
         documents=_reads_docstrings(tree.all, own) or _reads_docstrings(tree.not_run, own),
         imports=[*imports, *_literal_imports(tree.all, names)],
-        binds=_names_from_modules(bound),
-        uses=_uses(tree.all, bound),
+        binds=_names_from_modules(imports_by_name),
+        uses=_uses(tree.all, imports_by_name),
         definitions=_definitions(tree.texts),
         functions=functions,
-        constructs=unfollowed,
+        constructs=unfollowed_constructs,
         statements=statements(tree.blocks),
         depends=[*chain.from_iterable(_declared(item) for item, _ in tree.texts)],
         reach=reach,
@@ -608,16 +650,21 @@ def summarise(source: bytes, own: bool = False) -> Summary:
 
 def _names_from_modules(bound: Mapping[str, set[Import]]) -> list[str]:
     """Return the names that statements such as ``from module import name`` bind."""
-    return sorted(name for name, ways in bound.items() if any(way[2] for way in ways))
+    return sorted(
+        name
+        for name, import_forms in bound.items()
+        if any(import_form[2] for import_form in import_forms)
+    )
 
 
 def _full_names(bound: Mapping[str, set[Import]]) -> dict[str, str]:
     """Return the full name of each name that an import binds that is not relative."""
     names: dict[str, str] = {}
-    for name, ways in bound.items():
-        for way in sorted(ways):
-            if not way[0]:
-                names[name] = ".".join(filter(None, way[1:]))
+    for name, import_forms in bound.items():
+        for import_form in sorted(import_forms):
+            # level 0: not relative
+            if not import_form[0]:
+                names[name] = ".".join(filter(None, import_form[1:]))
     return names
 
 
@@ -639,6 +686,7 @@ def syntax_outline(source: bytes) -> tuple[str, list[tuple[str, list[str]]]]:
 
 
 def _digest_of_syntax(tree: Syntax) -> str:
+    """Return the digest of a syntax tree without docstrings."""
     return digest([text for _, text in tree.texts])
 
 
@@ -649,13 +697,14 @@ def _imports(kinds: Kinds) -> tuple[list[Import], dict[str, set[Import]]]:
     for item in each(kinds, ast.Import):
         for alias in item.names:
             imports.append((0, alias.name, ""))
-            named = alias.name if alias.asname else _top(alias.name)
-            bound[alias.asname or named].add((0, named, ""))
+            # `import a.b` binds a, `import a.b as c` binds c to a.b
+            module_name = alias.name if alias.asname else _top(alias.name)
+            bound[alias.asname or module_name].add((0, module_name, ""))
     for item in each(kinds, ast.ImportFrom):
         for alias in item.names:
-            way = (item.level, item.module or "", alias.name)
-            imports.append(way)
-            bound[alias.asname or alias.name].add(way)
+            import_form = (item.level, item.module or "", alias.name)
+            imports.append(import_form)
+            bound[alias.asname or alias.name].add(import_form)
     return list(dict.fromkeys(imports)), bound
 
 
@@ -664,8 +713,9 @@ def _literal_imports(kinds: Kinds, names: Mapping[str, str]) -> Iterator[Import]
     for call in each(kinds, ast.Call):
         module = literal_import(call, names)
         if module:
-            absolute = module.lstrip(".")
-            yield len(module) - len(absolute), absolute, ""
+            name_without_dots = module.lstrip(".")
+            # the number of leading dots is the level
+            yield len(module) - len(name_without_dots), name_without_dots, ""
 
 
 def _with_constructs_of_users(
@@ -673,11 +723,11 @@ def _with_constructs_of_users(
 ) -> list[Construct]:
     """Return what is not followed, with what only matters in code of a user."""
     usual_places = {(item.line, item.text.rpartition(".")[2]) for item in usual}
-    by_user = [*facts(tree.all, names), *moments(tree.all, names)]
-    beside = [
-        item for item in by_user if (item.line, item.text.rpartition(".")[2]) not in usual_places
+    of_users = [*facts(tree.all, names), *moments(tree.all, names)]
+    further = [
+        item for item in of_users if (item.line, item.text.rpartition(".")[2]) not in usual_places
     ]
-    return sorted({*usual, *orders(parsed), *beside}, key=lambda item: (item.line, item))
+    return sorted({*usual, *orders(parsed), *further}, key=lambda item: (item.line, item))
 
 
 def _reads_docstrings(kinds: Kinds, own: bool) -> bool:
@@ -686,23 +736,27 @@ def _reads_docstrings(kinds: Kinds, own: bool) -> bool:
     """
     if own and (reads_attributes_unnamed(kinds) or _spells_docstring(kinds)):
         return True
-    by_attribute = any(item.attr in _READS for item in each(kinds, ast.Attribute))
-    by_name = any(
-        item.id in _READS[:2] and isinstance(item.ctx, ast.Load) for item in each(kinds, ast.Name)
+    as_attribute = any(item.attr in _READS for item in each(kinds, ast.Attribute))
+    as_name = any(
+        # `__doc__` and `getdoc`, read as plain names
+        item.id in _READS[:2] and isinstance(item.ctx, ast.Load)
+        for item in each(kinds, ast.Name)
     )
     return (
-        by_attribute
-        or by_name
+        as_attribute
+        or as_name
         or any(item.value == "__doc__" for item in each(kinds, ast.Constant))
     )
 
 
 def _spells_docstring(kinds: Kinds) -> bool:
+    """Return True if a text of the code has the word ``__doc__`` in it."""
     return any("__doc__" in text for text, _ in texts(kinds))
 
 
 def _declared(item: ast.stmt) -> list[str]:
     """Return the entries of ``__depends__ = ("table.csv", "env:NAME")``."""
+    # a statement at the top level of the module
     if not isinstance(item, ast.Assign) or "__depends__" not in [
         getattr(name, "id", "") for name in item.targets
     ]:
@@ -735,6 +789,7 @@ def _chained(way: Import) -> bool:
 
 
 def _top(module: str) -> str:
+    """Return the top-level package of a module."""
     return module.partition(".")[0]
 
 
@@ -742,14 +797,16 @@ def _uses(kinds: Kinds, bound: dict[str, set[Import]]) -> list[Use]:
     """Return each use of an imported name in an expression such as ``a.b.c``, and each use of a
     whole package.
     """
-    followed = {name: set(filter(_chained, ways)) for name, ways in bound.items()}
-    lines: dict[tuple[int, str, str, str], int] = {}
+    followed_imports = {
+        name: set(filter(_chained, import_forms)) for name, import_forms in bound.items()
+    }
+    first_lines: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(kinds):
-        for way in followed.get(name, ()):
-            if attributes or ".".join(filter(None, way[1:])) in ("neusee", ROOT, "nodes"):
-                use = (*way, ".".join(attributes))
-                lines[use] = min(line, lines.get(use, line))
-    return sorted((*use, line) for use, line in lines.items())
+        for import_form in followed_imports.get(name, ()):
+            if attributes or ".".join(filter(None, import_form[1:])) in ("neusee", ROOT, "nodes"):
+                use = (*import_form, ".".join(attributes))
+                first_lines[use] = min(line, first_lines.get(use, line))
+    return sorted((*use, line) for use, line in first_lines.items())
 
 
 def _chains(kinds: Kinds) -> Iterator[tuple[str, list[str], int]]:
@@ -757,18 +814,21 @@ def _chains(kinds: Kinds) -> Iterator[tuple[str, list[str], int]]:
     ``a.b.c`` in a module.
     """
     # parts of earlier expressions, because an expression comes before its parts
-    inner: set[int] = set()
+    ids_of_parts: set[int] = set()
     for item in each(kinds, ast.Attribute, ast.Name):
-        if id(item) in inner:
+        if id(item) in ids_of_parts:
             continue
-        here: ast.expr = item
+        expression: ast.expr = item
         attributes: list[str] = []
-        while isinstance(here, ast.Attribute):
-            attributes.append(here.attr)
-            inner.add(id(here.value))
-            here = here.value
-        if isinstance(here, ast.Name) and (attributes or isinstance(here.ctx, ast.Load)):
-            yield here.id, attributes[::-1], item.lineno
+        # from the last attribute to the first name
+        while isinstance(expression, ast.Attribute):
+            attributes.append(expression.attr)
+            ids_of_parts.add(id(expression.value))
+            expression = expression.value
+        if isinstance(expression, ast.Name) and (
+            attributes or isinstance(expression.ctx, ast.Load)
+        ):
+            yield expression.id, attributes[::-1], item.lineno
 
 
 def _definitions(texts: Iterable[tuple[ast.stmt, str]]) -> dict[str, str]:
@@ -794,8 +854,8 @@ def _labels(item: ast.stmt) -> Iterable[str]:
         return [f"class {item.name}"]
     if isinstance(item, ast.Import | ast.ImportFrom):
         return ["imports"]
-    inside = chain.from_iterable(map(ast.walk, _targets(item)))
-    names = [part.id for part in inside if isinstance(part, ast.Name)]
+    target_parts = chain.from_iterable(map(ast.walk, _targets(item)))
+    names = [target_part.id for target_part in target_parts if isinstance(target_part, ast.Name)]
     return [f"constant {name}" for name in names] or ["other statements"]
 
 
@@ -803,8 +863,8 @@ def _owner(function: ast.FunctionDef | ast.AsyncFunctionDef) -> str:
     """Return the name of a function, or ``psf.check`` for a function ``_`` with the decorator
     ``@psf.check``.
     """
-    marks = function.decorator_list if function.name == "_" else []
-    for mark in marks:
-        if isinstance(mark, ast.Attribute) and isinstance(mark.value, ast.Name):
-            return f"{mark.value.id}.{mark.attr}"
+    decorators = function.decorator_list if function.name == "_" else []
+    for decorator in decorators:
+        if isinstance(decorator, ast.Attribute) and isinstance(decorator.value, ast.Name):
+            return f"{decorator.value.id}.{decorator.attr}"
     return function.name

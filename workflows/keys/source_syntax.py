@@ -53,8 +53,8 @@ class Syntax:
         self.blocks: list[Block] = []
         self.all: Kinds = defaultdict(list)  #: the parts of every block
         self.not_run: Kinds = defaultdict(list)
-        self._words: list[str] = []
-        self._kinds: Kinds = self.all
+        self._words: list[str] = []  # of the text of the present statement
+        self._kinds: Kinds = self.all  # where parts are added now
         for item in self._without_docstring(tree):
             self._top(item)
         for block in self.blocks:
@@ -68,16 +68,19 @@ class Syntax:
             self._words.append("If")
             self._visit_quietly(item.test)
             self._visit_quietly(*item.body)
+            # as in the text of any `if`: the number of statements, and these
             self._words.append(f"[{len(item.orelse)}")
             for statement in item.orelse:
                 self._block(statement)
             if not item.orelse:
+                # something stands there, so that each statement has a block
                 self.blocks.append(Block(ast.copy_location(ast.Pass(), item), {}))
         else:
             self._block(item)
         self.texts.append((item, " ".join(self._words)))
 
     def _block(self, item: ast.stmt) -> None:
+        """Add a statement that a process runs, with its parts by their types."""
         self._kinds = defaultdict(list)
         self._visit(item, ())
         self.blocks.append(Block(item, self._kinds))
@@ -95,6 +98,7 @@ class Syntax:
             value = getattr(item, field)
             children = self._listed(item, field, value) if type(value) is list else [value]
             for child in children:
+                # parts without fields, such as operators, are words
                 if isinstance(child, ast.AST) and child._fields:
                     self._visit(child, scope)
                 else:
@@ -129,26 +133,27 @@ class Syntax:
 
     def _visit_quietly(self, *items: ast.AST) -> None:
         """Add the text of items that no process runs."""
-        kinds, calls, joins = self._kinds, len(self.calls), len(self.joins)
+        kinds_before, call_count, join_count = self._kinds, len(self.calls), len(self.joins)
         self._kinds = self.not_run
         self._words.append(f"[{len(items)}")
         for item in items:
             self._visit(item, ())
-        self._kinds = kinds
-        del self.calls[calls:], self.joins[joins:]
+        self._kinds = kinds_before
+        # those that were added meanwhile
+        del self.calls[call_count:], self.joins[join_count:]
 
     def _without_docstring(self, item: Any) -> list[ast.stmt]:
         """Return the statements of a definition or a module without its docstring, which is
         noted.
         """
         body: list[ast.stmt] = item.body
-        first = body[0] if body else None
+        first_statement = body[0] if body else None
         if (
-            isinstance(first, ast.Expr)
-            and isinstance(first.value, ast.Constant)
-            and isinstance(first.value.value, str)
+            isinstance(first_statement, ast.Expr)
+            and isinstance(first_statement.value, ast.Constant)
+            and isinstance(first_statement.value.value, str)
         ):
-            self.documents.append((len(self.texts), len(self._words), first.value.value))
+            self.documents.append((len(self.texts), len(self._words), first_statement.value.value))
             return body[1:]
         return body
 
@@ -168,14 +173,14 @@ def _is_not_run(test: ast.expr) -> bool:
     """Return True for the test of a block for type checkers, or of a file that is run as a
     program.
     """
-    first = test
+    first_part = test
     if isinstance(test, ast.Compare):
-        first = test.left
+        first_part = test.left
     elif isinstance(test, ast.Attribute):
-        first = test.value
+        first_part = test.value
     return (
-        isinstance(first, ast.Name)
-        and first.id in _NOT_RUN
+        isinstance(first_part, ast.Name)
+        and first_part.id in _NOT_RUN
         and ast.unparse(test) in _NOT_RUN.values()
     )
 
@@ -184,6 +189,7 @@ _SHAPES: dict[type, tuple[str, tuple[str, ...]]] = {}  #: name and fields of eac
 
 
 def _shape(kind: type[ast.AST]) -> tuple[str, tuple[str, ...]]:
+    """Return the name of a kind of part, and its fields that count."""
     return _SHAPES.setdefault(
         kind, (kind.__name__, tuple(field for field in kind._fields if field not in _UNSEEN))
     )
@@ -233,6 +239,7 @@ class NameScope:
         self.above = above
         self.is_module = above is None
         self.arguments = arguments(item)
+        # by name: what is assigned; None for an import or definition
         self.values: dict[str, list[ast.expr | None]] = defaultdict(list)
         body = getattr(item, "body", [])
         statements = body if isinstance(body, list) else [body]
@@ -242,10 +249,10 @@ class NameScope:
 
     def holder(self, name: str) -> NameScope | None:
         """Return the scope that binds a name, the innermost first."""
-        here: NameScope | None = self
-        while here is not None and name not in here.arguments and name not in here.values:
-            here = here.above
-        return here
+        scope: NameScope | None = self
+        while scope is not None and name not in scope.arguments and name not in scope.values:
+            scope = scope.above
+        return scope
 
 
 def roots(
@@ -264,8 +271,10 @@ def roots(
         return _of_call(item, scope, bound, visited)
     if not isinstance(item, ast.Name):
         return _of_all(_parts(item), scope, bound, visited)
+    # a name that is assigned from itself
     if item.id in visited:
         return []
+    # its class is shared with other objects
     if "__class__" in attributes:
         return [Root("class", item.id)]
     return [
@@ -296,20 +305,24 @@ def last_name(item: ast.expr) -> str:
 def _of_name(
     name: str, scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
 ) -> list[Root]:
-    imported = [Root("import", bound[name])] if name in bound else []
+    """Return what a name in a scope stands for, through the values that are assigned to it."""
+    import_roots = [Root("import", bound[name])] if name in bound else []
     holder = scope.holder(name)
     if holder is None or (holder.is_module and name in bound):
-        return imported
+        return import_roots
     if name in holder.arguments:
         return _of_argument(name)
     values = [value for value in holder.values[name] if value is not None]
     origins = _of_all(values, holder, bound, visited)
     if None in holder.values[name]:  # an import inside of a function
-        origins += imported
+        origins += import_roots
     return [*origins, Root("own", name)] if holder.is_module else origins
 
 
 def _of_argument(name: str) -> list[Root]:
+    """Return what an argument stands for; nothing for the object of a method, which its caller
+    made.
+    """
     if name in _SELF:
         return []
     return [Root("class", name)] if name in _CLASS else [Root("argument", name)]
@@ -323,15 +336,17 @@ def _of_call(
     """
     name = last_name(call.func)
     if isinstance(call.func, ast.Name):
+        # the result is a part of an argument
         if name in _THROUGH:
             return _of_all(call.args, scope, bound, visited)
         if name in _GIVEN:
             return [_GIVEN[name]]
     origins = roots(call.func, scope, bound, visited)
+    # a class makes a new object
     if name[:1].isupper() or name in _COPYING:
         return []
-    called = [root.name.removesuffix("()") for root in origins if _is_of_library(root)]
-    return [Root("import", f"{name}()") for name in called]
+    library_names = [root.name.removesuffix("()") for root in origins if _is_of_library(root)]
+    return [Root("import", f"{name}()") for name in library_names]
 
 
 #: what builtin functions give a part of
@@ -341,6 +356,7 @@ _COPYING = ("copy", "clone", "deepcopy", "detach", "tolist", "item")
 
 
 def _is_of_library(root: Root) -> bool:
+    """Return True for something of a package whose functions may give what others see."""
     return root.kind == "import" and root.name.partition(".")[0] not in _NEW
 
 
@@ -361,12 +377,12 @@ def _parts(item: ast.expr) -> list[ast.expr]:
 
 def _inside(items: list[ast.AST]) -> Iterator[ast.AST]:
     """Yield the parts of a body, without those inside of inner functions and classes."""
-    todo = list(items)
-    while todo:
-        item = todo.pop()
+    items_left = list(items)
+    while items_left:
+        item = items_left.pop()
         yield item
         if not isinstance(item, _INNER):
-            todo.extend(ast.iter_child_nodes(item))
+            items_left.extend(ast.iter_child_nodes(item))
 
 
 def _bindings(item: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
@@ -385,6 +401,7 @@ def _bindings(item: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
 
 
 def _stored_names(target: ast.expr) -> list[str]:
+    """Return the names that a target of an assignment sets."""
     names = [child for child in ast.walk(target) if isinstance(child, ast.Name)]
     return [name.id for name in names if isinstance(name.ctx, ast.Store)]
 
@@ -413,20 +430,21 @@ def dotted(item: ast.expr, bound: Mapping[str, str]) -> str:
     """Return the full name of an expression such as ``np.random.rand``, or an empty text for any
     other expression.
     """
-    parts: list[str] = []
+    attributes: list[str] = []
     while isinstance(item, ast.Attribute):
-        parts.append(item.attr)
+        attributes.append(item.attr)
         item = item.value
     if not isinstance(item, ast.Name):
         return ""
-    return ".".join([bound.get(item.id, item.id), *reversed(parts)]).removeprefix("builtins.")
+    # attributes were collected from the last to the first
+    return ".".join([bound.get(item.id, item.id), *reversed(attributes)]).removeprefix("builtins.")
 
 
 def arguments(function: ast.AST) -> set[str]:
-    inner = getattr(function, "args", None)
-    if inner is None:
+    parameters = getattr(function, "args", None)
+    if parameters is None:
         return set()
-    return {argument.arg for argument in ast.walk(inner) if isinstance(argument, ast.arg)}
+    return {argument.arg for argument in ast.walk(parameters) if isinstance(argument, ast.arg)}
 
 
 def assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
@@ -440,8 +458,8 @@ def assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
 
 def read_by(call: ast.Call) -> ast.expr | None:
     """Return what a function of a library reads: an open file, or the first argument."""
-    files = [word.value for word in call.keywords if word.arg in ("fileobj", "fp")]
-    return next(iter([*files, *call.args, *(word.value for word in call.keywords)]), None)
+    file_arguments = [word.value for word in call.keywords if word.arg in ("fileobj", "fp")]
+    return next(iter([*file_arguments, *call.args, *(word.value for word in call.keywords)]), None)
 
 
 # --- literal texts --------------------------------------------------------------------------------
@@ -478,6 +496,7 @@ def text_of(item: ast.expr) -> str | None:
 
 
 def _without_format(piece: ast.expr) -> ast.expr:
+    """Return the expression in the braces of an f-string, or the text beside them."""
     return piece.value if isinstance(piece, ast.FormattedValue) else piece
 
 
@@ -485,8 +504,8 @@ def _text_of_join(call: ast.Call, method: ast.Attribute) -> str | None:
     """Return the text of ``", ".join(["a", "b"])``, or None for another call."""
     if method.attr != "join" or not call.args:
         return None
-    between, parts = text_of(method.value), call.args[0]
-    return _joined(parts.elts, between) if isinstance(parts, ast.List | ast.Tuple) else None
+    separator, sequence = text_of(method.value), call.args[0]
+    return _joined(sequence.elts, separator) if isinstance(sequence, ast.List | ast.Tuple) else None
 
 
 def reads_attributes_unnamed(kinds: Kinds) -> bool:
@@ -497,15 +516,19 @@ def reads_attributes_unnamed(kinds: Kinds) -> bool:
         return True
     for call in each(kinds, ast.Call):
         name = last_name(call.func)
-        names = call.args[1:2] if name != "attrgetter" else call.args
+        # getattr(object, name), attrgetter(name, ...)
+        name_arguments = call.args[1:2] if name != "attrgetter" else call.args
         if (name in _ALL and call.args) or (
-            name in _NAMING and any(text_of(argument) is None for argument in names)
+            name in _NAMING and any(text_of(argument) is None for argument in name_arguments)
         ):
             return True
     return False
 
 
 def _joined(parts: Iterable[ast.expr], between: str | None = "") -> str | None:
+    """Return the texts of some expressions in one, or None if any of them is no text of
+    literals.
+    """
     values = [text_of(piece) for piece in parts]
     literals = [text for text in values if text is not None]
     return between.join(literals) if between is not None and len(literals) == len(values) else None
@@ -574,11 +597,13 @@ class Scratch:
         """Return the ids of the texts that name a file in a temporary folder, or in an archive
         in memory.
         """
-        below = [item.right for scope, item in tree.joins if self.holds(item.left, scope)]
+        names_in_scratch = [
+            item.right for scope, item in tree.joins if self.holds(item.left, scope)
+        ]
         for scope, call in tree.calls:
             if self._is_below_made(call, scope):
-                below += call.args
-        return set(map(id, below))
+                names_in_scratch += call.args
+        return set(map(id, names_in_scratch))
 
     def _is_below_made(self, call: ast.Call, scope: Scope) -> bool:
         """Return True for a call that joins words to a temporary path, and for a method of an
@@ -586,37 +611,41 @@ class Scratch:
         """
         if isinstance(call.func, ast.Attribute) and self.holds(call.func.value, scope):
             return True
-        joins = dotted(call.func, self._bound) in _THROUGH_FILES
-        return joins and bool(call.args) and self.holds(call.args[0], scope)
+        is_through = dotted(call.func, self._bound) in _THROUGH_FILES
+        return is_through and bool(call.args) and self.holds(call.args[0], scope)
 
     def _is_made(self, item: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
+        """Return True if an expression is such a path or file, or what is made from one alone."""
         if isinstance(item, ast.Attribute | ast.Subscript | ast.Starred | ast.NamedExpr):
             return self._is_made(item.value, scope, visited)
         if isinstance(item, ast.BinOp):
             return self._is_made(item.left, scope, visited)
         if isinstance(item, ast.JoinedStr):
-            first = item.values[0] if item.values else item
-            return isinstance(first, ast.FormattedValue) and self._is_made(
-                first.value, scope, visited
+            first_piece = item.values[0] if item.values else item
+            return isinstance(first_piece, ast.FormattedValue) and self._is_made(
+                first_piece.value, scope, visited
             )
         if isinstance(item, ast.Call):
             return self._is_made_by(item, scope, visited)
         return isinstance(item, ast.Name) and self._is_name_made(item.id, scope, visited)
 
     def _is_made_by(self, call: ast.Call, scope: Scope, visited: frozenset[str]) -> bool:
-        full = dotted(call.func, self._bound)
-        last = call.func.attr if isinstance(call.func, ast.Attribute) else ""
-        if full in _MADE:
+        """Return True for a call that makes such a path or file, or gives what it gets first."""
+        full_name = dotted(call.func, self._bound)
+        method = call.func.attr if isinstance(call.func, ast.Attribute) else ""
+        if full_name in _MADE:
             return True
-        if full in _THROUGH_FILES or last in _THROUGH_FILES or self._reads(full):
-            first = read_by(call)
-            return first is not None and self._is_made(first, scope, visited)
-        return bool(last) and self._is_made(call.func, scope, visited)
+        if full_name in _THROUGH_FILES or method in _THROUGH_FILES or self._reads(full_name):
+            first_argument = read_by(call)
+            return first_argument is not None and self._is_made(first_argument, scope, visited)
+        # a method of such an object
+        return bool(method) and self._is_made(call.func, scope, visited)
 
     def _is_name_made(self, name: str, scope: Scope, visited: frozenset[str]) -> bool:
         """Return True if all that gives a local name its value is made."""
         if name in visited:
             return True  # a path that is lengthened
+        # from the innermost function to the outermost
         for depth in range(len(scope), 0, -1):
             function = scope[depth - 1]
             if name in arguments(function):

@@ -182,9 +182,12 @@ def constructs(tree: Syntax, bound: Mapping[str, str]) -> list[Construct]:
     """Return each construct of a module that is not followed; ``bound`` has the full name of
     each imported name.
     """
-    own = _bound_here(tree.all)
+    own_names = _bound_here(tree.all)
     scratch = Scratch(bound, lambda full: _READERS.fullmatch(full) is not None)
-    unfollowed = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own, scratch)]
+    unfollowed = [
+        *_named(tree.all, bound, own_names),
+        *_read(tree.calls, bound, own_names, scratch),
+    ]
     scratch_texts = scratch.texts(tree) if scratch else set[int]()
     unfollowed += _file_names(tree.all, scratch_texts)
     return sorted(set(unfollowed), key=lambda item: (item.line, item))
@@ -198,8 +201,12 @@ def literal_import(call: ast.expr, bound: Mapping[str, str]) -> str | None:
         return None
     if dotted(call.func, bound) not in _IMPORTERS:
         return None
-    first = call.args[0]
-    return first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else None
+    module_argument = call.args[0]
+    return (
+        module_argument.value
+        if isinstance(module_argument, ast.Constant) and isinstance(module_argument.value, str)
+        else None
+    )
 
 
 _IMPORTERS = (
@@ -221,22 +228,30 @@ def _bound_here(kinds: Kinds) -> set[str]:
 
 def _named(kinds: Kinds, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
     """Yield each use of a name that reads what no import shows, such as ``os.environ``."""
-    accounted = {id(call.func) for call in each(kinds, ast.Call) if literal_import(call, bound)}
-    accounted |= {id(use.value) for use in each(kinds, ast.Attribute)}
-    names = {id(use): name for use, name in _variables(kinds, bound)}
+    ids_accounted = {id(call.func) for call in each(kinds, ast.Call) if literal_import(call, bound)}
+    # only the longest chain of attributes counts
+    ids_accounted |= {id(use.value) for use in each(kinds, ast.Attribute)}
+    variable_names = {id(use): name for use, name in _variables(kinds, bound)}
     for item in each(kinds, ast.Attribute, ast.Name):
-        if id(item) in accounted or not isinstance(item.ctx, ast.Load):
+        if id(item) in ids_accounted or not isinstance(item.ctx, ast.Load):
             continue
         if not _is_imported_or_builtin(_first_name(item), bound, own):
             continue
-        full = dotted(item, bound)
-        if entry := entry_of(full):
+        full_name = dotted(item, bound)
+        if entry := entry_of(full_name):
             yield Construct(
-                entry[0], names.get(id(_environ(item)), ""), full, entry[1], item.lineno
+                entry[0],
+                variable_names.get(id(_environ(item)), ""),
+                full_name,
+                entry[1],
+                item.lineno,
             )
 
 
 def _is_imported_or_builtin(base: str, bound: Mapping[str, str], own: set[str]) -> bool:
+    """Return True for a name that is imported, or that is a builtin which the module does not
+    hide.
+    """
     return base in bound or (base not in own and base in _BUILTINS)
 
 
@@ -251,12 +266,16 @@ def entry_of(full: str) -> tuple[str, str] | None:
 
 
 def _first_name(item: ast.expr) -> str:
+    """Return the first name of ``a.b.c``, or an empty text."""
     while isinstance(item, ast.Attribute):
         item = item.value
     return item.id if isinstance(item, ast.Name) else ""
 
 
 def _environ(item: ast.expr) -> ast.expr:
+    """Return ``os.environ`` for ``os.environ.get`` and the like, and any other expression as it
+    is.
+    """
     if isinstance(item, ast.Attribute) and item.attr in ("get", "__getitem__", "pop"):
         return item.value
     return item
@@ -269,6 +288,7 @@ def _variables(kinds: Kinds, bound: Mapping[str, str]) -> Iterator[tuple[ast.exp
     pairs = [(item.value, item.slice) for item in each(kinds, ast.Subscript)]
     pairs += [(_environ(item.func), item.args[0]) for item in each(kinds, ast.Call) if item.args]
     for use, key in pairs:
+        # " ": an entry of no kind
         if (name := _literal(key)) and (entry_of(dotted(use, bound)) or " ")[0] == "env":
             yield use, name
 
@@ -292,19 +312,27 @@ def _read(
 
 def _path_read(call: ast.Call, bound: Mapping[str, str], own: set[str]) -> ast.expr | None:
     """Return the path of the file that a call reads, or None for a call that reads no file."""
-    full, is_imported = dotted(call.func, bound), _first_name(call.func) in bound
-    if (is_imported or (full == "open" and full not in own)) and _READERS.fullmatch(full):
+    full_name, is_imported = dotted(call.func, bound), _first_name(call.func) in bound
+    if (is_imported or (full_name == "open" and full_name not in own)) and _READERS.fullmatch(
+        full_name
+    ):
         return read_by(call)
     if is_imported or not isinstance(call.func, ast.Attribute) or call.func.attr not in _METHODS:
         return None
+    # a method of a path, such as `path.read_text()`
     return call.func.value
 
 
 def _writes(call: ast.Call) -> bool:
     """Return True if the mode of a call of ``open`` creates or extends a file."""
+    # the mode is the first argument of a method, and the second of `open`
     modes = [*call.args[:2], *(word.value for word in call.keywords if word.arg == "mode")]
-    texts = [m.value for m in modes if isinstance(m, ast.Constant) and isinstance(m.value, str)]
-    return any(re.fullmatch(r"[wax][bt+]*", text) for text in texts)
+    mode_texts = [
+        argument.value
+        for argument in modes
+        if isinstance(argument, ast.Constant) and isinstance(argument.value, str)
+    ]
+    return any(re.fullmatch(r"[wax][bt+]*", text) for text in mode_texts)
 
 
 def _literal(path: ast.AST) -> str:
@@ -316,15 +344,16 @@ def _given(path: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
     """Return True if a path comes from an argument of a function around it, through any local
     names.
     """
-    names = [
+    variables = [
         variable
         for variable in ast.walk(path)
         if isinstance(variable, ast.Name) and isinstance(variable.ctx, ast.Load)
     ]
-    return any(_name_given(name.id, scope, visited) for name in names)
+    return any(_name_given(name.id, scope, visited) for name in variables)
 
 
 def _name_given(name: str, scope: Scope, visited: frozenset[str]) -> bool:
+    """Return True if a name is an argument of a function around it, or has its value from one."""
     if name in visited:
         return False
     for function in reversed(scope):
@@ -342,12 +371,12 @@ def _file_names(kinds: Kinds, scratch: set[int]) -> Iterator[Construct]:
 
     ``scratch`` are the texts, by id, that name a file in a temporary folder.
     """
-    spoken = set[int]()
+    ids_in_messages = set[int]()
     for item in each(kinds, ast.Raise, ast.JoinedStr):
-        spoken |= {id(piece) for piece in ast.walk(item)}
+        ids_in_messages |= {id(part) for part in ast.walk(item)}
     for item in each(kinds, ast.Constant):
         text = _literal(item)
-        if _FILE_NAME.fullmatch(text) and id(item) not in spoken | scratch:
+        if _FILE_NAME.fullmatch(text) and id(item) not in ids_in_messages | scratch:
             yield Construct("file", text, repr(text), _FILE, item.lineno)
 
 
@@ -402,13 +431,14 @@ def _hash_ordered(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
     """Yield each expression in a part of the tree whose order or value the hash seed decides."""
     if isinstance(item, _SCOPES):
         scope = NameScope(item, scope)
-    yield from (taken for taken in _taken(item) if _is_set(taken, scope))
+    yield from (ordered_part for ordered_part in _taken(item) if _is_set(ordered_part, scope))
     if isinstance(item, ast.Call):
         if _hashes(item, scope):
             yield item
         if last_name(item.func) in _UNORDERED:
             for argument in item.args:
                 yield from _below(argument, scope)
+            # the arguments were looked at, so far as their order counts
             return
     if not _defines_hash(item):
         for child in ast.iter_child_nodes(item):
@@ -416,6 +446,7 @@ def _hash_ordered(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
 
 
 def _defines_hash(item: ast.AST) -> bool:
+    """Return True for the definition of ``__hash__``, which may call ``hash``."""
     return isinstance(item, ast.FunctionDef) and item.name == "__hash__"
 
 
@@ -446,12 +477,12 @@ def _below(argument: ast.expr, scope: NameScope) -> Iterator[ast.expr]:
 
 def _behind_first(listed: ast.ListComp | ast.DictComp | ast.GeneratorExp) -> list[ast.expr]:
     """Return the expressions of a comprehension but for what it goes through first."""
-    operands: list[ast.expr] = []
+    clause_parts: list[ast.expr] = []
     for clause in listed.generators:
-        operands += [clause.target, clause.iter, *clause.ifs]
-    operands.remove(listed.generators[0].iter)
-    values = [listed.key, listed.value] if isinstance(listed, ast.DictComp) else [listed.elt]
-    return [*operands, *values]
+        clause_parts += [clause.target, clause.iter, *clause.ifs]
+    clause_parts.remove(listed.generators[0].iter)
+    result_parts = [listed.key, listed.value] if isinstance(listed, ast.DictComp) else [listed.elt]
+    return [*clause_parts, *result_parts]
 
 
 def _taken(item: ast.AST) -> list[ast.expr]:
@@ -478,6 +509,7 @@ def _is_set(item: ast.expr, scope: NameScope, visited: frozenset[str] = frozense
     """Return True for an expression that is a set, and not one of numbers."""
     if isinstance(item, ast.Set):
         return not all(map(_is_number, item.elts))
+    # union, intersection and differences
     if isinstance(item, ast.BinOp) and isinstance(
         item.op, ast.BitOr | ast.BitAnd | ast.Sub | ast.BitXor
     ):
@@ -492,6 +524,7 @@ def _is_set(item: ast.expr, scope: NameScope, visited: frozenset[str] = frozense
 
 
 def _is_number(item: ast.expr) -> bool:
+    """Return True for a literal number."""
     return isinstance(item, ast.Constant) and isinstance(item.value, int | float)
 
 
@@ -499,8 +532,8 @@ def _makes_set(call: ast.Call) -> bool:
     """Return True for ``set(…)``, but not of a range of numbers."""
     if not isinstance(call.func, ast.Name) or call.func.id not in ("set", "frozenset"):
         return False
-    first = call.args[0] if call.args else None
-    return not (isinstance(first, ast.Call) and last_name(first.func) == "range")
+    argument = call.args[0] if call.args else None
+    return not (isinstance(argument, ast.Call) and last_name(argument.func) == "range")
 
 
 def _names_set(name: str, scope: NameScope, visited: frozenset[str]) -> bool:
@@ -513,6 +546,7 @@ def _names_set(name: str, scope: NameScope, visited: frozenset[str]) -> bool:
 
 
 def _of_set(function: ast.expr, scope: NameScope, visited: frozenset[str]) -> bool:
+    """Return True for a method of a set."""
     return isinstance(function, ast.Attribute) and _is_set(function.value, scope, visited)
 
 
@@ -604,32 +638,36 @@ def facts(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
     each imported name.
     """
     uses = [*_by_name(kinds, bound), *_by_text(kinds), *_by_place(kinds), *_of_paths(kinds)]
-    return [Construct(why[0], "", text, why[1], line) for text, why, line in uses]
+    return [
+        Construct(kind_and_reason[0], "", text, kind_and_reason[1], line)
+        for text, kind_and_reason, line in uses
+    ]
 
 
 _Found = Iterator[tuple[str, tuple[str, str], int]]
 
 
 def _by_name(kinds: Kinds, bound: Mapping[str, str]) -> _Found:
+    """Yield each use of such a fact by its name: the name, why it is not covered, and the line."""
     for item in each(kinds, ast.Attribute, ast.Name):
         if not isinstance(item.ctx, ast.Load):
             continue
-        full, is_imported = dotted(item, bound), _first_name(item) in bound
-        last = full.rpartition(".")[2] if is_imported else ""
+        full_name, is_imported = dotted(item, bound), _first_name(item) in bound
+        last_part = full_name.rpartition(".")[2] if is_imported else ""
         if isinstance(item, ast.Attribute):
-            last = item.attr
-        if last in _WHY_BESIDE:
-            yield last, _WHY_BESIDE[last], item.lineno
-        elif is_imported and full in _FULL:
-            yield full, _FULL[full], item.lineno
+            last_part = item.attr
+        if last_part in _WHY_BESIDE:
+            yield last_part, _WHY_BESIDE[last_part], item.lineno
+        elif is_imported and full_name in _FULL:
+            yield full_name, _FULL[full_name], item.lineno
 
 
 def _by_text(kinds: Kinds) -> _Found:
     """Yield each text that is such a name, or ends with one: ``"__code__.co_firstlineno"``."""
     for text, line in texts(kinds):
-        last = text.rpartition(".")[2]
-        if last in _WHY_BESIDE:
-            yield last, _WHY_BESIDE[last], line
+        last_part = text.rpartition(".")[2]
+        if last_part in _WHY_BESIDE:
+            yield last_part, _WHY_BESIDE[last_part], line
 
 
 def _by_place(kinds: Kinds) -> _Found:
@@ -638,9 +676,9 @@ def _by_place(kinds: Kinds) -> _Found:
     for item in each(kinds, ast.Assign):
         if _is_stat(item.value, frozenset()):
             targets += item.targets
-    named = frozenset(target.id for target in targets if isinstance(target, ast.Name))
-    unpacked = [target for target in targets if isinstance(target, ast.Tuple | ast.List)]
-    rows = [*unpacked, *_rows_of_stat(kinds, named)]
+    names_of_stat = frozenset(target.id for target in targets if isinstance(target, ast.Name))
+    unpacked_targets = [target for target in targets if isinstance(target, ast.Tuple | ast.List)]
+    rows = [*unpacked_targets, *_rows_of_stat(kinds, names_of_stat)]
     yield from (("stat", ("stamp", _STAMP), row.lineno) for row in rows)
 
 
@@ -674,15 +712,16 @@ def _of_paths(kinds: Kinds) -> _Found:
     """Yield ``path.owner()`` and ``path.group()`` of arguments that are paths; a match of a
     pattern has groups too.
     """
-    annotated = [item for item in each(kinds, ast.arg) if item.annotation is not None]
-    paths = {item.arg for item in annotated if _names_path(item.annotation)}
-    owners = [item for item in each(kinds, ast.Attribute) if item.attr in ("owner", "group")]
-    for item in owners:
-        if isinstance(item.value, ast.Name) and item.value.id in paths:
+    annotated_arguments = [item for item in each(kinds, ast.arg) if item.annotation is not None]
+    path_arguments = {item.arg for item in annotated_arguments if _names_path(item.annotation)}
+    owner_calls = [item for item in each(kinds, ast.Attribute) if item.attr in ("owner", "group")]
+    for item in owner_calls:
+        if isinstance(item.value, ast.Name) and item.value.id in path_arguments:
             yield item.attr, ("stamp", _STAMP), item.lineno
 
 
 def _names_path(annotation: ast.expr) -> bool:
+    """Return True for an annotation that names a path or a file of data."""
     text = ast.unparse(annotation)
     return "Path" in text or "DataFile" in text
 
@@ -760,18 +799,21 @@ def moments(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
         *_by_date(kinds),
         *_looked_up(kinds, bound),
     ]
-    return [Construct("state", "", text, why, line) for text, why, line in uses]
+    return [Construct("state", "", text, reason, line) for text, reason, line in uses]
 
 
 _MomentFact = Iterator[tuple[str, str, int]]
 
 
 def _moment_by_name(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
+    """Yield each use of a fact of the moment by its name: the name, why it is not covered, and
+    the line.
+    """
     for item in each(kinds, ast.Attribute, ast.Name):
         if isinstance(item.ctx, ast.Load) and (isinstance(item, ast.Attribute) or item.id in bound):
-            full = dotted(item, bound) or last_name(item)
-            if full.rpartition(".")[2] in _LAST or full in _FULL_NAMES_OF_MOMENT:
-                yield full, _WHY_OF_MOMENT, item.lineno
+            full_name = dotted(item, bound) or last_name(item)
+            if full_name.rpartition(".")[2] in _LAST or full_name in _FULL_NAMES_OF_MOMENT:
+                yield full_name, _WHY_OF_MOMENT, item.lineno
 
 
 def _by_date(kinds: Kinds) -> _MomentFact:
@@ -790,10 +832,10 @@ def _looked_up(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
     for call in each(kinds, ast.Call):
         if last_name(call.func) != "getattr" or len(call.args) < 2:
             continue
-        base, name = dotted(call.args[0], bound), text_of(call.args[1])
-        if base.partition(".")[0] not in _HOLDING:
+        module_name, name = dotted(call.args[0], bound), text_of(call.args[1])
+        if module_name.partition(".")[0] not in _HOLDING:
             continue
-        entry = entry_of(f"{base}.{name}") if name else ("state", _LOOKED_UP)
+        entry = entry_of(f"{module_name}.{name}") if name else ("state", _LOOKED_UP)
         if entry or name in _LAST:
-            why = entry[1] if entry else _WHY_OF_MOMENT
-            yield ast.unparse(call)[:60], why, call.lineno
+            reason = entry[1] if entry else _WHY_OF_MOMENT
+            yield ast.unparse(call)[:60], reason, call.lineno

@@ -80,8 +80,10 @@ def resolve(
     """
     declared = Declared({}, [], [])
     for entry in entries:
+        # "env:NAME", "unaffected:name", a file, or a module
         if entry.startswith(VARIABLE):
             name = entry.removeprefix(VARIABLE)
+            # at the import and now; one value if both are equal
             values = dict.fromkeys([then.get(name, os.environ.get(name)), os.environ.get(name)])
             declared.parts[f"environment variable {name}"] = {"value": digest(*values)[:16]}
         elif not entry.startswith(FREE):
@@ -113,10 +115,10 @@ def refusal(item: Construct, source: Path) -> str:
     """Return the message that refuses a construct: its place, its text, the reason and the fix."""
     fix = _FIX[item.kind].format(name=item.name or _NAME.get(item.kind, ""))
     name = item.text if item.text.isidentifier() else item.kind
-    free = f'or, if no result depends on it, depends=["{FREE}{name}"]'
+    free_advice = f'or, if no result depends on it, depends=["{FREE}{name}"]'
     return (
         f"{source}:{item.line}: {item.text}: {item.why}, and a cache key cannot see it: {fix};"
-        f" {free}"
+        f" {free_advice}"
     )
 
 
@@ -132,14 +134,18 @@ def changing_refusal(name: str, kind_of_object: str, source: Path) -> str:
 
 
 def _covers(entry: str, item: Construct) -> bool:
+    """Return True if a declared entry covers a construct that is not followed."""
     if entry.startswith(FREE):
-        free = entry.removeprefix(FREE)
-        named = (item.kind, item.name, PurePath(item.name).name, item.text)
-        return free in named or item.text.startswith((f"{free}.", f"{free}("))
+        free_name = entry.removeprefix(FREE)
+        names_of_construct = (item.kind, item.name, PurePath(item.name).name, item.text)
+        return free_name in names_of_construct or item.text.startswith(
+            (f"{free_name}.", f"{free_name}(")
+        )
     if entry.startswith(VARIABLE):
         return item.kind == "env" and item.name in ("", entry.removeprefix(VARIABLE))
     if item.kind == "file":
         return (
+            # the code does not say which file it reads
             not item.name
             or not PurePath(entry).suffix
             or PurePath(entry).name == PurePath(item.name).name
@@ -161,8 +167,8 @@ def _content(path: Path) -> str:
 
 def _changed(path: Path, since: int) -> bool:
     """Return True if a file, or anything in a folder, was changed after a time (ns)."""
-    inside = path.rglob("*") if path.is_dir() else ()
-    return any(os.stat(file).st_ctime_ns > since for file in (path, *inside))
+    files_inside = path.rglob("*") if path.is_dir() else ()
+    return any(os.stat(file).st_ctime_ns > since for file in (path, *files_inside))
 
 
 # --- tainted code ---------------------------------------------------------------------------------
@@ -198,9 +204,9 @@ def taint_code(modules: Iterable[str], taints: tuple[Any, ...]) -> bool:
     """Mark own modules as code whose results no other process may use; return True if one was
     not marked before.
     """
-    new = [module for module in modules if module not in _taints]
-    _taints.update(dict.fromkeys(new, taints))
-    return bool(new)
+    new_modules = [module for module in modules if module not in _taints]
+    _taints.update(dict.fromkeys(new_modules, taints))
+    return bool(new_modules)
 
 
 def taints_of(modules: Iterable[str]) -> tuple[Any, ...]:
@@ -236,7 +242,7 @@ class Siblings:
 
     def __init__(self, whole_of: Callable[[str], Whole]) -> None:
         self._whole_of = whole_of
-        self._scopes: dict[str, Scope] = {}
+        self._scopes: dict[str, Scope] = {}  # by module: whose results it may change
 
     def of(self, roots: Sequence[str]) -> list[str]:
         """Return the own modules that may change what the code of ``roots`` computes, in the order
@@ -244,23 +250,34 @@ class Siblings:
 
         Raises `LookupError` for a module that cannot be followed.
         """
-        others = own_modules()
-        if not others:
+        # all modules of users in this process
+        modules_of_user = own_modules()
+        if not modules_of_user:
             return []
-        followed = _looks_of(roots, lambda root: self._whole_of(root).looks)
-        mine, own = _own(followed), any(map(is_own, roots))
-        beside = [name for name in others if name not in followed]
-        return [name for name in beside if self._joins(name, mine, own)]
+        followed_looks = _looks_of(roots, lambda root: self._whole_of(root).looks)
+        own_reaches, has_own_root = _own(followed_looks), any(map(is_own, roots))
+        others_not_followed = [name for name in modules_of_user if name not in followed_looks]
+        return [
+            name for name in others_not_followed if self._joins(name, own_reaches, has_own_root)
+        ]
 
     def _joins(self, module: str, mine: Mapping[str, Reach], own: bool) -> bool:
+        """Return True if a module may change what a node computes.
+
+        ``mine`` is what the own modules of the node reach; ``own`` is False for a node without
+        any.
+        """
         scope = self._scope_of(module)
         if scope == "all" or not own:
             return scope == "all"
-        shared = _own(self._whole_of(module).looks).keys() & mine.keys()
-        changed = any(mine[name].inward for name in shared)
-        return scope == "own" or changed or any(reach.seeks for reach in mine.values())
+        # modules that both lead to, through which one may change the other
+        shared_modules = _own(self._whole_of(module).looks).keys() & mine.keys()
+        changes_itself = any(mine[name].inward for name in shared_modules)
+        # the last: code that looks for classes may find those of any module
+        return scope == "own" or changes_itself or any(reach.seeks for reach in mine.values())
 
     def _scope_of(self, module: str) -> Scope:
+        """Return whose results a module may change, found once."""
         if module not in self._scopes:
             self._scopes[module] = _scope(self._whole_of(module).looks)
         return self._scopes[module]
@@ -271,15 +288,17 @@ def _scope(looks: Mapping[str, Look]) -> Scope:
     reaches = _own(looks).values()
     names = outward_names(reaches)
     for reach in reaches:
+        # imported for what their import does
         names |= {name for name in reach.unused if _kind(name) == "distribution"}
-    own = {name for name in names if _is_of_user(name)}
-    if _holds_unseen(looks) or any(_is_shared(name) for name in names - own):
+    names_of_users = {name for name in names if _is_of_user(name)}
+    if _holds_unseen(looks) or any(_is_shared(name) for name in names - names_of_users):
         return "all"
-    return "own" if own else "nothing"
+    return "own" if names_of_users else "nothing"
 
 
 def _holds_unseen(looks: Mapping[str, Look]) -> bool:
     """Return True if own code among some modules has a construct whose reach nobody can see."""
+    # only code of users
     summaries = [look.summary for name, look in looks.items() if is_own(name) and look.summary]
     constructs = chain.from_iterable(summary.constructs for summary in summaries)
     return any(construct.kind in _UNSEEN for construct in constructs)
@@ -303,13 +322,16 @@ def _is_shared(name: str) -> bool:
     """Return True for something of a library that others see: not for the result of a call, such
     as an open file.
     """
-    called, separator, _ = name.rpartition("()")
-    return not separator or _GETTER.search(called.rpartition(".")[2]) is not None
+    function_name, separator, _ = name.rpartition("()")
+    return not separator or _GETTER.search(function_name.rpartition(".")[2]) is not None
 
 
 def _kind(name: str) -> str:
-    top = name.partition(".")[0]
-    return origin_of(top, frozenset()).kind if top else "nowhere"
+    """Return the kind of origin of the top-level package in a full name; "nowhere" for a
+    relative one.
+    """
+    top_package = name.partition(".")[0]
+    return origin_of(top_package, frozenset()).kind if top_package else "nowhere"
 
 
 # --- user code ------------------------------------------------------------------------------------
@@ -350,26 +372,27 @@ def own_code_of(
     """Return the code of a call of a node, as `own_code` does; ``networks`` are the modules of
     its network classes.
     """
-    roots = [node.fn.__module__, *networks]
-    if not any(map(is_own, roots)):
+    root_modules = [node.fn.__module__, *networks]
+    if not any(map(is_own, root_modules)):
         return None
-    looks = _looks_of(roots, code.looks)
+    looks = _looks_of(root_modules, code.looks)
     summaries = {name: look.summary for name, look in looks.items() if look.summary is not None}
-    own = {name: summary for name, summary in summaries.items() if is_own(name)}
-    declared = [(looks[name].path, summary.depends) for name, summary in summaries.items()]
-    declared.append((looks[roots[0]].path, [*node.depends]))
-    entries = [*chain.from_iterable(depends for _, depends in declared)]
-    files = map(os.path.realpath, files_in(params))
-    declared_files = chain.from_iterable(starmap(_declared_files, declared))
-    changed = outward_names([summary.reach for summary in own.values()])
+    own_summaries = {name: summary for name, summary in summaries.items() if is_own(name)}
+    files_and_entries = [(looks[name].path, summary.depends) for name, summary in summaries.items()]
+    # what the node declares stands beside its own module
+    files_and_entries.append((looks[root_modules[0]].path, [*node.depends]))
+    entries = [*chain.from_iterable(depends for _, depends in files_and_entries)]
+    parameter_files = map(os.path.realpath, files_in(params))
+    declared_files = chain.from_iterable(starmap(_declared_files, files_and_entries))
+    changed_names = outward_names([summary.reach for summary in own_summaries.values()])
     return OwnCode(
-        modules=frozenset(own),
+        modules=frozenset(own_summaries),
         followed=frozenset(looks),
-        files=frozenset(chain(files, declared_files)),
+        files=frozenset(chain(parameter_files, declared_files)),
         free=_after(FREE, entries),
-        changed=frozenset(changed),
-        unread=_unread_logs(own),
-        may_change=bool(changed) or _may_change_others(own),
+        changed=frozenset(changed_names),
+        unread=_unread_logs(own_summaries),
+        may_change=bool(changed_names) or _may_change_others(own_summaries),
         variables=_after(VARIABLE, entries),
     )
 
@@ -386,8 +409,8 @@ def _looks_of(
 
 def _declared_files(source: Path | None, entries: Sequence[str]) -> set[str]:
     """Return the real paths of the files beside a source file that its entries name."""
-    beside = [source.parent / entry for entry in entries] if source else []
-    return {os.path.realpath(path) for path in beside if path.exists()}
+    paths_beside = [source.parent / entry for entry in entries] if source else []
+    return {os.path.realpath(path) for path in paths_beside if path.exists()}
 
 
 def _after(prefix: str, entries: Iterable[str]) -> frozenset[str]:
@@ -415,9 +438,10 @@ def reads_time(looks: Mapping[str, Look]) -> bool:
     """Return True if code of a user may read the time zone: by the standard library, or by a
     package of its own.
     """
-    own = [look for name, look in looks.items() if is_own(name)]
-    imports = chain.from_iterable(look.imports for look in own)
+    own_looks = [look for name, look in looks.items() if is_own(name)]
+    imports = chain.from_iterable(look.imports for look in own_looks)
     if not _TIMED.isdisjoint(name.partition(".")[0] for name in imports):
         return True
-    contents = chain.from_iterable(look.parts.values() for look in own)
+    # packages whose content counts: nobody knows whether they read the clock
+    contents = chain.from_iterable(look.parts.values() for look in own_looks)
     return any("content" in content for content in contents)

@@ -87,22 +87,27 @@ def program() -> tuple[str, ...]:
     whole folder.
     """
     prefixes = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
-    python = itertools.starmap(os.path.join, itertools.product(prefixes, _OF_PYTHON))
+    parts_of_python = itertools.starmap(os.path.join, itertools.product(prefixes, _OF_PYTHON))
     paths = sysconfig.get_paths()
-    installed = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
-    zipped = os.path.join(
+    package_folders = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    # the standard library in one file, where Python was built so
+    zipped_library = os.path.join(
         sys.base_prefix, "lib", f"python{sys.version_info[0]}{sys.version_info[1]}.zip"
     )
-    return (*_neusee(), *_real([*python, *installed, zipped, site.getusersitepackages()]))
+    return (
+        *_neusee(),
+        *_real([*parts_of_python, *package_folders, zipped_library, site.getusersitepackages()]),
+    )
 
 
 @functools.cache
 def _neusee() -> tuple[str, ...]:
-    packaged = [
+    """Return the real paths of the code of the program itself."""
+    package_files = [
         Path(neusee.__file__ or "").parent / name
         for name in ("__init__.py", "__main__.py", "__pycache__")
     ]
-    return _real([*map(Path, neusee.nodes.__path__), Path(__file__).parents[1], *packaged])
+    return _real([*map(Path, neusee.nodes.__path__), Path(__file__).parents[1], *package_files])
 
 
 def is_of_neusee(path: str) -> bool:
@@ -111,6 +116,7 @@ def is_of_neusee(path: str) -> bool:
 
 
 def _cache() -> Path:
+    """Return the folder of caches of this user."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
@@ -136,18 +142,18 @@ def caches() -> tuple[str, ...]:
     """Return the folders of code that libraries compile for this machine, and that no result
     depends on.
     """
-    home, cache = Path.home(), _cache()
-    named = [
+    home_folder, cache_folder = Path.home(), _cache()
+    stated_folders = [
         os.environ[name] for name in ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR") if os.environ.get(name)
     ]
     # the first is `folder` of neusee.nodes._cpp_library
     return _real(
         [
-            cache / "neusee" / "build",
-            cache / "torch" / "kernels",
-            home / ".nv",
-            home / ".triton",
-            *named,
+            cache_folder / "neusee" / "build",
+            cache_folder / "torch" / "kernels",
+            home_folder / ".nv",
+            home_folder / ".triton",
+            *stated_folders,
         ]
     )
 
@@ -212,17 +218,21 @@ def is_searched_program(path: str) -> bool:
 
 @functools.cache
 def _plain_entries() -> tuple[str, ...]:
+    """Return the entries of `SYSTEM` that name one file or folder."""
     return tuple(entry for entry in SYSTEM if not entry.endswith("*"))
 
 
 @functools.cache
 def _starts() -> tuple[str, ...]:
+    """Return the beginnings of paths in `SYSTEM`, without the star."""
     return tuple(entry[:-1] for entry in SYSTEM if entry.endswith("*"))
 
 
 def _is_below(path: str, folders: Iterable[str]) -> bool:
+    """Return True if a path is one of the folders, or in one."""
     return any(path == folder or path.startswith(f"{folder}/") for folder in folders)
 
 
 def _real(paths: Iterable[str | Path]) -> tuple[str, ...]:
+    """Return the real path of each path, each once."""
     return tuple(dict.fromkeys(os.path.realpath(path) for path in paths))

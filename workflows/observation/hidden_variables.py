@@ -52,16 +52,18 @@ class _Shown(dict[bytes, bytes]):
 
     def __missing__(self, name: bytes) -> bytes:
         """Return a hidden variable to own code and to neusee; raise `KeyError` to a library."""
-        who, text = _who_asks(), os.fsdecode(name)
-        if who == "library" and name in self.hidden and text not in OF_WINDOWS:
-            self._asked.of_libraries[text] = None
+        asker, variable = _who_asks(), os.fsdecode(name)
+        # those of terminals and windows are not worth a word
+        if asker == "library" and name in self.hidden and variable not in OF_WINDOWS:
+            self._asked.of_libraries[variable] = None
+        # once all are asked for, single names say no more
         if (
-            who == "own"
-            and not is_shown(text, self._declared)
+            asker == "own"
+            and not is_shown(variable, self._declared)
             and ALL not in self._asked.of_own_code
         ):
-            self._asked.of_own_code[text] = None
-        if who == "library" or name not in self.hidden:
+            self._asked.of_own_code[variable] = None
+        if asker == "library" or name not in self.hidden:
             raise KeyError(name)
         return self.hidden[name]
 
@@ -69,10 +71,10 @@ class _Shown(dict[bytes, bytes]):
         """Yield the names of all variables to own code and to neusee, and of those that are not
         hidden to a library.
         """
-        who = _who_asks()
-        if who == "own":
+        asker = _who_asks()
+        if asker == "own":
             self._asked.of_own_code[ALL] = None
-        return iter([*self.keys(), *(() if who == "library" else self.hidden)])
+        return iter([*self.keys(), *(() if asker == "library" else self.hidden)])
 
 
 def is_shown(name: str, declared: frozenset[str]) -> bool:
@@ -86,41 +88,52 @@ def hide_for_good(declared: frozenset[str]) -> Asked:
 
     Libraries of C do not find them either.
     """
-    asked = Asked()
-    shown = _show_few(declared, asked)
+    asked_variables = Asked()
+    shown = _show_few(declared, asked_variables)
     posix = sys.modules.get("posix")
     for name in shown.hidden:
         os.unsetenv(name)
+        # what another import of `os` would read
         if posix is not None:
             posix.environ.pop(name, None)
-    return asked
+    return asked_variables
 
 
 @contextmanager
 def hidden_while_importing(declared: frozenset[str]) -> Iterator[Asked]:
     """Hide variables from the libraries of Python that the ``with`` block imports."""
-    asked, before = Asked(), _data(os.environ)
-    shown = _show_few(declared, asked)
+    asked_variables, environment_before = Asked(), _data(os.environ)
+    shown_variables = _show_few(declared, asked_variables)
     try:
-        yield asked
+        yield asked_variables
     finally:
         _set_data(
-            {**shown.hidden, **shown}
-            | {name: value for name, value in before.items() if name in shown.hidden}
+            # with what was set meanwhile; hidden variables have their earlier values
+            {**shown_variables.hidden, **shown_variables}
+            | {
+                name: value
+                for name, value in environment_before.items()
+                if name in shown_variables.hidden
+            }
         )
 
 
 def _show_few(declared: frozenset[str], asked: Asked) -> _Shown:
+    """Let libraries find the declared and known variables alone; return these, with the hidden
+    ones.
+    """
     shown = _Shown(_data(os.environ), declared, asked)
     _set_data(shown)
     return shown
 
 
 def _data(environ: os._Environ[str]) -> dict[bytes, bytes]:
+    """Return the dict behind ``os.environ``."""
     return environ._data  # type: ignore[attr-defined, no-any-return]
 
 
 def _set_data(data: dict[bytes, bytes]) -> None:
+    """Set the dict behind ``os.environ`` and ``os.environb``."""
     os.environ._data = data  # type: ignore[attr-defined]
     os.environb._data = data  # type: ignore[attr-defined]
 
@@ -134,6 +147,7 @@ def _who_asks() -> str:
 
     A module of the standard library that asks while it is imported counts as a library.
     """
+    # the caller of the method of `_Shown`
     frame = sys._getframe(2)
     while frame is not None:
         if frame.f_code.co_filename.startswith(_IMPORT):
@@ -153,6 +167,8 @@ def _standard() -> tuple[str, ...]:
 
 @functools.cache
 def _owner(file: str) -> str:
+    """Return whose code a file is: python, neusee, library or own."""
+    # code without a file, such as that of a dataclass
     if file.startswith("<"):
         return "python"
     path = _real(file)
@@ -168,13 +184,14 @@ def _real(file: str) -> str:
     watch = python_watch.watch_here()
     if watch is None:
         return os.path.realpath(file)
-    before = watch.trust(True)
+    was_trusted = watch.trust(True)
     try:
         return os.path.realpath(file)
     finally:
-        watch.trust(before)
+        watch.trust(was_trusted)
 
 
 def _is_of_python(path: str) -> bool:
-    inside = any(path.startswith(f"{folder}{os.sep}") for folder in _standard())
-    return inside and "site-packages" not in path and "dist-packages" not in path
+    """Return True for a file of the standard library."""
+    is_in_library = any(path.startswith(f"{folder}{os.sep}") for folder in _standard())
+    return is_in_library and "site-packages" not in path and "dist-packages" not in path

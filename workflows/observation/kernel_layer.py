@@ -51,10 +51,10 @@ class NotificationClient:
         #: True in a fork, which cannot see whether the server of its parent has ended
         self._is_of_parent = False
         self._server: subprocess.Popen[bytes] | None = None
-        self._socket, theirs = socket.socketpair()
+        self._socket, server_end = socket.socketpair()
         try:
-            with theirs:
-                self._server = self._started(theirs)
+            with server_end:
+                self._server = self._started(server_end)
             self._ask_for_sight(self._server.pid)
         except (OSError, ValueError) as error:
             self.close()
@@ -64,7 +64,7 @@ class NotificationClient:
         """Start the server in a session of its own: a Ctrl-C and the end of a terminal do not
         reach it.
         """
-        source = str(Path(neusee.__file__).parents[1])
+        package_folder = str(Path(neusee.__file__).parents[1])
         # as the interpreter is, without the settings, paths and start-up files of the user
         command = [
             sys.executable,
@@ -72,16 +72,16 @@ class NotificationClient:
             "-S",
             "-c",
             _SCRIPT,
-            source,
+            package_folder,
             str(theirs.fileno()),
             str(self.process),
         ]
-        quiet = subprocess.DEVNULL
+        no_stream = subprocess.DEVNULL
         return subprocess.Popen(
             command,
-            stdin=quiet,
-            stdout=quiet,
-            stderr=quiet,
+            stdin=no_stream,
+            stdout=no_stream,
+            stderr=no_stream,
             cwd="/",
             pass_fds=[theirs.fileno()],
             start_new_session=True,
@@ -93,6 +93,7 @@ class NotificationClient:
         ctypes.CDLL(None).prctl(PR_SET_PTRACER, ctypes.c_ulong(server), 0, 0, 0)
         probe = ctypes.create_string_buffer(_PROBE)
         self._socket.settimeout(_PATIENCE)
+        # the server reads the text at this address
         if self._asked(b"P", ctypes.addressof(probe)) != _PROBE.decode():
             raise ValueError("it may not read the memory of this process")
         self._socket.settimeout(None)
@@ -103,6 +104,7 @@ class NotificationClient:
         """
         self._is_of_parent = self.process != os.getpid()
         self.process = os.getpid()
+        # a message is a letter and a number of 8 bytes
         self._socket.sendall(b"O" + self.process.to_bytes(HEADER - 1, "little"))
         self._ask_for_sight(self.server())
 
@@ -145,10 +147,12 @@ class NotificationClient:
             self._server.returncode = 0  # no status is wanted, and so no warning that it still runs
 
     def _asked(self, kind: bytes, number: int) -> Any:
+        """Send a message and return the answer, which is a length of 8 bytes and JSON."""
         self._socket.sendall(kind + number.to_bytes(HEADER - 1, "little"))
         return json.loads(self._exactly(int.from_bytes(self._exactly(8), "little")))
 
     def _exactly(self, length: int) -> bytes:
+        """Return the next bytes that the server sends; raise `ValueError` if it ends before."""
         received = b""
         while len(received) < length:
             chunk = self._socket.recv(length - len(received))
@@ -168,6 +172,7 @@ _clients: list[NotificationClient] = []  #: the last one started, at most one
 
 @functools.cache
 def _filter() -> Filter:
+    """Return the filter of this processor, made once."""
     return Filter()
 
 

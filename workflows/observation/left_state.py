@@ -43,23 +43,30 @@ def is_lazy_constant(tree: ast.Module, name: str) -> bool:
     """Return True if functions of a module set a name, and no argument of a function decides the
     value.
     """
-    places = list(_places(tree, [], set(), set()))
-    stores = [place for place in places if name in place.shared and name in _targets(place.item)]
-    return bool(stores) and all(_is_free(store, places) for store in stores)
+    statements = list(_places(tree, [], set(), set()))
+    assignments = [
+        statement
+        for statement in statements
+        if name in statement.shared and name in _targets(statement.item)
+    ]
+    return bool(assignments) and all(_is_free(store, statements) for store in assignments)
 
 
 def _is_free(store: _Place, places: list[_Place]) -> bool:
     """Return True if no local name decides what a statement sets, or whether it is reached."""
     if not isinstance(store.item, ast.Assign | ast.AnnAssign) or store.item.value is None:
         return False
-    ends = [
-        place for place in places if isinstance(place.item, _ENDS) and place.local == store.local
+    exits = [
+        statement
+        for statement in places
+        if isinstance(statement.item, _ENDS) and statement.local == store.local
     ]
-    earlier = [end for end in ends if _line(end.item) < _line(store.item)]
-    before = [*chain.from_iterable(end.decides for end in earlier)]
+    # an earlier return or raise decides whether the assignment is reached
+    earlier = [end for end in exits if _line(end.item) < _line(store.item)]
+    conditions_before = [*chain.from_iterable(end.decides for end in earlier)]
     return not any(
         _names(expression) & store.local
-        for expression in [store.item.value, *store.decides, *before]
+        for expression in [store.item.value, *store.decides, *conditions_before]
     )
 
 
@@ -68,18 +75,19 @@ def _places(
 ) -> Iterator[_Place]:
     """Yield the statements below a part of a syntax tree that stand in functions."""
     for child in ast.iter_child_nodes(item):
-        inner, names, declared = decides, local, shared
+        conditions, local_names, global_names = decides, local, shared
         if isinstance(child, _FUNCTIONS):
-            statements = [part for part in ast.walk(child) if isinstance(part, ast.Global)]
-            declared = shared.union(*(statement.names for statement in statements))
-            names = local | _locals(child) - declared
+            global_statements = [part for part in ast.walk(child) if isinstance(part, ast.Global)]
+            global_names = shared.union(*(statement.names for statement in global_statements))
+            # a name that is declared global is not local
+            local_names = local | _locals(child) - global_names
         elif isinstance(child, ast.If | ast.While | ast.IfExp):
-            inner = [*decides, child.test]
+            conditions = [*decides, child.test]
         elif isinstance(child, ast.For | ast.AsyncFor):
-            inner = [*decides, child.iter]
+            conditions = [*decides, child.iter]
         if isinstance(child, ast.stmt) and not isinstance(child, _FUNCTIONS):
-            yield _Place(child, inner, names, declared)
-        yield from _places(child, inner, names, declared)
+            yield _Place(child, conditions, local_names, global_names)
+        yield from _places(child, conditions, local_names, global_names)
 
 
 def _locals(function: ast.AST) -> set[str]:
@@ -93,16 +101,18 @@ def _targets(item: ast.AST) -> set[str]:
     if isinstance(item, ast.For | ast.AsyncFor):
         return _stored(item.target)
     if isinstance(item, ast.With | ast.AsyncWith):
-        names = [context.optional_vars for context in item.items if context.optional_vars]
-        return set[str]().union(*map(_stored, names))
+        targets = [context.optional_vars for context in item.items if context.optional_vars]
+        return set[str]().union(*map(_stored, targets))
     return (
         set()
+        # statements in it have their own places
         if isinstance(item, ast.ClassDef) or hasattr(item, "body") or hasattr(item, "cases")
         else _stored(item)
     )
 
 
 def _stored(item: ast.AST) -> set[str]:
+    """Return the names that are set or deleted in a part of a syntax tree."""
     return {
         name.id
         for name in ast.walk(item)
@@ -111,10 +121,12 @@ def _stored(item: ast.AST) -> set[str]:
 
 
 def _names(item: ast.AST) -> set[str]:
+    """Return all names in a part of a syntax tree."""
     return {name.id for name in ast.walk(item) if isinstance(name, ast.Name)}
 
 
 def _line(item: ast.AST) -> int:
+    """Return the line of a part of a syntax tree, or 0."""
     return int(getattr(item, "lineno", 0))
 
 
@@ -137,15 +149,16 @@ def watch_state(own: OwnCode) -> _Told:
     """Note what own modules and changed libraries hold; return what tells what has changed since
     then.
     """
-    modules, others, now = _of_modules(own), _of_others(own), _settings()
+    # digests and attributes before the step
+    modules, of_libraries, settings_before = _of_modules(own), _of_others(own), _settings()
 
     def told() -> list[Taint]:
-        names = [*_changed_modules(own, modules), *_changed_others(own, others)]
-        later = _settings()
+        names = [*_changed_modules(own, modules), *_changed_others(own, of_libraries)]
+        settings_after = _settings()
         names += [
             f"a setting of the process, {name}"
-            for name in now | later
-            if now.get(name) != later.get(name)
+            for name in settings_before | settings_after
+            if settings_before.get(name) != settings_after.get(name)
         ]
         return [taint("memory", name) for name in dict.fromkeys(names)]
 
@@ -172,6 +185,7 @@ def _of_modules(own: OwnCode) -> dict[str, dict[str, str]]:
 
 
 def _digests(module: ModuleType, own: OwnCode) -> dict[str, str]:
+    """Return a digest of each value of a module, by name."""
     values = {
         name: value for name, value in vars(module).copy().items() if not name.startswith("__")
     }
@@ -179,6 +193,7 @@ def _digests(module: ModuleType, own: OwnCode) -> dict[str, str]:
 
 
 def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
+    """Return a text that differs if a value of a module has changed; empty for None."""
     if value is None:
         return ""
     kind = type(value)  # an object may state another class, or raise if it is asked for it
@@ -186,6 +201,7 @@ def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
         return "module"
     if kind in _UNLIKE:
         return f"{kind.__name__} {value!r}"
+    # fast, for most functions
     if kind is FunctionType and _is_usual(value):
         return f"function {id(value.__code__)} {value.__defaults__!r}"
     return LoadedState(module, (), own.modules.__contains__, lazy=False).digest({name: value})
@@ -204,13 +220,19 @@ def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterato
     """Yield the full names of what changed in own modules, but for constants that are made at
     the first call.
     """
-    for module, now in _of_modules(own).items():
-        then = before.get(module, now)
-        for name in dict.fromkeys([*then, *now]):
-            new, old = now.get(name), then.get(name)
-            if new == old or new == "module" or _is_unread(own, module, name):
+    for module, digests_now in _of_modules(own).items():
+        digests_before = before.get(module, digests_now)
+        for name in dict.fromkeys([*digests_before, *digests_now]):
+            digest_now, digest_before = digests_now.get(name), digests_before.get(name)
+            # an import is no change
+            if (
+                digest_now == digest_before
+                or digest_now == "module"
+                or _is_unread(own, module, name)
+            ):
                 continue
-            if not old and new and _is_lazy(module, name):
+            # a constant that is made at the first call
+            if not digest_before and digest_now and _is_lazy(module, name):
                 continue
             yield f"{module}.{name}"
 
@@ -221,18 +243,22 @@ def _is_unread(own: OwnCode, module: str, name: str) -> bool:
     """
     if f"{module}.{name}" not in own.unread:
         return False
-    home = sys.modules[module]
-    value = getattr(home, name, None)
-    others = [
-        sys.modules[other]
-        for other in {*own_modules(), *own.modules} - {module}
-        if other in sys.modules
+    own_module = sys.modules[module]
+    value = getattr(own_module, name, None)
+    other_modules = [
+        sys.modules[other_name]
+        for other_name in {*own_modules(), *own.modules} - {module}
+        if other_name in sys.modules
     ]
-    attributes = chain.from_iterable(vars(other).values() for other in others)
-    return not any(attribute is value or attribute is home for attribute in attributes)
+    attributes = chain.from_iterable(vars(other_name).values() for other_name in other_modules)
+    # nobody else holds the log, or the module with it
+    return not any(attribute is value or attribute is own_module for attribute in attributes)
 
 
 def _is_lazy(module: str, name: str) -> bool:
+    """Return True if a name of a module is set by functions, to a value that no argument
+    decides.
+    """
     path = module_path(module)
     if path is None:
         return False
@@ -243,25 +269,38 @@ def _of_others(own: OwnCode) -> dict[str, dict[str, Any]]:
     """Return the attributes of the modules, classes and objects of libraries that own code may
     change.
     """
+    # without what a call returned, and relative names
     names = [name for name in own.changed if "()" not in name and not name.startswith(".")]
     values = {name: _found(name) for name in names}
     attributes = {name: _attributes(value) for name, value in values.items() if value is not None}
     for name in names:
-        place, _, last = name.rpartition(".")
-        parts = getattr(_found(place), "__dict__", {}) if place else {}
-        attribute = {last: parts[last]} if last in parts else {}
-        attributes.setdefault(place, attribute)
+        holder, _, attribute_name = name.rpartition(".")
+        attributes_of_holder = getattr(_found(holder), "__dict__", {}) if holder else {}
+        attribute = (
+            {attribute_name: attributes_of_holder[attribute_name]}
+            if attribute_name in attributes_of_holder
+            else {}
+        )
+        attributes.setdefault(holder, attribute)
     return attributes
 
 
 def _found(name: str) -> Any:
     """Return what has a full name, or None for a name that nothing has."""
-    parts = name.split(".")
-    depth = next((n for n in range(len(parts), 0, -1) if ".".join(parts[:n]) in sys.modules), 0)
-    if not depth or parts[0] == _SYSTEM:
+    name_parts = name.split(".")
+    # the longest beginning of the name that is a loaded module
+    module_depth = next(
+        (
+            count
+            for count in range(len(name_parts), 0, -1)
+            if ".".join(name_parts[:count]) in sys.modules
+        ),
+        0,
+    )
+    if not module_depth or name_parts[0] == _SYSTEM:
         return None
-    value: Any = sys.modules[".".join(parts[:depth])]
-    for attribute in parts[depth:]:
+    value: Any = sys.modules[".".join(name_parts[:module_depth])]
+    for attribute in name_parts[module_depth:]:
         value = getattr(value, "__dict__", {}).get(attribute)
     return value
 
@@ -272,11 +311,15 @@ def _attributes(value: Any) -> dict[str, Any]:
     The entries of a dict in an attribute of an object count too: a table of a library is often a
     class around one.
     """
-    names = getattr(value, "__dict__", None)
-    if isinstance(names, dict | MappingProxyType):
+    # without it, such as for a list: a digest of all
+    attribute_dict = getattr(value, "__dict__", None)
+    if isinstance(attribute_dict, dict | MappingProxyType):
         attributes = {
-            name: attribute for name, attribute in names.copy().items() if not name.startswith("__")
+            name: attribute
+            for name, attribute in attribute_dict.copy().items()
+            if not name.startswith("__")
         }
+        # of modules and classes, entries of dicts do not count
         tables = (
             []
             if isinstance(value, ModuleType | type)
@@ -293,13 +336,23 @@ def _attributes(value: Any) -> dict[str, Any]:
 
 
 def _changed_others(own: OwnCode, before: dict[str, dict[str, Any]]) -> Iterator[str]:
-    for place, now in _of_others(own).items():
-        then = before.get(place, now)
-        for name in dict.fromkeys([*then, *now]):
-            new, old = now.get(name, _ABSENT), then.get(name, _ABSENT)
-            lazy = old is _ABSENT and _is_of_package(new, place)
-            if not (isinstance(new, ModuleType) or lazy or _is_alike(new, old)):
-                yield f"{place}.{name}".rstrip(".")
+    """Yield the full names of what changed in libraries, but for what a package itself imports
+    when it is first asked for.
+    """
+    for holder, attributes_now in _of_others(own).items():
+        attributes_before = before.get(holder, attributes_now)
+        for name in dict.fromkeys([*attributes_before, *attributes_now]):
+            value_now, value_before = (
+                attributes_now.get(name, _ABSENT),
+                attributes_before.get(name, _ABSENT),
+            )
+            is_late_import = value_before is _ABSENT and _is_of_package(value_now, holder)
+            if not (
+                isinstance(value_now, ModuleType)
+                or is_late_import
+                or _is_alike(value_now, value_before)
+            ):
+                yield f"{holder}.{name}".rstrip(".")
 
 
 def _is_of_package(value: Any, place: str) -> bool:
@@ -310,6 +363,7 @@ def _is_of_package(value: Any, place: str) -> bool:
 
 
 def _is_alike(value: Any, other: Any) -> bool:
+    """Return True for the same object, or for equal numbers and texts of one type."""
     return value is other or (
         type(value) is type(other) and type(value) in _UNLIKE and value == other
     )

@@ -82,7 +82,7 @@ class Observation:
     def __init__(self, process: int) -> None:
         self._calls, self._arch = numbers(machine()), audit_arch(machine())
         self._tasks = TrustedTasks(process)
-        self.records: dict[Record, None] = {}
+        self.records: dict[Record, None] = {}  # as an ordered set
 
     def take(self, stopped: seccomp_notif) -> None:
         """Record a stopped call; what cannot be read is recorded as unseen."""
@@ -91,6 +91,7 @@ class Observation:
             self.records[Record("unseen", "a call of 32 bits")] = None
             return
         task, arguments = Task(stopped.pid), tuple(stopped.data.args)
+        # a mark of the observed process, in place of the rights it asks for
         if call.does == "check" and call.number >= 0 and arguments[call.number] in MARKS:
             self._tasks.mark(task.thread, arguments[call.number])
             return
@@ -102,12 +103,14 @@ class Observation:
             self.records[record] = None
 
     def _kept(self, task: Task, call: Call, arguments: tuple[int, ...]) -> Record | None:
+        """Return the record of a call, or None for a trusted task that only reads."""
         if not self._tasks.holds(task):
             return recorded(task, call, arguments)
         if call.does == "open" and not arguments[call.number] & (os.O_CREAT | os.O_TRUNC):
             return None  # an import makes hundreds of these
-        makes = call.does in ("open", "openat2", "creat", "make", "move")
-        return without_reading(recorded(task, call, arguments)) if makes else None
+        # what it makes may be read by the step later
+        may_make = call.does in ("open", "openat2", "creat", "make", "move")
+        return without_reading(recorded(task, call, arguments)) if may_make else None
 
 
 class Server:
@@ -116,7 +119,7 @@ class Server:
     def __init__(self, parent: socket.socket, process: int) -> None:
         self._parent, self._process = parent, process
         self._poll = select.poll()
-        self._open: set[int] = set()
+        self._open: set[int] = set()  # files that are listened to
         #: listener of the last observation; older ones belong to threads that were left over
         self._current = -1
         self._observation = Observation(process)
@@ -135,14 +138,17 @@ class Server:
                     os.close(file)
 
     def _add(self, file: int) -> None:
+        """Listen to a file: the socket of the parent, or a listener."""
         self._poll.register(file, select.POLLIN)
         self._open.add(file)
 
     def _remove(self, file: int) -> None:
+        """Listen to a file no longer."""
         self._poll.unregister(file)
         self._open.discard(file)
 
     def _obey(self) -> None:
+        """Do what the next message of the parent says; without one the parent has ended."""
         try:
             message, files, _, _ = socket.recv_fds(self._parent, HEADER, 1)
         except OSError:
@@ -160,19 +166,23 @@ class Server:
             self._reply(list(self._observation.records))
 
     def _listen(self, listener: int) -> None:
+        """Begin a new observation with its listener."""
         with contextlib.suppress(OSError):  # an older kernel wakes the thread in its own time
             fcntl.ioctl(listener, SECCOMP_IOCTL_NOTIF_SET_FLAGS, SECCOMP_USER_NOTIF_FD_SYNC_WAKE_UP)
         self._add(listener)
         self._current, self._observation = listener, Observation(self._process)
 
     def _reply(self, value: object) -> None:
-        body = json.dumps(value).encode()
-        self._parent.sendall(len(body).to_bytes(8, "little") + body)
+        """Send a value to the parent: its length in 8 bytes, and JSON."""
+        json_text = json.dumps(value).encode()
+        self._parent.sendall(len(json_text).to_bytes(8, "little") + json_text)
 
     def _answer(self, listener: int) -> None:
+        """Record a call that a listener stopped, and let it go on."""
         call, answer = seccomp_notif(), seccomp_notif_resp()
         with contextlib.suppress(OSError):  # the thread was killed in between
             fcntl.ioctl(listener, SECCOMP_IOCTL_NOTIF_RECV, call)
+            # others belong to steps that were left behind
             if listener == self._current:
                 self._observation.take(call)
             answer.id, answer.flags = call.id, SECCOMP_USER_NOTIF_FLAG_CONTINUE

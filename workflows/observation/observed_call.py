@@ -65,9 +65,11 @@ def observed(
     function is called again: what it uses up, such as a generator, it makes itself. An observed
     call within an observed call is a part of it, without taints.
     """
+    # an observed call within another one is a part of that
     if python_watch.watch_here() is not None:
         return function(), ()
     with one_at_a_time():
+        # tells after the call what it left in modules
         left_taints = state() if state is not None else list[Taint]
         step, taints = _observed(function, covered)
         taints += tuple(left_taints())
@@ -78,6 +80,7 @@ def observed(
 def one_at_a_time() -> Iterator[None]:
     """Wait until no other thread of this process observes a call."""
     turn = _turn[0]
+    # wakes now and then, so that Ctrl-C is seen
     while not turn.acquire(timeout=_LOOK):
         pass
     try:
@@ -93,20 +96,21 @@ def watched_in_fork() -> Iterator[Callable[[], None]]:
 
     Only one fork is observed at a time, and this process waits for it: see `one_at_a_time`.
     """
-    answering, succeeded = kernel_layer.begun_for_fork(), False
+    server, succeeded = kernel_layer.begun_for_fork(), False
 
     def begin() -> None:
-        if answering is not None:
+        if server is not None:
             with suppress(OSError, ValueError):  # then the call says that it is not watched
-                answering.observe_here()
+                # this process again, when the fork has ended
+                server.observe_here()
 
     try:
         yield begin
         succeeded = True
     finally:
-        if answering is not None:
+        if server is not None:
             try:
-                answering.observe_here()
+                server.observe_here()
             except (OSError, ValueError):
                 succeeded = False
             if not succeeded:
@@ -127,16 +131,21 @@ def _observed(
     function: Callable[[], T], covered: Covered
 ) -> tuple[StepThread[T], tuple[Taint, ...]]:
     """Return the step that has ended, and its taints; without the kernel's layer where it fails."""
-    unwatched = ""
+    reason_unwatched = ""
     if not kernel_layer.missing():
         try:
             client = kernel_layer.client()
             step, watch = _run(function, client)
             return step, _judged(watch, covered, client.records())
         except NoServer as error:
-            unwatched = str(error)
+            reason_unwatched = str(error)
+    # a second time, without the kernel
     step, watch = _run(function, None)
-    unseen = [Record("unseen", f"the kernel did not watch: {unwatched}")] if unwatched else []
+    unseen = (
+        [Record("unseen", f"the kernel did not watch: {reason_unwatched}")]
+        if reason_unwatched
+        else []
+    )
     return step, _judged(watch, covered, [*watch.records, *unseen])
 
 
@@ -147,6 +156,7 @@ def _run(
     be watched.
     """
     watch = Watch(kernel=client is not None)
+    # the filter of the kernel begins in the thread of the step
     step = StepThread(function, lambda: kernel_layer.stop_here(client) if client else None)
     watch.add(step.thread)
     audit_events.listen()
@@ -155,31 +165,33 @@ def _run(
         WatchedLegacyGenerators(),
         WatchedImports(),
         WatchedThreads(),
-        SharedGenerators() as shared,
+        SharedGenerators() as shared_generators,
     ):
         python_watch.begin(watch)
         try:
             step.run()
         finally:
             python_watch.end()
-        watch.draws.update(shared.drawn(), watch.kept.changed())
+        # draws that only a comparison of states shows
+        watch.draws.update(shared_generators.drawn(), watch.kept.changed())
     if step.unprepared is not None:
         raise step.unprepared
     return step, watch
 
 
 def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Taint, ...]:
-    chance = watch.chance()
-    if not any((records, watch.bodies, watch.settings, chance)):
+    """Return the taints of an observed call, from what the kernel and Python saw."""
+    chance_sources = watch.chance()
+    if not any((records, watch.bodies, watch.settings, chance_sources)):
         return ()
-    quiet = {path for path, is_quiet in watch.quiet.items() if is_quiet}
-    judgement = Judgement(covered, watch.bodies, quiet, watch.temporary)
+    quiet_paths = {path for path, is_quiet in watch.quiet.items() if is_quiet}
+    judgement = Judgement(covered, watch.bodies, quiet_paths, watch.temporary)
     # where Python knows which source of chance was asked, what the kernel says of it is the same
     # once more
-    judgement.judge(record for record in records if record.does != "entropy" or not chance)
+    judgement.judge(record for record in records if record.does != "entropy" or not chance_sources)
     judgement.judge(Record("input", path) for path in sorted(watch.settings) if decides(path))
     judgement.judge_modules()
-    for source in sorted(chance):
+    for source in sorted(chance_sources):
         judgement.add("random", source)
     return judgement.taints()
 
@@ -290,20 +302,22 @@ def import_observed(name: str) -> ModuleType:
     """
     if name in sys.modules:
         return sys.modules[name]
-    before = set(sys.modules)
+    modules_before = set(sys.modules)
     load = functools.partial(importlib.import_module, name)
-    with _hidden(name) as asked:
+    with _hidden(name) as asked_variables:
         module, reaches = observed_import(load, Covered(frozenset(), lambda _: True))
-    say_hidden(name, asked)
-    reaches += tuple(taint("variable", variable) for variable in asked.of_own_code)
-    new = [
+    say_hidden(name, asked_variables)
+    reaches += tuple(taint("variable", variable) for variable in asked_variables.of_own_code)
+    # modules of users alone
+    new_modules = [
         module_name
         for module_name in sys.modules
-        if module_name not in before and origin_of(module_name, frozenset()).kind == "source"
+        if module_name not in modules_before
+        and origin_of(module_name, frozenset()).kind == "source"
     ]
-    taints = tuple(reach for reach in reaches if not _is_declared(reach, new))
+    taints = tuple(reach for reach in reaches if not _is_declared(reach, new_modules))
     if taints:
-        taint_code(new, taints)
+        taint_code(new_modules, taints)
         for reach in taints:
             reached = (
                 f"{WORDS[reach.kind]} {reach.what} when it is imported, which no cache key covers"
@@ -317,6 +331,7 @@ def import_observed(name: str) -> ModuleType:
 
 
 def _is_declared(reached: Taint, modules: Iterable[str]) -> bool:
+    """Return True if one of the modules declares what was reached."""
     return any(declares(module, reached) for module in modules)
 
 
@@ -328,8 +343,8 @@ def _hidden(name: str) -> Iterator[Asked]:
     if not is_alone():
         yield Asked()
         return
-    with hidden_while_importing(_declared_variables(name)) as asked:
-        yield asked
+    with hidden_while_importing(_declared_variables(name)) as asked_variables:
+        yield asked_variables
 
 
 def _declared_variables(name: str) -> frozenset[str]:
@@ -340,6 +355,7 @@ def _declared_variables(name: str) -> frozenset[str]:
     if spec is None or not spec.has_location or spec.origin is None:
         return frozenset()
     folder = Path(spec.origin).parent
+    # of a package: at any depth
     sources = folder.rglob("*.py") if spec.submodule_search_locations else folder.glob("*.py")
     names = set[str]()
     for source in sources:
@@ -350,14 +366,17 @@ def _declared_variables(name: str) -> frozenset[str]:
 
 def declares(module: str, taint: Taint) -> bool:
     """Return True if the ``__depends__`` of a module has what was reached."""
-    loaded = sys.modules[module]
-    entries = [entry for entry in getattr(loaded, "__depends__", ()) if isinstance(entry, str)]
-    free = {entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE)}
-    if free & {taint.kind, taint.what, Path(taint.what).name}:
+    loaded_module = sys.modules[module]
+    entries = [
+        entry for entry in getattr(loaded_module, "__depends__", ()) if isinstance(entry, str)
+    ]
+    free_names = {entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE)}
+    # a kind, a path or the name of a file
+    if free_names & {taint.kind, taint.what, Path(taint.what).name}:
         return True
     return any(
         path == Path(taint.what) or path in Path(taint.what).parents
-        for path in _beside(loaded, entries)
+        for path in _beside(loaded_module, entries)
     )
 
 
@@ -378,26 +397,28 @@ def call_hook(node: Node, hook: Callable[[], T], params: Mapping[str, Any]) -> T
     """Return what a hook of an own node returns; taint own modules by what it reaches beyond the
     parameters.
     """
-    home = node.fn.__module__
+    module_name = node.fn.__module__
     files = frozenset(Path(os.path.realpath(file)) for file in files_in(params))
     value, taints = observed(hook, Covered(files, lambda _: True))
-    free = {entry.removeprefix(FREE) for entry in node.depends}
-    left = [
+    free_names = {entry.removeprefix(FREE) for entry in node.depends}
+    undeclared_taints = [
         reached
         for reached in taints
         if not (
-            free & {reached.kind, reached.what, Path(reached.what).name} or declares(home, reached)
+            free_names & {reached.kind, reached.what, Path(reached.what).name}
+            or declares(module_name, reached)
         )
     ]
-    if left:
-        taint_code({home, *own_modules()}, tuple(left))
-        for reached in left:
+    if undeclared_taints:
+        # any own module may read what the hook left
+        taint_code({module_name, *own_modules()}, tuple(undeclared_taints))
+        for reached in undeclared_taints:
             text = (
                 f"a hook of {node.path} {WORDS[reached.kind]} {reached.what},"
                 " which no cache key covers"
             )
             say_once(
-                home,
+                module_name,
                 f"{text}: the results of own nodes are not stored; to have them stored,"
                 f" {reached.fix}",
             )

@@ -34,9 +34,9 @@ Wrapping = tuple[Any, str, Callable[[Any], Any]]
 def wrapped(wrappings: Iterable[Wrapping]) -> list[tuple[Any, str, Any]]:
     """Return place, name and wrapped function, without those that this Python does not have."""
     return [
-        (place, name, wrap(getattr(place, name)))
-        for place, name, wrap in wrappings
-        if hasattr(place, name)
+        (holder, name, wrap(getattr(holder, name)))
+        for holder, name, wrap in wrappings
+        if hasattr(holder, name)
     ]
 
 
@@ -46,16 +46,16 @@ class ReplacedFunctions:
     def __init__(self, replacements: Sequence[tuple[Any, str, Any]]) -> None:
         """Take the place and the name of each function, and what stands there meanwhile."""
         self._meanwhile = replacements
-        self._before = [(place, name, getattr(place, name)) for place, name, _ in replacements]
+        self._before = [(holder, name, getattr(holder, name)) for holder, name, _ in replacements]
 
     def __enter__(self) -> Self:
-        for place, name, function in self._meanwhile:
-            setattr(place, name, function)
+        for holder, name, function in self._meanwhile:
+            setattr(holder, name, function)
         return self
 
     def __exit__(self, *_: object) -> None:
-        for place, name, function in self._before:
-            setattr(place, name, function)
+        for holder, name, function in self._before:
+            setattr(holder, name, function)
 
 
 # --- kept generators ------------------------------------------------------------------------------
@@ -76,7 +76,7 @@ class KeptGenerators:
 
     def __init__(self) -> None:
         self.drew = False  #: an installed package has asked for chance when it was imported
-        self._modules = set(sys.modules)
+        self._modules = set(sys.modules)  # loaded before the call
         self._states = {number: _state(generator) for number, (_, generator) in _kept.items()}
         self._drawn: list[str] = []  #: modules with a generator that drew while they were imported
 
@@ -94,18 +94,22 @@ class KeptGenerators:
         for number in _kept.keys() - self._states.keys():
             module, generator = _kept[number]
             self._states[number] = _state(generator)
+            # such a generator has a method of that name; any other answers with bool(), which is
+            # False
             if getattr(generator, "has_drawn_by_chance", bool)():
                 self._drawn.append(module)
 
     def changed(self) -> list[str]:
         """Return what has drawn since."""
-        drawn = [
+        modules_drawn = [
+            # the module of the generator
             _kept[number][0]
             for number, state in self._states.items()
             if _state(_kept[number][1]) != state
         ]
         return [
-            f"a generator that {module} keeps" for module in dict.fromkeys([*self._drawn, *drawn])
+            f"a generator that {module} keeps"
+            for module in dict.fromkeys([*self._drawn, *modules_drawn])
         ]
 
     def _keep_of_modules(self) -> None:
@@ -116,6 +120,7 @@ class KeptGenerators:
             values = getattr(module, "__dict__", {})
             if name not in self._modules and is_installed(str(values.get("__file__"))):
                 for value in values.copy().values():
+                    # not of a class derived from it
                     if type(value) in (np.random.Generator, np.random.RandomState):
                         self.keep(value._bit_generator, name)
                     elif type(value) is random.Random:
@@ -123,6 +128,7 @@ class KeptGenerators:
 
 
 def _state(generator: Any) -> bytes:
+    """Return the state of a generator of Python, or of the bits of NumPy, as bytes."""
     is_of_python = isinstance(generator, random.Random)
     state = generator.getstate() if is_of_python else generator.state
     return pickle.dumps(state)
@@ -158,8 +164,8 @@ class Watch:
         #: files that installed packages read while they were imported
         self.settings: set[str] = set()
         self.temporary: set[str] = set()  #: files and folders with names that chance gave
-        self._threads: set[threading.Thread] = set()
-        self._local = threading.local()
+        self._threads: set[threading.Thread] = set()  # those of the call
+        self._local = threading.local()  # by thread: whether it is trusted
 
     def add(self, thread: threading.Thread) -> None:
         """Count a thread as one of the call."""
@@ -171,8 +177,8 @@ class Watch:
 
     def chance(self) -> set[str]:
         """Return the sources of chance that the call has asked, up to now."""
-        unseeded = any(not generator.is_seeded() for generator in self.generators)
-        return self.draws | ({"numpy.random.RandomState without a seed"} if unseeded else set())
+        has_unseeded = any(not generator.is_seeded() for generator in self.generators)
+        return self.draws | ({"numpy.random.RandomState without a seed"} if has_unseeded else set())
 
     def trusted(self) -> bool:
         """Return True if the current thread imports an installed package, or searches for a
@@ -186,12 +192,12 @@ class Watch:
 
     def trust(self, trusted: bool) -> bool:
         """Trust the current thread, or no longer, and return what held before."""
-        before = self.trusted()
-        if before != trusted:
+        was_trusted = self.trusted()
+        if was_trusted != trusted:
             self._local.trusted = trusted
             mark = TRUSTED if trusted else UNTRUSTED
             self._mark(mark)
-        return before
+        return was_trusted
 
     def heard(self, path: str, quiet: bool) -> None:
         """Take note of who asks for the source or the marks of a file."""
@@ -255,13 +261,15 @@ def _searching(function: Callable[..., Any]) -> Callable[..., Any]:
         watch = watch_here()
         if watch is None:
             return function(name, import_)
-        before = watch.trust(True)
+        # folders that are searched are no inputs
+        was_trusted = watch.trust(True)
         try:
             return function(name, import_)
         finally:
-            if not before:
+            # the outermost import has ended
+            if not was_trusted:
                 watch.kept.note()
-            watch.trust(before)
+            watch.trust(was_trusted)
 
     return search
 
@@ -273,21 +281,24 @@ def _executing(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def execute(called: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         watch = watch_here()
-        module = _module(called, arguments) if watch is not None else None
-        if watch is None or module is None:
+        name_and_file = _module(called, arguments) if watch is not None else None
+        if watch is None or name_and_file is None:
             return function(called, *arguments, **named)
-        watch.bodies[module[0]] = module[1]
-        before = watch.trust(False)
+        # name and file of a module of the user
+        watch.bodies[name_and_file[0]] = name_and_file[1]
+        # what the body of a module does is the user's
+        was_trusted = watch.trust(False)
         try:
             return function(called, *arguments, **named)
         finally:
-            watch.trust(before)
+            watch.trust(was_trusted)
 
     return execute
 
 
 def _module(called: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, str] | None:
     """Return name and file of the module of the user that a call executes, or None."""
+    # exec(code, namespace of the module)
     if called is builtins.exec:
         name, file = arguments[1].get("__name__"), arguments[1].get("__file__")
     elif called in _NATIVE:
@@ -319,6 +330,8 @@ class WatchedThreads(ReplacedFunctions):
 
 
 def _starting(function: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
+    """Return the start of a thread, which counts it as one of the call."""
+
     def start(self: threading.Thread) -> None:
         if (watch := watch_here()) is not None:
             watch.add(self)
@@ -328,6 +341,8 @@ def _starting(function: Callable[[threading.Thread], None]) -> Callable[[threadi
 
 
 def _starting_nameless(function: Callable[..., int]) -> Callable[..., int]:
+    """Return the start of a thread without an object, of which Python knows no owner."""
+
     def start_new_thread(*arguments: Any) -> int:
         watch = watch_here()
         if watch is not None and not watch.kernel:  # nobody knows whose calls are its
@@ -410,10 +425,13 @@ def listen() -> None:
 
 
 def _heard(event: str, arguments: tuple[Any, ...]) -> None:
+    """Take note of an audit event of an observed call, as far as its kind counts."""
     if event not in _EVENTS or (watch := watch_here()) is None:
         return
+    # what the kernel cannot know
     if event in _FOR_BOTH and not watch.trusted():
         _FOR_BOTH[event](watch, arguments)
+    # an installed package reads while it is imported
     if event == "open" and watch.trusted():
         _settings(watch, arguments)
     if event == "subprocess.Popen":
@@ -427,6 +445,7 @@ def _program(watch: Watch, arguments: tuple[Any, ...]) -> None:
     if _called_by_program():
         watch.trust_child()
     elif watch.needs_record():
+        # the program, or the first word of its arguments
         command = arguments[0] or arguments[1]
         is_text = isinstance(command, str | bytes | os.PathLike)
         first_word = command if is_text else next(iter(command), "")
@@ -441,6 +460,7 @@ def _called_by_program() -> bool:
         name = str(frame.f_globals.get("__name__", ""))
         if name.startswith("neusee.nodes."):
             return True
+        # past the functions of this hook and of subprocess
         if not name.startswith((__package__, "subprocess")):
             return False
     return False
@@ -449,11 +469,11 @@ def _called_by_program() -> bool:
 @contextmanager
 def _unwatched(watch: Watch) -> Iterator[None]:
     """Trust the current thread while this hook itself looks at folders."""
-    before = watch.trust(True)
+    was_trusted = watch.trust(True)
     try:
         yield
     finally:
-        watch.trust(before)
+        watch.trust(was_trusted)
 
 
 def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
@@ -462,6 +482,7 @@ def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
     """
     path = arguments[0]
     if isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path).endswith(SOURCES):
+        # who opens the file, behind this handler and the hook
         frame = sys._getframe(2)
         with _unwatched(watch):
             watch.heard(os.path.realpath(os.fsdecode(path)), quotes_source(frame))
@@ -480,15 +501,16 @@ def _settings(watch: Watch, arguments: tuple[Any, ...]) -> None:
         or os.fsdecode(path).endswith(_OF_CODE)
     ):
         return
-    real = os.path.realpath(os.fsdecode(path))
-    if os.path.isfile(real):
-        watch.settings.add(real)
+    real_path = os.path.realpath(os.fsdecode(path))
+    if os.path.isfile(real_path):
+        watch.settings.add(real_path)
 
 
 def _copied(watch: Watch, arguments: tuple[Any, ...]) -> None:
     """Take note of whether the attributes of a file are asked for in order to copy it."""
     path = arguments[0]
     if not isinstance(path, int):
+        # behind this handler and the hook
         copies = sys._getframe(2).f_globals.get("__name__") == "shutil"
         with _unwatched(watch):
             watch.heard(os.path.realpath(os.fsdecode(path)), copies)
@@ -496,20 +518,24 @@ def _copied(watch: Watch, arguments: tuple[Any, ...]) -> None:
 
 def _named_by_chance(watch: Watch, arguments: tuple[Any, ...]) -> None:
     """Take note of a temporary file, whose name no other process expects."""
-    above, name = os.path.split(os.path.abspath(os.fsdecode(arguments[0])))
+    parent_folder, name = os.path.split(os.path.abspath(os.fsdecode(arguments[0])))
     with _unwatched(watch):
-        watch.temporary.add(os.path.join(os.path.realpath(above), name))
+        watch.temporary.add(os.path.join(os.path.realpath(parent_folder), name))
 
 
 def _file(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a file that is opened."""
     path, mode, flags = arguments
     if isinstance(path, int):
         return
-    text = os.fsdecode(path)
-    real = os.path.realpath(text)
-    if mode is None and not os.path.isabs(text) and not os.path.lexists(real):
-        real = text  # below an open folder, which the event of ``os.open`` does not name
-    watch.records.append(Record("open", real, "", flags & 0x7FFFFFFF, os.path.lexists(real)))
+    given_path = os.fsdecode(path)
+    real_path = os.path.realpath(given_path)
+    if mode is None and not os.path.isabs(given_path) and not os.path.lexists(real_path):
+        real_path = given_path  # below an open folder, which the event of ``os.open`` does not name
+    # flags as a positive number of 31 bits
+    watch.records.append(
+        Record("open", real_path, "", flags & 0x7FFFFFFF, os.path.lexists(real_path))
+    )
 
 
 def _of_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
@@ -517,9 +543,10 @@ def _of_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
 
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
         path = "." if arguments[0] is None else arguments[0]
+        # a number is an open file, whose opening was noted
         if not isinstance(path, int):
-            real = os.path.realpath(os.fsdecode(path))
-            watch.records.append(Record(does, real, there=os.path.lexists(real)))
+            real_path = os.path.realpath(os.fsdecode(path))
+            watch.records.append(Record(does, real_path, there=os.path.lexists(real_path)))
 
     return note
 
@@ -530,36 +557,42 @@ def _of_named_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
     """
 
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
-        text, folder = os.fsdecode(arguments[0]), arguments[-1]
-        if not os.path.isabs(text) and folder != -1:
+        given_path, folder = os.fsdecode(arguments[0]), arguments[-1]
+        if not os.path.isabs(given_path) and folder != -1:
             return  # below an open folder that the event does not name
-        above, name = os.path.split(os.path.abspath(text))
-        path = os.path.join(os.path.realpath(above), name)
+        parent_folder, name = os.path.split(os.path.abspath(given_path))
+        path = os.path.join(os.path.realpath(parent_folder), name)
         watch.records.append(Record(does, path, there=os.path.lexists(path)))
 
     return note
 
 
 def _of_two_paths(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
+    """Return what takes note of an event whose first two arguments are paths."""
+
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
-        first, second = (os.path.abspath(os.fsdecode(path)) for path in arguments[:2])
-        watch.records.append(Record(does, first, second, there=os.path.lexists(first)))
+        first_path, second_path = (os.path.abspath(os.fsdecode(path)) for path in arguments[:2])
+        watch.records.append(
+            Record(does, first_path, second_path, there=os.path.lexists(first_path))
+        )
 
     return note
 
 
 def _library(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a native library that is loaded by its path."""
     name = os.fsdecode(arguments[0] or "")
     if "/" in name:
         watch.records.append(Record("open", os.path.realpath(name), flags=os.O_RDONLY))
 
 
 def _database(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a database file that is opened."""
     name = os.fsdecode(arguments[0])
     if name and name != ":memory:":
-        real = os.path.realpath(name)
+        real_path = os.path.realpath(name)
         watch.records.append(
-            Record("open", real, "", os.O_RDWR | os.O_CREAT, os.path.lexists(real))
+            Record("open", real_path, "", os.O_RDWR | os.O_CREAT, os.path.lexists(real_path))
         )
 
 
@@ -569,10 +602,10 @@ def _of_address(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
         address = arguments[1]
         if isinstance(address, str | bytes):
-            where, family = os.path.realpath(os.fsdecode(address)), "unix"
+            address_text, family = os.path.realpath(os.fsdecode(address)), "unix"
         else:
-            where, family = ":".join(map(str, address)), "internet"
-        watch.records.append(Record(does, where, family))
+            address_text, family = ":".join(map(str, address)), "internet"
+        watch.records.append(Record(does, address_text, family))
 
     return note
 
@@ -583,6 +616,7 @@ def _named(does: Does, path: str) -> Callable[[Watch, tuple[Any, ...]], None]:
 
 
 def _command(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a program that is started."""
     watch.records.append(Record("exec", os.fsdecode(arguments[0])))
 
 

@@ -48,12 +48,14 @@ def draws_name(depth: int) -> bool:
     frame = sys._getframe(depth + 1)
     if _module(frame) != "uuid":
         return False
+    # back to the function behind those that draw for others
     while frame.f_back is not None and _module(frame).startswith(_BETWEEN):
         frame = frame.f_back
     return any(f"{_module(frame)}.".startswith(f"{name}.") for name in NAMING)
 
 
 def _module(frame: object) -> str:
+    """Return the name of the module whose code runs in a frame."""
     return str(getattr(frame, "f_globals", {}).get("__name__"))
 
 
@@ -80,6 +82,9 @@ class WatchedChance(ReplacedFunctions):
 
 
 def _note(source: str) -> None:
+    """Take note of a source of chance that the observed call asks; during an import of a
+    package, of that alone.
+    """
     watch = watch_here()
     if watch is not None and watch.trusted():
         watch.kept.drew = True
@@ -88,21 +93,27 @@ def _note(source: str) -> None:
 
 
 def _asking(function: Callable[[int], bytes]) -> Callable[[int], bytes]:
+    """Return a function that asks the system for chance, with a note of it unless a name is
+    drawn.
+    """
+
     def urandom(size: int, /) -> bytes:
         watch = watch_here()
         if watch is None or not draws_name(1):
             _note("os.urandom")
             return function(size)
-        before = watch.trust(True)
+        was_trusted = watch.trust(True)
         try:
             return function(size)
         finally:
-            watch.trust(before)
+            watch.trust(was_trusted)
 
     return urandom
 
 
 def _seeding(function: Callable[..., None]) -> Callable[..., None]:
+    """Return `random.Random.seed` with a note of a call without a seed."""
+
     def seed(self: random.Random, a: Any = None, *arguments: Any, **named: Any) -> None:
         if a is None:
             _note("random.Random without a seed")
@@ -149,14 +160,15 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
             watch.kept.keep(self, str(sys._getframe(1).f_globals.get("__name__")))
         else:
             watch.generators.append(self)
-        before = watch.trust(True)
+        was_trusted = watch.trust(True)
         try:
             super().__init__()
             self._first = pickle.dumps(self.state)
         finally:
-            watch.trust(before)
+            watch.trust(was_trusted)
 
     def _legacy_seeding(self, seed: Any) -> None:
+        """Seed the generator as NumPy does, and remember whether a seed was given."""
         self._seeded = self._seeded or seed is not None
         super()._legacy_seeding(seed)
 
@@ -170,10 +182,10 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
 
     def __reduce__(self) -> Any:
         """Return what a file keeps: the generator of NumPy that this is."""
-        made: tuple[Any, ...] = super().__reduce__()
-        make, arguments, *state = made
+        parts: tuple[Any, ...] = super().__reduce__()
+        function, arguments, *state = parts
         return (
-            make,
+            function,
             tuple(
                 np.random.MT19937 if argument is LegacyGenerator else argument
                 for argument in arguments
@@ -233,10 +245,12 @@ class Shared:
         """Let a call set the generator; the state that it had at the beginning determines
         nothing.
         """
+        # what was drawn before, as long as its state shows it
         self.drew()
         value, state = change(), self._state()
-        disturbed = watch_here() is None and bool(state)  # by a thread that is not of the call
-        self._drew = self._drew or by == "system" or disturbed
+        is_disturbed = watch_here() is None and bool(state)  # by a thread that is not of the call
+        self._drew = self._drew or by == "system" or is_disturbed
+        # a state from before the call determines nothing
         self._seeded = by == "seed" or _differs(state, self._first)
         return value
 
@@ -272,16 +286,17 @@ class SharedGenerators(ReplacedFunctions):
             "manual_seed_all": _setting(torch.cuda.manual_seed_all, cuda, "seed"),
             "set_rng_state": _setting(torch.cuda.set_rng_state, cuda, "state"),
         }
+        # each function stands in two modules
         places = (
             (np.random, of_numpy),
             (np.random.mtrand, of_numpy),
             (torch.cuda, of_cuda),
             (torch.cuda.random, of_cuda),
         )
-        replaced: list[tuple[Any, str, Any]] = [(_TORCH, _GENERATOR, generator)]
-        for place, functions in places:
-            replaced += [(place, name, function) for name, function in functions.items()]
-        return replaced
+        replacements: list[tuple[Any, str, Any]] = [(_TORCH, _GENERATOR, generator)]
+        for holder, functions in places:
+            replacements += [(holder, name, function) for name, function in functions.items()]
+        return replacements
 
 
 class _Seeded:
@@ -310,8 +325,8 @@ def _setting(function: Callable[..., Any], shared: Shared, by: _By) -> Callable[
 
     def set_generator(*arguments: Any, **named: Any) -> Any:
         without_value = next(iter((*arguments, *named.values())), None) is None
-        source: _By = "system" if without_value else by
-        return shared.set(lambda: function(*arguments, **named), source)
+        determined_by: _By = "system" if without_value else by
+        return shared.set(lambda: function(*arguments, **named), determined_by)
 
     return set_generator
 
@@ -321,12 +336,18 @@ def _differs(state: Any, first: Any) -> bool:
     drawn nothing yet.
     """
     if isinstance(state, dict):
-        return any(now != first.get(number, (now[0], 0)) for number, now in state.items())
+        # (seed, number of draws): a device without an earlier entry begins with 0 draws
+        return any(
+            seed_and_count != first.get(number, (seed_and_count[0], 0))
+            for number, seed_and_count in state.items()
+        )
     return bool(state != first)
 
 
 def _of_numpy() -> tuple[Any, ...]:
+    """Return the state of NumPy's own generator, in a form that can be compared."""
     state: Any = np.random.get_state()
+    # name, numbers, position, and the spare normal deviate
     return (state[0], state[1].tobytes(), *state[2:])
 
 

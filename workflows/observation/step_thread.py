@@ -42,6 +42,7 @@ class StepThread(Generic[T]):
         #: the error of ``prepare``; the function did not run
         self.unprepared: Exception | None = None
         self._ended = False
+        # both are held: the thread waits for the first, the caller for the second
         self._begin, self._end = threading.Lock(), threading.Lock()
         self._begin.acquire()
         self._end.acquire()
@@ -87,10 +88,12 @@ class StepThread(Generic[T]):
             self._end.acquire(timeout=_LOOK)
 
     def _stop(self, kind: type[BaseException]) -> None:
+        """Raise an exception in the thread of the step."""
         if self.thread.ident is not None:
             _raise_in(ctypes.c_ulong(self.thread.ident), ctypes.py_object(kind))
 
     def _keep(self) -> None:
+        """Run the function in the thread, and keep its value or its error."""
         self._begin.acquire()
         try:
             if self._is_prepared():
@@ -102,7 +105,8 @@ class StepThread(Generic[T]):
             self._end.release()
 
     def _is_prepared(self) -> bool:
-        with_garbage = gc.isenabled()
+        """Prepare the thread; return False, and keep the error, if that fails."""
+        collects_garbage = gc.isenabled()
         # a finalizer could make a call that is stopped before there is anybody to answer it
         gc.disable()
         try:
@@ -110,17 +114,18 @@ class StepThread(Generic[T]):
         except Exception as error:
             self.unprepared = error
         finally:
-            if with_garbage:
+            if collects_garbage:
                 gc.enable()
         return self.unprepared is None
 
     def _in_modes(self) -> T:
-        grad, inference, threads, device = self._modes
-        if torch.get_num_threads() != threads:
-            torch.set_num_threads(threads)
+        """Run the function with the modes of torch that the caller has."""
+        records_gradients, is_inference, thread_count, device = self._modes
+        if torch.get_num_threads() != thread_count:
+            torch.set_num_threads(thread_count)
         if device is not None:
             torch.cuda.set_device(device)
-        with torch.inference_mode(inference), torch.set_grad_enabled(grad):
+        with torch.inference_mode(is_inference), torch.set_grad_enabled(records_gradients):
             return self._function()
 
 

@@ -85,6 +85,7 @@ class Call(NamedTuple):
 
 
 def _about_path(argument: int) -> Condition:
+    """Return the condition that a call asks about a path, by the flags in one of its arguments."""
     return Condition(argument, "without", AT_EMPTY_PATH)
 
 
@@ -251,22 +252,27 @@ _STOP, _PASS = Step(BPF_RET, 0, 0, SECCOMP_RET_USER_NOTIF), Step(BPF_RET, 0, 0, 
 
 def program(name: str) -> list[Step]:
     """Return the instructions of the filter for a processor."""
-    of_32_bits = _calls_of_32_bits() if name == "x86_64" else []
-    x32 = [Step(BPF_JGE, 0, 1, _X32), _STOP] if name == "x86_64" else []
+    for_32_bits = _calls_of_32_bits() if name == "x86_64" else []
+    # a call of that convention is stopped whatever it is
+    for_x32 = [Step(BPF_JGE, 0, 1, _X32), _STOP] if name == "x86_64" else []
     calls: list[Step] = []
     for number, call in numbers(name).items():
         calls += _call(number, call.when)
-    usual = [_load(_NUMBER), *x32, *calls, _PASS]
+    for_64_bits = [_load(_NUMBER), *for_x32, *calls, _PASS]
     return [
         _load(_ARCH),
-        Step(BPF_JEQ, len(of_32_bits) + 1, 0, audit_arch(name)),
-        *of_32_bits,
+        # to the calls of 64 bits, past those of 32 bits and the instruction that lets pass
+        Step(BPF_JEQ, len(for_32_bits) + 1, 0, audit_arch(name)),
+        *for_32_bits,
         _PASS,
-        *usual,
+        *for_64_bits,
     ]
 
 
 def _calls_of_32_bits() -> list[Step]:
+    """Return instructions that stop the calls of 32 bits, and go on behind them for other
+    processors.
+    """
     stops: list[Step] = []
     for number in CALLS_OF_32_BITS.values():
         stops += [Step(BPF_JEQ, 0, 1, number), _STOP]
@@ -274,23 +280,33 @@ def _calls_of_32_bits() -> list[Step]:
 
 
 def _call(number: int, when: Condition | None) -> list[Step]:
-    inside = [*_test(when), _STOP]
-    return [Step(BPF_JEQ, 0, len(inside), number), *inside]
+    """Return instructions that stop a call with a number, if its argument is what the table
+    says.
+    """
+    inner_steps = [*_test(when), _STOP]
+    # another number skips what is inside
+    return [Step(BPF_JEQ, 0, len(inner_steps), number), *inner_steps]
 
 
 def _test(when: Condition | None) -> list[Step]:
     """Return instructions that let a call pass unless its argument is what the table says."""
     if when is None:
         return []
-    low, high = _load(_ARGUMENTS + 8 * when.argument), _load(_ARGUMENTS + 8 * when.argument + 4)
+    # an argument has 8 bytes, of which one instruction reads 4
+    load_low_half, load_high_half = (
+        _load(_ARGUMENTS + 8 * when.argument),
+        _load(_ARGUMENTS + 8 * when.argument + 4),
+    )
+    # a step is (code, instructions to skip if it holds, and if not, operand)
     if when.test == "without":
-        return [low, Step(BPF_JSET, 0, 1, when.mask), _PASS]
+        return [load_low_half, Step(BPF_JSET, 0, 1, when.mask), _PASS]
     if when.test == "zero":
-        return [low, Step(BPF_JEQ, 1, 0, 0), _PASS]
-    return [low, Step(BPF_JEQ, 0, 3, 0), high, Step(BPF_JEQ, 0, 1, 0), _PASS]
+        return [load_low_half, Step(BPF_JEQ, 1, 0, 0), _PASS]
+    return [load_low_half, Step(BPF_JEQ, 0, 3, 0), load_high_half, Step(BPF_JEQ, 0, 1, 0), _PASS]
 
 
 def _load(place: int) -> Step:
+    """Return the instruction that loads the 4 bytes at a place of ``struct seccomp_data``."""
     return Step(BPF_LD_W_ABS, 0, 0, place)
 
 
@@ -311,6 +327,7 @@ class Filter:
 
         From here the thread waits at the calls of the table until somebody serves the listener.
         """
+        # asked for by the kernel where the process has no special rights
         if self._libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0):
             raise OSError(ctypes.get_errno(), "the thread may not give up new rights")
         listener = self._seccomp(SECCOMP_SET_MODE_FILTER, self._flags, ctypes.byref(self._program))
@@ -329,6 +346,7 @@ class Filter:
         return self._seccomp(SECCOMP_GET_ACTION_AVAIL, 0, ctypes.byref(action)) == 0
 
     def _seccomp(self, operation: int, flags: int, argument: object) -> int:
+        """Call ``seccomp``, for which the library of C has no function."""
         return int(self._libc.syscall(self._call, operation, flags, argument))
 
 
@@ -381,13 +399,14 @@ class Task:
             start = "cwd" if folder == AT_FDCWD else f"fd/{folder}"
             text = os.path.join(self.link(start), text)
         # of the thread, not of the process that reads this
-        for own in ("/proc/self", "/proc/thread-self"):
-            if f"{text}/".startswith(f"{own}/"):
-                text = f"/proc/{self.thread}{text.removeprefix(own)}"
+        for own_folder in ("/proc/self", "/proc/thread-self"):
+            if f"{text}/".startswith(f"{own_folder}/"):
+                text = f"/proc/{self.thread}{text.removeprefix(own_folder)}"
         if follow:
             return os.path.realpath(text)
-        above, name = os.path.split(text.rstrip("/"))
-        return os.path.join(os.path.realpath(above), name)
+        # the last name itself, even if it is a link
+        parent_folder, name = os.path.split(text.rstrip("/"))
+        return os.path.join(os.path.realpath(parent_folder), name)
 
 
 # --- recorded call --------------------------------------------------------------------------------
@@ -424,10 +443,12 @@ def without_reading(record: Record) -> Record | None:
 
 
 def _number(call: Call, arguments: Sequence[int]) -> int:
+    """Return an argument that is recorded as it is, as a positive number of 31 bits."""
     return arguments[call.number] & 0x7FFFFFFF
 
 
 def _path(task: Task, place: Path | None, arguments: Sequence[int], follow: bool = True) -> str:
+    """Return the real path that an argument of a call points to."""
     assert place is not None
     folder = AT_FDCWD if place.folder < 0 else _signed(arguments[place.folder])
     return task.path(task.text(arguments[place.pointer]), folder, follow)
@@ -435,11 +456,13 @@ def _path(task: Task, place: Path | None, arguments: Sequence[int], follow: bool
 
 def _signed(argument: int) -> int:
     """Return an argument of 32 bits with its sign."""
-    low = argument & 0xFFFFFFFF
-    return low - (low >> 31 << 32)
+    low_half = argument & 0xFFFFFFFF
+    # 2^32 less where the highest of the 32 bits is set
+    return low_half - (low_half >> 31 << 32)
 
 
 def _opened(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    """Return the record of a file that is opened or made."""
     if call.does == "creat":
         flags = os.O_CREAT | os.O_WRONLY | os.O_TRUNC
     elif (
@@ -453,46 +476,65 @@ def _opened(task: Task, call: Call, arguments: Sequence[int]) -> Record:
 
 
 def _at_path(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    itself = call.does in ("make", "remove")  # a link at the end of the path is meant itself
-    path = _path(task, call.path, arguments, follow=not itself)
+    """Return the record of a call with one path."""
+    # a link at the end of the path is meant itself
+    of_link_itself = call.does in (
+        "make",
+        "remove",
+    )
+    path = _path(task, call.path, arguments, follow=not of_link_itself)
     return Record(call.does, path, there=os.path.lexists(path))
 
 
 def _two_paths(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    first, second = (
+    """Return the record of a call with two paths."""
+    first_path, second_path = (
         _path(task, place, arguments, follow=False) for place in (call.path, call.second)
     )
-    return Record(call.does, first, second, there=os.path.lexists(first))
+    return Record(call.does, first_path, second_path, there=os.path.lexists(first_path))
 
 
 def _descriptor(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    """Return the record of a call on an open file."""
     does: Does = "xattr" if call.does == "xattr_open" else call.does
     return Record(does, task.link(f"fd/{_number(call, arguments)}"))
 
 
 def _address(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    """Return the record of a call with the address of a socket."""
     assert call.path is not None
-    data = task.memory(arguments[call.path.pointer], min(_number(call, arguments), 128))
-    family = struct.unpack_from("H", data)[0] if len(data) > 1 else socket.AF_UNSPEC
+    address_bytes = task.memory(arguments[call.path.pointer], min(_number(call, arguments), 128))
+    family = (
+        struct.unpack_from("H", address_bytes)[0] if len(address_bytes) > 1 else socket.AF_UNSPEC
+    )
     if family == socket.AF_UNIX:
-        name = os.fsdecode(data[2:].partition(b"\0")[0])
-        path = task.path(name, AT_FDCWD) if name else f"@{os.fsdecode(data[3:])}"
+        # behind the 2 bytes of the family; an abstract name begins with a zero byte
+        name = os.fsdecode(address_bytes[2:].partition(b"\0")[0])
+        path = task.path(name, AT_FDCWD) if name else f"@{os.fsdecode(address_bytes[3:])}"
         return Record(call.does, path, "unix")
     if family in (socket.AF_INET, socket.AF_INET6):
+        # place and length of the host in `sockaddr_in` and `sockaddr_in6`
         start, length = (4, 4) if family == socket.AF_INET else (8, 16)
-        host = socket.inet_ntop(family, data[start : start + length])
-        return Record(call.does, f"{host}:{struct.unpack_from('!H', data, 2)[0]}", "internet")
+        host = socket.inet_ntop(family, address_bytes[start : start + length])
+        # the port, in the order of bytes of the network
+        return Record(
+            call.does, f"{host}:{struct.unpack_from('!H', address_bytes, 2)[0]}", "internet"
+        )
     # the kernel itself answers a netlink socket, and a socket without a family is only let go
     reaches_nothing = family in (socket.AF_UNSPEC, socket.AF_NETLINK)
-    kind = "" if reaches_nothing else "other"
-    return Record(call.does, f"family {family}", kind)
+    family_name = "" if reaches_nothing else "other"
+    return Record(call.does, f"family {family}", family_name)
 
 
 def _named(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    """Return the record of a call that is told by its name alone."""
     return Record(call.does, call.name)
 
 
 def _entropy(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    """Return the record of a call for chance; ``there`` tells whether it is more than names and
+    places need.
+    """
     length, flags = arguments[call.number], arguments[call.number + 1]
     return Record(
         "entropy", f"{call.name} of {length} bytes", flags=flags & 0xFF, there=length > _SMALL
@@ -554,11 +596,13 @@ class TrustedTasks:
         return self._of_thread[task.thread]
 
     def _child(self, process: int) -> bool:
+        """Return True for a child process that the program, or a trusted thread, started."""
         if process not in self._of_process:
-            parent = Task(process).status("PPid")
-            trusted = self._of_process.get(parent, False)
-            if parent == self._process:
-                trusted = self._children > 0 or any(self._of_thread.values())
+            parent_process = Task(process).status("PPid")
+            is_trusted = self._of_process.get(parent_process, False)
+            if parent_process == self._process:
+                is_trusted = self._children > 0 or any(self._of_thread.values())
+                # one announced child less, if there was one
                 self._children -= self._children > 0
-            self._of_process[process] = trusted
+            self._of_process[process] = is_trusted
         return self._of_process[process]

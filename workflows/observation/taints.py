@@ -169,9 +169,12 @@ class Judgement:
     def taints(self) -> tuple[Taint, ...]:
         """Return the taints, each once; a look at a folder on the way to another one is none."""
         kinds = ("file", "folder", "write")
-        reached = [reached_item.what for reached_item in self._taints if reached_item.kind in kinds]
+        reached_paths = [
+            reached_item.what for reached_item in self._taints if reached_item.kind in kinds
+        ]
         on_the_way = set[str]()
-        for path in (*reached, *self._looks):
+        for path in (*reached_paths, *self._looks):
+            # without the path itself
             on_the_way.update(_with_parents(path)[1:])
         for path in self._looks:
             if path not in on_the_way:
@@ -185,14 +188,19 @@ class Judgement:
         it was there.
         """
         flags = record.flags
+        # the flag has several bits
         if _TMPFILE and flags & _TMPFILE == _TMPFILE:
             return  # a new file without a name
+        # made by the call, if it was not there
         if _creates(record):
             self._make(record)
+        # emptied: its old content is not read
         elif flags & os.O_TRUNC and flags & _ACCESS != os.O_RDONLY:
             self._add_made(record.path)
+        # a look at it
         elif flags & _PATH or os.path.isdir(record.path):
             self._check(record)
+        # written without a look at its content
         elif flags & _ACCESS == os.O_WRONLY:
             self._meet(record)
         else:
@@ -209,14 +217,15 @@ class Judgement:
             self._add_made(record.path)
 
     def _remove(self, record: Record) -> None:
+        """Judge what is removed: that it could be removed says that it was there."""
         self._meet(record)
 
     def _meet(self, record: Record) -> None:
         """Judge a path where the success of a call depends on what was there before."""
         path = record.path
         named_by_chance = not self._temporary.isdisjoint(_with_parents(path))
-        free = record.trusted or named_by_chance or path in self._folders
-        if not (free or self._is_covered(path) or is_searched_program(path)):
+        needs_no_taint = record.trusted or named_by_chance or path in self._folders
+        if not (needs_no_taint or self._is_covered(path) or is_searched_program(path)):
             self.add("write", path)
 
     def _move(self, record: Record) -> None:
@@ -225,12 +234,14 @@ class Judgement:
         """
         if os.path.isdir(record.second):  # one that is there stops a move
             self._meet(record._replace(path=record.second))
+        # its own file has another name now
         if self._is_made(record.path):
             self._add_made(record.second)
         elif record.there or not record.trusted:
             self._read(record.path)
 
     def _link(self, record: Record) -> None:
+        """Judge a link like a move: the file has the new name too."""
         if os.path.lexists(record.second):
             self._meet(record._replace(path=record.second))
         self._move(record)
@@ -243,6 +254,7 @@ class Judgement:
             self.add("attribute", record.path)
 
     def _check(self, record: Record) -> None:
+        """Judge a look at a path; whether it counts is known at the end."""
         if not (
             record.path in self._folders
             or self._is_covered(record.path)
@@ -251,42 +263,54 @@ class Judgement:
             self._looks[record.path] = None
 
     def _list(self, record: Record) -> None:
+        """Judge a folder whose names are read."""
         if not self._is_covered(record.path):
             self.add("folder", record.path)
 
     def _input(self, record: Record) -> None:
+        """Judge what is read from an open file, such as the terminal."""
         self._read(record.path)
 
     def _exec(self, record: Record) -> None:
+        """Judge a program that is started; a look for one that is not there is none."""
         if record.there:
             self.add("process", record.path)
 
     def _fork(self, record: Record) -> None:
+        """Judge a fork, whose calls may be those of the step."""
         self.add("process", "a fork of this process")
 
     def _connect(self, record: Record) -> None:
-        own = record.second == "unix" and (self._is_made(record.path) or is_of_system(record.path))
-        if record.second and not own:
+        """Judge an address that is asked; a socket of the step or of the system is none."""
+        is_own_socket = record.second == "unix" and (
+            self._is_made(record.path) or is_of_system(record.path)
+        )
+        # an empty family reaches nothing
+        if record.second and not is_own_socket:
             self.add("network", record.path)
 
     def _bind(self, record: Record) -> None:
+        """Judge an address at which the step listens."""
         if record.second == "unix":
             self._add_made(record.path)
         else:
             self._connect(record)
 
     def _entropy(self, record: Record) -> None:
+        """Judge a call for chance; a small one that does not wait seeds tables and names."""
         if record.flags & _GRND_INSECURE:
             return  # seeds of the hash tables of Rust, as in safetensors
         if not record.flags & _GRND_NONBLOCK or record.there:
             self.add("random", record.path)
 
     def _unseen(self, record: Record) -> None:
+        """Judge a call that nobody can follow."""
         self.add("unknown", record.path)
 
     # --- what is covered --------------------------------------------------------------------------
 
     def _read(self, path: str) -> None:
+        """Judge a file or folder that is read."""
         if is_chance(path):
             self.add("random", path)
         elif not self._is_covered(path):
@@ -305,20 +329,26 @@ class Judgement:
             self.add("file", path)
 
     def _is_covered(self, path: str) -> bool:
+        """Return True for a path that the key covers, source of followed modules included."""
         if "\n" in path and not os.path.lexists(path):
             # a text of several lines, of which a library asks whether it is the name of a file
             return True
         return self._is_covered_as_a_whole(path) or self._is_source(path)
 
     def _is_covered_as_a_whole(self, path: str) -> bool:
+        """Return True for a path of which every byte is covered: made by the call, declared, or
+        of the machine.
+        """
         if self._is_made(path) or not self._files.isdisjoint(_with_parents(path)):
             return True
         return self._is_of_machine(path)
 
     def _is_of_machine(self, path: str) -> bool:
+        """Return True for a path of installed packages, the system or a cache."""
         return is_installed(path) or is_of_system(path) or self._is_cache(path)
 
     def _is_cache(self, path: str) -> bool:
+        """Return True for a path in a folder of caches."""
         return not self._caches.isdisjoint(_with_parents(path))
 
     def _is_source(self, path: str) -> bool:
@@ -327,6 +357,7 @@ class Judgement:
         """
         folder, name = os.path.split(path)
         if os.path.basename(folder) == "__pycache__":
+            # "__pycache__/node.cpython-311.pyc" is byte code of "node.py"
             folder, name = os.path.dirname(folder), f"{name.partition('.')[0]}.py"
         source = os.path.join(folder, name)
         return any(self._covered.modules(module) for module in self._modules_of(source))
@@ -345,11 +376,13 @@ class Judgement:
                 yield module
 
     def _is_made(self, path: str) -> bool:
+        """Return True for a path that the call made, or that is in a folder which it made."""
         if not os.path.isabs(path):  # below an open folder that nobody named
-            return any(made.endswith(f"/{path}") for made in self._made)
+            return any(made_path.endswith(f"/{path}") for made_path in self._made)
         return not self._made.isdisjoint(_with_parents(path))
 
     def _add_made(self, path: str) -> None:
+        """Count a path as made by the call."""
         self._made.add(path)
         self._folders.update(_with_parents(path))
 
@@ -362,9 +395,10 @@ def _creates(record: Record) -> bool:
 
 
 def _with_parents(path: str) -> list[str]:
+    """Return a path and the folders that it is in, the innermost first."""
     paths = [path]
-    while path not in ("/", "") and (above := os.path.dirname(path)) != path:
-        path = above
+    while path not in ("/", "") and (parent_folder := os.path.dirname(path)) != path:
+        path = parent_folder
         paths.append(path)
     return paths
 

@@ -49,6 +49,7 @@ class MemoryProfile:
     def __init__(self, limit: float) -> None:
         self.limit = limit
         self.times = [-math.inf]
+        # bytes in use from each of the times on; longer than the list of times
         self.level = np.zeros(64)
         self.kept = 0.0  # bytes that are reserved without end
 
@@ -57,8 +58,11 @@ class MemoryProfile:
         frees reserved bytes.
         """
         if size and start < end:
-            first = self._cut(start)
-            self.level[first : self._cut(end) if end < math.inf else len(self.times)] += size
+            first_interval = self._cut(start)
+            # one entry for each interval between two times; the last one has no end
+            self.level[first_interval : self._cut(end) if end < math.inf else len(self.times)] += (
+                size
+            )
             self.kept += size if end == math.inf else 0.0
 
     def highest(self, start: float, end: float) -> float:
@@ -75,22 +79,30 @@ class MemoryProfile:
         """Return the smallest delay (s) of the reservations ``holds`` that keeps the memory in
         use within the limit.
         """
-        shift = 0.0
+        delay = 0.0
         for start, end, size in stacked(holds):
-            span = self._within(start, end)
-            level = self.level[span]
-            if level.max() > self.limit - size:
-                above = span.start + int(np.flatnonzero(level > self.limit - size)[-1]) + 1
-                shift = max(
-                    shift, (self.times[above] if above < len(self.times) else math.inf) - start
+            intervals = self._within(start, end)
+            levels = self.level[intervals]
+            if levels.max() > self.limit - size:
+                # the interval after the last one that is too full
+                next_interval = (
+                    intervals.start + int(np.flatnonzero(levels > self.limit - size)[-1]) + 1
                 )
-        return shift
+                delay = max(
+                    delay,
+                    (self.times[next_interval] if next_interval < len(self.times) else math.inf)
+                    - start,
+                )
+        return delay
 
     def _within(self, start: float, end: float) -> slice:
-        first = bisect_right(self.times, start) - 1
+        """Return the intervals of time that overlap [start, end), as a slice of the profile."""
+        first_interval = bisect_right(self.times, start) - 1
         return slice(
-            first,
-            len(self.times) if end == math.inf else max(bisect_left(self.times, end), first + 1),
+            first_interval,
+            len(self.times)
+            if end == math.inf
+            else max(bisect_left(self.times, end), first_interval + 1),
         )
 
     def _cut(self, time: float) -> int:
@@ -100,10 +112,12 @@ class MemoryProfile:
         index, count = bisect_left(self.times, time), len(self.times)
         if index < count and self.times[index] == time:
             return index
+        # twice the room, as for any growing list
         if count == len(self.level):
             self.level = np.concatenate([self.level, np.zeros(count)])
         self.times.insert(index, time)
         self.level[index + 1 : count + 1] = self.level[index:count].copy()
+        # the new interval begins with the level of the one that it is cut from
         self.level[index] = self.level[index - 1]
         return index
 
@@ -112,16 +126,16 @@ def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
     """Yield the total memory reserved by ``holds`` as consecutive time intervals with a constant
     number of bytes.
     """
-    steps = defaultdict[float, float](float)
+    changes = defaultdict[float, float](float)
     for start, end, size in holds:
         if start < end and size:
-            steps[start] += size
-            steps[end] -= size
-    times, now = sorted(steps), 0.0
+            changes[start] += size
+            changes[end] -= size
+    times, bytes_now = sorted(changes), 0.0
     for start, end in pairwise(times):
-        now += steps[start]
-        if now > 0:
-            yield start, end, now
+        bytes_now += changes[start]
+        if bytes_now > 0:
+            yield start, end, bytes_now
 
 
 def without(
@@ -130,11 +144,11 @@ def without(
     """Yield the parts of the time interval [start, end) outside the sorted, disjoint intervals
     in ``taken``.
     """
-    for first, last in taken:
-        if first < end and last > start:
-            if start < first:
-                yield start, first
-            start = max(start, last)
+    for taken_start, taken_end in taken:
+        if taken_start < end and taken_end > start:
+            if start < taken_start:
+                yield start, taken_start
+            start = max(start, taken_end)
     if start < end:
         yield start, end
 
@@ -151,10 +165,12 @@ Of = tuple[int, float, int]  #: task of the result, bytes of the result, device
 
 def _most_memory(graph: Graph) -> float:
     """Return an upper bound of the bytes that a schedule holds on a device at any time."""
-    numbers = range(len(graph.tasks))
-    most = sum(graph.own) + max((graph.work(i, 1) for i in numbers), default=0.0)
-    parts_sent = (graph.sizes[i] for i in numbers if graph.tasks[i].takes)
-    return most + sum(max(0.0, math.ceil(size)) for size in chain.from_iterable(parts_sent))
+    task_numbers = range(len(graph.tasks))
+    bytes_on_device = sum(graph.own) + max((graph.work(i, 1) for i in task_numbers), default=0.0)
+    parts_sent = (graph.sizes[i] for i in task_numbers if graph.tasks[i].takes)
+    return bytes_on_device + sum(
+        max(0.0, math.ceil(size)) for size in chain.from_iterable(parts_sent)
+    )
 
 
 class PartialSchedule:
@@ -164,19 +180,26 @@ class PartialSchedule:
 
     def __init__(self, graph: Graph, bounded: bool = True) -> None:
         self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
+        # by task: its device (-1: not placed), its number of parts, its times
         self.where, self.parts = [-1] * count, [1] * count
         self.start, self.end = [0.0] * count, [0.0] * count
         # time at which the last reader placed so far has its input
         self.free_at: list[float] = [0.0] * count
-        self.left = [len(readers) for readers in graph.readers]
+        self.left = [len(readers) for readers in graph.readers]  # readers that are not placed yet
+        # by device: the starts and the ends of its idle times
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
-        enough = _most_memory(graph) if bounded else -math.inf
-        self.rooms = [MemoryProfile(d.memory) if d.memory < enough else None for d in devices]
+        # a device with that much memory needs no profile
+        largest_need = _most_memory(graph) if bounded else -math.inf
+        self.rooms = [MemoryProfile(d.memory) if d.memory < largest_need else None for d in devices]
         # no delay to itself
         self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
-        self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
-        self.copies: dict[Of, list[Copy]] = {}
-        self.placed: list[int] = []
+        # bytes that a task needs at least: its result, and its work in as many parts as it allows
+        self.least = [
+            result_bytes + graph.work(i, graph.tasks[i].parts)
+            for i, result_bytes in enumerate(graph.own)
+        ]
+        self.copies: dict[Of, list[Copy]] = {}  # of results on other devices
+        self.placed: list[int] = []  # tasks in the order of their placement
         self.refused: list[tuple[int, int, float]] = []  # task, device, bytes needed there
 
     # --- where and when ---------------------------------------------------------------------------
@@ -185,20 +208,24 @@ class PartialSchedule:
         """Place task ``i`` on the device that finishes it first; return False if no device has
         enough memory.
         """
-        best, on, begin = math.inf, -1, 0.0
+        earliest_end, best_device, best_start = math.inf, -1, 0.0
         for d in among:
-            room = self.rooms[d]
-            if room is not None and (room.free() < self.least[i] or self._needs(i, d) > room.limit):
+            memory = self.rooms[d]
+            # the memory never suffices, whatever ends before
+            if memory is not None and (
+                memory.free() < self.least[i] or self._needs(i, d) > memory.limit
+            ):
                 continue
             ready, seconds = self._ready(i, d), self.graph.seconds[i][d]
-            if ready + seconds >= best:
+            # even without a wait for the device it would end later
+            if ready + seconds >= earliest_end:
                 continue
-            start = self._slot(i, d, ready, seconds, best)
-            if start + seconds < best:
-                best, on, begin = start + seconds, d, start
-        if on >= 0:
-            self._commit(i, on, begin, best)
-        return on >= 0
+            start = self._slot(i, d, ready, seconds, earliest_end)
+            if start + seconds < earliest_end:
+                earliest_end, best_device, best_start = start + seconds, d, start
+        if best_device >= 0:
+            self._commit(i, best_device, best_start, earliest_end)
+        return best_device >= 0
 
     def gave_back(self, i: int) -> bool:
         """Return True if the placement of task ``i`` freed memory that waiting tasks may use."""
@@ -208,19 +235,29 @@ class PartialSchedule:
         """Place task ``i`` as if a device had enough memory for this task, and record the bytes
         that the task needs.
         """
-        needs = {d: self._needs(i, d) for d in self.graph.able[i] if self.rooms[d] is not None}
-        d = min(needs, key=lambda d: (needs[d] - self.graph.cluster.devices[d].memory, d))
+        bytes_needed = {
+            d: self._needs(i, d) for d in self.graph.able[i] if self.rooms[d] is not None
+        }
+        # the device that lacks least
+        d = min(
+            bytes_needed, key=lambda d: (bytes_needed[d] - self.graph.cluster.devices[d].memory, d)
+        )
         room = self.rooms[d]
         assert room is not None
-        self.refused.append((i, d, needs[d]))
-        room.limit = needs[d]
+        self.refused.append((i, d, bytes_needed[d]))
+        # as if the device had the memory; the error names it
+        room.limit = bytes_needed[d]
         self.place(i, [d])
 
     def _ready(self, i: int, d: int) -> float:
         """Return the earliest time at which all inputs of task ``i`` can be on device ``d``."""
         end, where, links = self.end, self.where, self.links
         return max(
-            (end[j] + links[where[j]][d].seconds(size) for j, size in self._inputs(i)), default=0.0
+            (
+                end[source] + links[where[source]][d].seconds(size)
+                for source, size in self._inputs(i)
+            ),
+            default=0.0,
         )
 
     def _inputs(self, i: int) -> Iterator[tuple[int, float]]:
@@ -234,6 +271,7 @@ class PartialSchedule:
         before ``best``.
         """
         starts, ends = self.gaps[d]
+        # idle times that end late enough
         for gap in range(bisect_left(ends, ready + seconds), len(ends)):
             start = max(starts[gap], ready)
             if start + seconds >= best:
@@ -243,6 +281,7 @@ class PartialSchedule:
             start = self._fitting(i, d, start, seconds, ends[gap])
             if start + seconds <= ends[gap] and start < math.inf:
                 return start
+            # the wait for memory holds for later gaps too
             ready = max(ready, start)
         return math.inf
 
@@ -252,14 +291,15 @@ class PartialSchedule:
         If the task cannot end before ``end``, where the idle gap ends, the returned start is too
         late for the gap.
         """
-        room, parts = self.rooms[d], self.graph.tasks[i].parts
-        if room is None:
+        memory, most_parts = self.rooms[d], self.graph.tasks[i].parts
+        if memory is None:
             return start
         while start + seconds <= end and start < math.inf:
-            wait = room.wait(self._holds(i, d, start, start + seconds, parts))
-            if not wait:
+            delay = memory.wait(self._holds(i, d, start, start + seconds, most_parts))
+            if not delay:
                 return start
-            start = max(start + wait, math.nextafter(start, math.inf))
+            # at least one step of the numbers, or a tiny delay would be lost in rounding
+            start = max(start + delay, math.nextafter(start, math.inf))
         return start
 
     def _holds(self, i: int, d: int, start: float, end: float, parts: int) -> list[Hold]:
@@ -271,9 +311,18 @@ class PartialSchedule:
             (start, math.inf if graph.held(i) else end, graph.own[i]),
             (start, end, graph.work(i, parts)),
         ]
-        for of, leaves in self._arriving(i, d, start):
-            spans = without(leaves, end, ((a, until) for a, _, until in self.copies.get(of, ())))
-            holds += [(a, b, float(math.ceil(of[1]))) for a, b in spans]
+        for copy_of, departure in self._arriving(i, d, start):
+            # copies of an earlier reader on the device serve this one too
+            new_spans = without(
+                departure,
+                end,
+                ((from_time, until) for from_time, _, until in self.copies.get(copy_of, ())),
+            )
+            # copy_of[1]: bytes of the result
+            holds += [
+                (from_time, to_time, float(math.ceil(copy_of[1])))
+                for from_time, to_time in new_spans
+            ]
         return holds
 
     def _arriving(self, i: int, d: int, start: float) -> Iterator[tuple[Of, float]]:
@@ -294,26 +343,32 @@ class PartialSchedule:
         room = self.rooms[d]
         assert room is not None
         copies = sum(math.ceil(size) for j, size in self._inputs(i) if self.where[j] != d)
+        # what stays reserved without end, and this task with its copies
         return room.limit - room.free() + self.least[i] + copies
 
     # --- records of a placement -------------------------------------------------------------------
 
     def _commit(self, i: int, d: int, start: float, end: float) -> None:
-        graph, room = self.graph, self.rooms[d]
-        if room is not None:
-            self.parts[i] = self._fewest(i, d, start, end, room)
+        """Place a task on a device at its times: reserve its memory and the time, and free
+        results that it is the last to read.
+        """
+        graph, memory = self.graph, self.rooms[d]
+        if memory is not None:
+            self.parts[i] = self._fewest(i, d, start, end, memory)
             for hold in self._holds(i, d, start, end, self.parts[i]):
-                room.add(*hold)
+                memory.add(*hold)
         self.put(i, d, start, end)
+        # the time of the device
         self._fill(d, start, end)
-        for of, leaves in self._arriving(i, d, start):
-            self.copies[of] = _joined([*self.copies.get(of, ()), (leaves, start, end)])
+        for copy_of, departure in self._arriving(i, d, start):
+            self.copies[copy_of] = _joined([*self.copies.get(copy_of, ()), (departure, start, end)])
         for j in graph.sources[i]:
+            # on another device the copy is needed, and the result itself no longer
             self.free_at[j] = max(self.free_at[j], end if self.where[j] == d else start)
             self.left[j] -= 1
-            home = self.rooms[self.where[j]]
-            if not self.left[j] and j not in graph.kept and home is not None:
-                home.add(self.free_at[j], math.inf, -graph.own[j])
+            memory_of_source = self.rooms[self.where[j]]
+            if not self.left[j] and j not in graph.kept and memory_of_source is not None:
+                memory_of_source.add(self.free_at[j], math.inf, -graph.own[j])
 
     def put(self, i: int, d: int, start: float, end: float) -> None:
         self.where[i], self.start[i], self.end[i], self.free_at[i] = d, start, end, end
@@ -329,15 +384,20 @@ class PartialSchedule:
         def fits(parts: int) -> bool:
             return not room.wait(self._holds(i, d, start, end, parts))
 
+        # the fewest that fit, by bisection: more parts need less memory
         return 1 + bisect_left(range(1, self.graph.tasks[i].parts), True, key=fits)
 
     def _fill(self, d: int, start: float, end: float) -> None:
         """Mark the time from ``start`` to ``end`` as busy on device ``d``."""
         starts, ends = self.gaps[d]
         gap = bisect_left(ends, end)
-        left = [(a, b) for a, b in ((starts[gap], start), (end, ends[gap])) if a < b]
-        starts[gap : gap + 1] = [a for a, _ in left]
-        ends[gap : gap + 1] = [b for _, b in left]
+        gaps_left = [
+            (gap_start, gap_end)
+            for gap_start, gap_end in ((starts[gap], start), (end, ends[gap]))
+            if gap_start < gap_end
+        ]
+        starts[gap : gap + 1] = [gap_start for gap_start, _ in gaps_left]
+        ends[gap : gap + 1] = [gap_end for _, gap_end in gaps_left]
 
     # --- the finished schedule --------------------------------------------------------------------
 
@@ -346,7 +406,10 @@ class PartialSchedule:
         that would suffice.
         """
         graph, (i, d, _) = self.graph, self.refused[0]
-        needed, device = max(n for _, on, n in self.refused if on == d), graph.cluster.devices[d]
+        needed, device = (
+            max(bytes_needed for _, refused_on, bytes_needed in self.refused if refused_on == d),
+            graph.cluster.devices[d],
+        )
         return TooLarge(
             graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts
         )
@@ -354,13 +417,14 @@ class PartialSchedule:
     def schedule(self) -> Schedule:
         """Return the finished schedule; all tasks must have been placed before."""
         devices = self.graph.cluster.devices
+        # first, because it joins transfers
         self._bridge()
         moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
         slots = sorted(self._slots(), key=lambda slot: (slot.start, slot.end))
         holds = zip(devices, self._held(), strict=True)
         peak = {
-            device.name: max((size for _, _, size in stacked(held)), default=0.0)
-            for device, held in holds
+            device.name: max((size for _, _, size in stacked(device_holds)), default=0.0)
+            for device, device_holds in holds
         }
         return Schedule(
             tuple(slots),
@@ -375,53 +439,66 @@ class PartialSchedule:
         memory allows.
         """
         for (j, size, d), copies in self.copies.items():
-            room, joined = self.rooms[d], copies[:1]
+            memory, joined_copies = self.rooms[d], copies[:1]
+            # a copy is (departure, arrival, last use)
             for copy in copies[1:]:
-                until = joined[-1][2]
-                if room is None or room.highest(until, copy[0]) + math.ceil(size) <= room.limit:
-                    if room is not None:
-                        room.add(until, copy[0], math.ceil(size))
-                    joined[-1] = (*joined[-1][:2], max(until, copy[2]))
+                last_use = joined_copies[-1][2]
+                if (
+                    memory is None
+                    or memory.highest(last_use, copy[0]) + math.ceil(size) <= memory.limit
+                ):
+                    if memory is not None:
+                        memory.add(last_use, copy[0], math.ceil(size))
+                    # the first copy stays until the last use of the second
+                    joined_copies[-1] = (*joined_copies[-1][:2], max(last_use, copy[2]))
                 else:
-                    joined.append(copy)
-            self.copies[j, size, d] = joined
+                    joined_copies.append(copy)
+            self.copies[j, size, d] = joined_copies
 
     def _moves(self) -> Iterator[Move]:
+        """Yield the transfers of the finished schedule."""
         devices = self.graph.cluster.devices
         for (j, size, d), copies in self.copies.items():
             task, source = self.graph.tasks[j].name, devices[self.where[j]].name
-            for leaves, arrives, until in copies:
-                yield Move(task, size, source, devices[d].name, leaves, arrives, until)
+            for departure, arrival, last_use in copies:
+                yield Move(task, size, source, devices[d].name, departure, arrival, last_use)
 
     def _held(self) -> list[list[Hold]]:
         """Return the memory reservations of the finished schedule, as one list for each device."""
-        graph, held = self.graph, list[list[Hold]]([] for _ in self.rooms)
-        until, over = list(self.end), max(self.end, default=0.0)
+        graph, holds_by_device = self.graph, list[list[Hold]]([] for _ in self.rooms)
+        free_times, end_of_all = list(self.end), max(self.end, default=0.0)
+        # copies: from their departure to their last use
         for (j, size, d), copies in self.copies.items():
-            held[d] += [(leaves, last, float(math.ceil(size))) for leaves, _, last in copies]
-            until[j] = max(until[j], copies[-1][1])
+            holds_by_device[d] += [
+                (departure, last_use, float(math.ceil(size))) for departure, _, last_use in copies
+            ]
+            # a result stays until its last copy has arrived
+            free_times[j] = max(free_times[j], copies[-1][1])
         for i, sources in enumerate(graph.sources):
             for j in sources:
                 if self.where[j] == self.where[i]:
-                    until[j] = max(until[j], self.end[i])
+                    free_times[j] = max(free_times[j], self.end[i])
+        # the result, and the working memory while the task runs
         for i, d in enumerate(self.where):
-            held[d].append((self.start[i], over if i in graph.kept else until[i], graph.own[i]))
-            held[d].append((self.start[i], self.end[i], graph.work(i, self.parts[i])))
-        return held
+            holds_by_device[d].append(
+                (self.start[i], end_of_all if i in graph.kept else free_times[i], graph.own[i])
+            )
+            holds_by_device[d].append((self.start[i], self.end[i], graph.work(i, self.parts[i])))
+        return holds_by_device
 
     def _slots(self) -> Iterator[Slot]:
         """Yield the schedule entry of each task: device, start, end, and the task that delayed
         the start.
         """
         tasks, devices = self.graph.tasks, self.graph.cluster.devices
-        before, ended = [-1] * len(devices), dict[float, int]()
+        task_before, task_ending_at = [-1] * len(devices), dict[float, int]()
         for i in sorted(self.placed, key=self.start.__getitem__):
             d, start = self.where[i], self.start[i]
-            after = self._waited(i, before[d], ended.get(start, -1))
-            name = tasks[after].name if after >= 0 else ""
+            delayed_by = self._waited(i, task_before[d], task_ending_at.get(start, -1))
+            name = tasks[delayed_by].name if delayed_by >= 0 else ""
             yield Slot(tasks[i].name, devices[d].name, start, self.end[i], self.parts[i], name)
-            before[d] = i
-            ended[self.end[i]] = i
+            task_before[d] = i
+            task_ending_at[self.end[i]] = i
 
     def _waited(self, i: int, before: int, other: int) -> int:
         """Return the task that delayed task ``i``: an input, the previous task, or a task that
@@ -429,11 +506,14 @@ class PartialSchedule:
         """
         start, d = self.start[i], self.where[i]
         for j, size in self._inputs(i):
+            # it started the moment that its input arrived
             if self.end[j] + self.links[self.where[j]][d].seconds(size) == start:
                 return j
+        # it started at once, or the moment that the device was free
         if start == 0.0 or (before >= 0 and self.end[before] == start):
             return before
         candidates = [j for j in (before, *self.graph.sources[i]) if j >= 0]
+        # a task that ended at this moment freed memory
         return other if other >= 0 else max(candidates, key=self.end.__getitem__, default=-1)
 
 
@@ -481,16 +561,27 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
     graph = Graph(tasks, cluster, keep)
     if len(cluster.devices) == 1:
         return _alone(graph, _able(graph))
+    # by rank, as given, and with little memory
     orders = [ranked(graph, upward(graph)), graph.by(range(len(graph.tasks))), frugal(graph)]
     try:
         schedule = _best(graph, orders)
     except TooLarge as error:
         # reports the memory for one device, if this is less
         return _alone(graph, _able(graph), error)
-    seconds = {d: sum(row[d] for row in graph.seconds) for d in _able(graph)}
-    sooner = {d: took for d, took in seconds.items() if took < schedule.makespan}
+    seconds = {
+        d: sum(seconds_of_task[d] for seconds_of_task in graph.seconds) for d in _able(graph)
+    }
+    faster_alone = {
+        d: device_seconds
+        for d, device_seconds in seconds.items()
+        if device_seconds < schedule.makespan
+    }
     try:
-        return _alone(graph, sorted(sooner, key=sooner.__getitem__)) if sooner else schedule
+        return (
+            _alone(graph, sorted(faster_alone, key=faster_alone.__getitem__))
+            if faster_alone
+            else schedule
+        )
     except TooLarge:
         return schedule
 
@@ -500,6 +591,7 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
     schedule that fits.
     """
     memory = {device.name: device.memory for device in graph.cluster.devices}
+    # without memory limits first, which is fast and mostly suffices
     schedule = _placed(PartialSchedule(graph, bounded=False), orders[0]).schedule()
     if all(peak <= memory[name] for name, peak in schedule.peak.items()):
         return schedule
@@ -510,17 +602,21 @@ def _shortest(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
     """Return the shortest schedule within the memory, or raise the least error of the task
     orders.
     """
-    best, refused = None, list[TooLarge]()
+    shortest, errors = None, list[TooLarge]()
     for order in orders:
-        board = _placed(PartialSchedule(graph), order, best.makespan if best else math.inf)
-        if board.refused:
-            refused.append(board.too_large())
-        elif len(board.placed) == len(order):
-            schedule = board.schedule()
-            best = schedule if best is None or schedule.makespan < best.makespan else best
-    if best is None:
-        raise min(refused, key=lambda error: error.short)
-    return best
+        partial = _placed(
+            PartialSchedule(graph), order, shortest.makespan if shortest else math.inf
+        )
+        if partial.refused:
+            errors.append(partial.too_large())
+        elif len(partial.placed) == len(order):
+            schedule = partial.schedule()
+            shortest = (
+                schedule if shortest is None or schedule.makespan < shortest.makespan else shortest
+            )
+    if shortest is None:
+        raise min(errors, key=lambda error: error.short)
+    return shortest
 
 
 def _placed(
@@ -531,20 +627,20 @@ def _placed(
     A task that does not fit into memory waits until later tasks free memory. The placement stops
     early if it cannot end before ``below``.
     """
-    turns = _Turns(board.graph, order)
-    while turns.ready or turns.waiting:
-        n, forced = turns.take()
-        i = order[n]
-        if forced:
+    queue = _Turns(board.graph, order)
+    while queue.ready or queue.waiting:
+        place_in_order, is_forced = queue.take()
+        i = order[place_in_order]
+        if is_forced:
             board.force(i)
         elif not board.place(i, board.graph.able[i]):
-            turns.waiting.append(n)
+            queue.waiting.append(place_in_order)
             continue
-        if below < math.inf and (forced or board.end[i] >= below):
+        if below < math.inf and (is_forced or board.end[i] >= below):
             return board
-        turns.release(i)
-        if turns.waiting and board.gave_back(i):
-            turns.try_again()
+        queue.release(i)
+        if queue.waiting and board.gave_back(i):
+            queue.try_again()
     return board
 
 
@@ -555,8 +651,9 @@ class _Turns:
 
     def __init__(self, graph: Graph, order: Sequence[int]) -> None:
         self._readers = graph.readers
+        # inputs that are not placed yet
         self._missing = [len(sources) for sources in graph.sources]
-        self._turn = {i: n for n, i in enumerate(order)}
+        self._turn = {i: n for n, i in enumerate(order)}  # place of each task in the order
         self.ready = [n for n, i in enumerate(order) if not self._missing[i]]
         self.waiting: list[int] = []
 
@@ -566,8 +663,8 @@ class _Turns:
         """
         if self.ready:
             return heapq.heappop(self.ready), False
-        first, *self.waiting = sorted(self.waiting)
-        return first, True
+        first_waiting, *self.waiting = sorted(self.waiting)
+        return first_waiting, True
 
     def release(self, i: int) -> None:
         """Let those tasks be placed that waited only for the result of task ``i``."""
@@ -588,8 +685,8 @@ class _Turns:
 def _able(graph: Graph) -> list[int]:
     """Return the devices that can run every task, in order of decreasing memory."""
     devices = graph.cluster.devices
-    able = set(range(len(devices))).intersection(*graph.able)
-    return sorted(able, key=lambda d: (-devices[d].memory, d))
+    able_devices = set(range(len(devices))).intersection(*graph.able)
+    return sorted(able_devices, key=lambda d: (-devices[d].memory, d))
 
 
 def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
@@ -609,27 +706,36 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
     """Return the schedule of all tasks in ``order`` on device ``d``; raise `TooLarge` if the
     device lacks memory.
     """
-    board, device = PartialSchedule(graph, bounded=False), graph.cluster.devices[d]
-    left, held, peak, now = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
-    needed, largest = 0.0, 0
+    partial, device = PartialSchedule(graph, bounded=False), graph.cluster.devices[d]
+    readers_left, held_bytes, peak_bytes, end = (
+        [len(readers) for readers in graph.readers],
+        0.0,
+        0.0,
+        0.0,
+    )
+    needed, largest_task = 0.0, 0
     for i in order:
-        held += graph.own[i]
-        board.parts[i] = _fewest(graph, i, device.memory - held)
-        peak = max(peak, held + graph.work(i, board.parts[i]))
-        smallest = held + graph.work(i, graph.tasks[i].parts)
-        needed, largest = (smallest, i) if smallest > needed else (needed, largest)
-        began, now = now, now + graph.seconds[i][d]
-        board.put(i, d, began, now)
+        held_bytes += graph.own[i]
+        # in as few parts as the memory allows
+        partial.parts[i] = _fewest(graph, i, device.memory - held_bytes)
+        peak_bytes = max(peak_bytes, held_bytes + graph.work(i, partial.parts[i]))
+        # in as many parts as the task allows
+        least_need = held_bytes + graph.work(i, graph.tasks[i].parts)
+        needed, largest_task = (least_need, i) if least_need > needed else (needed, largest_task)
+        start, end = end, end + graph.seconds[i][d]
+        partial.put(i, d, start, end)
         for j in graph.sources[i]:
-            left[j] -= 1
-        held -= sum(
-            graph.own[j] for j in (*graph.sources[i], i) if not left[j] and j not in graph.kept
+            readers_left[j] -= 1
+        held_bytes -= sum(
+            graph.own[j]
+            for j in (*graph.sources[i], i)
+            if not readers_left[j] and j not in graph.kept
         )
     if graph.tasks and needed > device.memory:
-        task = graph.tasks[largest]
+        task = graph.tasks[largest_task]
         raise TooLarge(task.name, device.name, needed, device.memory, task.parts)
-    schedule = board.schedule()
-    return replace(schedule, peak={**schedule.peak, device.name: peak})
+    schedule = partial.schedule()
+    return replace(schedule, peak={**schedule.peak, device.name: peak_bytes})
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
@@ -639,4 +745,5 @@ def _fewest(graph: Graph, i: int, room: float) -> int:
     If no allowed number suffices, return the largest allowed number.
     """
     limit = graph.tasks[i].parts
+    # by bisection: more parts need less memory; the largest number if none suffices
     return 1 + bisect_left(range(1, limit), True, key=lambda parts: graph.work(i, parts) <= room)

@@ -66,6 +66,7 @@ def read_machines(path: Path | str) -> Machines:
     """
     document = read(_path(path), str(path))
     diagnostics: list[Diagnostic] = []
+    # mistakes are collected, and raised together
     root = _fields(
         document.root,
         {"devices": _groups, "links": _links, "network": _link},
@@ -84,6 +85,7 @@ def read_machines(path: Path | str) -> Machines:
         message = f"must be {_MOST} devices or fewer, not {len(devices)}"
         raise RecipeError([_problem(document.root.items["devices"], message)])
     speeds = {device.name: group["speed"] for device, group in devices.items()}
+    # by default that of `Cluster`
     network = root.get("network") or Cluster.network
     return Machines(document.title, Cluster(tuple(devices), links, BUS, network), speeds)
 
@@ -95,13 +97,14 @@ def examples() -> dict[str, Path]:
 
 
 def _path(path: Path | str) -> Path:
+    """Return the path of a machine file, or of the packaged example with that name."""
     if Path(path).is_file():
         return Path(path)
-    packaged = examples()
-    if str(path) not in packaged:
-        message = f"no such file, and no example of that name; {nearest(str(path), packaged)}"
+    example_paths = examples()
+    if str(path) not in example_paths:
+        message = f"no such file, and no example of that name; {nearest(str(path), example_paths)}"
         raise RecipeError([Diagnostic(Location("--devices"), str(path), message)])
-    return packaged[str(path)]
+    return example_paths[str(path)]
 
 
 def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
@@ -113,16 +116,23 @@ def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
     for group in groups:
         for machine in group["node"]:
             rows += [(machine, group)] * group["count"]
-    total, numbers = (
+    group_sizes, numbers_used = (
         Counter((machine, group["kind"]) for machine, group in rows),
         Counter[tuple[str, str]](),
     )
     devices = {}
     for machine, group in rows:
-        of = (machine, group["kind"])
-        name = "cpu" if of[1] == "cpu" and total[of] == 1 else f"{of[1]}:{numbers[of]}"
-        numbers[of] += 1
-        devices[Device(f"{machine}/{name}" if machine else name, of[1], group["memory"])] = group
+        machine_and_kind = (machine, group["kind"])
+        # a single CPU of a machine has no number
+        name = (
+            "cpu"
+            if machine_and_kind[1] == "cpu" and group_sizes[machine_and_kind] == 1
+            else f"{machine_and_kind[1]}:{numbers_used[machine_and_kind]}"
+        )
+        numbers_used[machine_and_kind] += 1
+        devices[
+            Device(f"{machine}/{name}" if machine else name, machine_and_kind[1], group["memory"])
+        ] = group
     return devices
 
 
@@ -130,6 +140,7 @@ def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
 
 
 def _groups(value: Value, diagnostics: list[Diagnostic]) -> list[dict[str, Any]]:
+    """Return the groups of devices in a machine file, with defaults in place of missing fields."""
     if not isinstance(value.data, dict) or not value.data:
         diagnostics.append(
             _problem(
@@ -145,14 +156,16 @@ def _groups(value: Value, diagnostics: list[Diagnostic]) -> list[dict[str, Any]]
         "speed": _speed,
         "node": _names,
     }
-    usual: dict[str, Any] = {"count": 1, "speed": {"default": 1.0}, "node": [""]}
+    # one device as fast as the measured one, on a machine without a name
+    defaults: dict[str, Any] = {"count": 1, "speed": {"default": 1.0}, "node": [""]}
     return [
-        usual | _fields(group, readers, ("kind", "memory"), diagnostics)
+        defaults | _fields(group, readers, ("kind", "memory"), diagnostics)
         for group in value.data.values()
     ]
 
 
 def _links(value: Value, diagnostics: list[Diagnostic]) -> dict[tuple[str, str], Link]:
+    """Return the links between kinds of devices, by the two kinds."""
     if not isinstance(value.data, dict):
         diagnostics.append(
             _problem(
@@ -162,18 +175,22 @@ def _links(value: Value, diagnostics: list[Diagnostic]) -> dict[tuple[str, str],
         return {}
     links = {}
     for name, link in value.data.items():
-        first, dash, other = str(name).partition("-")
-        if not dash:
+        first_kind, hyphen, other_kind = str(name).partition("-")
+        if not hyphen:
             diagnostics.append(
                 _problem(link, "must name two kinds, such as cuda-cuda or cpu-cuda", link.key)
             )
-        if (other, first) in links:
-            diagnostics.append(_problem(link, f"is the same as {other}-{first}", link.key))
-        links[first, other or first] = _link(link, diagnostics)
+        if (other_kind, first_kind) in links:
+            diagnostics.append(
+                _problem(link, f"is the same as {other_kind}-{first_kind}", link.key)
+            )
+        # without a second kind, so that further mistakes are found
+        links[first_kind, other_kind or first_kind] = _link(link, diagnostics)
     return links
 
 
 def _link(value: Value, diagnostics: list[Diagnostic]) -> Link:
+    """Return the bandwidth (bytes/s) and the latency (s) of a link."""
     return Link(
         **_fields(value, {"bandwidth": _rate, "latency": _time}, ("bandwidth",), diagnostics)
     )
@@ -208,6 +225,7 @@ def _fields(
 
 
 def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
+    """Return the kind of a group of devices; note one that is not known."""
     if value.data not in _KINDS:
         diagnostics.append(
             _problem(value, f"unknown kind of device; {nearest(str(value.data), _KINDS)}")
@@ -216,6 +234,7 @@ def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
 
 
 def _count(value: Value, diagnostics: list[Diagnostic]) -> int:
+    """Return the number of devices of a group; note one that is no number of devices."""
     if (
         isinstance(value.data, bool)
         or not isinstance(value.data, int)
@@ -227,19 +246,21 @@ def _count(value: Value, diagnostics: list[Diagnostic]) -> int:
 
 
 def _names(value: Value, diagnostics: list[Diagnostic]) -> list[str]:
+    """Return the machines of a group of devices, a single one as a list."""
     names = value.data if isinstance(value.data, list) else [value]
     for name in names:
         if not isinstance(name.data, str) or not re.fullmatch(r"[\w.-]+", name.data):
             diagnostics.append(
                 _problem(name, "must be the name of a machine, or a list of such names")
             )
-    plain = [str(name.data) for name in names]
-    if len(set(plain)) < len(plain) or not plain:
+    machine_names = [str(name.data) for name in names]
+    if len(set(machine_names)) < len(machine_names) or not machine_names:
         diagnostics.append(_problem(value, "must name at least one machine, and no machine twice"))
-    return plain
+    return machine_names
 
 
 def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
+    """Return the speed of a group of devices by family of nodes, or one for all of them."""
     if not isinstance(value.data, dict):
         return {"default": _factor(value, diagnostics)}
     spec = find_spec("neusee.nodes")  # lists the families of nodes without importing a node
@@ -249,8 +270,9 @@ def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
 
 
 def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
-    good = isinstance(value.data, int | float) and not isinstance(value.data, bool)
-    if not good or not 0 < value.data < math.inf:
+    """Return a speed relative to the measured one; note one that is no positive number."""
+    is_number = isinstance(value.data, int | float) and not isinstance(value.data, bool)
+    if not is_number or not 0 < value.data < math.inf:
         diagnostics.append(
             _problem(value, "must be a number above 0: the ratio to the measured speed")
         )
@@ -272,6 +294,7 @@ def _quantity(
         diagnostics.append(
             _problem(value, f"{mistake}: write a number and one of {', '.join(units)}")
         )
+    # a latency may be 0
     elif units is not _SECONDS and not 0 < float(match[1]) < math.inf:
         diagnostics.append(_problem(value, f"must be above 0, such as {such}"))
     else:
@@ -298,4 +321,5 @@ def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
 
 
 def _problem(value: Value, message: str, mark: Location | None = None) -> Diagnostic:
+    """Return the mistake of a value, at its place in the file."""
     return Diagnostic(mark or value.mark, value.name, message)

@@ -71,10 +71,10 @@ class Cluster:
         """Return the link between two devices; from a device to itself, the link has no delay."""
         if a == b:
             return Link()
-        device, other = self._by_name[a], self._by_name[b]
-        if device.machine != other.machine:
+        device, other_device = self._by_name[a], self._by_name[b]
+        if device.machine != other_device.machine:
             return self.network
-        pair = (device.kind, other.kind)
+        pair = (device.kind, other_device.kind)
         return self.links.get(pair) or self.links.get((pair[1], pair[0])) or self.bus
 
     @cached_property
@@ -141,21 +141,25 @@ class Schedule:
         """Return the fraction of the makespan during which each device works, by the name of the
         device.
         """
-        busy = dict.fromkeys(self.peak, 0.0)
+        busy_seconds = dict.fromkeys(self.peak, 0.0)
         for slot in self.slots:
-            busy[slot.device] += slot.end - slot.start
-        return {name: time / self.makespan if self.makespan else 0.0 for name, time in busy.items()}
+            busy_seconds[slot.device] += slot.end - slot.start
+        return {
+            name: device_seconds / self.makespan if self.makespan else 0.0
+            for name, device_seconds in busy_seconds.items()
+        }
 
     def critical_path(self) -> tuple[Slot, ...]:
         """Return the critical path: a chain of tasks, each of which delays the next, up to the
         task that ends last.
         """
-        by_name = {slot.task: slot for slot in self.slots}
-        last = max(self.slots, key=lambda slot: slot.end, default=None)
+        slot_of_task = {slot.task: slot for slot in self.slots}
+        slot_on_path = max(self.slots, key=lambda slot: slot.end, default=None)
         path = []
-        while last is not None:
-            path.append(last)
-            last = by_name.get(last.after)
+        while slot_on_path is not None:
+            path.append(slot_on_path)
+            # the task that delayed this one; none for the first
+            slot_on_path = slot_of_task.get(slot_on_path.after)
         return tuple(path[::-1])
 
 
@@ -174,10 +178,10 @@ class TooLarge(ValueError):
             memory,
             parts,
         )
-        cut = f" in {parts} parts" if parts > 1 else ""
+        parts_text = f" in {parts} parts" if parts > 1 else ""
         super().__init__(
             f"{task} does not fit: its inputs, result and results kept there need {_size(needed)}"
-            f" on {device}{cut}, which has {_size(memory)}"
+            f" on {device}{parts_text}, which has {_size(memory)}"
         )
 
     def with_program(self, held: float) -> TooLarge:
@@ -185,12 +189,12 @@ class TooLarge(ValueError):
         of need and limit.
         """
         error = TooLarge(self.task, self.device, self.needed, self.memory, self.parts)
-        cut = f" in {self.parts} parts" if self.parts > 1 else ""
+        in_parts = f" in {self.parts} parts" if self.parts > 1 else ""
         error.args = (
             (
-                f"{self.task} needs {_size(self.needed + held)}{cut}, of which the program itself"
-                f" holds {_size(held)}, and the limit is {_size(self.memory + held)}: give more"
-                " memory, or choose a smaller picture, pupil or number of bands"
+                f"{self.task} needs {_size(self.needed + held)}{in_parts}, of which the program"
+                f" itself holds {_size(held)}, and the limit is {_size(self.memory + held)}: give"
+                " more memory, or choose a smaller picture, pupil or number of bands"
             ),
         )
         return error
@@ -202,10 +206,11 @@ class TooLarge(ValueError):
 
 
 def _size(count: float) -> str:
+    """Return a number of bytes as text, exactly and in GB."""
     if count == math.inf:
         return "more bytes than a machine can address"
-    exact = f"{count:,.0f} B"
-    return exact if count < 1e6 else f"{exact} ({count / 1e9:.3g} GB)"
+    exact_text = f"{count:,.0f} B"
+    return exact_text if count < 1e6 else f"{exact_text} ({count / 1e9:.3g} GB)"
 
 
 # --- task priorities ------------------------------------------------------------------------------
@@ -224,10 +229,12 @@ class Graph:
         index = _numbers_of_names(self.tasks, keep)
         self.sources = [_sources_of(task, index) for task in self.tasks]
         self.readers = _readers_of(self.sources)
-        self.kept = set(map(index.__getitem__, keep))
+        self.kept = set(map(index.__getitem__, keep))  # results that stay to the end
+        # bytes that a task takes of each of its sources
         self.sizes = list(map(self._sent, self.tasks, self.sources))
         # whole bytes add up without round-off
         self.own = [float(math.ceil(task.bytes)) for task in self.tasks]
+        # by task: the devices that can run it
         self.able = [_able_devices(task, cluster) for task in self.tasks]
         self.seconds = [_seconds_by_device(task, cluster) for task in self.tasks]
         self._check()
@@ -250,20 +257,23 @@ class Graph:
         """Return the tasks in order, each after its inputs; the ready task with the smallest key
         comes next.
         """
-        missing = [len(sources) for sources in self.sources]
-        ready = [(keys[i], i) for i, count in enumerate(missing) if not count]
+        missing_inputs = [len(sources) for sources in self.sources]
+        ready = [(keys[i], i) for i, count in enumerate(missing_inputs) if not count]
         heapq.heapify(ready)
         order = []
         while ready:
             i = heapq.heappop(ready)[1]
             order.append(i)
             for reader in self.readers[i]:
-                missing[reader] -= 1
-                if not missing[reader]:
+                missing_inputs[reader] -= 1
+                if not missing_inputs[reader]:
                     heapq.heappush(ready, (keys[reader], reader))
         return order
 
     def _check(self) -> None:
+        """Raise ValueError for a task that no device runs, a time that is not finite, or a
+        cycle.
+        """
         names = ", ".join(device.name for device in self.cluster.devices)
         for task, able in zip(self.tasks, self.able, strict=True):
             if not able:
@@ -276,6 +286,7 @@ class Graph:
                     f"{task.name} must take a finite time of 0 s or more, not"
                     f" {dict(task.seconds)} s"
                 )
+        # a task in a cycle is never ready
         if len(self.by(range(len(self.tasks)))) < len(self.tasks):
             raise ValueError("the tasks depend on each other in a cycle")
 
@@ -284,35 +295,41 @@ def _numbers_of_names(tasks: Sequence[Task], keep: Collection[str]) -> dict[str,
     """Return the number of each task by its name; raise ValueError for a name that two tasks have,
     and for one that a task reads, or the run keeps, and that none has.
     """
-    index = {task.name: i for i, task in enumerate(tasks)}
-    if len(index) < len(tasks):
-        twice = next(task.name for i, task in enumerate(tasks) if index[task.name] != i)
-        raise ValueError(f"two tasks have the name {twice}")
-    read = chain.from_iterable(task.sources for task in tasks)
-    for name in (*read, *keep):
-        if name not in index:
-            raise ValueError(f"there is no task {name}; {nearest(name, index)}")
-    return index
+    number_of_task = {task.name: i for i, task in enumerate(tasks)}
+    if len(number_of_task) < len(tasks):
+        # the later of two tasks has the number that the name leads to
+        repeated_name = next(
+            task.name for i, task in enumerate(tasks) if number_of_task[task.name] != i
+        )
+        raise ValueError(f"two tasks have the name {repeated_name}")
+    names_read = chain.from_iterable(task.sources for task in tasks)
+    for name in (*names_read, *keep):
+        if name not in number_of_task:
+            raise ValueError(f"there is no task {name}; {nearest(name, number_of_task)}")
+    return number_of_task
 
 
 def _sources_of(task: Task, index: Mapping[str, int]) -> list[int]:
+    """Return the numbers of the tasks that a task reads, each once."""
     return [index[name] for name in dict.fromkeys(task.sources)]
 
 
 def _readers_of(sources: Sequence[Sequence[int]]) -> list[list[int]]:
     """Return the tasks that read the result of each task."""
     readers: list[list[int]] = [[] for _ in sources]
-    for i, read in enumerate(sources):
-        for j in read:
+    for i, sources_of_task in enumerate(sources):
+        for j in sources_of_task:
             readers[j].append(i)
     return readers
 
 
 def _able_devices(task: Task, cluster: Cluster) -> list[int]:
+    """Return the numbers of the devices that can run a task."""
     return [d for d, device in enumerate(cluster.devices) if device.name in task.seconds]
 
 
 def _seconds_by_device(task: Task, cluster: Cluster) -> list[float]:
+    """Return the time of a task on each device; infinity where it cannot run."""
     return [task.seconds.get(device.name, math.inf) for device in cluster.devices]
 
 
@@ -329,12 +346,19 @@ def upward(graph: Graph) -> list[float]:
 
     Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 8.
     """
-    ranks, wait, cost = [0.0] * len(graph.tasks), _mean_transfer(graph), _mean_seconds(graph)
-    onward = [0.0] * len(graph.tasks)
+    ranks, latency_and_rate, mean_seconds = (
+        [0.0] * len(graph.tasks),
+        _mean_transfer(graph),
+        _mean_seconds(graph),
+    )
+    longest_after = [0.0] * len(graph.tasks)
     for i in reversed(graph.by(range(len(graph.tasks)))):
-        ranks[i] = cost[i] + onward[i]
+        ranks[i] = mean_seconds[i] + longest_after[i]
         for j, size in zip(graph.sources[i], graph.sizes[i], strict=True):
-            onward[j] = max(onward[j], wait[0] + wait[1] * size + ranks[i])
+            # eq. 8: rank = mean cost + max over readers of (mean transfer + rank of the reader)
+            longest_after[j] = max(
+                longest_after[j], latency_and_rate[0] + latency_and_rate[1] * size + ranks[i]
+            )
     return ranks
 
 
@@ -345,41 +369,47 @@ def frugal(graph: Graph) -> list[int]:
     depth-first orders of a tree this order has the smallest peak memory (Liu, ACM TOMS 12 (1986)
     249).
     """
-    need, befores = _needs(graph)
-    left = {
+    peak_up_to, input_order = _needs(graph)
+    # by final task: what stays after it
+    bytes_after = {
         i: graph.own[i] if i in graph.kept else 0.0 for i, r in enumerate(graph.readers) if not r
     }
-    place: dict[int, int] = {}
-    stack = sorted(left, key=lambda i: (left[i] - need[i], i), reverse=True)
+    position: dict[int, int] = {}
+    # a stack: the last one comes first, that which frees most of its peak
+    stack = sorted(bytes_after, key=lambda i: (bytes_after[i] - peak_up_to[i], i), reverse=True)
     while stack:
         i = stack[-1]
-        missing = [j for j in befores[i] if j not in place]
+        missing = [j for j in input_order[i] if j not in position]
         if missing:
             stack += reversed(missing)
             continue
-        place.setdefault(stack.pop(), len(place))
-    return list(place)
+        position.setdefault(stack.pop(), len(position))
+    return list(position)
 
 
 def _needs(graph: Graph) -> tuple[list[float], list[list[int]]]:
     """Return for each task the peak memory of a run up to this task, and the order of inputs
     with the lowest peak.
     """
-    need, befores = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
+    peak_up_to, input_order = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
     for i in graph.by(range(len(graph.tasks))):
-        befores[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - need[j], j))
-        held = 0.0
-        for j in befores[i]:
-            need[i] = max(need[i], held + need[j])
-            held += graph.own[j]
-        need[i] = max(need[i], held + graph.own[i] + graph.work(i, graph.tasks[i].parts))
-    return need, befores
+        # the input that frees most of its peak first
+        input_order[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - peak_up_to[j], j))
+        held_bytes = 0.0
+        for j in input_order[i]:
+            peak_up_to[i] = max(peak_up_to[i], held_bytes + peak_up_to[j])
+            held_bytes += graph.own[j]
+        peak_up_to[i] = max(
+            peak_up_to[i], held_bytes + graph.own[i] + graph.work(i, graph.tasks[i].parts)
+        )
+    return peak_up_to, input_order
 
 
 def _mean_seconds(graph: Graph) -> list[float]:
+    """Return the mean time (s) of each task over the devices that can run it."""
     return [
-        sum(row[d] for d in able) / len(able)
-        for row, able in zip(graph.seconds, graph.able, strict=True)
+        sum(seconds_of_task[d] for d in able) / len(able)
+        for seconds_of_task, able in zip(graph.seconds, graph.able, strict=True)
     ]
 
 

@@ -126,14 +126,18 @@ class Blobs:
                 if secrets():  # a forged band must not be part of what is signed
                     self.read([name], (1, *blob.shape), blob.dtype)
                 return blob.xxh3
-        data, kind = bytes_of(x), _kind(x.dtype, tuple(x.shape), name)
-        kind = _signed(kind, signature("band", name, _sha256(data, kind)) if secrets() else "")
-        xxh3 = _checksum(data, kind)
+        band_bytes, trailer = bytes_of(x), _kind(x.dtype, tuple(x.shape), name)
+        # the signature covers the bytes and the trailer without itself
+        trailer = _signed(
+            trailer, signature("band", name, _sha256(band_bytes, trailer)) if secrets() else ""
+        )
+        xxh3 = _checksum(band_bytes, trailer)
         with self._disk.temporary(name) as (temporary, file):
-            for piece in (data, kind, xxh3.encode(), len(kind).to_bytes(4, "little")):
+            # the order that `_trailer` reads, from the end of the file
+            for piece in (band_bytes, trailer, xxh3.encode(), len(trailer).to_bytes(4, "little")):
                 file.write(piece)
             file.flush()
-            if len(data) > _SMALL:
+            if len(band_bytes) > _SMALL:
                 os.fsync(file.fileno())
             return self._named(name, temporary) or xxh3
 
@@ -149,6 +153,7 @@ class Blobs:
         the file of that name.
         """
         self._disk.make_folder(self._folder)
+        # a link fails where a file has the name: the first writer wins, unless its file is damaged
         if name in self._lost or not self._disk.link(temporary, self.path(name)):
             if name not in self._lost:
                 with suppress(Damaged):
@@ -172,23 +177,26 @@ class Blobs:
         compares the checksum of every byte; ``xxh3`` lists the expected checksums. Raises `Damaged`
         for a missing or damaged file, which then counts as missing.
         """
-        if bad := [name for name in names if not is_band(name)]:
-            raise Damaged(f"{bad[0]!r} is not the name of a band")
+        if wrong_names := [name for name in names if not is_band(name)]:
+            raise Damaged(f"{wrong_names[0]!r} is not the name of a band")
         expected = [
             Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "", name)
             for i, name in enumerate(names)
         ]
-        size = expected[0].nbytes if expected else 0
-        if not size:
+        bytes_of_slice = expected[0].nbytes if expected else 0
+        if not bytes_of_slice:
             return torch.empty(*shape, dtype=dtype)
         self._need_kind(names[0], expected[0])  # before memory is reserved
-        if _LIBC is not None and size % mmap.PAGESIZE == 0:
+        # only whole pages can be mapped side by side
+        if _LIBC is not None and bytes_of_slice % mmap.PAGESIZE == 0:
             with suppress(OSError):  # a file system or a limit that allows no maps
-                space = _reserve(len(names) * size)
+                # one range of addresses, into which each file is mapped
+                space = _reserve(len(names) * bytes_of_slice)
                 self._fill(
                     names, expected, memoryview(space).cast("B"), ctypes.addressof(space), verify
                 )
                 return torch.frombuffer(space, dtype=dtype).reshape(*shape)
+        # copies, where the files cannot be mapped
         x = torch.empty(*shape, dtype=dtype)
         self._fill(names, expected, bytes_of(x), None, verify)
         return x
@@ -211,13 +219,20 @@ class Blobs:
         """Load stored bands side by side into memory; map the files if an ``address`` is given,
         else read the files.
         """
-        size = expected[0].nbytes
+        bytes_of_slice = expected[0].nbytes
         for i, (name, blob) in enumerate(zip(names, expected, strict=True)):
             try:
                 with open(self.path(name), "rb", opener=open_now) as file:
-                    start = address and address + i * size
-                    _load(file, blob, into[i * size : (i + 1) * size], start, verify)
+                    map_address = address and address + i * bytes_of_slice
+                    _load(
+                        file,
+                        blob,
+                        into[i * bytes_of_slice : (i + 1) * bytes_of_slice],
+                        map_address,
+                        verify,
+                    )
             except (OSError, *_UNREADABLE) as error:
+                # no map is possible here; `read` copies instead
                 if address is not None and not isinstance(error, _UNREADABLE):
                     raise
                 raise self._damaged(name, error) from None
@@ -231,6 +246,7 @@ class Blobs:
         the error to raise.
         """
         self._lost.add(name)
+        # the file itself is not to blame where the system failed, or for another format
         if not isinstance(error, OSError | NotRead) and is_band(name):
             self._disk.put_aside(self.path(name))
         return Damaged(f"the band {name} is damaged or missing: {error}")
@@ -238,6 +254,7 @@ class Blobs:
 
 def bytes_of(x: Tensor) -> memoryview:
     """Return the bytes of a tensor, without a copy if the tensor is contiguous and on the CPU."""
+    # torch may only note that a tensor is conjugated or negative
     flat = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
     # a single element is contiguous whatever its stride, but cannot be viewed as bytes
     if flat.stride() != (1,):
@@ -255,14 +272,18 @@ def dtype_of(name: str) -> torch.dtype:
 
 
 def _kind(dtype: torch.dtype, shape: tuple[int, ...], name: str) -> bytes:
+    """Return the unsigned trailer of a band file: type, shape, format version and name as JSON."""
     return json.dumps([str(dtype).removeprefix("torch."), list(shape), FORMAT, name]).encode()
 
 
 def _signed(kind: bytes, sign: str) -> bytes:
+    """Return a trailer with the signature as its fifth entry."""
+    # in place of the bracket at the end
     return kind[:-1] + f', "{sign}"]'.encode()
 
 
 def _checksum(data: memoryview, kind: bytes) -> str:
+    """Return the checksum (xxh3) of the bytes of a band and its trailer."""
     digest = xxhash.xxh3_128(data)
     digest.update(kind)
     return digest.hexdigest()
@@ -270,16 +291,17 @@ def _checksum(data: memoryview, kind: bytes) -> str:
 
 def _checksum_read(file: BufferedReader, size: int, kind: bytes) -> str:
     """Return the checksum of the first bytes of a file, read piece by piece."""
-    digest, piece, left = xxhash.xxh3_128(), memoryview(bytearray(min(_PIECE, size))), size
+    digest, buffer, bytes_left = xxhash.xxh3_128(), memoryview(bytearray(min(_PIECE, size))), size
     file.seek(0)
-    while left and (count := file.readinto(piece[:left])):
-        digest.update(piece[:count])
-        left -= count
+    while bytes_left and (count := file.readinto(buffer[:bytes_left])):
+        digest.update(buffer[:count])
+        bytes_left -= count
     digest.update(kind)
     return digest.hexdigest()
 
 
 def _sha256(data: memoryview, kind: bytes) -> bytes:
+    """Return the SHA-256 of the bytes of a band and its trailer, which a signature covers."""
     digest = hashlib.sha256(data)
     digest.update(kind)
     return digest.digest()
@@ -292,36 +314,45 @@ def _trailer(file: int, name: str) -> tuple[Blob, bytes]:
     Raises `OtherFormat` for a file of another version, and `ValueError` for a wrong size or name.
     """
     size = os.fstat(file).st_size
-    tail = os.pread(file, _TAIL, max(0, size - _TAIL))
-    length = int.from_bytes(tail[-4:], "little")
-    body = tail[-36 - length : -4]
-    if len(body) != length + 32:
+    file_end = os.pread(file, _TAIL, max(0, size - _TAIL))
+    # at the end: trailer, 32 digits of its checksum, 4 bytes with its length
+    trailer_length = int.from_bytes(file_end[-4:], "little")
+    trailer_and_checksum = file_end[-36 - trailer_length : -4]
+    # the file is shorter than its trailer says
+    if len(trailer_and_checksum) != trailer_length + 32:
         raise ValueError("the trailer of the band file is missing or cut short")
-    dtype, shape, own, sign = _fields_of_trailer(body[:length])
-    xxh3 = body[length:].decode(errors="replace")
-    if own != name or not isinstance(sign, str) or not is_shape(shape) or not is_checksum(xxh3):
+    dtype, shape, stated_name, sign = _fields_of_trailer(trailer_and_checksum[:trailer_length])
+    xxh3 = trailer_and_checksum[trailer_length:].decode(errors="replace")
+    if (
+        stated_name != name
+        or not isinstance(sign, str)
+        or not is_shape(shape)
+        or not is_checksum(xxh3)
+    ):
         raise ValueError(
-            f"the band file belongs to the band {own!r}, or its trailer is not what was written"
+            f"the band file belongs to the band {stated_name!r}, or its trailer is not what was"
+            " written"
         )
     blob = Blob(dtype_of(str(dtype)), tuple(shape), xxh3, name, sign)
-    if size != blob.nbytes + length + 36:
+    if size != blob.nbytes + trailer_length + 36:
         raise ValueError(
-            f"the band file has {size} bytes instead of {blob.nbytes + length + 36} bytes"
+            f"the band file has {size} bytes instead of {blob.nbytes + trailer_length + 36} bytes"
         )
-    return blob, body[:length]
+    return blob, trailer_and_checksum[:trailer_length]
 
 
 def _fields_of_trailer(text: bytes) -> tuple[Any, Any, Any, Any]:
     """Return type, shape, name and signature that the trailer of a band file states."""
-    said = json.loads(text)
-    if not isinstance(said, list) or len(said) < 2:
+    fields = json.loads(text)
+    if not isinstance(fields, list) or len(fields) < 2:
         raise ValueError("the trailer of the band file is not what was written")
-    if said[2:3] != [FORMAT] or len(said) != 5:
+    if fields[2:3] != [FORMAT] or len(fields) != 5:
         raise OtherFormat(
-            f"its format is version {said[2] if len(said) > 2 else 1!r}, not version {FORMAT}"
+            # the first version stated type and shape alone
+            f"its format is version {fields[2] if len(fields) > 2 else 1!r}, not version {FORMAT}"
         )
-    dtype, shape, _, own, sign = said
-    return dtype, shape, own, sign
+    dtype, shape, _, stated_name, sign = fields
+    return dtype, shape, stated_name, sign
 
 
 def _load(
@@ -333,22 +364,25 @@ def _load(
     It is mapped to ``address``, if that is given and nobody else could change the file after its
     check.
     """
-    blob, kind = _trailer(file.fileno(), expected.name)
+    blob, trailer = _trailer(file.fileno(), expected.name)
     _refuse_other_band(blob, expected)
-    copied = address is None or may_change(file.fileno())
+    # who may write the file could change it after its check
+    is_copied = address is None or may_change(file.fileno())
     # a map is looked into once the file was read: where a device fails, a read raises an error and
     # ends no process
-    checksum = "" if copied or not verify else _checksum_read(file, blob.nbytes, kind)
+    checksum = "" if is_copied or not verify else _checksum_read(file, blob.nbytes, trailer)
     if address is not None:
-        _map(None if copied else file.fileno(), address, blob.nbytes)
-    if copied and file.readinto(into) != len(into):
+        _map(None if is_copied else file.fileno(), address, blob.nbytes)
+    if is_copied and file.readinto(into) != len(into):
         raise ValueError("the band file was truncated while it was read")
     if verify:
-        _refuse_changed_bytes(blob, checksum or _checksum(into, kind))
+        _refuse_changed_bytes(blob, checksum or _checksum(into, trailer))
     _check_signed(blob, into)
 
 
 def _refuse_other_band(blob: Blob, expected: Blob) -> None:
+    """Raise `ValueError` if a band file has another type, shape or checksum than expected."""
+    # type and shape
     if blob[:2] != expected[:2]:
         raise ValueError(
             f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}"
@@ -367,8 +401,8 @@ def _refuse_changed_bytes(blob: Blob, checksum: str) -> None:
 def _check_signed(blob: Blob, data: memoryview) -> None:
     """Check the signature of a band, where this store has a secret to sign with."""
     if secrets():
-        plain = _kind(blob.dtype, blob.shape, blob.name)
-        check_signature(blob.sign, "band", blob.name, _sha256(data, plain))
+        unsigned_trailer = _kind(blob.dtype, blob.shape, blob.name)
+        check_signature(blob.sign, "band", blob.name, _sha256(data, unsigned_trailer))
 
 
 def _reserve(size: int) -> Any:
@@ -376,24 +410,25 @@ def _reserve(size: int) -> Any:
     deleted.
     """
     assert _LIBC is not None
-    flags = mmap.MAP_PRIVATE | mmap.MAP_ANON
-    address = _LIBC.mmap(None, size, 0, flags, -1, 0)
+    map_flags = mmap.MAP_PRIVATE | mmap.MAP_ANON
+    # 0: no access until files are mapped there
+    address = _LIBC.mmap(None, size, 0, map_flags, -1, 0)
     if address in (None, ctypes.c_void_p(-1).value):
         raise OSError(
             ctypes.get_errno(), "the address space has no free range for the band files of a tensor"
         )
-    space = (ctypes.c_char * size).from_address(address)
+    reserved = (ctypes.c_char * size).from_address(address)
     # a thread may use it until the very end
-    weakref.finalize(space, _LIBC.munmap, address, size).atexit = False
-    return space
+    weakref.finalize(reserved, _LIBC.munmap, address, size).atexit = False
+    return reserved
 
 
 def _map(file: int | None, address: int, size: int) -> None:
     """Map a file, or empty memory if it is None, to an address."""
     assert _LIBC is not None
-    access, kind = (
+    access, map_flags = (
         mmap.PROT_READ | mmap.PROT_WRITE,
         mmap.MAP_PRIVATE | _FIXED | (mmap.MAP_ANON if file is None else 0),
     )
-    if _LIBC.mmap(address, size, access, kind, -1 if file is None else file, 0) != address:
+    if _LIBC.mmap(address, size, access, map_flags, -1 if file is None else file, 0) != address:
         raise OSError(ctypes.get_errno(), "the band file cannot be mapped into memory")

@@ -35,6 +35,7 @@ def parse_size(text: str) -> int:
     match = _SIZE.fullmatch(text)
     if not match:
         raise ValueError(f"{text!r} is not a size: write a number of bytes, such as 20 GB")
+    # "20 G", "20 GB" and "20 gb" are the same
     unit = match[2].lower().removesuffix("b") + "b"
     return int(float(match[1]) * _ANY_CASE[unit])
 
@@ -69,8 +70,8 @@ def default_root() -> Path:
                 f"NEUSEE_CACHE is {value!r}, which is not a folder: open a URL with `open_store`"
             )
         return Path(value)
-    here = Path.cwd()
-    for folder in (here, *here.parents):
+    working_folder = Path.cwd()
+    for folder in (working_folder, *working_folder.parents):
         if (folder / "cache").is_dir() and _is_checkout(folder):
             return folder / "cache"
     return Path.home() / ".cache" / "neusee"

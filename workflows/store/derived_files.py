@@ -56,11 +56,12 @@ class DerivedFiles:
 
         path = self._path(key, suffix)
         with suppress(KeyError, OSError):
+            # unchanged since it was written or compared
             if path in self._fresh and self._fresh[path] == _state(path):
                 return path
-            about = self.store.about(key) if path.is_file() else None
-            named = is_kept(about) and about.get("file") == path.name
-            if named and _is_right(path, self.store.get(key, Tensor)):
+            metadata = self.store.about(key) if path.is_file() else None
+            is_named = is_kept(metadata) and metadata.get("file") == path.name
+            if is_named and _is_right(path, self.store.get(key, Tensor)):
                 self._fresh[path] = _state(path)
                 return path
         return None
@@ -73,6 +74,7 @@ class DerivedFiles:
         written into a temporary folder.
         """
         try:
+            # once more below where the folder of the store fails
             path, digest = self._compared(key, suffix, write)
         except OSError as error:
             self.store.report_failure(error)
@@ -82,14 +84,14 @@ class DerivedFiles:
                     weakref.finalize(self, _remove, self._spare, os.getpid())
                 self.folder = Path(self._spare)
             path, digest = self._compared(key, suffix, write)
-        about = {
+        metadata = {
             "step": step,
             "seconds": 0.0,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "file": path.name,
             "file_bytes": path.stat().st_size,
         }
-        self.store.put(key, digest, about)
+        self.store.put(key, digest, metadata)
         self._fresh[path] = _state(path)
         return path
 
@@ -106,6 +108,9 @@ class DerivedFiles:
         return path, _digest(path, "sha256" if secrets() else _FAST)
 
     def _written(self, key: str, suffix: str, write: Callable[[Path], None]) -> Path:
+        """Let ``write`` write a read-only file, which gets its name when it is complete; return
+        its path.
+        """
         path = self._path(key, suffix)
         make_folders(str(path.parent), str(self.store.root))
         temporary = path.with_name(f".{key}.{os.getpid()}{suffix}")
@@ -125,8 +130,9 @@ def _remove(folder: str, process: int) -> None:
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    about = path.stat()
-    return about.st_ino, about.st_size, about.st_mtime_ns
+    """Return what the system says of a file, which differs after each change of it."""
+    file_status = path.stat()
+    return file_status.st_ino, file_status.st_size, file_status.st_mtime_ns
 
 
 def _is_right(path: Path, stored_digest: Tensor) -> bool:

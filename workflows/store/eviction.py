@@ -51,24 +51,27 @@ def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
     """
     evictable = [c for c in candidates if c.size > 0]
     newest = max((c.used for c in evictable), default=0.0)
+    # the least valuable first
     evictable.sort(
         key=lambda c: (
+            # s saved for each byte, halved for each week without use; then age and key decide
             max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF),
             c.used,
             c.key,
         )
     )
-    going, freed = list[Candidate](), 0
+    to_evict, freed = list[Candidate](), 0
     for candidate in evictable:
         if freed >= excess:
             break
-        going.append(candidate)
+        to_evict.append(candidate)
         freed += candidate.size
-    for candidate in going[::-1]:
+    # the last values may be large enough to make earlier ones needless
+    for candidate in to_evict[::-1]:
         if freed - candidate.size >= excess:
-            going.remove(candidate)
+            to_evict.remove(candidate)
             freed -= candidate.size
-    return going
+    return to_evict
 
 
 def evict(
@@ -77,16 +80,20 @@ def evict(
     """Delete stored values until ``excess`` bytes are freed; return the deleted and the
     undeletable values.
     """
-    left, deleted, refused = {c.key: c for c in among}, list[Candidate](), list[Candidate]()
-    while excess > 0 and (batch := chosen(left.values(), excess)):
+    candidates_left, deleted, undeletable = (
+        {c.key: c for c in among},
+        list[Candidate](),
+        list[Candidate](),
+    )
+    while excess > 0 and (batch := chosen(candidates_left.values(), excess)):
         for candidate in batch:
-            del left[candidate.key]
+            del candidates_left[candidate.key]
             if dry or drop(disk, candidate.key):
                 deleted.append(candidate)
                 excess -= candidate.size
             else:
-                refused.append(candidate)
-    return deleted, refused
+                undeletable.append(candidate)
+    return deleted, undeletable
 
 
 class CacheBudget:
@@ -109,7 +116,9 @@ class CacheBudget:
         stored = total(self._disk)
         self._spare = self.budget / 20
         if stored > self.budget:
+            # more than the excess, so that the next writes fit without another eviction
             return stored - LOW * self.budget
+        # not beyond the budget
         self._spare = min(self._spare, self.budget - stored)
         return 0.0
 
@@ -129,16 +138,18 @@ def candidates(
     does not read saves no time.
     """
     sizes, changes = dict[str, int](), dict[str, float]()
+    # by name without the folder, because names of keys and bands are unique
     for path, size, changed in files(disk):
         sizes[os.path.basename(path)], changes[os.path.basename(path)] = size, changed
     values = [_stored_value(disk, key, sizes, read_seconds) for key in metadata.names(disk)]
     stored = [value for value in values if value is not None]
-    users = Counter(chain.from_iterable(value.bands for value in stored))
+    # how many values share each band
+    users_of_band = Counter(chain.from_iterable(value.bands for value in stored))
     for value in stored:
         record = f"{value.key}.json"
         if value.key not in pinned and record in changes:
-            bands = int(sum(sizes.get(name, 0) / users[name] for name in value.bands))
-            yield Candidate(value.key, value.size + bands, value.seconds, changes[record])
+            band_bytes = int(sum(sizes.get(name, 0) / users_of_band[name] for name in value.bands))
+            yield Candidate(value.key, value.size + band_bytes, value.seconds, changes[record])
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,19 +168,23 @@ def _stored_value(
     """Return what is known of a stored value, or None if its metadata are unreadable or a
     receipt.
     """
-    payload = sizes.get(f"{key}.safetensors", 0)
+    payload_bytes = sizes.get(f"{key}.safetensors", 0)
     try:
-        about = metadata.read(disk, key)
-        if not metadata.is_kept(about):
+        entry = metadata.read(disk, key)
+        if not metadata.is_kept(entry):
             return None
-        inline = sum(len(tensor[-1]) for tensor in about.get("tensors") or ())
-        derived = sizes.get(about.get("file") or "", 0)
-        saved = float(about.get("seconds") or 0.0) - read_seconds(float(about.get("bytes") or 0))
+        # the last of the four entries of a tensor is its bytes as text
+        inline_bytes = sum(len(tensor[-1]) for tensor in entry.get("tensors") or ())
+        derived_bytes = sizes.get(entry.get("file") or "", 0)
+        seconds = float(entry.get("seconds") or 0.0) - read_seconds(float(entry.get("bytes") or 0))
         return _StoredValue(
-            key, payload + inline + derived, saved, frozenset(metadata.bands(about))
+            key,
+            payload_bytes + inline_bytes + derived_bytes,
+            seconds,
+            frozenset(metadata.bands(entry)),
         )
     except NotRead:
-        return _StoredValue(key, payload + sizes.get(f"{key}.json", 0), 0.0, frozenset())
+        return _StoredValue(key, payload_bytes + sizes.get(f"{key}.json", 0), 0.0, frozenset())
     except UNREADABLE:
         return None
 
@@ -177,16 +192,19 @@ def _stored_value(
 def drop(disk: Disk, key: str) -> bool:
     """Delete a stored value but keep its metadata; return False if the value cannot be deleted."""
     try:
+        # so that nobody stores the value anew in between
         with disk.lock():
             try:
-                about = metadata.read(disk, key)
+                entry = metadata.read(disk, key)
             except NotRead:
-                about = {"payload": True}
+                # of another format: only its file of tensors is known
+                entry = {"payload": True}
                 disk.unlink(disk.path(key, "json"))
-            if metadata.is_kept(about):
-                if "key" in about:
-                    _write_receipt(disk, key, about)
-                _delete_files(disk, key, about)
+            if metadata.is_kept(entry):
+                # metadata that were read; others are deleted above
+                if "key" in entry:
+                    _write_receipt(disk, key, entry)
+                _delete_files(disk, key, entry)
     except FileNotFoundError:
         pass  # another process was first
     except UNREADABLE:
@@ -207,6 +225,9 @@ def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
 
 
 def _delete_files(disk: Disk, key: str, about: Metadata) -> None:
+    """Delete the file of tensors and the derived file of a value; its bands may have other
+    users.
+    """
     paths = [disk.path(key, "safetensors")] if about.get("payload") else []
     if name := about.get("file"):
         paths.append(f"{disk.folder}/files/{key[:2]}/{os.path.basename(name)}")
@@ -248,17 +269,18 @@ def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
     """
     if not os.path.isdir(disk.folder):
         return []
-    swept = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
-    for find in (_not_read, _payloads, bands, _files, _damaged):
-        swept += removed(disk, find, dry)
-    return swept
+    # temporary files of dead processes
+    swept_files = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
+    for find_orphans in (_not_read, _payloads, bands, _files, _damaged):
+        swept_files += removed(disk, find_orphans, dry)
+    return swept_files
 
 
 def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
     """Remove the files that ``find`` yields, or only list them if ``dry``; return the path and
     size of each file.
     """
-    deleted = []
+    paths_and_sizes = []
     with suppress(OSError):
         orphans = list(find(disk))  # without the lock; ``find`` decides again under the lock
         if dry or not orphans:
@@ -268,8 +290,8 @@ def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
                 with suppress(OSError):
                     size = entry.stat(follow_symlinks=False).st_size
                     disk.unlink(entry.path)
-                    deleted.append((entry.path, size))
-    return deleted
+                    paths_and_sizes.append((entry.path, size))
+    return paths_and_sizes
 
 
 def _not_read(disk: Disk) -> Iterator[os.DirEntry[str]]:
@@ -283,6 +305,7 @@ def _not_read(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def _is_not_read(disk: Disk, key: str) -> bool:
+    """Return True if the metadata of a result are of another format version or unsigned."""
     try:
         metadata.read(disk, key)
     except NotRead:
@@ -299,12 +322,13 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
         if suffix == "safetensors":
             with suppress(*UNREADABLE):
                 try:
-                    orphan = _HAS_PAYLOAD not in _raw(disk, key) and not metadata.read(
+                    # the search for the text is fast; only metadata without it are checked
+                    is_orphan = _HAS_PAYLOAD not in _raw(disk, key) and not metadata.read(
                         disk, key
                     ).get("payload")
                 except FileNotFoundError:
-                    orphan = True
-                if orphan:
+                    is_orphan = True
+                if is_orphan:
                     yield entry
 
 
@@ -314,18 +338,23 @@ def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
     The bands of results of another format version count as used.
     """
-    files, needed = list(below(f"{disk.folder}/bands")), set[str]()
-    for key in metadata.names(disk) if files else ():
+    band_entries, needed_names = list(below(f"{disk.folder}/bands")), set[str]()
+    for key in metadata.names(disk) if band_entries else ():
         try:
-            raw = _raw(disk, key)
-            if _HAS_BANDS in raw:
-                about = json.loads(checked_body(raw)[0] + b"}")
-                needed.update(about["bands"]["names"] if are_bands(about["bands"]["names"]) else ())
+            metadata_bytes = _raw(disk, key)
+            if _HAS_BANDS in metadata_bytes:
+                # the body ends before its checksum and lacks the bracket
+                entry_fields = json.loads(checked_body(metadata_bytes)[0] + b"}")
+                needed_names.update(
+                    entry_fields["bands"]["names"]
+                    if are_bands(entry_fields["bands"]["names"])
+                    else ()
+                )
         except PermissionError:
             return
         except UNREADABLE:
             continue
-    yield from (entry for entry in files if entry.name not in needed)
+    yield from (entry for entry in band_entries if entry.name not in needed_names)
 
 
 def _raw(disk: Disk, key: str) -> bytes:
@@ -342,13 +371,14 @@ def _files(disk: Disk) -> Iterator[os.DirEntry[str]]:
     """
     for entry in below(f"{disk.folder}/files"):
         try:
-            needed = (
+            is_needed = (
                 not entry.name.startswith(".")
+                # the name begins with the key of its result
                 and metadata.read(disk, entry.name[:32]).get("file") == entry.name
             )
         except UNREADABLE:
-            needed = False
-        if not needed and _age(entry) > OLD:
+            is_needed = False
+        if not is_needed and _age(entry) > OLD:
             yield entry
 
 
@@ -359,6 +389,7 @@ def _damaged(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def _age(entry: os.DirEntry[str]) -> float:
+    """Return the time (s) since a file was changed, moved or renamed."""
     stat = entry.stat(follow_symlinks=False)
     return time.time() - max(stat.st_mtime, stat.st_ctime)
 
@@ -420,17 +451,28 @@ class Maintained(Protocol):
         A ``budget`` of None means the budget of the store.
         """
         budget = self.budget if budget is None else budget
-        before = total(self.disk)
+        bytes_before = total(self.disk)
         orphans = dict(sweep(self.disk, dry))
-        outside = _outside_budget(orphans, self.disk.folder)
-        left = before - (sum(orphans.values()) - outside)
-        deleted, refused = self.make_room(left - budget, dry) if budget is not None else ([], [])
-        after = left - sum(c.size for c in deleted) if dry or not deleted else total(self.disk)
+        uncounted_bytes = _outside_budget(orphans, self.disk.folder)
+        bytes_after_sweep = bytes_before - (sum(orphans.values()) - uncounted_bytes)
+        deleted, refused = (
+            self.make_room(bytes_after_sweep - budget, dry) if budget is not None else ([], [])
+        )
+        # a dry run can only predict; bands of deleted values are counted from the files
+        bytes_after = (
+            bytes_after_sweep - sum(c.size for c in deleted)
+            if dry or not deleted
+            else total(self.disk)
+        )
         if not dry:
             self.journal.compact()
-        freed = max(before - after, 0) + outside
+        freed = max(bytes_before - bytes_after, 0) + uncounted_bytes
         return Swept(
-            tuple(c.key for c in deleted), tuple(c.key for c in refused), freed, len(orphans), after
+            tuple(c.key for c in deleted),
+            tuple(c.key for c in refused),
+            freed,
+            len(orphans),
+            bytes_after,
         )
 
     def make_room(
@@ -460,11 +502,11 @@ class Maintained(Protocol):
         The mode ``verify`` of the store has no effect on this check.
         """
         for key in metadata.names(self.disk):
-            about, problem = None, ""
+            entry, problem = None, ""
             try:
-                about = metadata.read(self.disk, key)
-                if is_kept(about):
-                    self.load(about, "always", None)
+                entry = metadata.read(self.disk, key)
+                if is_kept(entry):
+                    self.load(entry, "always", None)
             except NotRead as error:
                 self.leave(error)
                 continue
@@ -473,7 +515,7 @@ class Maintained(Protocol):
                     continue  # another process evicted the value meanwhile
                 self.put_aside(key, error)
                 problem = str(error) or type(error).__name__
-            yield Checked(key, about, problem)
+            yield Checked(key, entry, problem)
 
     def pin(self, key: str) -> None:
         """Protect the stored value of ``key`` from eviction. Raises `OSError` if the folder

@@ -56,6 +56,7 @@ class Journal:
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._rows: list[Row] = []
+        # True where the file cannot be written: the rows are in memory alone
         self._fileless = False
         self._forget()
 
@@ -96,6 +97,7 @@ class Journal:
         """
         newest = dict[bytes, tuple[int, bool]]()
         with suppress(OSError), open(self._path, "rb", opener=_opened) as file:
+            # a later line of a key replaces an earlier one
             for key, size, mark in _TOTALS.findall(file.read()):
                 newest[key] = int(size or 0), mark == b"true"
         sizes = [size for size, has_value in newest.values() if has_value]
@@ -126,38 +128,44 @@ class Journal:
         Lines are copied as they are, so that a long journal needs little memory.
         """
         with self._guard:
-            newest = self._newest_lines()
-            place = {key: i for i, key in enumerate(newest)}
+            newest_lines = self._newest_lines()
+            position = {key: i for i, key in enumerate(newest_lines)}
+            # position in the old file (-1 for results without a line), date, and the line
             lines = list[tuple[int, str, bytes]]()
             for key in metadata.names(self._disk):
                 with suppress(*metadata.UNREADABLE):
                     has_value = NO_VALUE not in read_file(self._disk.path(key, "json"))
-                    lines.append((place.get(key, -1), *self._line(key, newest.get(key), has_value)))
-            for key, about in self._others():
-                raw = newest.get(key) or seal_record("journal", row_of(key, about))
-                lines.append((place.get(key, -1), str(about.get("date")), raw))
+                    lines.append(
+                        (position.get(key, -1), *self._line(key, newest_lines.get(key), has_value))
+                    )
+            for key, entry in self._others():
+                line_bytes = newest_lines.get(key) or seal_record("journal", row_of(key, entry))
+                lines.append((position.get(key, -1), str(entry.get("date")), line_bytes))
             lines.sort(key=lambda line: line[:2])
             self._forget()
-            self._replace_lines([raw for _, _, raw in lines])
+            self._replace_lines([line_bytes for _, _, line_bytes in lines])
             if self._fileless:
-                self._rows = list(_parsed(b"\n".join(raw for _, _, raw in lines)))
+                self._rows = list(_parsed(b"\n".join(line_bytes for _, _, line_bytes in lines)))
             else:
                 self._forget()  # the next query reads the file
 
     def _newest_lines(self) -> dict[str, bytes]:
         """Return the newest undamaged line of each key, the newest last."""
-        newest = dict[str, bytes]()
+        line_of_key = dict[str, bytes]()
         with suppress(OSError), open(self._path, "rb", opener=_opened) as file:
+            # without the first line, which is the head
             for line in itertools.islice(file, 1, None):
                 key = line[_KEY].decode(errors="replace")
                 if line.startswith(_START) and any(_parsed(line := line.rstrip(b"\n"))):
-                    newest.pop(key, None)
-                    newest[key] = line
-        return newest
+                    # so that the key moves to the end
+                    line_of_key.pop(key, None)
+                    line_of_key[key] = line
+        return line_of_key
 
     def _line(self, key: str, line: bytes | None, has_value: bool) -> tuple[str, bytes]:
         """Return the date and the line of a result, which is ``line`` if that is right."""
         if line is not None and has_value == (NO_VALUE not in line):
+            # lines with a position need no date
             return "", line
         row = (
             row_of(key, metadata.read(self._disk, key))
@@ -167,10 +175,15 @@ class Journal:
         return str(row["date"]), seal_record("journal", {**row, "kept": has_value})
 
     def _forget(self) -> None:
+        """Forget what was read, so that the next call reads the file from its beginning."""
         self._rows = []
+        # first line, bytes read so far, no file, all lines were read
         self._head, self._offset, self._fileless, self._whole = b"", 0, False, True
 
     def _read(self, all_lines: bool = True) -> None:
+        """Read the lines that are new in the file; all of it where only its end was read before
+        and ``all_lines`` are asked for.
+        """
         with self._guard:
             if all_lines and not self._whole:
                 self._forget()
@@ -186,19 +199,20 @@ class Journal:
         try:
             with open(self._path, "rb", opener=_opened) as file:
                 head = file.readline(100).strip()
+                # another process has written the file anew
                 if head != self._head or os.fstat(file.fileno()).st_size < self._offset:
                     self._forget()
                 start = self._offset or self._first_byte(file, len(head), all_lines)
                 file.seek(start)
-                raw = file.read()
+                new_bytes = file.read()
         except FileNotFoundError:
             return self._rebuild()
         except OSError:
             return
         if not _HEAD.fullmatch(head):
             return self._rebuild()
-        self._head, self._offset = head, start + len(raw)
-        self._rows += _parsed(raw)
+        self._head, self._offset = head, start + len(new_bytes)
+        self._rows += _parsed(new_bytes)
         if self._whole and len(self._rows) > _SPARE:
             self._drop_old_rows()
 
@@ -217,6 +231,7 @@ class Journal:
             return head
         self._whole = False
         file.seek(size - _LATEST)
+        # the rest of a line that began before
         file.readline(_LATEST)
         return file.tell()
 
@@ -224,7 +239,8 @@ class Journal:
         return itertools.chain(metadata.each(self._disk), self._others())
 
     def _rebuild(self) -> None:
-        rows = [row_of(key, about) for key, about in self._each()]
+        """Write the journal anew from the metadata of all results, in the order of their dates."""
+        rows = [row_of(key, entry) for key, entry in self._each()]
         self._replace(sorted(rows, key=lambda row: str(row["date"])))
 
     def _replace(self, rows: list[Row]) -> None:
@@ -236,12 +252,15 @@ class Journal:
         self._rows = rows
 
     def _replace_lines(self, lines: list[bytes]) -> None:
+        """Write the file of the journal from lines, with a new head that tells other processes;
+        where it cannot be written, the rows stay in memory alone.
+        """
         self._head = f'{{"journal":"{os.urandom(8).hex()}","format":{FORMAT}}}'.encode()
-        raw = b"\n".join([self._head, *lines])
-        self._offset = len(raw)
+        content = b"\n".join([self._head, *lines])
+        self._offset = len(content)
         try:
             if lines:
-                self._disk.replace("journal.jsonl", raw)
+                self._disk.replace("journal.jsonl", content)
         except OSError:
             self._fileless = True
 
@@ -257,6 +276,7 @@ def _parsed(raw: bytes) -> Iterator[Row]:
 
 
 def _is_row(row: Row) -> bool:
+    """Return True for a line with all fields, each of its type."""
     if not row.keys() >= _NAMES:
         return False
     key, node = row["key"], row["node"]

@@ -82,14 +82,17 @@ class Leases:
             return Lease()
 
     def _claimed(self, key: str, path: str) -> Lease | None:
+        """Take the lease at ``path``, or take it over from a dead owner; None while its owner
+        lives.
+        """
         try:
             return self._taken(path)
         except FileExistsError:
-            look = _look(path)
-        if look is not None and not self._dead(path, look):
+            lease_state = _look(path)
+        if lease_state is not None and not self._dead(path, lease_state):
             return None
         try:
-            return self._taken_over(key, path, look)
+            return self._taken_over(key, path, lease_state)
         except FileExistsError:
             return None
 
@@ -100,6 +103,7 @@ class Leases:
         with _guard:
             try:
                 os.link(_badge(self._disk), path)
+            # the folder of leases, or the badge in it, was removed
             except FileNotFoundError:
                 _badges.pop(self._disk.folder, None)
                 self._disk.forget()
@@ -113,14 +117,15 @@ class Leases:
         """
         temporary = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
         with self._disk.lock():
-            now = _look(path)
-            if now is not None and (look is None or now[:2] != look[:2]):
+            state_now = _look(path)
+            # another content or inode: somebody else took it since the look
+            if state_now is not None and (look is None or state_now[:2] != look[:2]):
                 raise FileExistsError(path)
             with _guard:
                 # fails for the later of two observers
-                os.link(_badge(self._disk), path if now is None else temporary)
+                os.link(_badge(self._disk), path if state_now is None else temporary)
             try:
-                if now is not None:
+                if state_now is not None:
                     os.replace(temporary, path)
             finally:
                 with suppress(OSError):
@@ -129,6 +134,7 @@ class Leases:
         return self._kept(path)
 
     def _kept(self, path: str) -> Lease:
+        """Hold a lease that was taken, and start the heartbeat if none runs."""
         global _thread
         lease = Lease(path)
         self._seen.pop(path, None)
@@ -140,14 +146,20 @@ class Leases:
         return lease
 
     def _dead(self, path: str, look: tuple[object, ...]) -> bool:
+        """Return True if the owner of a lease has ended.
+
+        An owner on another machine is dead if its lease did not change for `WINDOW` seconds
+        between two looks of this process.
+        """
+        # the first word of a lease names its owner
         owner = owner_of(str(look[0]).partition(" ")[0])
         state = owner.state if owner else "foreign"
         if state != "foreign":
             return state == "dead"
-        now = time.monotonic()
-        before, since = self._seen.get(path, (None, now))
-        self._seen[path] = (look, since if before == look else now)
-        return before == look and now - since > WINDOW
+        present_time = time.monotonic()
+        state_before, unchanged_since = self._seen.get(path, (None, present_time))
+        self._seen[path] = (look, unchanged_since if state_before == look else present_time)
+        return state_before == look and present_time - unchanged_since > WINDOW
 
 
 def _look(path: str) -> tuple[object, ...] | None:
@@ -156,12 +168,15 @@ def _look(path: str) -> tuple[object, ...] | None:
     """
     try:
         with open(path, "rb", opener=open_now) as file:
-            stat, text = os.fstat(file.fileno()), file.readline(200).decode(errors="replace")
+            file_status, content = (
+                os.fstat(file.fileno()),
+                file.readline(200).decode(errors="replace"),
+            )
     except FileNotFoundError:
         return None
     except OSError:
-        stat, text = os.stat(path), ""
-    return text, stat.st_ino, stat.st_size, stat.st_mtime_ns
+        file_status, content = os.stat(path), ""
+    return content, file_status.st_ino, file_status.st_size, file_status.st_mtime_ns
 
 
 def _badge(disk: Disk) -> str:
@@ -171,6 +186,7 @@ def _badge(disk: Disk) -> str:
     if disk.folder not in _badges:
         disk.prepare()
         path = f"{disk.folder}/tmp/badge.{me()}"
+        # of an earlier process with this number
         with suppress(FileNotFoundError):
             os.unlink(path)
         with open(path, "xb") as file:

@@ -42,54 +42,62 @@ def checked_layout(layout: Any) -> dict[str, str]:
     any other mistake.
     """
     bands: dict[str, str] = {}
-    todo: list[tuple[Any, int]] = [(layout, 0)]
-    while todo:
-        item, depth = todo.pop()
+    layouts_left: list[tuple[Any, int]] = [(layout, 0)]
+    while layouts_left:
+        item, depth = layouts_left.pop()
         if not isinstance(item, dict) or depth > DEEPEST:
             raise ValueError("the layout of the value is not a tree of mappings, or is too deep")
         kinds = [kind for kind in _KINDS if kind in item]
+        # a class has its items beside its name, any other kind nothing
         if len(kinds) != 1 or len(item) != 1 + ("class" in item):
             raise OtherFormat(
                 f"its layout has a kind that is not known: {', '.join(map(str, item))[:80]}"
             )
-        todo += [(inner, depth + 1) for inner in _inner(kinds[0], item, bands)]
+        layouts_left += [
+            (inner_layout, depth + 1) for inner_layout in _inner(kinds[0], item, bands)
+        ]
     return bands
 
 
 def _inner(kind: str, item: dict[str, Any], bands: dict[str, str]) -> Iterable[Any]:
     """Check one level of a layout, add its bands to ``bands``, and return the layouts in it."""
-    body = item[kind]
+    content = item[kind]
     if kind in ("tensor", "bytes"):
-        _expect(is_count(body), kind)
+        _expect(is_count(content), kind)
         return ()
+    # a number or text that needs no tensor
     if kind == "value":
-        _expect(body is None or isinstance(body, bool | int | float | str), kind)
+        _expect(content is None or isinstance(content, bool | int | float | str), kind)
         return ()
     if kind == "stacked":
-        bands |= _stacked(body)
+        bands |= _stacked(content)
         return ()
     if kind == "dict":
-        _expect(isinstance(body, dict), kind)
-        return list(body.values())
-    items = item.get("items") if kind == "class" else body
-    _expect(isinstance(items, list) and (kind != "class" or isinstance(body, str)), kind)
+        _expect(isinstance(content, dict), kind)
+        return list(content.values())
+    items = item.get("items") if kind == "class" else content
+    _expect(isinstance(items, list) and (kind != "class" or isinstance(content, str)), kind)
     assert isinstance(items, list)
     return items
 
 
 def _stacked(body: Any) -> dict[str, str]:
+    """Check the part of a layout for a tensor that is stored by bands; return the checksum of
+    each band by name.
+    """
     _expect(
         isinstance(body, dict) and body.keys() == {"names", "xxh3", "dtype", "shape"}, "stacked"
     )
-    names, sums, shape = body["names"], body["xxh3"], body["shape"]
+    names, checksums, shape = body["names"], body["xxh3"], body["shape"]
     _expect(
         isinstance(body["dtype"], str) and is_shape(shape) and isinstance(names, list), "stacked"
     )
-    if bad := [name for name in names if not is_band(name)]:
-        raise ValueError(f"{str(bad[0])[:60]!r} is not the name of a band file")
-    _expect(isinstance(sums, list) and all(map(is_checksum, sums)), "stacked")
-    _expect(shape[:1] == [len(names)] and len(sums) == len(names), "stacked")
-    return dict(zip(names, sums, strict=True))
+    if wrong_names := [name for name in names if not is_band(name)]:
+        raise ValueError(f"{str(wrong_names[0])[:60]!r} is not the name of a band file")
+    _expect(isinstance(checksums, list) and all(map(is_checksum, checksums)), "stacked")
+    # one band for each index of the first axis
+    _expect(shape[:1] == [len(names)] and len(checksums) == len(names), "stacked")
+    return dict(zip(names, checksums, strict=True))
 
 
 def is_count(value: Any) -> bool:
@@ -154,6 +162,9 @@ def is_number(value: Any) -> bool:
 
 
 def _is_payload(value: Any) -> bool:
+    """Return True for what the metadata say of a file of tensors: size and digests, and the
+    stamp of the file.
+    """
     is_payload = (
         isinstance(value, dict) and is_count(value.get("size")) and is_checksum(value.get("xxh3"))
     )
@@ -168,6 +179,9 @@ def _is_inline(value: Any) -> bool:
 
 
 def _is_tensor(value: Any) -> bool:
+    """Return True for a tensor in the metadata: type, shape, whether it is complex, and its
+    bytes as text.
+    """
     if not isinstance(value, list) or len(value) != 4:
         return False
     kind, shape, is_complex, text = value
@@ -247,20 +261,23 @@ def checked_fields(about: dict[str, Any], key: str) -> dict[str, Any]:
     Raises `OtherFormat` for a layout of an unknown kind, and `ValueError` for any other field that
     cannot be right.
     """
-    if (own := about.get("key")) != key:
-        raise ValueError(f"the metadata of {key} belong to the key {own if is_text(own) else '?'}")
+    if (stated_key := about.get("key")) != key:
+        raise ValueError(
+            f"the metadata of {key} belong to the key {stated_key if is_text(stated_key) else '?'}"
+        )
     for name, is_right in FIELDS.items():
         value = about.get(name)
         if value is not None and not is_right(value):
             raise ValueError(
                 f"the field {name} of the metadata is not what was written: {str(value)[:60]!r}"
             )
+    # a value: all files of its layout must be named
     if about.get("kept", True):
-        named, bands = (
+        bands_of_layout, listed_bands = (
             checked_layout(about.get("layout")),
             (about.get("bands") or {}).get("names", []),
         )
-        if named.keys() != set(bands) or "payload" not in about:
+        if bands_of_layout.keys() != set(listed_bands) or "payload" not in about:
             raise ValueError(
                 "the metadata do not name the files that the layout of the value needs"
             )
@@ -314,10 +331,11 @@ def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
     with disk.temporary(key) as (temporary, file):
         file.write(seal_record("result", about))
         file.flush()  # without a sync to disk, because torn metadata fail their checksum
-        linked = disk.link(temporary, path)
-        if over and not linked:
+        # fails where the file exists
+        is_new = disk.link(temporary, path)
+        if over and not is_new:
             disk.rename(temporary, path)
-    return over or linked
+    return over or is_new
 
 
 def _read_whole(disk: Disk, key: str) -> Metadata:
@@ -326,18 +344,20 @@ def _read_whole(disk: Disk, key: str) -> Metadata:
 
     Raises an error in `UNREADABLE` if a file is missing or damaged.
     """
-    about = read(disk, key)
-    payload = about.get("payload")
+    entry = read(disk, key)
+    payload_entry = entry.get("payload")
     try:
-        size = os.stat(disk.path(key, "safetensors")).st_size if payload else 0
+        file_size = os.stat(disk.path(key, "safetensors")).st_size if payload_entry else 0
     except FileNotFoundError:
-        about = read(disk, key)
-        if is_kept(about):
+        entry = read(disk, key)
+        if is_kept(entry):
             raise
-        return about  # the value was evicted between the two reads
-    if payload and size != payload["size"]:
-        raise ValueError(f"the file of tensors has {size} bytes instead of {payload['size']} bytes")
-    return about
+        return entry  # the value was evicted between the two reads
+    if payload_entry and file_size != payload_entry["size"]:
+        raise ValueError(
+            f"the file of tensors has {file_size} bytes instead of {payload_entry['size']} bytes"
+        )
+    return entry
 
 
 def find(disk: Disk, key: str) -> Metadata | None:
@@ -347,6 +367,7 @@ def find(disk: Disk, key: str) -> Metadata | None:
     Damaged metadata are read a second time before the result counts as damaged, because another
     process may be renaming the file at that moment.
     """
+    # the second reading decides
     for _ in range(2):
         try:
             return _read_whole(disk, key)
@@ -406,9 +427,12 @@ def names(disk: Disk) -> Iterator[str]:
 
 
 def _folders(disk: Disk) -> list[os.DirEntry[str]]:
-    matching = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
+    """Return the folders of a store that hold results, whose names are two hexadecimal digits,
+    in order.
+    """
+    named_folders = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
     return sorted(
-        (entry for entry in matching if entry.is_dir(follow_symlinks=False)),
+        (entry for entry in named_folders if entry.is_dir(follow_symlinks=False)),
         key=lambda entry: entry.name,
     )
 

@@ -44,12 +44,20 @@ def described(
     Small tensors are part of the metadata.
     """
     layout, tensors = lazy.serialization.pack(value, blobs)
-    size = inline = sum(t.nbytes for t in tensors)
+    value_bytes = tensor_bytes = sum(t.nbytes for t in tensors)
     bands = checked_layout(layout)
+    # packed bands are not among the tensors; who computed the value knows its size
     if bands:
-        size = max(inline, about.get("bytes") or 0)
-    entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
-    if inline <= INLINE:
+        value_bytes = max(tensor_bytes, about.get("bytes") or 0)
+    entry = {
+        "key": key,
+        **about,
+        "layout": layout,
+        "bytes": value_bytes,
+        "payload": None,
+        "kept": True,
+    }
+    if tensor_bytes <= INLINE:
         entry["tensors"], tensors = [lazy.serialization.to_text(t) for t in tensors], []
     return entry, tensors, bands
 
@@ -58,10 +66,12 @@ def written(file: IO[bytes], tensors: list[Tensor]) -> Metadata:
     """Write tensors to a new file and to the disk; return the size and the digests of the file."""
     sha256 = hashlib.sha256() if secrets() else None
     write = lazy.serialization.write
-    xxh3 = write(file, tensors, sha256) if sha256 else write(file, tensors)
+    checksum = write(file, tensors, sha256) if sha256 else write(file, tensors)
     file.flush()
     os.fsync(file.fileno())
-    return {"size": file.tell(), "xxh3": xxh3} | ({"sha256": sha256.hexdigest()} if sha256 else {})
+    return {"size": file.tell(), "xxh3": checksum} | (
+        {"sha256": sha256.hexdigest()} if sha256 else {}
+    )
 
 
 def load(
@@ -75,13 +85,19 @@ def load(
     Raises one of the errors in `UNREADABLE` if the value is missing or damaged.
     """
     bands = about.get("bands")
-    check = verify == "always" or (verify == "sampled" and _draw.random() < _SAMPLED)
-    tensors, compared = [lazy.serialization.from_text(*t) for t in about.get("tensors") or ()], 0
+    compares = verify == "always" or (verify == "sampled" and _draw.random() < _SAMPLED)
+    tensors, bytes_compared = (
+        [lazy.serialization.from_text(*t) for t in about.get("tensors") or ()],
+        0,
+    )
     if about["payload"]:
-        tensors, compared = _tensors_of_file(disk, about, verify, check)
-    if bands and verify == "sampled" and not check:
-        check = newest(blobs, bands["names"]) > bands["newest"]
-    return lazy.serialization.unpack(about["layout"], tensors, blobs, check, typed), compared
+        tensors, bytes_compared = _tensors_of_file(disk, about, verify, compares)
+    # a band file that was touched since the value was written
+    if bands and verify == "sampled" and not compares:
+        compares = newest(blobs, bands["names"]) > bands["newest"]
+    return lazy.serialization.unpack(
+        about["layout"], tensors, blobs, compares, typed
+    ), bytes_compared
 
 
 def _tensors_of_file(
@@ -91,16 +107,17 @@ def _tensors_of_file(
     checksum: all if ``check``, or if the file is not the one that was written.
     """
     payload, path = about["payload"], disk.path(about["key"], "safetensors")
-    stamp = stamp_of(path)
-    if stamp[1] != payload["size"]:
+    file_stamp = stamp_of(path)
+    # the second number of a stamp is the size
+    if file_stamp[1] != payload["size"]:
         raise ValueError(
-            f"the file of tensors has {stamp[1]} bytes instead of {payload['size']} bytes"
+            f"the file of tensors has {file_stamp[1]} bytes instead of {payload['size']} bytes"
         )
-    due = check or (verify == "sampled" and stamp != payload.get("stamp"))
+    is_compared = check or (verify == "sampled" and file_stamp != payload.get("stamp"))
     # whatever ``verify`` says: the checksum has no key
     sha256 = payload.get("sha256", "") if secrets() else None
-    tensors = lazy.serialization.read(path, payload["xxh3"] if due else None, sha256)
-    return tensors, payload["size"] if due else 0
+    tensors = lazy.serialization.read(path, payload["xxh3"] if is_compared else None, sha256)
+    return tensors, payload["size"] if is_compared else 0
 
 
 def check_kind(value: Any, kind: Any) -> None:
@@ -115,10 +132,15 @@ def stamp_of(path: str) -> list[int]:
 
     Raises `ValueError` for what is no file, such as a pipe.
     """
-    about = os.stat(path)
-    if not stat.S_ISREG(about.st_mode):
+    file_status = os.stat(path)
+    if not stat.S_ISREG(file_status.st_mode):
         raise ValueError(f"{path} is not a file")
-    return [about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns]
+    return [
+        file_status.st_ino,
+        file_status.st_size,
+        file_status.st_mtime_ns,
+        file_status.st_ctime_ns,
+    ]
 
 
 def newest(blobs: Blobs, names: Iterable[str]) -> int:
@@ -140,6 +162,7 @@ class Receipts:
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
+        # stamp of the file, and its metadata
         self._read: dict[str, tuple[list[int], Metadata]] = {}
 
     def find(self, key: str) -> Metadata | None:
@@ -148,16 +171,16 @@ class Receipts:
         Raises an error in `UNREADABLE` for damaged metadata.
         """
         try:
-            stamp = stamp_of(self._disk.path(key, "json"))
+            file_stamp = stamp_of(self._disk.path(key, "json"))
         except (OSError, ValueError):
             # which tells what is wrong with the file, or that there is none
             return metadata.find(self._disk, key)
-        if key in self._read and self._read[key][0] == stamp:
+        if key in self._read and self._read[key][0] == file_stamp:
             return self._read[key][1]
-        about = metadata.find(self._disk, key)
-        if about is not None and not is_kept(about):
-            self._read[key] = stamp, about
-        return about
+        entry = metadata.find(self._disk, key)
+        if entry is not None and not is_kept(entry):
+            self._read[key] = file_stamp, entry
+        return entry
 
 
 # --- small results --------------------------------------------------------------------------------
@@ -181,9 +204,10 @@ class SmallResults:
     def __init__(self, disk: Disk) -> None:
         self._disk, self._guard = disk, threading.Lock()
         self._path = f"{disk.folder}/brief.jsonl"
-        self._lines: dict[str, bytes] = {}
+        self._lines: dict[str, bytes] = {}  # newest line of each key
         # lines that were read, with their metadata
         self._read: dict[str, tuple[bytes, Metadata]] = {}
+        # inode of the file, and bytes read of it so far
         self._file, self._offset = 0, 0
 
     def find(self, key: str) -> Metadata | None:
@@ -193,9 +217,10 @@ class SmallResults:
         if key not in self._lines:
             self._read_new_lines()
         with suppress(*UNREADABLE):  # also a KeyError if the key has no line
-            raw = self._lines[key]
-            if key not in self._read or self._read[key][0] is not raw:
-                self._read[key] = raw, metadata.unseal_of("small result", key, raw)
+            line = self._lines[key]
+            # a newer line is another object
+            if key not in self._read or self._read[key][0] is not line:
+                self._read[key] = line, metadata.unseal_of("small result", key, line)
             return self._read[key][1]
         return None
 
@@ -204,21 +229,21 @@ class SmallResults:
 
         Raises `OSError` if the line cannot be written.
         """
-        raw = seal_record("small result", about)
+        line = seal_record("small result", about)
         try:
-            self._write(raw)
+            self._write(line)
         except (FileNotFoundError, IsADirectoryError):
             self._disk.prepare()
             if os.path.isdir(self._path):
                 self._disk.put_aside(self._path)
-            self._write(raw, os.O_CREAT)
+            self._write(line, os.O_CREAT)
             self._disk.share(self._path)
 
     def each(self) -> Iterator[tuple[str, Metadata]]:
         """Yield the key and the newest metadata of every small result."""
         for key in sorted(self.keys()):
-            if (about := self.find(key)) is not None:
-                yield key, about
+            if (entry := self.find(key)) is not None:
+                yield key, entry
 
     def keys(self) -> set[str]:
         """Return the keys of all small results, some of which may be damaged."""
@@ -232,15 +257,15 @@ class SmallResults:
         The new file has at most half of `MOST` bytes.
         """
         self._read_new_lines()
-        newest_lines, size = list[bytes](), 0
-        for raw in reversed(self._lines.values()):
-            size += len(raw) + 1
-            if size > MOST // 2:
+        newest_lines, total_bytes = list[bytes](), 0
+        for line in reversed(self._lines.values()):
+            total_bytes += len(line) + 1
+            if total_bytes > MOST // 2:
                 break
-            newest_lines.append(raw)
+            newest_lines.append(line)
         with suppress(OSError):
             self._disk.replace(
-                "brief.jsonl", b"".join(b"\n" + raw for raw in reversed(newest_lines))
+                "brief.jsonl", b"".join(b"\n" + line for line in reversed(newest_lines))
             )
 
     def _write(self, raw: bytes, flags: int = 0) -> None:
@@ -271,13 +296,20 @@ class SmallResults:
         if not S_ISREG(stat.st_mode):
             return
         with self._guard, suppress(OSError), open(self._path, "rb", opener=open_now) as file:
+            # the file was written anew
             if stat.st_ino != self._file or stat.st_size < self._offset:
                 self._lines, self._offset = {}, 0
             file.seek(self._offset)
-            raw = file.read()
-            end = raw.rfind(b"\n") if not raw.endswith(b"}") else len(raw)
-            for line in raw[:end].split(b"\n"):
+            new_bytes = file.read()
+            # a last line without its bracket is still being written
+            end_of_lines = (
+                new_bytes.rfind(b"\n") if not new_bytes.endswith(b"}") else len(new_bytes)
+            )
+            for line in new_bytes[:end_of_lines].split(b"\n"):
                 self._add(line)
-            self._file, self._offset = os.fstat(file.fileno()).st_ino, self._offset + max(0, end)
+            self._file, self._offset = (
+                os.fstat(file.fileno()).st_ino,
+                self._offset + max(0, end_of_lines),
+            )
         if self._offset > MOST:
             self.compact()

@@ -161,17 +161,21 @@ class RemoteFiles:
     def __init__(self, url: str) -> None:
         self.url = url
         self._fs, self._root = _file_system(url)
-        kinds = (
+        protocols = (
             {self._fs.protocol} if isinstance(self._fs.protocol, str) else set(self._fs.protocol)
         )
-        self._renames, near = bool(kinds & _RENAMES), bool(kinds & _NEAR)
-        self._latency = dict.fromkeys(_DIRECTIONS, 5e-4 if near else 0.05)
-        self._rate = dict.fromkeys(_DIRECTIONS, 4e8 if near else 5e7)
+        self._renames, is_near = bool(protocols & _RENAMES), bool(protocols & _NEAR)
+        # s for each transfer, and bytes / s: guesses until transfers are measured
+        self._latency = dict.fromkeys(_DIRECTIONS, 5e-4 if is_near else 0.05)
+        self._rate = dict.fromkeys(_DIRECTIONS, 4e8 if is_near else 5e7)
+        # time before which the URL is not used in a direction
         self._resume = dict.fromkeys(_DIRECTIONS, 0.0)
+        # s of the next pause after a failure
         self._pause = dict.fromkeys(_DIRECTIONS, _PAUSE)
         self._warned = False
+        # by folder: time of the listing (s), and names
         self._listed: dict[str, tuple[float, set[str]]] = {}
-        self._made: set[str] = set()
+        self._made: set[str] = set()  # folders that exist at the URL
         self._lock = threading.Lock()
 
     def seconds(self, direction: Direction, size: float) -> float:
@@ -186,8 +190,9 @@ class RemoteFiles:
         """
         with self._lock:
             if not self._fresh(name[:2]):
-                few = sum(map(self._fresh, self._listed)) < _FEW
-                self._list_folders([name[:2]] if few else _FOLDERS)
+                # with few fresh listings, one folder; then all at once, in parallel
+                lists_one = sum(map(self._fresh, self._listed)) < _FEW
+                self._list_folders([name[:2]] if lists_one else _FOLDERS)
             return name in self._listed[name[:2]][1]
 
     def names(self) -> set[str]:
@@ -220,6 +225,7 @@ class RemoteFiles:
             except FileNotFoundError:
                 if os.path.exists(path):
                     raise
+                # the local file was evicted meanwhile: nothing is sent
                 return -1
             return os.path.getsize(path)
 
@@ -242,8 +248,9 @@ class RemoteFiles:
                 self._fs.pipe_file(to, raw)
             return len(raw)
 
-        looks = not over and self._renames
-        exists = looks and self._attempt("down", lambda: self._fs.exists(self._path(name)))
+        # where files are renamed, the file system itself would replace an existing one
+        must_look = not over and self._renames
+        exists = must_look and self._attempt("down", lambda: self._fs.exists(self._path(name)))
         return bool(exists) or self._write(name, pipe)
 
     def warn(self, text: str) -> None:
@@ -256,21 +263,23 @@ class RemoteFiles:
         return f"{self._root}/{name[:2]}/{name}"
 
     def _fresh(self, folder: str) -> bool:
+        """Return True if a folder was listed within the last `_FRESH` seconds."""
         return folder in self._listed and time.monotonic() - self._listed[folder][0] < _FRESH
 
     def _list_folders(self, folders: Sequence[str]) -> None:
         """List the files of ``folders`` at the URL in parallel; skip a folder that was listed a
         few seconds ago.
         """
-        old = [folder for folder in folders if not self._fresh(folder)]
+        outdated = [folder for folder in folders if not self._fresh(folder)]
         with suppress(AttributeError):
             self._fs.invalidate_cache()
-        now = time.monotonic()
-        with ThreadPoolExecutor(min(16, max(1, len(old)))) as pool:
-            for folder, names in zip(old, pool.map(self._listing, old), strict=True):
-                self._listed[folder] = (now, names)
+        present_time = time.monotonic()
+        with ThreadPoolExecutor(min(16, max(1, len(outdated)))) as pool:
+            for folder, names in zip(outdated, pool.map(self._listing, outdated), strict=True):
+                self._listed[folder] = (present_time, names)
 
     def _listing(self, folder: str) -> set[str]:
+        """Return the names of the files in a folder at the URL; none if it cannot be listed."""
         paths = self._attempt("down", lambda: self._fs.ls(f"{self._root}/{folder}", detail=False))
         return {str(path).rpartition("/")[2] for path in paths or ()}
 
@@ -285,6 +294,7 @@ class RemoteFiles:
             temporary = f"{self._root}/tmp/{uuid.uuid4().hex}"
             self._folder(f"{self._root}/tmp")
             self._folder(f"{self._root}/{name[:2]}")
+            # below zero: there was nothing to send
             size = put(temporary)
             if size >= 0:
                 self._fs.mv(temporary, self._path(name))
@@ -295,10 +305,12 @@ class RemoteFiles:
             return False
         with self._lock:
             if name[:2] in self._listed:
+                # the first two letters are the folder
                 self._listed[name[:2]][1].add(name)
         return True
 
     def _folder(self, path: str) -> None:
+        """Make a folder at the URL once; remove old files from the folder of half-written ones."""
         if path not in self._made:
             self._fs.makedirs(path, exist_ok=True)
             self._made.add(path)
@@ -333,6 +345,7 @@ class RemoteFiles:
             if not (direction == "down" and _counts_as_missing(error)):
                 self._failed(direction, error)
             return None
+        # a success ends the doubling of pauses
         self._pause[direction] = _PAUSE
         if size is not None:
             self._update_speed(direction, size(result), time.perf_counter() - began)
@@ -345,13 +358,14 @@ class RemoteFiles:
         return hasattr(self._fs, "is_read_only") and bool(self._fs.is_read_only())
 
     def _failed(self, direction: Direction, error: Exception) -> None:
+        """Stop using the URL for a while, each time twice as long, and warn once."""
         if direction == "up" and isinstance(error, IsADirectoryError):
             return  # a folder in the place of one file
         # a file that cannot be written may be readable
-        alone = isinstance(error, PermissionError | FileNotFoundError)
-        for way in (direction,) if alone else _DIRECTIONS:
-            self._resume[way] = time.monotonic() + self._pause[way]
-            self._pause[way] *= 2
+        is_one_way = isinstance(error, PermissionError | FileNotFoundError)
+        for paused_direction in (direction,) if is_one_way else _DIRECTIONS:
+            self._resume[paused_direction] = time.monotonic() + self._pause[paused_direction]
+            self._pause[paused_direction] *= 2
         action = "read" if direction == "down" else "written"
         self.warn(
             f"{self.url} cannot be {action} ({type(error).__name__}: {error}): results are stored"
@@ -363,6 +377,7 @@ class RemoteFiles:
         the measured value.
         """
         if size < _LEARN:
+            # a small transfer takes little but the latency
             self._latency[direction] += (seconds - self._latency[direction]) / 3
         else:
             rate = size / max(seconds - self._latency[direction], 1e-6)
@@ -390,13 +405,15 @@ def _file_system(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise ModuleNotFoundError(f"a store at {url} needs one more package: {error}") from error
     except ValueError as error:
-        schemes, scheme = fsspec.available_protocols(), url.partition("://")[0]
-        if scheme in schemes:
+        known_schemes, scheme = fsspec.available_protocols(), url.partition("://")[0]
+        # the rest of the URL is wrong
+        if scheme in known_schemes:
             raise
         raise ValueError(
-            f"no file system has the scheme {scheme}:// of {url}; {nearest(scheme, schemes)}"
+            f"no file system has the scheme {scheme}:// of {url}; {nearest(scheme, known_schemes)}"
         ) from error
     path = str(path).rstrip("/")
+    # a folder, with the care that one of others needs
     if file_system.protocol in ("file", "local", ("file", "local")):
         file_system = FolderAtUrl(path)
     return file_system, path
@@ -461,8 +478,12 @@ class RemoteStore(Store):
         """Return the metadata of a result from the local folder or the URL, without reading the
         value.
         """
-        here = super().about(key)
-        return here if is_kept(here) else self._remote_metadata(key) or here
+        local_metadata = super().about(key)
+        return (
+            local_metadata
+            if is_kept(local_metadata)
+            else self._remote_metadata(key) or local_metadata
+        )
 
     def get(self, key: Key, kind: Any = Any) -> Any:
         """Return the value of ``key``; raise `KeyError` if neither the local folder nor the URL
@@ -477,6 +498,7 @@ class RemoteStore(Store):
         copy at the URL.
         """
         super().put_aside(key, error)
+        # the copy at the URL was damaged as well
         if key in self._failed:
             self._give_up(key)
         self._failed.add(key)
@@ -507,17 +529,20 @@ class RemoteStore(Store):
         """Yield every key with its metadata: first the local results, then the results that are
         only at the URL.
         """
-        here = set()
-        for key, about in super().entries():
-            here.add(key)
-            yield key, about
+        local_keys = set()
+        for key, local_metadata in super().entries():
+            local_keys.add(key)
+            yield key, local_metadata
         at_url = sorted(
-            {name.partition(".")[0] for name in self._remote.names() if ".json" in name} - here
+            {name.partition(".")[0] for name in self._remote.names() if ".json" in name}
+            - local_keys
         )
         with ThreadPoolExecutor(16) as pool:
-            for key, remote in zip(at_url, pool.map(self._remote_metadata, at_url), strict=True):
-                if remote is not None:
-                    yield key, remote
+            for key, remote_metadata in zip(
+                at_url, pool.map(self._remote_metadata, at_url), strict=True
+            ):
+                if remote_metadata is not None:
+                    yield key, remote_metadata
 
     def write_seconds(self, size: float) -> float:
         return super().write_seconds(size) + self._remote.seconds("up", size)
@@ -526,31 +551,32 @@ class RemoteStore(Store):
         return super().read_seconds(size) + self._remote.seconds("down", size)
 
     def _is_local(self, key: Key) -> bool:
+        """Return True if the local folder has the value of a key."""
         return is_kept(super().about(key))
 
     def _remote_metadata(self, key: Key, look: bool = False) -> Metadata | None:
         """Return the metadata of a result at the URL; if ``look`` is True, request an unlisted
         file too.
         """
-        value, note = f"{key}.json", _receipt_name(key)
+        metadata_name, receipt_name = f"{key}.json", _receipt_name(key)
         if (
             key not in self._broken
-            and (look or self._remote.exists(value))
+            and (look or self._remote.exists(metadata_name))
             and not is_kept(self._seen.get(key))
         ):
-            self._read_metadata(key, value, "result at a URL")
-        if key not in self._seen and self._remote.exists(note):
-            self._read_metadata(key, note, "receipt at a URL")
+            self._read_metadata(key, metadata_name, "result at a URL")
+        if key not in self._seen and self._remote.exists(receipt_name):
+            self._read_metadata(key, receipt_name, "receipt at a URL")
         return self._seen.get(key)
 
     def _read_metadata(self, key: Key, name: str, kind: Kind) -> None:
         """Read the metadata file ``name`` at the URL; damaged metadata count as missing, after a
         warning.
         """
-        raw = self._remote.read(name)
-        if raw is not None:
+        file_bytes = self._remote.read(name)
+        if file_bytes is not None:
             try:
-                self._seen[key] = unseal_of(kind, key, raw)
+                self._seen[key] = unseal_of(kind, key, file_bytes)
             except NotRead as error:
                 self._give_up(key)
                 self.leave(error)
@@ -561,9 +587,10 @@ class RemoteStore(Store):
         """Copy the value of a key from the URL into the local folder; after a failure, do not
         fetch this key again.
         """
-        about = self._remote_metadata(key, look=True)
+        # asks for the file also where no listing shows it: it may be new
+        metadata = self._remote_metadata(key, look=True)
         try:
-            if is_kept(about) and not self._value_fetched(key, about):
+            if is_kept(metadata) and not self._value_fetched(key, metadata):
                 self._give_up(key)
         except OSError as error:
             self._give_up(key)
@@ -578,26 +605,35 @@ class RemoteStore(Store):
         False if a copy fails.
         """
         payload, bands = about["payload"], checked_layout(about["layout"])
-        missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
-        with ExitStack() as files:
-            payload_file, *parts = (self._part(files, name) for name in (key, *missing))
+        missing_bands = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
+        with ExitStack() as open_files:
+            # temporary files: one for the tensors, then one for each missing band
+            payload_copy, *band_copies = (
+                self._part(open_files, name) for name in (key, *missing_bands)
+            )
             if payload and not self._fetched(
-                _payload_name(key, payload["xxh3"]), payload_file, payload
+                _payload_name(key, payload["xxh3"]), payload_copy, payload
             ):
                 return False
             with ThreadPoolExecutor(16) as pool:
                 if not all(
-                    pool.map(self._remote.fetch, starmap(_band_name, missing.items()), parts)
+                    pool.map(
+                        self._remote.fetch, starmap(_band_name, missing_bands.items()), band_copies
+                    )
                 ):
                     return False
             with self.disk.lock():
+                # another process may have fetched the value meanwhile
                 if not self._is_local(key):
-                    self._named(dict(zip(missing, parts, strict=True)), bands)
-                    self._described(key, about, payload_file)
+                    self._named(dict(zip(missing_bands, band_copies, strict=True)), bands)
+                    self._described(key, about, payload_copy)
         self.journal.append(key, about)
         return True
 
     def _part(self, files: ExitStack, name: str) -> str:
+        """Return the path of a new temporary file, which goes with ``files`` unless it was
+        renamed.
+        """
         path, file = files.enter_context(self.disk.temporary(name))
         file.close()
         return path
@@ -611,6 +647,7 @@ class RemoteStore(Store):
             self.disk.link(copied, self.blobs.path(name))
         for name, xxh3 in bands.items():
             blob = self.blobs.about(name)
+            # compares every byte with the checksum
             self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
 
     def _described(self, key: Key, about: Metadata, copied: str) -> None:
@@ -638,10 +675,11 @@ class RemoteStore(Store):
             xxh3, size = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest(), file.tell()
             os.fsync(file.fileno())
             file.seek(0)
-            signed = not secrets() or hashlib.file_digest(
+            # without a secret nothing is signed
+            is_signed = not secrets() or hashlib.file_digest(
                 file, "sha256"
             ).hexdigest() == payload.get("sha256")
-        if (size, xxh3) != (payload["size"], payload["xxh3"]) or not signed:
+        if (size, xxh3) != (payload["size"], payload["xxh3"]) or not is_signed:
             raise ValueError(
                 "checksum mismatch: the stored bytes have changed since they were written"
             )
@@ -651,24 +689,27 @@ class RemoteStore(Store):
         """Copy a local value to the URL, the large files before the metadata; copy nothing for
         an evicted value.
         """
-        name, over = f"{key}.json", key in self._broken
-        if not over and self._remote.exists(name):
+        # a copy that cannot be used is replaced
+        name, replaces = f"{key}.json", key in self._broken
+        if not replaces and self._remote.exists(name):
             return
         try:
-            about = read(self.disk, key)
-            files = self._files(key, about)
+            metadata = read(self.disk, key)
+            local_paths = self._files(key, metadata)
         except UNREADABLE:
             return
         with ThreadPoolExecutor(16) as pool:
-            sent = pool.map(
+            # band files may be at the URL already
+            results = pool.map(
                 lambda to: (
-                    (not over and self._remote.exists(to)) or self._remote.send(files[to], to)
+                    (not replaces and self._remote.exists(to))
+                    or self._remote.send(local_paths[to], to)
                 ),
-                files,
+                local_paths,
             )
-            if not all(sent):
+            if not all(results):
                 return
-        if self._remote.write(name, seal_record("result at a URL", about), over):
+        if self._remote.write(name, seal_record("result at a URL", metadata), replaces):
             self._broken.discard(key)
 
     def _files(self, key: Key, about: Metadata) -> dict[str, str]:
@@ -683,10 +724,12 @@ class RemoteStore(Store):
         return paths
 
     def _give_up(self, key: Key) -> None:
+        """Use the copy of a key at the URL no more."""
         self._seen.pop(key, None)
         self._broken.add(key)
 
     def _distrust(self, key: Key, error: Exception) -> None:
+        """Use a damaged copy at the URL no more, and warn of it."""
         self._give_up(key)
         warnings.warn(
             f"the result {key} at {self.url} is damaged ({error}) and is not used", stacklevel=4

@@ -53,8 +53,8 @@ class Speeds:
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
-        self._now: dict[Direction, float] = {}
-        self._written: dict[Direction, float] = {}
+        self._now: dict[Direction, float] = {}  # bytes / s, as learned so far
+        self._written: dict[Direction, float] = {}  # bytes / s, as in the file
 
     def seconds(self, way: Direction, size: float) -> float:
         """Return the predicted time in seconds for reading or writing ``size`` bytes in the
@@ -68,10 +68,11 @@ class Speeds:
         """
         if size < LARGE:
             return
-        newest = size / max(seconds - _setup(way, size), 1e-6)
-        self._now[way] = self._speed(way) ** (1 - _LEARN) * newest**_LEARN
-        written = self._written.get(way, _USUAL[way])
-        if not written / _NEWS < self._now[way] < written * _NEWS:
+        measured_speed = size / max(seconds - _setup(way, size), 1e-6)
+        # a weighted geometric mean, because speeds differ by factors
+        self._now[way] = self._speed(way) ** (1 - _LEARN) * measured_speed**_LEARN
+        saved_speed = self._written.get(way, _USUAL[way])
+        if not saved_speed / _NEWS < self._now[way] < saved_speed * _NEWS:
             self._written = dict(self._now)
             with suppress(OSError):
                 self._disk.replace(
@@ -80,20 +81,30 @@ class Speeds:
                 )
 
     def _speed(self, way: Direction) -> float:
+        """Return the speed of reading or writing in bytes / s, at first as the file says or as
+        is usual.
+        """
         if not self._now:
             self._written = self._stored()
             self._now = {**_USUAL, **self._written}
         return self._now[way]
 
     def _stored(self) -> dict[Direction, float]:
+        """Return the speeds that the file of the store says; none if it is missing or wrong."""
         try:
             speeds = unseal_record("speeds", read_file(f"{self._disk.folder}/{_FILE}"))
-            return {way: float(speeds[way]) for way in _USUAL if 1e3 < speeds[way] < 1e13}
+            # bytes / s that a disk may have
+            return {
+                direction: float(speeds[direction])
+                for direction in _USUAL
+                if 1e3 < speeds[direction] < 1e13
+            }
         except (OSError, ValueError, LookupError, TypeError):
             return {}
 
 
 def _setup(way: Direction, size: float) -> float:
+    """Return the time (s) that a transfer takes beside that of its bytes."""
     return _SETUP[way] + (_SYNC if way == "write" and size > INLINE else 0.0)
 
 
@@ -193,11 +204,11 @@ class Store(Warned, Maintained):
         self._leases = Leases(self.disk)
         self._room = None if self.budget is None else CacheBudget(self.disk, self.budget)
         self._speeds = Speeds(self.disk)
-        self._known: dict[str, Metadata] = {}
+        self._known: dict[str, Metadata] = {}  # metadata that were read or written
         self._receipts = Receipts(self.disk)
         self._lost: set[str] = set()  # damaged results that the user may have no permission to move
-        self._used: set[str] = set()
-        self._missed: set[str] = set()
+        self._used: set[str] = set()  # keys of values that were loaded
+        self._missed: set[str] = set()  # keys that were asked for in vain
 
     # another process receives the path and opens the store
     def __reduce__(self) -> tuple[Any, ...]:
@@ -216,24 +227,26 @@ class Store(Warned, Maintained):
         """Return the metadata of a result, or None; the field ``kept`` tells whether the value
         is stored as well.
         """
-        about = self._known.get(key)
-        if is_kept(about):
-            return about
+        entry = self._known.get(key)
+        if is_kept(entry):
+            return entry
+        # damaged: it counts as missing
         if key in self._lost:
             return None
-        about = self.brief.find(key)
-        if not is_kept(about):
+        entry = self.brief.find(key)
+        if not is_kept(entry):
             try:
-                about = self._receipts.find(key) or about
+                # a receipt among the small results counts only if there is no file
+                entry = self._receipts.find(key) or entry
             except NotRead as error:
                 self.leave(error)
             except UNREADABLE as error:
                 self._put_aside(key, error)
-        if about is not None:
-            self._known[key] = about
+        if entry is not None:
+            self._known[key] = entry
         else:
             self._missed.add(key)
-        return about
+        return entry
 
     def asked(self) -> dict[str, Metadata | None]:
         """Return the metadata of each result that this process asked for so far; None for one
@@ -250,13 +263,14 @@ class Store(Warned, Maintained):
 
         ``kind`` is the annotated type of the value; a value that does not fit counts as damaged.
         """
-        about = self.about(key)
-        while is_kept(about):
+        entry = self.about(key)
+        while is_kept(entry):
             try:
-                value = self.load(about, self.verify, kind)
+                value = self.load(entry, self.verify, kind)
             except UNREADABLE as error:
-                before, about = about, self._again(key)
-                if about == before or self.brief.find(key) == before:
+                # another process may have replaced or evicted the value between metadata and bytes
+                metadata_before, entry = entry, self._again(key)
+                if entry == metadata_before or self.brief.find(key) == metadata_before:
                     self._put_aside(key, error)
                     break
             else:
@@ -286,12 +300,13 @@ class Store(Warned, Maintained):
         """Yield key and metadata of every result in the order of the keys, also of results
         without a stored value.
         """
-        small, before = self.brief.keys(), ""
-        for key in heapq.merge(metadata.names(self.disk), sorted(small)):
-            about = self._listed(key, key in small) if key != before else None
-            before = key
-            if about is not None:
-                yield key, about
+        small_keys, key_before = self.brief.keys(), ""
+        for key in heapq.merge(metadata.names(self.disk), sorted(small_keys)):
+            # a key may be in both places
+            entry = self._listed(key, key in small_keys) if key != key_before else None
+            key_before = key
+            if entry is not None:
+                yield key, entry
 
     def _listed(self, key: str, small: bool) -> Metadata | None:
         """Return the metadata of a result as `about`, but remember nothing, so that a list of any
@@ -301,8 +316,8 @@ class Store(Warned, Maintained):
         """
         if key in self._known or key in self._lost:
             return self.about(key)
-        if small and is_kept(about := self.brief.find(key)):
-            return about
+        if small and is_kept(entry := self.brief.find(key)):
+            return entry
         try:
             return metadata.read(self.disk, key)
         except UNREADABLE:
@@ -330,6 +345,7 @@ class Store(Warned, Maintained):
         """Read the metadata of a result again; return None if the metadata were removed or
         cannot be read.
         """
+        # so that the file is read
         self._known.pop(key, None)
         with suppress(*UNREADABLE):
             return metadata.read(self.disk, key)
@@ -365,6 +381,7 @@ class Store(Warned, Maintained):
             try:
                 return write(key, *arguments)
             except FileNotFoundError:
+                # another process has removed the folder of temporary files
                 self.disk.forget()
                 return write(key, *arguments)
         except OSError as error:
@@ -372,23 +389,31 @@ class Store(Warned, Maintained):
             return False
 
     def _write(self, key: str, value: Any, about: Metadata) -> bool:
+        """Write a value with its metadata; only the metadata, and False, for a value larger than
+        the budget.
+        """
         began = time.perf_counter()
-        entry, tensors, bands = payload.described(key, value, about, self.blobs)
-        if self._room and entry["bytes"] > LOW * self._room.budget:
-            self._write_receipt(key, entry)
+        metadata_entry, tensors, band_checksums = payload.described(key, value, about, self.blobs)
+        # larger than what an eviction leaves of the budget
+        if self._room and metadata_entry["bytes"] > LOW * self._room.budget:
+            self._write_receipt(key, metadata_entry)
             return False
-        if tensors or bands:
-            self._write_parts(key, entry, tensors, value if bands else None)
+        if tensors or band_checksums:
+            self._write_parts(key, metadata_entry, tensors, value if band_checksums else None)
             self._speeds.learn("write", sum(t.nbytes for t in tensors), time.perf_counter() - began)
         else:
-            self._write_about(key, entry)
+            self._write_about(key, metadata_entry)
         self._lost.discard(key)
-        self.journal.append(key, entry)
-        self._make_room(entry["bytes"])
+        self.journal.append(key, metadata_entry)
+        self._make_room(metadata_entry["bytes"])
         return True
 
     def _write_small(self, key: str, value: Any, about: Metadata) -> bool:
+        """Write a value into the file of small results; only its metadata, and False, if it is
+        too large for a line.
+        """
         entry, tensors, _ = payload.described(key, value, about)
+        # they do not fit into the metadata
         if tensors:
             entry = metadata.receipt(entry)
         self.brief.append(entry)
@@ -406,17 +431,23 @@ class Store(Warned, Maintained):
                 entry["payload"] = payload.written(file, tensors)
             with self.disk.lock():
                 if key not in self._lost and metadata.has_value(self.disk, key):
+                    # the value that is stored stays
                     return
                 if banded is not None:  # a sweep may have removed bands that no value names yet
-                    names = list(payload.described(key, banded, {}, self.blobs)[2])
-                    entry["bands"] = {"names": names, "newest": payload.newest(self.blobs, names)}
+                    band_names = list(payload.described(key, banded, {}, self.blobs)[2])
+                    entry["bands"] = {
+                        "names": band_names,
+                        "newest": payload.newest(self.blobs, band_names),
+                    }
                 if tensors:
                     path = self.disk.path(key, "safetensors")
+                    # the file has its name before the metadata that name it
                     self.disk.rename(temporary, path)
                     entry["payload"]["stamp"] = payload.stamp_of(path)
                 self._write_about(key, entry)
 
     def _write_about(self, key: str, entry: Metadata) -> None:
+        """Write metadata over those that are there, and remember them."""
         metadata.write(self.disk, key, entry, over=True)
         self._known[key] = entry
 
@@ -436,6 +467,7 @@ class Store(Warned, Maintained):
             self.journal.mark_evicted({candidate.key for candidate in self.make_room(excess)[0]})
 
     def _put_aside(self, key: str, error: Exception) -> None:
+        """Put a damaged result aside and warn of it."""
         self.put_aside(key, error)
         if isinstance(error, OSError) and not isinstance(
             error, FileNotFoundError | PermissionError
@@ -452,13 +484,16 @@ class Store(Warned, Maintained):
         """
         self._known.pop(key, None)
         self._lost.add(key)
-        unreadable = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)
-        for suffix in () if unreadable else ("json", "safetensors"):
+        is_unreadable = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)
+        # a device that fails needs no inspection of the file
+        for suffix in () if is_unreadable else ("json", "safetensors"):
             self.disk.put_aside(self.disk.path(key, suffix))
-        small = self.brief.find(key)
+        small_result = self.brief.find(key)
         with suppress(OSError):
-            if is_kept(small):
-                self.brief.append(metadata.receipt(small))
+            # a later line replaces the damaged one
+            if is_kept(small_result):
+                self.brief.append(metadata.receipt(small_result))
+            # the damaged file is away, so that the key may be written again
             if not os.path.lexists(self.disk.path(key, "json")):
                 self._lost.discard(key)
 
@@ -490,21 +525,21 @@ def compute_once(
     """
     with suppress(KeyError):
         stored = store.get(key, dict if is_dataclass(kind) else kind)
-        make: Callable[..., T] = kind
+        make_value: Callable[..., T] = kind
         try:
-            return make(**stored) if is_dataclass(kind) else make(stored)
+            return make_value(**stored) if is_dataclass(kind) else make_value(stored)
         except (TypeError, ValueError) as error:  # a value with other fields
             store.put_aside(key, error)
     began = time.perf_counter()
     value = compute()
-    spent: Metadata = {
+    time_and_date: Metadata = {
         "seconds": time.perf_counter() - began,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    keep = store.put_small if small else store.put
-    keep(
+    store_value = store.put_small if small else store.put
+    store_value(
         key,
         asdict(value) if is_dataclass(value) and not isinstance(value, type) else value,
-        spent | about,
+        time_and_date | about,
     )
     return value

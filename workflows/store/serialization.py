@@ -95,13 +95,15 @@ def fits(value: Any, kind: Any) -> bool:
     """Return True if a value has the annotated type ``kind``; a type that no stored value has
     allows every value.
     """
-    origin, inner = get_origin(kind), get_args(kind)
+    origin, type_arguments = get_origin(kind), get_args(kind)
     if origin is typing.Annotated:
-        return fits(value, inner[0])
+        # Annotated[type, notes]
+        return fits(value, type_arguments[0])
     if origin in (typing.Union, types.UnionType):
-        return any(fits(value, alternative) for alternative in inner)
+        return any(fits(value, union_member) for union_member in type_arguments)
     if origin in (list, dict) or (origin is tuple and not hasattr(value, "_fields")):
-        return isinstance(value, origin) and _items_fit(value, origin, inner)
+        return isinstance(value, origin) and _items_fit(value, origin, type_arguments)
+    # any other type with parameters is no type of a stored value
     return origin is not None or _fits_plain(value, kind)
 
 
@@ -111,6 +113,7 @@ def _fits_plain(value: Any, kind: Any) -> bool:
     """
     if kind is None or kind is types.NoneType:
         return value is None
+    # a truth value is an int to Python, and no number here
     if kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     if kind is int:
@@ -121,14 +124,20 @@ def _fits_plain(value: Any, kind: Any) -> bool:
 
 
 def _items_fit(value: Any, origin: type, inner: tuple[Any, ...]) -> bool:
+    """Return True if the items of a list, dict or tuple have the types ``inner`` in the brackets
+    of the annotation.
+    """
     if origin is dict:
+        # dict[key type, value type]; keys are always texts
         return len(inner) != 2 or all(fits(item, inner[1]) for item in value.values())
+    # list[type] or tuple[type, ...]
     if origin is list or inner[1:] == (...,):
         return not inner or all(fits(item, inner[0]) for item in value)
     return len(value) == len(inner) and all(map(fits, value, inner))
 
 
 def _is_named_tuple(kind: Any) -> TypeGuard[NamedTupleType]:
+    """Return True for the class of a named tuple."""
     return isinstance(kind, type) and issubclass(kind, tuple) and hasattr(kind, "_fields")
 
 
@@ -137,11 +146,12 @@ def _update() -> None:
     if not _types:
         for kind in vars(values).values():
             _add(kind)
-    nodes = registered_nodes()
-    if nodes == _all_nodes[0]:  # the same objects, as almost always
+    known_nodes = registered_nodes()
+    if known_nodes == _all_nodes[0]:  # the same objects, as almost always
         return
-    _all_nodes[0] = nodes
-    for node in nodes:
+    _all_nodes[0] = known_nodes
+    for node in known_nodes:
+        # not looked at yet, or defined anew
         if _looked_at.get(name := f"{node.fn.__module__}:{node.fn.__name__}") is not node:
             _looked_at[name] = node
             for kind in _annotated(node):
@@ -149,6 +159,7 @@ def _update() -> None:
 
 
 def _annotated(node: Node) -> Iterator[Any]:
+    """Yield the annotated types of the inputs and the result of a node."""
     try:
         hints = node.hints
     except Exception:  # an annotation may be any text; the check of a recipe reports it
@@ -158,20 +169,21 @@ def _annotated(node: Node) -> Iterator[Any]:
 
 def _add(kind: Any) -> None:
     """Add a type and the types in its parts, if they are named tuples."""
-    todo, visited = [kind], set[int]()
-    while todo:
-        kind = todo.pop()
-        if id(kind) in visited:
+    types_to_add, visited_ids = [kind], set[int]()
+    while types_to_add:
+        kind = types_to_add.pop()
+        if id(kind) in visited_ids:
             continue
-        visited.add(id(kind))
-        todo += get_args(kind)
+        visited_ids.add(id(kind))
+        types_to_add += get_args(kind)
         if _is_named_tuple(kind):
             _types[type_name(kind)] = kind
-            todo += _hints(kind).values()
+            types_to_add += _hints(kind).values()
 
 
 @functools.lru_cache(256)
 def _hints(kind: type) -> dict[str, Any]:
+    """Return the annotated types of the fields of a class; none if they cannot be read."""
     try:
         return get_type_hints(kind, include_extras=True)
     except Exception:  # an annotation may be any text
@@ -230,8 +242,8 @@ def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tenso
             done[id(item)] = change(item)
         return done[id(item)]
     if isinstance(item, tuple):
-        items = [_change(i, change, done) for i in item]
-        return item._make(items) if hasattr(item, "_make") else tuple(items)
+        changed_items = [_change(i, change, done) for i in item]
+        return item._make(changed_items) if hasattr(item, "_make") else tuple(changed_items)
     if isinstance(item, list):
         return [_change(i, change, done) for i in item]
     return (
@@ -257,14 +269,15 @@ def settle(value: Any) -> Any:
 
 
 def _settled(x: Tensor) -> Tensor:
+    """Return a tensor of its own class, contiguous, with no memory beyond its elements."""
     x = _bare(x).resolve_conj().resolve_neg().contiguous()
     try:
-        spare = x.untyped_storage().nbytes() > x.nbytes
+        has_spare_memory = x.untyped_storage().nbytes() > x.nbytes
     except (
         NotImplementedError
     ):  # a tensor inside a transform of torch.func has no memory of its own
-        spare = False
-    return x.clone(memory_format=torch.contiguous_format) if spare else x
+        has_spare_memory = False
+    return x.clone(memory_format=torch.contiguous_format) if has_spare_memory else x
 
 
 def forget_attributes(x: Tensor) -> None:
@@ -280,6 +293,7 @@ def _bare(x: Tensor) -> Tensor:
     if x.requires_grad and not torch.is_grad_enabled():
         x = x.detach()
     kind = type(x)
+    # a plain tensor has attributes that somebody added; another class may be one of torch
     if vars(x) if kind is Tensor else kind.__module__.partition(".")[0] != "torch":
         with torch._C.DisableTorchFunctionSubclass():
             return x.as_subclass(Tensor)
@@ -294,6 +308,7 @@ class _Listed:
         self._known: dict[tuple[Any, ...], int] = {}
 
     def add(self, x: Tensor) -> int:
+        # an empty tensor has no address
         identity = (x.data_ptr() or id(x), x.dtype, x.shape, x.stride(), x.is_conj(), x.is_neg())
         if identity not in self._known:
             self._known[identity] = len(self.tensors)
@@ -313,6 +328,7 @@ def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
 
 
 def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
+    """Return the layout of a value, and add its tensors to ``listed``."""
     if isinstance(item, Stacked):
         return _layout(item.tensor, listed, None) if blobs is None else _stack_layout(item, blobs)
     if isinstance(item, Tensor):
@@ -334,12 +350,14 @@ def _cannot_be_stored(item: Any) -> TypeError:
 
 
 def _tensor_of_bytes(text: bytes) -> Tensor:
+    """Return bytes as a tensor; torch makes none from an empty buffer."""
     return torch.frombuffer(bytearray(text), dtype=torch.uint8) if text else torch.empty(0)
 
 
 def _collection_layout(
     item: tuple[Any, ...] | list[Any] | dict[Any, Any], listed: _Listed, blobs: Blobs | None
 ) -> dict[str, Any]:
+    """Return the layout of a dict, list, tuple or named tuple."""
     if isinstance(item, dict):
         if not all(isinstance(key, str) for key in item):
             raise _cannot_be_stored(item)
@@ -351,13 +369,16 @@ def _collection_layout(
 
 
 def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
-    written = blobs.write_all(item.names, item.tensor.unbind())
-    kind = str(item.tensor.dtype).removeprefix("torch.")
+    """Write the bands of a tensor to their files; return the layout with their names and
+    checksums.
+    """
+    checksums = blobs.write_all(item.names, item.tensor.unbind())
+    dtype_name = str(item.tensor.dtype).removeprefix("torch.")
     return {
         "stacked": {
             "names": list(item.names),
-            "xxh3": written,
-            "dtype": kind,
+            "xxh3": checksums,
+            "dtype": dtype_name,
             "shape": list(item.tensor.shape),
         }
     }
@@ -383,36 +404,41 @@ def unpack(
 def _unpacked(
     layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None, verify: bool, typed: bool
 ) -> Any:
-    inner = partial(_unpacked, tensors=tensors, blobs=blobs, verify=verify, typed=typed)
+    """Return the value of a layout; see `unpack`."""
+    unpack_item = partial(_unpacked, tensors=tensors, blobs=blobs, verify=verify, typed=typed)
     if "class" in layout:
-        items = list(map(inner, layout["items"]))
+        items = list(map(unpack_item, layout["items"]))
         return made(stored_type(layout["class"]), items) if typed else tuple(items)
+    # any other layout has one entry
     ((kind, body),) = layout.items()
     if kind in ("tensor", "bytes"):
         return _stored_tensor(kind, body, tensors)
     if kind == "stacked":
         return _stacked_bands(body, blobs, verify)
     if kind in ("tuple", "list"):
-        items = list(map(inner, body))
+        items = list(map(unpack_item, body))
         return tuple(items) if kind == "tuple" else items
     if kind == "dict":
-        return dict(zip(body, map(inner, body.values()), strict=True))
+        return dict(zip(body, map(unpack_item, body.values()), strict=True))
     return body
 
 
 def _stored_tensor(kind: str, number: int, tensors: list[Tensor]) -> Tensor | bytes:
+    """Return the tensor with a number in the file, or the bytes that it holds."""
     if number >= len(tensors):
         raise ValueError(f"the value needs tensor {number}, but only {len(tensors)} are stored")
     return tensors[number] if kind == "tensor" else _bytes(tensors[number])
 
 
 def _stacked_bands(body: dict[str, Any], blobs: Blobs | None, verify: bool) -> Tensor:
+    """Return a tensor from its band files, as the layout names them."""
     if blobs is None:
         raise ValueError("the value has band files: give the folder of the band files as ``blobs``")
     return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
 
 
 def _bytes(x: Tensor) -> bytes:
+    """Return the bytes that a tensor holds; see `_tensor_of_bytes`."""
     if x.dtype != torch.uint8 and x.numel():
         raise ValueError(f"bytes cannot be stored as a tensor of {x.dtype}")
     return x.numpy().tobytes()
@@ -440,10 +466,10 @@ def to_text(x: Tensor) -> list[Any]:
 
 def from_text(kind: str, shape: list[int], is_complex: bool, text: str) -> Tensor:
     """Return the tensor that `to_text` turned into four JSON values."""
-    data = bytearray(base64.b64decode(text, validate=True))
-    x = _tensor(data, 0, kind, shape, is_complex)
-    if x.nbytes != len(data):
-        raise ValueError(f"a tensor of {x.nbytes} bytes is stored as {len(data)} bytes")
+    raw_bytes = bytearray(base64.b64decode(text, validate=True))
+    x = _tensor(raw_bytes, 0, kind, shape, is_complex)
+    if x.nbytes != len(raw_bytes):
+        raise ValueError(f"a tensor of {x.nbytes} bytes is stored as {len(raw_bytes)} bytes")
     return x
 
 
@@ -465,23 +491,29 @@ def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
     padded tensors.
     """
     header: dict[str, Any] = {"__metadata__": {}}
-    end = 0
+    offset = 0
     for i, x in enumerate(tensors):
-        kind, shape, is_complex = _kind(x)
+        type_name, shape, is_complex = _kind(x)
         header["__metadata__"][str(i)] = "complex" if is_complex else "real"
-        header[str(i)] = {"dtype": kind, "shape": shape, "data_offsets": [end, end + x.nbytes]}
-        end += x.nbytes
-        if pad := -end % _ALIGN:
+        header[str(i)] = {
+            "dtype": type_name,
+            "shape": shape,
+            "data_offsets": [offset, offset + x.nbytes],
+        }
+        offset += x.nbytes
+        # the next tensor is aligned
+        if padding := -offset % _ALIGN:
             header[f"{_FILLER}{i}"] = {
                 "dtype": "U8",
-                "shape": [pad],
-                "data_offsets": [end, end + pad],
+                "shape": [padding],
+                "data_offsets": [offset, offset + padding],
             }
-            end += pad
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-(8 + len(text)) % _ALIGN)
-    yield len(text).to_bytes(8, "little")
-    yield text
+            offset += padding
+    header_text = json.dumps(header, separators=(",", ":")).encode()
+    # spaces, so that the first tensor is aligned too; 8 bytes are the length
+    header_text += b" " * (-(8 + len(header_text)) % _ALIGN)
+    yield len(header_text).to_bytes(8, "little")
+    yield header_text
     for x in tensors:
         yield bytes_of(x)
         yield bytes(-x.nbytes % _ALIGN)
@@ -494,15 +526,17 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
     Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises
     `ValueError` for a file that differs, or that `write` did not write.
     """
-    checksum = xxhash.xxh3_128() if expected is not None else None
-    signed = hashlib.sha256() if sha256 is not None else None
+    checksum_hasher = xxhash.xxh3_128() if expected is not None else None
+    sha256_hasher = hashlib.sha256() if sha256 is not None else None
     with open(path, "rb", buffering=0, opener=open_now) as file:
-        data = _mapped(file, [digest for digest in (checksum, signed) if digest is not None])
-    if checksum is not None and checksum.hexdigest() != expected:
+        file_bytes = _mapped(
+            file, [digest for digest in (checksum_hasher, sha256_hasher) if digest is not None]
+        )
+    if checksum_hasher is not None and checksum_hasher.hexdigest() != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
-    if signed is not None and signed.hexdigest() != sha256:
+    if sha256_hasher is not None and sha256_hasher.hexdigest() != sha256:
         raise ValueError("the stored bytes are not those that were signed")
-    return _tensors_in(data)
+    return _tensors_in(file_bytes)
 
 
 def _mapped(file: IO[bytes], digests: Sequence[Any]) -> mmap.mmap:
@@ -524,21 +558,27 @@ def _tensors_in(data: mmap.mmap) -> list[Tensor]:
     """Return the tensors of a safetensors file; raise ValueError for a file that `write` did not
     write.
     """
-    start = 8 + int.from_bytes(data[:8], "little")
-    header = json.loads(data[8:start]) if start <= len(data) else None
-    if not isinstance(header, dict) or not isinstance(kinds := header.get("__metadata__"), dict):
+    # 8 bytes with the length of the header, the header, the tensors
+    first_byte = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:first_byte]) if first_byte <= len(data) else None
+    if not isinstance(header, dict) or not isinstance(
+        complex_or_real := header.get("__metadata__"), dict
+    ):
         raise ValueError("the header of the file of tensors is missing or cut short")
+    # padding entries have no number as their name
     numbers = sorted(int(name) for name in header if name.isdecimal())
-    return [_entry(data, start, header.get(str(i)), kinds.get(str(i))) for i in numbers]
+    return [
+        _entry(data, first_byte, header.get(str(i)), complex_or_real.get(str(i))) for i in numbers
+    ]
 
 
 def _copied(file: IO[bytes]) -> mmap.mmap:
     """Return the bytes of a file in memory of this process."""
     size = os.fstat(file.fileno()).st_size
-    data, done = mmap.mmap(-1, size), 0
-    while done < size and (count := file.readinto(memoryview(data)[done:])):  # type: ignore[attr-defined]
-        done += count
-    return data
+    memory, bytes_read = mmap.mmap(-1, size), 0
+    while bytes_read < size and (count := file.readinto(memoryview(memory)[bytes_read:])):  # type: ignore[attr-defined]
+        bytes_read += count
+    return memory
 
 
 def digests_of(file: IO[bytes], *digests: Any) -> list[str]:
@@ -551,6 +591,9 @@ def digests_of(file: IO[bytes], *digests: Any) -> list[str]:
 
 
 def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:
+    """Return the tensor that one entry of the header describes; ``start`` is the first byte
+    behind the header, ``kind`` real or complex.
+    """
     offsets = entry.get("data_offsets") if isinstance(entry, dict) else None
     if not is_shape(offsets) or len(offsets) != 2 or kind not in ("real", "complex"):
         raise ValueError("the header of the file of tensors is not what was written")
@@ -563,10 +606,13 @@ def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:
 
 
 def _kind(x: Tensor) -> tuple[str, list[int], bool]:
-    real = torch.empty(0, dtype=x.dtype).real.dtype if x.is_complex() else x.dtype
-    if real not in _DTYPES:
+    """Return the safetensors type, the shape and whether a tensor is complex; a complex tensor
+    is stored as pairs of real numbers.
+    """
+    real_dtype = torch.empty(0, dtype=x.dtype).real.dtype if x.is_complex() else x.dtype
+    if real_dtype not in _DTYPES:
         raise TypeError(f"a tensor of {x.dtype} cannot be stored")
-    return _DTYPES[real], [*x.shape, 2] if x.is_complex() else list(x.shape), x.is_complex()
+    return _DTYPES[real_dtype], [*x.shape, 2] if x.is_complex() else list(x.shape), x.is_complex()
 
 
 def tensor_kind(x: Tensor) -> str:
@@ -597,14 +643,15 @@ def _tensor(data: Any, offset: int, kind: Any, shape: Any, is_complex: bool) -> 
     cannot be right.
     """
     dtype, count = _type_and_count(kind, shape)
+    # pairs of floating-point numbers of at least 16 bits
     if is_complex and (shape[-1:] != [2] or not dtype.is_floating_point or dtype.itemsize < 2):
         raise ValueError(f"a complex tensor is stored as {kind} of the shape {shape}")
     if offset + count * dtype.itemsize > len(data):
         raise ValueError(f"a stored tensor of {count} elements is longer than its file")
-    flat = (
+    elements = (
         torch.frombuffer(data, dtype=dtype, count=count, offset=offset)
         if count
         else torch.empty(0, dtype=dtype)
     )
-    x = flat.reshape(shape)
+    x = elements.reshape(shape)
     return torch.view_as_complex(x) if is_complex else x

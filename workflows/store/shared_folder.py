@@ -48,26 +48,29 @@ class Owner:
         """
         if self.host != host():
             return "foreign"
+        # of an earlier process with this number
         if self.pid == os.getpid():
             return "alive" if self.began == me().began else "dead"
         try:
-            status, began = _process(self.pid)
+            status, start_time = _process(self.pid)
         except FileNotFoundError:
+            # without /proc, ask by a signal
             return "dead" if os.path.exists("/proc/self/stat") else _signalled(self.pid)
         except (OSError, ValueError):
             return "dead"
-        return "alive" if began == self.began and status not in _IDLE else "dead"
+        return "alive" if start_time == self.began and status not in _IDLE else "dead"
 
 
 def owner_of(text: str) -> Owner | None:
     """Return the process that a text such as ``<host>-<number>-<start time>`` names, or None for
     any other text.
     """
-    host, _, numbers = text.partition("-")
-    pid, _, began = numbers.partition("-")
+    host_digest, _, number_and_time = text.partition("-")
+    pid, _, start_time = number_and_time.partition("-")
     return (
-        Owner(host, int(pid), began)
-        if len(host) == 12 and pid.isdecimal() and len(pid) < 12
+        Owner(host_digest, int(pid), start_time)
+        # 6 bytes as hexadecimal digits
+        if len(host_digest) == 12 and pid.isdecimal() and len(pid) < 12
         else None
     )
 
@@ -79,6 +82,7 @@ def me() -> Owner:
 
 @cache
 def _me(pid: int) -> Owner:
+    """Return this process as an owner, without a start time if the system gives none."""
     try:
         return Owner(host(), pid, _process(pid)[1])
     except (OSError, ValueError):
@@ -90,25 +94,28 @@ def host() -> str:
     """Return a digest of this machine and its present boot; two containers of the same name have
     different digests.
     """
-    parts = [os.uname().nodename]
+    machine_texts = [os.uname().nodename]
     with suppress(OSError):  # a system without these files
         with open("/proc/sys/kernel/random/boot_id") as file:
-            parts.append(file.read())
-        parts.append(str(os.stat("/proc/self/ns/pid").st_ino))
-    return hashlib.blake2b("\n".join(parts).encode(), digest_size=6).hexdigest()
+            machine_texts.append(file.read())
+        machine_texts.append(str(os.stat("/proc/self/ns/pid").st_ino))
+    return hashlib.blake2b("\n".join(machine_texts).encode(), digest_size=6).hexdigest()
 
 
 def _process(pid: int) -> tuple[str, str]:
     """Return the state and the start time of a process from ``/proc``."""
     with open(f"/proc/{pid}/stat", "rb") as file:
         # behind the name, which may hold any character
+        # "number (name) state ...": the fields behind the name begin with the state
         fields = file.read().rpartition(b")")[2].split()
     if len(fields) < 20:
         raise ValueError(f"the file /proc/{pid}/stat is incomplete")
+    # field 22 of proc(5): the start time
     return fields[0].decode(), fields[19].decode()
 
 
 def _signalled(pid: int) -> State:
+    """Return whether a process of this machine runs, by a signal that does nothing."""
     try:
         with suppress(PermissionError):  # a process of another user
             os.kill(pid, 0)
@@ -171,6 +178,7 @@ class Disk:
         path = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
             with open(path, "xb") as file:
+                # readable for those who may read the store, and never changed later
                 self.share(path, 0o444)
                 yield path, file
         finally:
@@ -238,45 +246,46 @@ class Disk:
         `_PATIENCE` seconds.
         """
         self.prepare()
-        file = self._lock_file()
+        lock_file = self._lock_file()
         try:
-            ends = time.monotonic() + _PATIENCE
-            while not _locked(file) and time.monotonic() < ends:
+            deadline = time.monotonic() + _PATIENCE
+            while not _locked(lock_file) and time.monotonic() < deadline:
                 time.sleep(0.001)
             yield
         finally:
-            os.close(file)
+            os.close(lock_file)
 
     def _lock_file(self) -> int:
         """Open the file of the lock without waiting; what is no file is removed first, if this
         user may.
         """
-        path, careful = f"{self.folder}/tmp/.lock", os.O_NOFOLLOW | os.O_NONBLOCK
+        path, safe_flags = f"{self.folder}/tmp/.lock", os.O_NOFOLLOW | os.O_NONBLOCK
         with suppress(OSError):
             if not stat.S_ISREG(os.lstat(path).st_mode):
                 os.unlink(path)
         try:
-            return os.open(path, os.O_RDWR | os.O_TRUNC | careful)
+            return os.open(path, os.O_RDWR | os.O_TRUNC | safe_flags)
         except FileNotFoundError:
-            file = os.open(path, os.O_RDWR | os.O_CREAT | careful, 0o666)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | safe_flags, 0o666)
             self.share(path)
             return file
         except (PermissionError, IsADirectoryError):
-            return os.open(path, os.O_RDONLY | careful)
+            # a lock needs no right to write
+            return os.open(path, os.O_RDONLY | safe_flags)
 
     def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
         """Remove the temporary files of dead processes; return the path and the bytes of each file.
 
         Leases and badges of other machines stay for ``patience`` seconds, because clocks may jump.
         """
-        swept = []
+        paths_and_sizes = []
         for entry in entries(f"{self.folder}/tmp"):
             with suppress(OSError):
                 if entry.name != ".lock" and _abandoned(entry, patience):
-                    swept.append((entry.path, entry.stat(follow_symlinks=False).st_size))
+                    paths_and_sizes.append((entry.path, entry.stat(follow_symlinks=False).st_size))
                     if not dry:
                         self.unlink(entry.path)
-        return swept
+        return paths_and_sizes
 
     def unlink(self, path: str) -> None:
         """Delete a file below the root folder; raise `OSError` if a folder on the way there is a
@@ -305,18 +314,23 @@ class Disk:
         however late it is put there. Raises `OSError` for a symbolic link.
         """
         *folders, name = path.removeprefix(f"{self.folder}/").split("/")
+        # a path with any of these may lead out of the root
         if {"", ".", ".."} & {*folders, name}:
             raise OSError(errno.EPERM, f"{path} is not below {self.folder}")
-        opened = [os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)]
+        open_folders = [os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)]
         try:
             for folder in folders:
-                opened.append(
-                    os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=opened[-1])
+                open_folders.append(
+                    os.open(
+                        folder,
+                        os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW,
+                        dir_fd=open_folders[-1],
+                    )
                 )
-            yield opened[-1], name
+            yield open_folders[-1], name
         finally:
-            for file in opened:
-                os.close(file)
+            for open_folder in open_folders:
+                os.close(open_folder)
 
 
 def append(path: str, raw: bytes, flags: int = 0) -> int:
@@ -348,17 +362,18 @@ def read_file(path: str, limit: int = MOST_READ) -> bytes:
     """
     file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        about = os.fstat(file)
-        if not stat.S_ISREG(about.st_mode) or about.st_size > limit:
+        file_status = os.fstat(file)
+        if not stat.S_ISREG(file_status.st_mode) or file_status.st_size > limit:
             raise ValueError(f"{path} is not a file of at most {limit} bytes")
-        raw = os.read(file, about.st_size)
+        content = os.read(file, file_status.st_size)
+        # the file may grow or shrink while it is read
         while (
-            len(raw) != about.st_size
-            and (chunk := os.read(file, limit + 1 - len(raw)))
-            and len(raw) <= limit
+            len(content) != file_status.st_size
+            and (chunk := os.read(file, limit + 1 - len(content)))
+            and len(content) <= limit
         ):
-            raw += chunk
-        return raw
+            content += chunk
+        return content
     finally:
         os.close(file)
 
@@ -391,6 +406,7 @@ def below(base: str) -> Iterator[os.DirEntry[str]]:
 
 
 def _locked(file: int) -> bool:
+    """Return True if the lock of a file was taken; False while another process holds it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -404,15 +420,16 @@ def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
     """Return True if the owner of a temporary file is dead, or if the owner is unknown and the
     file is old.
     """
-    words = entry.name.split(".")
-    shows_owner = words[-1] == "lease" or words[0] == "badge"
-    if words[-1] == "lease" and entry.is_file(follow_symlinks=False):
+    name_parts = entry.name.split(".")
+    is_lease_or_badge = name_parts[-1] == "lease" or name_parts[0] == "badge"
+    if name_parts[-1] == "lease" and entry.is_file(follow_symlinks=False):
         with open(entry.path, "rb", opener=open_now) as file:
-            words = file.readline(200).decode(errors="replace").split()
-    owner = next(filter(None, map(owner_of, words)), None)
+            # the name of a lease is that of a key; its content names the owner
+            name_parts = file.readline(200).decode(errors="replace").split()
+    owner = next(filter(None, map(owner_of, name_parts)), None)
     state = owner.state if owner else "foreign"
     if state == "foreign":
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > (
-            patience if shows_owner else OLD
+            patience if is_lease_or_badge else OLD
         )
     return state == "dead"

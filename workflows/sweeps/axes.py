@@ -41,19 +41,19 @@ def split(text: str) -> list[str]:
     """Split a text at the commas outside of quotes and brackets; raise `ValueError` for an
     unclosed bracket.
     """
-    parts, waiting = [""], list[str]()
+    pieces, closing_brackets = [""], list[str]()
     for token in _TOKEN.findall(text):
-        if token == "," and not waiting:
-            parts.append("")
+        if token == "," and not closing_brackets:
+            pieces.append("")
             continue
-        parts[-1] += token
+        pieces[-1] += token
         if token in _PAIRS:
-            waiting.append(_PAIRS[token])
-        elif waiting and token == waiting[-1]:
-            waiting.pop()
-    if waiting:
-        raise ValueError(f"a bracket is not closed: {waiting[-1]} is missing")
-    return parts
+            closing_brackets.append(_PAIRS[token])
+        elif closing_brackets and token == closing_brackets[-1]:
+            closing_brackets.pop()
+    if closing_brackets:
+        raise ValueError(f"a bracket is not closed: {closing_brackets[-1]} is missing")
+    return pieces
 
 
 def values_of(text: str) -> list[str]:
@@ -98,14 +98,16 @@ def _function(text: str) -> tuple[str, str] | None:
     """
     match = _CALL.fullmatch(text)
     if match is None or match[1] in _FUNCTIONS:
+        # None for a text that is no call
         return match and (match[1], match[2])
-    close = difflib.get_close_matches(match[1].lower(), _FUNCTIONS, 1, 0.7)
-    if close:
-        raise ValueError(f"there is no range function {match[1]}; did you mean {close[0]}?")
+    similar_names = difflib.get_close_matches(match[1].lower(), _FUNCTIONS, 1, 0.7)
+    if similar_names:
+        raise ValueError(f"there is no range function {match[1]}; did you mean {similar_names[0]}?")
     return None
 
 
 def _range(arguments: list[str]) -> list[str]:
+    """Return the values of ``range(start, stop, step)``, as for Python's range, but with a unit."""
     if not 1 <= len(arguments) <= 3:
         raise ValueError("write range(stop), range(start, stop) or range(start, stop, step)")
     numbers, unit = _numbers(arguments)
@@ -118,20 +120,26 @@ def _range(arguments: list[str]) -> list[str]:
 
 
 def _linspace(arguments: list[str]) -> list[str]:
+    """Return equally spaced values; both ends are among them."""
     (start, stop), unit, count = _ends(arguments, "linspace(450 nm, 650 nm, 5)")
+    # a single value needs no step
     step = (stop - start) / max(count - 1, 1)
     return [_written(start + i * step, unit) for i in range(count)]
 
 
 def _logspace(arguments: list[str]) -> list[str]:
+    """Return values with equal ratios; both ends are among them, exactly."""
     (start, stop), unit, count = _ends(arguments, "logspace(1e2, 1e6, 5)")
     if start <= 0 or stop <= 0:
         raise ValueError("the first and the last value of a logarithmic range must be positive")
+    # 50 digits, so that the values are right to the last digit of a float
     with localcontext(prec=50):
-        low, high = (Decimal(x.numerator) / Decimal(x.denominator) for x in (start, stop))
-        step = (high / low).ln() / max(count - 1, 1)
-        inner = [Fraction(low * (step * i).exp()) for i in range(count)]
-    ends = [start, *inner[1:-1], stop][:count]
+        first_value, last_value = (
+            Decimal(x.numerator) / Decimal(x.denominator) for x in (start, stop)
+        )
+        log_ratio = (last_value / first_value).ln() / max(count - 1, 1)
+        values = [Fraction(first_value * (log_ratio * i).exp()) for i in range(count)]
+    ends = [start, *values[1:-1], stop][:count]
     return [_written(x, unit) for x in ends]
 
 
@@ -156,6 +164,7 @@ def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]
 
 
 def _count(count: int) -> int:
+    """Return a number of values that an axis can have; raise `ValueError` for any other number."""
     if count < 1:
         raise ValueError(
             "the range is empty: change its first value, its last value or the number of values"
@@ -173,8 +182,8 @@ def _numbers(texts: list[str]) -> tuple[list[Fraction], str]:
     pairs = [_number(text) for text in texts]
     units = list(dict.fromkeys(unit for _, unit in pairs))
     if len(units) > 1:
-        several = ", ".join(unit or "none" for unit in units)
-        raise ValueError(f"write all numbers in the same unit instead of {several}")
+        unit_names = ", ".join(unit or "none" for unit in units)
+        raise ValueError(f"write all numbers in the same unit instead of {unit_names}")
     return [number for number, _ in pairs], units[0]
 
 
@@ -183,10 +192,12 @@ def _number(text: str) -> tuple[Fraction, str]:
     match = _NUMBER.fullmatch(text)
     if match is None or not math.isfinite(float(match[1])):
         raise ValueError(f"{text or 'nothing'} is not a number")
+    # as written: 0.1 is 1/10, not the nearest float
     return Fraction(repr(float(match[1]))), (match[2] or "").strip()
 
 
 def _written(number: Fraction, unit: str) -> str:
+    """Return a number with its unit as a user writes it."""
     value = float(number)
     is_whole = value.is_integer() and abs(value) < _EXACT
     return f"{int(value) if is_whole else value!r} {unit}".strip()
@@ -236,7 +247,8 @@ class Point:
     def shown(self) -> str:
         """Return the point of a sweep as text, such as ``sensor.read_noise=5 e-, doe=axicon``."""
         return ", ".join(
-            f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True)
+            f"{name}={coordinate.shown}"
+            for name, coordinate in zip(self.axes, self.coordinates, strict=True)
         )
 
 
@@ -270,8 +282,10 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
     if diagnostics:
         raise RecipeError(diagnostics)
     sizes = [range(len(axis.coordinates)) for axis in axes]
-    places = zip(*sizes, strict=True) if paired else itertools.product(*sizes)
-    return [_point(number, place, arguments, axes) for number, place in enumerate(places, 1)]
+    index_tuples = zip(*sizes, strict=True) if paired else itertools.product(*sizes)
+    return [
+        _point(number, indices, arguments, axes) for number, indices in enumerate(index_tuples, 1)
+    ]
 
 
 # --- arguments ------------------------------------------------------------------------------------
@@ -283,9 +297,9 @@ def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
     """
     results: list[_T] = []
     diagnostics: list[Diagnostic] = []
-    for read in readers:
+    for read_argument in readers:
         try:
-            results.append(read())
+            results.append(read_argument())
         except RecipeError as error:
             diagnostics += error.diagnostics
     if diagnostics:
@@ -294,10 +308,14 @@ def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
 
 
 def _read_word(word: str | Override, number: int, folder: Path) -> Argument:
+    """Read one argument of the command line: a change of the recipe, or an axis if it has
+    several values.
+    """
     if isinstance(word, Override):
         return word
     mark = Location(f"argument {number}", folder=str(folder))
     name, _, text = word.partition("=")
+    # "~name" removes a value
     if "=" not in word or name.startswith("~"):
         return read_override(word, mark)
     values = _values(text, word, mark)
@@ -310,11 +328,13 @@ def _read_word(word: str | Override, number: int, folder: Path) -> Argument:
 
 
 def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
+    """Read an axis from a list of values, or from a text as on the command line."""
     mark = Location(f"axis {name}", folder=str(folder))
     if name.startswith(("+", "~")):
         raise RecipeError([Diagnostic(mark, name, "write the name of an axis without + or ~")])
     if isinstance(values, str):
         return _axis(name, _values(values, f"{name}={values}", mark), mark)
+    # an array of NumPy has this method
     listed = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
         raise RecipeError(
@@ -333,6 +353,7 @@ def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
 
 
 def _values(text: str, path: str, mark: Location) -> list[str]:
+    """Return the values in a text; raise `RecipeError` if the text is malformed."""
     try:
         return values_of(text)
     except ValueError as error:
@@ -340,24 +361,35 @@ def _values(text: str, path: str, mark: Location) -> list[str]:
 
 
 def _coordinate(name: str, value: Any, folder: Path) -> Coordinate:
+    """Return one value of an axis with its changes of the recipe."""
     changes = tuple(overrides_of({name: value}, folder))
-    alone = (
+    # a mapping may change several values at once
+    single_change = (
         changes[0].value
         if len(changes) == 1 and changes[0].path == tuple(name.split("."))
         else None
     )
-    plain = value if alone is None else alone.plain
-    return Coordinate(plain if isinstance(plain, str) else flow(plain), plain, changes)
+    plain_value = value if single_change is None else single_change.plain
+    return Coordinate(
+        plain_value if isinstance(plain_value, str) else flow(plain_value), plain_value, changes
+    )
 
 
 def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
+    """Return an axis with values that are written as texts."""
     coordinates = []
-    for text, change in zip(
-        values, _every(partial(read_override, f"{name}={v}", mark) for v in values), strict=True
+    for text, override in zip(
+        values,
+        _every(partial(read_override, f"{name}={value}", mark) for value in values),
+        strict=True,
     ):
-        assert change.value is not None
-        plain = change.value.plain
-        coordinates.append(Coordinate(plain if isinstance(plain, str) else text, plain, (change,)))
+        assert override.value is not None
+        plain_value = override.value.plain
+        coordinates.append(
+            Coordinate(
+                plain_value if isinstance(plain_value, str) else text, plain_value, (override,)
+            )
+        )
     return Axis(name, tuple(coordinates), mark)
 
 
@@ -374,31 +406,36 @@ def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
             "",
             "the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'",
         )
-    first: dict[str, Axis] = {}
+    axis_of_name: dict[str, Axis] = {}
     for axis in axes:
-        if first.setdefault(axis.name, axis) is not axis:
+        # an axis of this name came before
+        if axis_of_name.setdefault(axis.name, axis) is not axis:
             yield Diagnostic(
                 axis.mark,
                 axis.name,
-                f"axis {axis.name} is also in {first[axis.name].mark}: remove one",
+                f"axis {axis.name} is also in {axis_of_name[axis.name].mark}: remove one",
             )
         yield from _repeated(axis)
         if paired:
             yield from _unequal(axis, axes[0])
-    product = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
-    if product > MOST:
+    point_count = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
+    if point_count > MOST:
         yield Diagnostic(
-            Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points"
+            Location("sweep"),
+            "",
+            f"a sweep of {point_count} points is too long: at most {MOST} points",
         )
 
 
 def _repeated(axis: Axis) -> Iterator[Diagnostic]:
     """Yield the first value that an axis has twice."""
-    counts = Counter(c.shown for c in axis.coordinates)
-    twice = [value for value, count in counts.items() if count > 1]
-    if twice:
+    counts = Counter(coordinate.shown for coordinate in axis.coordinates)
+    repeated_values = [value for value, count in counts.items() if count > 1]
+    if repeated_values:
         yield Diagnostic(
-            axis.mark, axis.name, f"the value {twice[0]} appears twice on the axis: remove one"
+            axis.mark,
+            axis.name,
+            f"the value {repeated_values[0]} appears twice on the axis: remove one",
         )
 
 
@@ -415,8 +452,15 @@ def _unequal(axis: Axis, first: Axis) -> Iterator[Diagnostic]:
 def _point(
     number: int, place: tuple[int, ...], arguments: Sequence[Argument], axes: Sequence[Axis]
 ) -> Point:
+    """Return one point: its number, the index on each axis, and all changes of the recipe in the
+    order of the arguments.
+    """
     coordinates = tuple(axis.coordinates[i] for axis, i in zip(axes, place, strict=True))
-    here = iter(coordinates)
-    changes = (next(here).overrides if isinstance(a, Axis) else (a,) for a in arguments)
+    next_coordinate = iter(coordinates)
+    # the arguments that are axes come in the order of the axes
+    changes = (
+        next(next_coordinate).overrides if isinstance(argument, Axis) else (argument,)
+        for argument in arguments
+    )
     names = tuple(axis.name for axis in axes)
     return Point(number, place, coordinates, tuple(itertools.chain.from_iterable(changes)), names)

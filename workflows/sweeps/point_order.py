@@ -56,8 +56,8 @@ def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]
     """
     steps = list(steps)
     times = [costs[step] for step in steps if step in costs]
-    usual = median(times) if times else 1.0
-    return {step: costs.get(step, usual) for step in steps}
+    median_time = median(times) if times else 1.0
+    return {step: costs.get(step, median_time) for step in steps}
 
 
 def best_order(
@@ -77,11 +77,11 @@ def best_order(
     weights = filled(costs, _steps(jobs))
     if paired:
         return _grouped(jobs, weights)
-    sizes = [1 + max(job.place[n] for job in jobs) for n in range(len(jobs[0].place))]
-    reach = [_reach(jobs, weights, sizes, n) for n in range(len(sizes))]
-    slowest_first = sorted(range(len(sizes)), key=lambda n: -reach[n])
-    index = {job.place: i for i, job in enumerate(jobs)}
-    return [index[place] for place in _there_and_back(sizes, slowest_first)]
+    sizes = [1 + max(job.place[axis] for job in jobs) for axis in range(len(jobs[0].place))]
+    recompute_times = [_reach(jobs, weights, sizes, axis) for axis in range(len(sizes))]
+    slowest_first = sorted(range(len(sizes)), key=lambda n: -recompute_times[n])
+    job_of_place = {job.place: i for i, job in enumerate(jobs)}
+    return [job_of_place[indices] for indices in _there_and_back(sizes, slowest_first)]
 
 
 def _steps(jobs: Iterable[PointJob]) -> set[str]:
@@ -94,15 +94,23 @@ def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
     without sharing.
     """
     weights = filled(costs, _steps(jobs))
-    different: dict[Key, float] = {}
-    alone, steps = 0.0, 0
+    weight_of_result: dict[Key, float] = {}
+    work_apart, steps = 0.0, 0
     for job in jobs:
-        own = {key: weights[step] for step, key in job.keys.items()}
-        different |= own
-        alone, steps = alone + sum(own.values()), steps + len(own)
+        weight_of_key = {key: weights[step] for step, key in job.keys.items()}
+        # results that points share count once
+        weight_of_result |= weight_of_key
+        work_apart, steps = work_apart + sum(weight_of_key.values()), steps + len(weight_of_key)
     pairs = set[tuple[str, Key]]().union(*(job.keys.items() for job in jobs))
     distinct = Counter(step for step, _ in pairs)
-    return Sharing(len(jobs), distinct, steps, len(different), alone, sum(different.values()))
+    return Sharing(
+        len(jobs),
+        distinct,
+        steps,
+        len(weight_of_result),
+        work_apart,
+        sum(weight_of_result.values()),
+    )
 
 
 def work_left(
@@ -113,18 +121,18 @@ def work_left(
     """
     computed: set[Key] = set()
     in_store = cache(stored)
-    work = []
+    work_of_points = []
     for job in jobs:
-        weights, seconds, waiting = filled(costs, job.keys), list[float](), list(job.outputs)
-        while waiting:
-            name = waiting.pop()
+        step_times, seconds, names_left = filled(costs, job.keys), list[float](), list(job.outputs)
+        while names_left:
+            name = names_left.pop()
             key = job.keys[name]
             if key not in computed and not in_store(key):
                 computed.add(key)
-                seconds.append(weights[name])
-                waiting += job.sources[name]
-        work.append(sum(seconds))
-    return work
+                seconds.append(step_times[name])
+                names_left += job.sources[name]
+        work_of_points.append(sum(seconds))
+    return work_of_points
 
 
 def _reach(
@@ -133,17 +141,19 @@ def _reach(
     """Return the mean computing time of the steps that must run again after a change to the next
     value of ``axis``.
     """
-    stride = math.prod(sizes[axis + 1 :])
-    work = [
+    # jobs are in the order of the product: so far lies the previous value of the axis
+    distance = math.prod(sizes[axis + 1 :])
+    times = [
         sum(
             weights[step]
             for step, key in job.keys.items()
-            if jobs[i - stride].keys.get(step) != key
+            if jobs[i - distance].keys.get(step) != key
         )
         for i, job in enumerate(jobs)
+        # the first value has no previous one
         if job.place[axis]
     ]
-    return sum(work) / len(work) if work else 0.0
+    return sum(times) / len(times) if times else 0.0
 
 
 def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[tuple[int, ...]]:
@@ -152,11 +162,12 @@ def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[
     """
     rows: list[list[int]] = [[0] * len(sizes)]
     for axis in slowest_first:
-        grown = []
-        for n, row in enumerate(rows):
-            steps = range(sizes[axis]) if n % 2 == 0 else reversed(range(sizes[axis]))
-            grown += [[*row[:axis], i, *row[axis + 1 :]] for i in steps]
-        rows = grown
+        longer_rows = []
+        for row_number, row in enumerate(rows):
+            # each second row backwards
+            indices = range(sizes[axis]) if row_number % 2 == 0 else reversed(range(sizes[axis]))
+            longer_rows += [[*row[:axis], i, *row[axis + 1 :]] for i in indices]
+        rows = longer_rows
     return [tuple(row) for row in rows]
 
 
@@ -164,13 +175,17 @@ def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int
     """Return the indices of the points of a sweep, sorted so that points that share costly
     results are neighbours.
     """
-    first: dict[str, dict[Key, int]] = defaultdict(dict)
+    first_job_of_key: dict[str, dict[Key, int]] = defaultdict(dict)
     for i, job in enumerate(jobs):
         for step, key in job.keys.items():
-            first[step].setdefault(key, i)
-    shared = [step for step, keys in first.items() if 1 < len(keys) < len(jobs)]
-    shared.sort(key=lambda step: -weights[step])
+            first_job_of_key[step].setdefault(key, i)
+    # steps with one result for all points, or another for each, put nothing together
+    shared_steps = [step for step, keys in first_job_of_key.items() if 1 < len(keys) < len(jobs)]
+    shared_steps.sort(key=lambda step: -weights[step])
     return sorted(
         range(len(jobs)),
-        key=lambda i: [first[step].get(jobs[i].keys.get(step, ""), -1) for step in shared],
+        # the costliest step first: points with equal results of it are neighbours
+        key=lambda i: [
+            first_job_of_key[step].get(jobs[i].keys.get(step, ""), -1) for step in shared_steps
+        ],
     )

@@ -64,25 +64,29 @@ class KeptRecipe:
         """
         same = same or Same()
         names = (f.name for f in fields(Recipe))
-        others = {
+        other_fields = {
             name: getattr(recipe, name)
             for name in names
             if getattr(recipe, name) is not getattr(first, name)
         }
         steps = _changed(recipe.steps, first.steps, same.steps)
         values = _changed(recipe.config.settings, first.config.settings, same.values)
+        # kept by its differences alone
         if steps is not None:
-            others.pop("steps", None)
+            other_fields.pop("steps", None)
         if values is not None:
-            others.pop("config", None)
-        return cls(first, steps or {}, values or {}, others)
+            other_fields.pop("config", None)
+        return cls(first, steps or {}, values or {}, other_fields)
 
     @property
     def recipe(self) -> Recipe:
         """Return the recipe, equal to the one that was kept."""
-        same = self.first
-        steps, values = {**same.steps, **self.steps}, {**same.config.settings, **self.values}
-        return replace(same, **{"steps": steps, "config": Config(values), **self.others})
+        first_recipe = self.first
+        steps, values = (
+            {**first_recipe.steps, **self.steps},
+            {**first_recipe.config.settings, **self.values},
+        )
+        return replace(first_recipe, **{"steps": steps, "config": Config(values), **self.others})
 
 
 def _changed(
@@ -95,15 +99,15 @@ def _changed(
     """
     if list(mapping) != list(first):
         return None
-    changed = {}
+    different = {}
     for key, value in mapping.items():
         if value is first[key] or (key in same and value is same[key]):
             continue
         if _equal(value, first[key]):
             same[key] = value
         else:
-            changed[key] = value
-    return changed
+            different[key] = value
+    return different
 
 
 def _equal(left: Any, right: Any) -> bool:
@@ -186,14 +190,25 @@ def plan_sweep(
     Raises `RecipeError` with the mistakes of all points.
     """
     checker = _Checker(recipe, folder, store, device)
-    checked = list(checker.every(points))
+    checked_points = list(checker.every(points))
     if checker.diagnostics or checker.first is None:
         raise RecipeError(checker.diagnostics)
     costs = _costs(store)
-    in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
-    work = work_left([c.job for c in in_turn], costs, store.has)
+    ordered_points = [
+        checked_points[i]
+        for i in best_order([checked_point.job for checked_point in checked_points], costs, paired)
+    ]
+    # without results that are stored or shared with earlier points
+    work_of_points = work_left(
+        [checked_point.job for checked_point in ordered_points], costs, store.has
+    )
     return SweepPlan(
-        checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.series
+        checker.first,
+        tuple(ordered_points),
+        costs,
+        tuple(work_of_points),
+        tuple(checker.notes),
+        checker.series,
     )
 
 
@@ -221,6 +236,7 @@ def outcomes(
     with closing(shared(alone, range(len(plan.checked)), workers, apart=True)) as ended:
         for number, returned in ended:
             checked, began = plan.checked[number], time.perf_counter()
+            # this process runs the point: no worker finished it
             if returned is None:
                 started(checked.point)
             try:
@@ -234,6 +250,7 @@ def outcomes(
             else:
                 if outcome.failure:
                     store.pass_on(outcome.failure)
+                # state, seconds and numbers
                 yield PointOutcome(checked.point, *outcome[:3], left=clock.left(number))
 
 
@@ -256,6 +273,7 @@ def _found(
     device: str,
     memory: int | None = None,
 ) -> _Found:
+    """Run one point of a sweep; return its state, time and numbers."""
     began = time.perf_counter()
     recipe = plan.checked[number].kept.recipe
     result = run(recipe, store, watch=watch, device=device, memory=memory, series=plan.series)
@@ -263,12 +281,13 @@ def _found(
     for step, value in result.values.items():
         rows = numbers_of(step, value)
         numbers += [(name, field, index, number) for name, field, index, number in rows]
-    ran = any(done.state == "run" for done in result.done.values())
-    state: PointState = "run" if ran else "cached"
+    has_run = any(record.state == "run" for record in result.done.values())
+    state: PointState = "run" if has_run else "cached"
     return _Found(state, time.perf_counter() - began, tuple(numbers), store.failure)
 
 
 def _failed(point: Point, error: Exception, seconds: float, left: float) -> PointOutcome:
+    """Return the outcome of a point that ended with an error."""
     step = error.step if isinstance(error, RunError) else ""
     message = (
         str(error)
@@ -279,6 +298,7 @@ def _failed(point: Point, error: Exception, seconds: float, left: float) -> Poin
 
 
 def _costs(store: Store) -> dict[str, float]:
+    """Return the median time (s) of each step, as the journal of a store has it."""
     times: dict[str, list[float]] = defaultdict(list)
     for row in store.journal.latest():
         if row["step"] and row["seconds"] is not None:
@@ -293,8 +313,10 @@ class _Clock:
 
     def __init__(self, work: Sequence[float]) -> None:
         # reading the numbers of a stored point also takes time
+        # a hundredth of the mean work of a point; 1 where all is stored
         shortest = sum(work) / 100 / len(work) or 1.0
         self.work = [max(seconds, shortest) for seconds in work]
+        # work left, work done, points left
         self.todo, self.done, self.points = sum(self.work), 0.0, len(self.work)
         self.began = time.perf_counter()
 
@@ -302,9 +324,10 @@ class _Clock:
         """Record that a point of a sweep has ended, and return the predicted seconds of all
         remaining points.
         """
-        work, self.points = self.work[number], self.points - 1
-        self.todo, self.done = self.todo - work, self.done + work
+        work_of_point, self.points = self.work[number], self.points - 1
+        self.todo, self.done = self.todo - work_of_point, self.done + work_of_point
         return (
+            # work left, at the pace of the work done; rounding may leave less than 0
             max(self.todo, 0.0) * (time.perf_counter() - self.began) / self.done
             if self.points
             else 0.0
@@ -320,7 +343,7 @@ class _Checker:
         self.diagnostics: list[Diagnostic] = []
         self.notes: dict[str, None] = {}
         self.first: Recipe | None = None
-        self._same: dict[Any, Any] = {}
+        self._same: dict[Any, Any] = {}  # one object for equal keys and graphs
         self._equal = Same()
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
@@ -340,6 +363,9 @@ class _Checker:
         self.series.known_keys.code.save()
 
     def _job(self, point: Point, recipe: Recipe) -> PointJob:
+        """Return the steps that a point needs with their keys; raise `RecipeError` where a key
+        cannot be found.
+        """
         self.notes.update(dict.fromkeys(recipe.notes))
         keys: dict[str, Key] = {}
         recipe = with_substitutions(recipe, recipe.outputs)
@@ -353,6 +379,7 @@ class _Checker:
             except (OSError, LookupError, TypeError) as error:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)
+        # one object for all points with the same graph
         graph = self._same.setdefault(sources, dict(sources))
         return PointJob(point.place, keys, graph, recipe.outputs)
 

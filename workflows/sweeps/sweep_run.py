@@ -93,19 +93,20 @@ class Sweep:
         Raises: RecipeError if xarray is not installed.
         """
         require_xarray("to_xarray")
-        about = {
+        attributes = {
             "recipe": self.recipe,
             "title": self.title,
             "neusee": versions()["neusee"],
             "state": self.state,
         }
-        return dataset(self.outcomes, self.columns, self.paired, about)
+        return dataset(self.outcomes, self.columns, self.paired, attributes)
 
     def _repr_html_(self) -> str:
         names, *rows = wide(self.outcomes, self.columns)
         head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
         body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows
+            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
+            for row in rows
         )
         summary = html.escape(f"{self.title or self.recipe}: {counted(self)}")
         return f"<p>{summary}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
@@ -134,11 +135,15 @@ def sweep(
 
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
-    place = Path(folder or ".").absolute()
-    arguments = [*read_words(overrides, place), *read_axes(axes, place)]
-    work = Sweeping(os.fspath(recipe), arguments, place, store or open_store(), zip, device)
-    done = outcomes(work.plan, work.store, on_error, device, workers=work.workers(workers))
-    return work.sweep(list(done), "complete")
+    working_folder = Path(folder or ".").absolute()
+    arguments = [*read_words(overrides, working_folder), *read_axes(axes, working_folder)]
+    sweeping = Sweeping(
+        os.fspath(recipe), arguments, working_folder, store or open_store(), zip, device
+    )
+    point_outcomes = outcomes(
+        sweeping.plan, sweeping.store, on_error, device, workers=sweeping.workers(workers)
+    )
+    return sweeping.sweep(list(point_outcomes), "complete")
 
 
 class Sweeping:
@@ -170,7 +175,7 @@ class Sweeping:
 
     def sweep(self, outcomes: Sequence[PointOutcome], state: SweepState) -> Sweep:
         """Return the result of the sweep, with the outcomes sorted by the number of the point."""
-        recipe, in_turn = (
+        recipe, sorted_outcomes = (
             self.plan.recipe,
             sorted(outcomes, key=lambda outcome: outcome.point.number),
         )
@@ -179,7 +184,7 @@ class Sweeping:
             recipe.name,
             recipe.title,
             self.columns,
-            tuple(in_turn),
+            tuple(sorted_outcomes),
             count,
             self.sharing,
             self.paired,
@@ -197,14 +202,15 @@ def write_sweep(
     keys: list[str] = []
     for checked in work.plan.checked:
         keys += [checked.job.keys[output] for output in checked.job.outputs]
+    # the folder is named by all results of the sweep
     key = digest(keys)
     with new_run(out / "sweeps", name, key) as folder:
         folder.write_rows(
             "sweep.csv", header(result.columns), (list(row.values()) for row in result.rows)
         )
         title = f"{(result.title or result.recipe).rstrip('.')}: {counted(result)}"
-        account = folder.said = _account(work, result, again, seconds)
-        lines = [f"# {title}\n", *(f"{key}: {flow(value)}\n" for key, value in account.items())]
+        summary = folder.said = _account(work, result, again, seconds)
+        lines = [f"# {title}\n", *(f"{key}: {flow(value)}\n" for key, value in summary.items())]
         folder.write("sweep.yaml", "".join(lines))
         if netcdf:
             result.to_xarray().to_netcdf(folder.path / "sweep.nc", engine="h5netcdf")
@@ -212,13 +218,16 @@ def write_sweep(
 
 
 def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float) -> dict[str, Any]:
+    """Return what the file of a sweep says of it, with the command that repeats it."""
     return {
         "recipe": result.recipe,
         "state": result.state,
         "points": result.points,
         "done": len(result.outcomes) - len(result.failed),
         "failed": [outcome.point.number for outcome in result.failed],
-        "axes": {axis.name: [c.value for c in axis.coordinates] for axis in work.axes},
+        "axes": {
+            axis.name: [coordinate.value for coordinate in axis.coordinates] for axis in work.axes
+        },
         "paired": result.paired,
         "overrides": work.fixed,
         "order": [checked.point.number for checked in work.plan.checked],
@@ -235,9 +244,9 @@ def counted(result: Sweep) -> str:
     cached, 1 failed``.
     """
     states = [outcome.state for outcome in result.outcomes]
-    parts = [
+    state_texts = [
         f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states
     ]
-    missing = result.points - len(states)
-    parts += [f"{missing} not run"] if missing else []
-    return f"{result.points} point{'s' * (result.points > 1)}: {', '.join(parts)}"
+    not_run = result.points - len(states)
+    state_texts += [f"{not_run} not run"] if not_run else []
+    return f"{result.points} point{'s' * (result.points > 1)}: {', '.join(state_texts)}"

@@ -44,31 +44,31 @@ def column(axis: Axis) -> AxisColumn:
 
     Words are unchanged.
     """
-    values = [c.value for c in axis.coordinates]
+    values = [coordinate.value for coordinate in axis.coordinates]
     header = f"{axis.name} (axis)" if axis.name in ("point", *AFTER) else axis.name
     quantities = _alike(values)
     if quantities:
         return _of_quantities(axis.name, header, quantities)
-    if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
         return AxisColumn(axis.name, header, tuple(values), tuple(map(float, values)), "")
-    words = tuple(c.shown for c in axis.coordinates)
+    words = tuple(coordinate.shown for coordinate in axis.coordinates)
     return AxisColumn(axis.name, header, words, words, "")
 
 
 def _alike(values: Sequence[Any]) -> list[_Quantity]:
     """Return the values as quantities if all are quantities of one SI unit, and else none."""
-    quantities = [q for q in map(_quantity, values) if q is not None]
-    one_unit = len({q.si_unit for q in quantities}) == 1
+    quantities = [quantity for quantity in map(_quantity, values) if quantity is not None]
+    one_unit = len({quantity.si_unit for quantity in quantities}) == 1
     return quantities if one_unit and len(quantities) == len(values) else []
 
 
 def _of_quantities(name: str, header: str, quantities: Sequence[_Quantity]) -> AxisColumn:
     """Return the column of quantities of one SI unit, in their own unit if all have the same."""
-    si, unit = tuple(q.si for q in quantities), quantities[0].si_unit
-    if len({q.unit for q in quantities}) > 1:
-        return AxisColumn(name, f"{header} ({unit})", si, si, unit)
-    numbers = tuple(q.number for q in quantities)
-    return AxisColumn(name, f"{header} ({quantities[0].unit})", numbers, si, unit)
+    si_values, unit = tuple(quantity.si for quantity in quantities), quantities[0].si_unit
+    if len({quantity.unit for quantity in quantities}) > 1:
+        return AxisColumn(name, f"{header} ({unit})", si_values, si_values, unit)
+    numbers = tuple(quantity.number for quantity in quantities)
+    return AxisColumn(name, f"{header} ({quantities[0].unit})", numbers, si_values, unit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +80,7 @@ class _Quantity:
 
 
 def _quantity(value: Any) -> _Quantity | None:
+    """Return a text such as ``450 nm`` as a quantity; None for anything else."""
     match = units._NUMBER.fullmatch(value.strip()) if isinstance(value, str) else None
     for si_unit, scale in units._SCALE.items():
         if match and match[2].strip() in scale:
@@ -103,11 +104,12 @@ def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[li
 
     A point has no numbers if it failed or if its results have none.
     """
-    where = [outcome.point.number, *point_cells(outcome.point, columns)]
+    point_columns = [outcome.point.number, *point_cells(outcome.point, columns)]
     status = "failed" if outcome.state == "failed" else "ok"
-    last = [round(outcome.seconds, 6), outcome.state == "cached", outcome.message]
+    last_columns = [round(outcome.seconds, 6), outcome.state == "cached", outcome.message]
+    # without numbers, one row with the step that failed
     for number in outcome.numbers or ((outcome.step, "", "", ""),):
-        yield [*where, status, *number, *last]
+        yield [*point_columns, status, *number, *last_columns]
 
 
 def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
@@ -121,6 +123,7 @@ def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
         results.setdefault(f"{step}.{field}".rstrip("."), []).append(value)
     return {
         name: _range_of(values)
+        # False before True: single numbers first
         for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)
     }
 
@@ -131,7 +134,7 @@ def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> lis
     """
     results = [headline(outcome.numbers) for outcome in outcomes]
     names = list(dict.fromkeys(itertools.chain.from_iterable(results)))
-    rows = [["point", *(c.header for c in columns), *names, "state", "seconds"]]
+    rows = [["point", *(axis_column.header for axis_column in columns), *names, "state", "seconds"]]
     for outcome, result in zip(outcomes, results, strict=True):
         cells = [cell_text(cell) for cell in point_cells(outcome.point, columns)]
         values = [result.get(name, "") for name in names]
@@ -143,10 +146,11 @@ def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> lis
 
 def point_cells(point: Point, columns: Sequence[AxisColumn]) -> list[Any]:
     """Return the axis values of one point of a sweep as they appear in the table."""
-    return [c.cells[i] for c, i in zip(columns, point.place, strict=True)]
+    return [axis_column.cells[i] for axis_column, i in zip(columns, point.place, strict=True)]
 
 
 def _range_of(values: Sequence[float]) -> str:
+    """Return a single number as text, or the range of several."""
     return f"{values[0]:.4g}" if len(values) == 1 else f"{min(values):.3g} … {max(values):.3g}"
 
 
@@ -187,30 +191,34 @@ def dataset(
     import numpy
     import xarray
 
-    shape, dims = _shape(columns, paired)
-    coords = {c.name: _coordinate(c, paired) for c in columns}
-    ran, seconds = numpy.zeros(shape, bool), numpy.full(shape, numpy.nan)
+    shape, axis_names = _shape(columns, paired)
+    coords = {axis_column.name: _coordinate(axis_column, paired) for axis_column in columns}
+    has_run, seconds = numpy.zeros(shape, bool), numpy.full(shape, numpy.nan)
     arrays: dict[str, Any] = {}
-    taken = {"ran", "seconds", *coords}
-    long = _lengths(outcomes, taken)
+    taken_names = {"ran", "seconds", *coords}
+    lengths = _lengths(outcomes, taken_names)
     for outcome in outcomes:
-        place = outcome.point.place[:1] if paired else outcome.point.place
-        seconds[place], ran[place] = outcome.seconds, outcome.state != "failed"
-        for name, index, value in _named(outcome, taken):
+        # paired axes have one index
+        indices = outcome.point.place[:1] if paired else outcome.point.place
+        seconds[indices], has_run[indices] = outcome.seconds, outcome.state != "failed"
+        for name, index, value in _named(outcome, taken_names):
             if name not in arrays:
-                size = (*shape, long[name]) if name in long else shape
-                arrays[name] = numpy.full(size, numpy.nan)
-            arrays[name][(*place, index or 0) if name in long else place] = value
-    results = {name: (_dims(name, dims, long), array) for name, array in arrays.items()}
-    own = {"ran": (dims, ran), "seconds": (dims, seconds, {"units": "s"})}
-    return xarray.Dataset({**results, **own}, coords, dict(about))
+                array_shape = (*shape, lengths[name]) if name in lengths else shape
+                arrays[name] = numpy.full(array_shape, numpy.nan)
+            # an empty index is that of a single number
+            arrays[name][(*indices, index or 0) if name in lengths else indices] = value
+    results = {name: (_dims(name, axis_names, lengths), array) for name, array in arrays.items()}
+    own_variables = {"ran": (axis_names, has_run), "seconds": (axis_names, seconds, {"units": "s"})}
+    return xarray.Dataset({**results, **own_variables}, coords, dict(about))
 
 
 def _shape(columns: Sequence[AxisColumn], paired: bool) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return the sizes and the names of the dimensions of the axes."""
     if paired:
         return (len(columns[0].si),), ("point",)
-    return tuple(len(c.si) for c in columns), tuple(c.name for c in columns)
+    return tuple(len(axis_column.si) for axis_column in columns), tuple(
+        axis_column.name for axis_column in columns
+    )
 
 
 def _named(outcome: PointOutcome, taken: Collection[str]) -> Iterator[tuple[str, int | str, float]]:
@@ -232,12 +240,12 @@ def _dims(name: str, dims: tuple[str, ...], long: Container[str]) -> tuple[str, 
 
 def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
     """Return the largest length of each result that is an array, over all points of the sweep."""
-    long: dict[str, int] = {}
+    lengths: dict[str, int] = {}
     for outcome in outcomes:
         for name, index, _ in _named(outcome, taken):
             if index != "":
-                long[name] = max(long.get(name, 0), int(index) + 1)
-    return long
+                lengths[name] = max(lengths.get(name, 0), int(index) + 1)
+    return lengths
 
 
 def _variable(step: str, field: str, taken: Collection[str]) -> str:

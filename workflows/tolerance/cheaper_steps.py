@@ -59,20 +59,21 @@ def with_substitutions(
     nothing.
     """
     outputs = frozenset(outputs)
-    planned, again = (
+    plan, has_substitutions = (
         _substituted(recipe, outputs, pinned),
         any(substitution.within for substitution in recipe.substitutions),
     )
-    for _ in range(0 if again else _TRIES):
-        if not any(substitution.within for substitution in planned.substitutions):
+    # a recipe that has cheaper steps already stays as it is
+    for _ in range(0 if has_substitutions else _TRIES):
+        if not any(substitution.within for substitution in plan.substitutions):
             break
-        if (excess := expected_excess(planned, sorted(outputs), _USED)) <= 1.0:
+        if (excess := expected_excess(plan, sorted(outputs), _USED)) <= 1.0:
             break
-        scale = planned.tolerance_scale * _SAFE / excess if math.isfinite(excess) else 0.0
-        planned = _substituted(
-            replace(planned.unsubstituted or recipe, tolerance_scale=scale), outputs, pinned
+        tolerance_scale = plan.tolerance_scale * _SAFE / excess if math.isfinite(excess) else 0.0
+        plan = _substituted(
+            replace(plan.unsubstituted or recipe, tolerance_scale=tolerance_scale), outputs, pinned
         )
-    return planned
+    return plan
 
 
 def stricter_scale(recipe: Recipe, over: float) -> float:
@@ -82,13 +83,17 @@ def stricter_scale(recipe: Recipe, over: float) -> float:
     The limits of low-rank cubes are powers of ten. The scale is so small that these limits become
     smaller too, because a cube that stays the same may be what was too coarse.
     """
-    images = [
+    image_names = [
         substitution.step
         for substitution in recipe.substitutions
         if substitution.within and substitution.step in recipe.steps
     ]
-    cubes = [recipe.allowed(name) * _MIXTURE for name in images if recipe.allowed(name) > 0]
-    next_power = min((_power_of_ten(limit) / limit for limit in cubes), default=1.0)
+    cube_limits = [
+        recipe.allowed(name) * _MIXTURE for name in image_names if recipe.allowed(name) > 0
+    ]
+    # the factor to the power of ten below each limit
+    next_power = min((_power_of_ten(limit) / limit for limit in cube_limits), default=1.0)
+    # 0.99: just below the power, so that the limit drops to the next one
     return recipe.tolerance_scale * min(_SAFE / over, 0.99 * next_power)
 
 
@@ -106,18 +111,19 @@ def _substituted(recipe: Recipe, outputs: frozenset[str], pinned: Collection[str
     order = needed(recipe, sorted(outputs))
     recipe = _limited(recipe, order)
     images = [
-        recipe.steps[n]
-        for n in order
-        if recipe.steps[n].node.channel_sum_form is not None and n not in outputs
+        recipe.steps[name]
+        for name in order
+        if recipe.steps[name].node.channel_sum_form is not None and name not in outputs
     ]
     if not images or recipe.tolerance * recipe.tolerance_scale <= _LEAST:
         return recipe
-    dependent = _dependent(recipe, order, pinned)
-    draft = _Draft(recipe, outputs, _readers(recipe, order), frozenset(dependent))
+    pinned_and_later = _dependent(recipe, order, pinned)
+    cheaper = _Draft(recipe, outputs, _readers(recipe, order), frozenset(pinned_and_later))
     for image in images:
-        if image.name not in pinned and image.wires.get("radiance") not in dependent:
-            draft.collapse(image)
-    recipe = draft.finished()
+        if image.name not in pinned and image.wires.get("radiance") not in pinned_and_later:
+            cheaper.collapse(image)
+    recipe = cheaper.finished()
+    # the cheaper steps may change which steps have no bound
     return _limited(recipe, needed(recipe, sorted(outputs)))
 
 
@@ -173,18 +179,28 @@ class _Draft:
         weights = self.spectral(image.name, readers)
         if node is None or weights is None or not isinstance(radiance, str):
             return
-        name, within = f"{image.name}.channels", self.recipe.allowed(image.name)
-        cube, rows = self._mixture(radiance, image), self._rows(*weights, readers, image)
+        name, error_limit = f"{image.name}.channels", self.recipe.allowed(image.name)
+        cube_step, rows_step = self._mixture(radiance, image), self._rows(*weights, readers, image)
         # the level of the scene follows the brightest pixel
         largest = any(reader.node.hooks.band_invariant is not None for reader in readers)
-        wires = {"radiance": cube, "rows": rows, **self._few_bands(image, cube, rows, largest)}
-        within *= BESIDE if "few" in wires else CHANNELS
-        self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
+        wires = {
+            "radiance": cube_step,
+            "rows": rows_step,
+            **self._few_bands(image, cube_step, rows_step, largest),
+        }
+        # beside an estimate of few bands the channels get a smaller share
+        error_limit *= BESIDE if "few" in wires else CHANNELS
+        self._add(
+            name, node, wires, {**image.params, "within": error_limit, "largest": largest}, image
+        )
         for reader in readers:
-            changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
-            self.rewired[reader.name] = replace(reader, wires=changed)
+            new_wires = {
+                input_name: _exchanged(wire, image.name, name)
+                for input_name, wire in reader.wires.items()
+            }
+            self.rewired[reader.name] = replace(reader, wires=new_wires)
         self.substitutions.append(
-            Substitution(image.name, name, within, "only sums over its bands are needed")
+            Substitution(image.name, name, error_limit, "only sums over its bands are needed")
         )
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
@@ -193,14 +209,16 @@ class _Draft:
         Return None if a step in ``readers`` needs single bands, or if the steps read different
         bands or responses.
         """
-        pairs = {
-            (r.wires.get("bands"), r.wires.get("responses"))
-            for r in readers
-            if "responses" in r.node.inputs
+        bands_and_responses = {
+            (reader.wires.get("bands"), reader.wires.get("responses"))
+            for reader in readers
+            if "responses" in reader.node.inputs
         }
-        if len(pairs) != 1 or not all(self._sums(r, image) for r in readers):
+        if len(bands_and_responses) != 1 or not all(
+            self._sums(reader, image) for reader in readers
+        ):
             return None
-        bands, responses = pairs.pop()
+        bands, responses = bands_and_responses.pop()
         return (bands, responses) if isinstance(bands, str) and isinstance(responses, str) else None
 
     def finished(self) -> Recipe:
@@ -221,16 +239,19 @@ class _Draft:
     def _sums(self, reader: Step, image: str) -> bool:
         """Return True if the step ``reader`` needs only sums over wavelength bands of an image."""
         node, band_invariant = reader.node, reader.node.hooks.band_invariant
-        reads = {
-            i
-            for i, wire in reader.wires.items()
+        inputs_read = {
+            input_name
+            for input_name, wire in reader.wires.items()
             if image == wire or (isinstance(wire, tuple) and image in wire)
         }
-        if not reads <= set(node.accepts_channel_sums) or (
+        if not inputs_read <= set(node.accepts_channel_sums) or (
             band_invariant and not band_invariant(reader.params)
         ):
             return False
-        return all(self._even(reader.wires.get(i)) for i in node.needs_band_invariant)
+        # such an input must be equal in all bands
+        return all(
+            self._even(reader.wires.get(input_name)) for input_name in node.needs_band_invariant
+        )
 
     def _even(self, wire: Wire) -> bool:
         """Return True if an input is unconnected, or if the connected node states that all bands
@@ -251,27 +272,40 @@ class _Draft:
         step = self.recipe.steps[name] if isinstance(name, str) else None
         if step is None or step.node is not optics.psf or not self._only(step.name, image.name):
             return {"psf": name}
-        lens = {p: step.params[p] for p in ("focal_length", "pixel_pitch", "pixel", "sensor")}
+        lens_params = {
+            param: step.params[param]
+            for param in ("focal_length", "pixel_pitch", "pixel", "sensor")
+        }
         inputs = {"pupil": step.wires["pupil"], "radiance": cube, "rows": rows}
-        within = self.recipe.allowed(image.name) * ESTIMATED
-        params = {**lens, "shape": step.params["shape"], "within": within, "largest": largest}
-        choice = self._add(f"{name}.choice", optics.few_bands, inputs, params, step)
-        pupil = self._add(
+        error_limit = self.recipe.allowed(image.name) * ESTIMATED
+        params = {
+            **lens_params,
+            "shape": step.params["shape"],
+            "within": error_limit,
+            "largest": largest,
+        }
+        # which bands are enough
+        choice_step = self._add(f"{name}.choice", optics.few_bands, inputs, params, step)
+        pupil_step = self._add(
             f"{name}.pupil",
             optics.pupil_of_bands,
-            {"pupil": inputs["pupil"], "few": choice},
+            {"pupil": inputs["pupil"], "few": choice_step},
             {},
             step,
         )
-        few = self._add(f"{name}.few", step.node, {"pupil": pupil}, step.params, step)
-        checked = {"few": choice, "psf": few, **inputs}
-        checked_name = self._add(f"{name}.checked", optics.few_bands_checked, checked, lens, step)
+        # the PSF of these bands
+        few_psf = self._add(f"{name}.few", step.node, {"pupil": pupil_step}, step.params, step)
+        # their error is estimated, and the run sees it
+        check_inputs = {"few": choice_step, "psf": few_psf, **inputs}
+        checked_name = self._add(
+            f"{name}.checked", optics.few_bands_checked, check_inputs, lens_params, step
+        )
         self.substitutions.append(
             Substitution(
-                step.name, checked_name, within, "PSFs of few bands are enough for the image"
+                step.name, checked_name, error_limit, "PSFs of few bands are enough for the image"
             )
         )
-        return {"psf": few, "few": checked_name}
+        return {"psf": few_psf, "few": checked_name}
 
     def _only(self, psf: str, image: str) -> bool:
         """Return True if no step but ``image`` reads a PSF on the axis, and an estimate of its
@@ -280,19 +314,19 @@ class _Draft:
         if not self.recipe.estimates or psf in self.wanted or psf in self.dependent:
             return False
         step = self.recipe.steps[psf]
-        apart = step.wires.get("direction") is not None or any(step.params["angle"])
-        return self.readers.get(psf) == [image] and not apart
+        is_off_axis = step.wires.get("direction") is not None or any(step.params["angle"])
+        return self.readers.get(psf) == [image] and not is_off_axis
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
         """Add a step that computes the weight of each wavelength band in each channel sum;
         return the step's name.
         """
-        well = _well(readers)
+        counts_electrons = _well(readers)
         name, wires = (
-            f"{responses}.{'wells' if well else 'rows'}",
+            f"{responses}.{'wells' if counts_electrons else 'rows'}",
             {"bands": bands, "responses": responses},
         )
-        return self._add(name, spectra.rows, wires, {"well": well}, image)
+        return self._add(name, spectra.rows, wires, {"well": counts_electrons}, image)
 
     def _mixture(self, name: str, image: Step) -> str:
         """Add steps that compute the spectral cube ``name`` in low-rank form; return the name of
@@ -300,19 +334,28 @@ class _Draft:
 
         The conversion to low rank comes as early as the nodes allow.
         """
-        step, new = self.recipe.steps[name], f"{name}.mixture"
-        through = next(
-            (i for i in step.node.accepts_low_rank if isinstance(step.wires.get(i), str)), None
+        step, new_name = self.recipe.steps[name], f"{name}.mixture"
+        # an input of which the node takes the low-rank form: the conversion comes before it
+        low_rank_input = next(
+            (
+                input_name
+                for input_name in step.node.accepts_low_rank
+                if isinstance(step.wires.get(input_name), str)
+            ),
+            None,
         )
-        if through is not None and name not in self.wanted:
-            wires = {**step.wires, through: self._mixture(str(step.wires[through]), image)}
-            return self._add(new, step.node, wires, step.params, step)
-        within = {"within": _power_of_ten(self.recipe.allowed(image.name) * _MIXTURE)}
+        if low_rank_input is not None and name not in self.wanted:
+            wires = {
+                **step.wires,
+                low_rank_input: self._mixture(str(step.wires[low_rank_input]), image),
+            }
+            return self._add(new_name, step.node, wires, step.params, step)
+        error_limit = {"within": _power_of_ten(self.recipe.allowed(image.name) * _MIXTURE)}
         if step.node.low_rank_form is not None and name not in self.wanted:
             return self._add(
-                new, step.node.low_rank_form, step.wires, {**step.params, **within}, step
+                new_name, step.node.low_rank_form, step.wires, {**step.params, **error_limit}, step
             )
-        return self._add(new, spectra.compress, {"cube": name}, within, step)
+        return self._add(new_name, spectra.compress, {"cube": name}, error_limit, step)
 
     def _add(
         self,
@@ -333,10 +376,14 @@ def _well(readers: Iterable[Step]) -> bool:
     """Return True if a step reads bands but no responses, as a step that computes the electrons
     of a pixel does.
     """
-    return any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
+    return any(
+        "bands" in reader.node.inputs and "responses" not in reader.node.inputs
+        for reader in readers
+    )
 
 
 def _exchanged(wire: Wire, old: str, new: str) -> Wire:
+    """Return a wire with the step ``new`` in place of ``old``."""
     if isinstance(wire, tuple):
         return tuple(new if name == old else name for name in wire)
     return new if wire == old else wire

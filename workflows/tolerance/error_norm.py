@@ -36,18 +36,20 @@ def _errors(value: Any, reference: Any) -> tuple[float, float]:
     """Return the root mean square error and the largest error, each as the maximum over all
     pairs of tensors.
     """
-    pairs, mean, largest = [(value, reference)], 0.0, 0.0
+    pairs, largest_rms, largest = [(value, reference)], 0.0, 0.0
     while pairs:
-        a, b = pairs.pop()
-        inner = _inner_pairs(a, b)
-        if inner is not None:
-            pairs += inner
-        elif isinstance(b, Tensor | int | float) and isinstance(a, Tensor | int | float):
-            errors = _tensor_errors(torch.as_tensor(a), torch.as_tensor(b))
-            mean, largest = max(mean, errors[0]), max(largest, errors[1])
-        elif a is not b:
-            raise ValueError(f"cannot compare {_kind(a)} with {_kind(b)}")
-    return mean, largest
+        actual, expected = pairs.pop()
+        inner_pairs = _inner_pairs(actual, expected)
+        if inner_pairs is not None:
+            pairs += inner_pairs
+        elif isinstance(expected, Tensor | int | float) and isinstance(
+            actual, Tensor | int | float
+        ):
+            errors = _tensor_errors(torch.as_tensor(actual), torch.as_tensor(expected))
+            largest_rms, largest = max(largest_rms, errors[0]), max(largest, errors[1])
+        elif actual is not expected:
+            raise ValueError(f"cannot compare {_kind(actual)} with {_kind(expected)}")
+    return largest_rms, largest
 
 
 def _inner_pairs(a: Any, b: Any) -> list[tuple[Any, Any]] | None:
@@ -60,31 +62,40 @@ def _inner_pairs(a: Any, b: Any) -> list[tuple[Any, Any]] | None:
 
 
 def _tensor_errors(a: Tensor, b: Tensor) -> tuple[float, float]:
+    """Return the root mean square error and the largest error of a tensor ``a`` relative to the
+    largest element of ``b``.
+    """
     if a.shape != b.shape:
         raise ValueError(f"cannot compare {_kind(a)} with {_kind(b)}")
     if a.numel() == 0:
         return 0.0, 0.0
-    top, squares, largest = 0.0, 0.0, 0.0
-    wide = torch.complex128 if a.is_complex() or b.is_complex() else torch.float64
-    for piece, other in zip(_parts(a), _parts(b), strict=True):
-        x, y = piece.to(wide).cpu(), other.to(wide).cpu()
-        same = (x == y) | (x.isnan() & y.isnan())
-        off = (x - y).abs().where(~same, 0.0)
-        if not bool(off.isfinite().all()):
+    largest_expected, sum_of_squares, largest = 0.0, 0.0, 0.0
+    double_type = torch.complex128 if a.is_complex() or b.is_complex() else torch.float64
+    for actual_part, expected_part in zip(_parts(a), _parts(b), strict=True):
+        x, y = actual_part.to(double_type).cpu(), expected_part.to(double_type).cpu()
+        is_same = (x == y) | (x.isnan() & y.isnan())
+        # the same infinity on both sides is no difference
+        difference = (x - y).abs().where(~is_same, 0.0)
+        if not bool(difference.isfinite().all()):
             return math.inf, math.inf
-        top = max(top, float(y.abs().where(y.isfinite(), 0.0).max()))
-        squares += float(off.square().sum())
-        largest = max(largest, float(off.max()))
-    scale = top if top > 0 else 1.0
-    return math.sqrt(squares / a.numel()) / scale, largest / scale
+        largest_expected = max(largest_expected, float(y.abs().where(y.isfinite(), 0.0).max()))
+        sum_of_squares += float(difference.square().sum())
+        largest = max(largest, float(difference.max()))
+    # of an expected 0 the absolute error counts
+    scale = largest_expected if largest_expected > 0 else 1.0
+    return math.sqrt(sum_of_squares / a.numel()) / scale, largest / scale
 
 
 def _kind(x: Any) -> str:
+    """Return what a value is, for an error message."""
     return (
         f"a tensor of shape {tuple(x.shape)}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
     )
 
 
 def _parts(x: Tensor) -> tuple[Tensor, ...]:
+    """Return the elements of a tensor in parts of at most `_PART`, so that little is in float64
+    at once.
+    """
     parts: tuple[Tensor, ...] = torch.split(x.detach().reshape(-1), _PART)
     return parts

@@ -59,8 +59,8 @@ class ErrorBounds:
         one is unknown.
         """
         errors = [self.stated_of(step) for step in steps]
-        stated = [error for error in errors if error is not None]
-        return max(stated, default=0.0) if len(stated) == len(errors) else None
+        known_errors = [error for error in errors if error is not None]
+        return max(known_errors, default=0.0) if len(known_errors) == len(errors) else None
 
     def kind_of(self, step: str) -> Kind:
         """Return whether the error that a run states for a step is a proved bound or an
@@ -82,9 +82,12 @@ class ErrorBounds:
         """Return the largest ratio of an error bound to the error limit in ``recipe``; infinity
         if a limit is 0.
         """
-        shares = [(share, recipe.limit(name)) for name, share in self.held.items() if share > 0]
+        errors_and_limits = [
+            (share, recipe.limit(name)) for name, share in self.held.items() if share > 0
+        ]
         return max(
-            (share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0
+            (share / limit if limit > 0 else math.inf for share, limit in errors_and_limits),
+            default=0.0,
         )
 
 
@@ -104,10 +107,11 @@ def tolerance_frontier(recipe: Recipe, order: Iterable[str], outputs: Iterable[s
     inexact, frontier = set[str](), dict[str, None]()
     for name in order:
         step = recipe.steps[name]
-        reads = [source for source in step.sources if source in inexact]
-        if reads and not _bounds_its_error(step, recipe):
-            frontier |= dict.fromkeys(reads)
-        elif reads or _may_err(step):
+        inexact_sources = [source for source in step.sources if source in inexact]
+        # no bound behind it: the errors of its inputs must meet the tolerance
+        if inexact_sources and not _bounds_its_error(step, recipe):
+            frontier |= dict.fromkeys(inexact_sources)
+        elif inexact_sources or _may_err(step):
             inexact.add(name)
     return list(frontier | dict.fromkeys(name for name in outputs if name in inexact))
 
@@ -115,6 +119,7 @@ def tolerance_frontier(recipe: Recipe, order: Iterable[str], outputs: Iterable[s
 def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
     """Return the steps whose errors reach a node that gives no bound on the error of its result."""
     unbounded = set[str]()
+    # from the outputs upstream
     for name in reversed(order):
         if name in unbounded or not _bounds_its_error(recipe.steps[name], recipe):
             unbounded.update(recipe.steps[name].sources)
@@ -129,6 +134,7 @@ def _may_err(step: Step) -> bool:
 
 
 def _bounds_its_error(step: Step, recipe: Recipe) -> bool:
+    """Return True if a step has an error bound whatever errors its inputs have."""
     return _propagates(step, recipe) or step.node.hooks.approximation_error is not None
 
 
@@ -151,7 +157,7 @@ def proof(
     computing a step.
     """
     bounds: dict[str, ErrorBound] = {}
-    held: dict[str, float] = {}
+    held_shares: dict[str, float] = {}
     for name in order:
         step = recipe.steps[name]
         if not _may_err(step) and bounds.keys().isdisjoint(step.sources):
@@ -160,15 +166,16 @@ def proof(
         if bound is None:
             continue
         if math.isinf(bound.rms):
-            held |= _finite_shares(bounds, step.sources)
+            held_shares |= _finite_shares(bounds, step.sources)
         bounds[name] = bound
-    held |= _finite_shares(bounds, outputs)
-    final = bounds | _of_one_picture(recipe, bounds, done, facts_of)
+    held_shares |= _finite_shares(bounds, outputs)
+    # what the run states: with one draw of the noise and rounding
+    bounds_of_one_picture = bounds | _of_one_picture(recipe, bounds, done, facts_of)
     return ErrorBounds(
         {name: bound.share for name, bound in bounds.items()},
-        held,
-        {name: final[name].share for name in held},
-        frozenset(name for name, bound in final.items() if bound.estimated),
+        held_shares,
+        {name: bounds_of_one_picture[name].share for name in held_shares},
+        frozenset(name for name, bound in bounds_of_one_picture.items() if bound.estimated),
     )
 
 
@@ -192,15 +199,15 @@ def _bound(
     The bound is the root mean square over all draws of the noise, or with ``one_draw`` that of a
     single draw.
     """
-    own = _own(step, done, facts_of, one_draw)
+    own_error = _own(step, done, facts_of, one_draw)
     sources = [bounds[source] for source in step.sources if source in bounds]
-    if own is None and not any(bound.rms for bound in sources):
+    if own_error is None and not any(bound.rms for bound in sources):
         return None
-    inputs = [_gathered(step.wires.get(i), bounds) for i in step.node.inputs]
-    facts = facts_of(step.name)
+    inputs = [_gathered(step.wires.get(input_name), bounds) for input_name in step.node.inputs]
+    stats = facts_of(step.name)
     hook = _propagation(step, one_draw) if _propagates(step, recipe) else None
-    carried = _carried(step, inputs, facts, hook)
-    return _together(carried, own, facts)
+    carried_error = _carried(step, inputs, stats, hook)
+    return _together(carried_error, own_error, stats)
 
 
 def _propagation(step: Step, one_draw: bool) -> Callable[..., float | ErrorBound] | None:
@@ -219,13 +226,14 @@ def _together(carried: ErrorBound, own: ErrorBound | None, facts: TensorStats | 
     """
     if own is None:
         return replace(carried, stats=facts)
-    peak = None
+    largest_error = None
     if own.peak is not None and carried.peak is not None:
-        peak = own.peak + carried.peak
+        largest_error = own.peak + carried.peak
     return ErrorBound(
         carried.rms + own.rms,
         stats=facts,
-        peak=own.peak if carried.rms == 0.0 else peak,
+        # without an error of the inputs, the own largest error is all
+        peak=own.peak if carried.rms == 0.0 else largest_error,
         estimated=carried.estimated or own.estimated,
         scattered=carried.scattered + own.scattered,
     )
@@ -240,20 +248,22 @@ def _of_one_picture(
     """Return the bounds of ``bounds`` that are larger for one draw of the noise, and by rounding
     to digital numbers.
     """
-    larger: dict[str, ErrorBound] = {}
-    for name, before in bounds.items():
+    larger_bounds: dict[str, ErrorBound] = {}
+    for name, bound_of_draws in bounds.items():
         step, record = recipe.steps[name], done(name)
-        hooks, omitted = step.node.hooks, record.state == "left out"
-        chance = hooks.skip_draw if omitted else hooks.propagate_draw or hooks.rounding_error
-        if chance is None and larger.keys().isdisjoint(step.sources):
+        hooks, is_omitted = step.node.hooks, record.state == "left out"
+        draw_hook = hooks.skip_draw if is_omitted else hooks.propagate_draw or hooks.rounding_error
+        if draw_hook is None and larger_bounds.keys().isdisjoint(step.sources):
             continue
+        # larger bounds of earlier steps replace theirs
         bound = (
-            _bound(step, {**bounds, **larger}, record, facts_of, recipe, one_draw=True) or before
+            _bound(step, {**bounds, **larger_bounds}, record, facts_of, recipe, one_draw=True)
+            or bound_of_draws
         )
-        if hooks.rounding_error is not None and not omitted:
+        if hooks.rounding_error is not None and not is_omitted:
             bound = _with_rounding(step, bound)
-        larger[name] = bound
-    return larger
+        larger_bounds[name] = bound
+    return larger_bounds
 
 
 def _with_rounding(step: Step, bound: ErrorBound) -> ErrorBound:
@@ -261,9 +271,13 @@ def _with_rounding(step: Step, bound: ErrorBound) -> ErrorBound:
     rounding = step.node.hooks.rounding_error
     if rounding is None or bound.stats is None or not 0.0 < bound.rms < math.inf:
         return bound
-    total = float(rounding(bound.rms, result=bound.stats, **step.params))
-    added = math.sqrt(max(total**2 - bound.rms**2, 0.0))
-    return replace(bound, rms=bound.rms + added, scattered=bound.scattered + added, estimated=True)
+    total_rms = float(rounding(bound.rms, result=bound.stats, **step.params))
+    # independent errors add in squares: total^2 = before^2 + added^2
+    added_rms = math.sqrt(max(total_rms**2 - bound.rms**2, 0.0))
+    # the sum, as for any two errors: a bound, not the most likely value
+    return replace(
+        bound, rms=bound.rms + added_rms, scattered=bound.scattered + added_rms, estimated=True
+    )
 
 
 def _own(
@@ -272,12 +286,13 @@ def _own(
     """Return the error that a step adds by its own approximation or omission, in the unit of its
     result.
     """
-    omitted, hooks = done.state == "left out", step.node.hooks
-    share = done.bound if omitted else done.error and done.error[0]
+    is_omitted, hooks = done.state == "left out", step.node.hooks
+    share = done.bound if is_omitted else done.error and done.error[0]
     if not share or (facts := facts_of(done.step)) is None:
         return None
-    if omitted:
+    if is_omitted:
         return _of_omission(step, share, facts, one_draw)
+    # `share` is of the exact result, of which only the approximate one is known
     rms = _of_full_result(share, max(abs(facts.min), abs(facts.max)))
     return ErrorBound(rms, peak=done.error[1] if done.error else None, estimated=hooks.estimated)
 
@@ -285,10 +300,10 @@ def _own(
 def _of_omission(step: Step, share: float, facts: TensorStats, one_draw: bool) -> ErrorBound:
     """Return the error of leaving out a step, which is at most ``share`` of its full result."""
     hooks = step.node.hooks
-    largest = max(abs(facts.min), abs(facts.max))
+    largest_element = max(abs(facts.min), abs(facts.max))
     if hooks.skip_scale is not None:
-        largest = hooks.skip_scale(facts, **step.params)
-    rms = _of_full_result(share, largest)
+        largest_element = hooks.skip_scale(facts, **step.params)
+    rms = _of_full_result(share, largest_element)
     if one_draw and hooks.skip_draw is not None:
         rms *= hooks.skip_draw(facts, **step.params)
     return ErrorBound(
@@ -300,6 +315,7 @@ def _of_full_result(share: float, largest: float) -> float:
     """Return a ``share`` of the full result as an error, where the largest element of the result
     that there is has at least the share 1 - ``share`` of it.
     """
+    # full <= largest / (1 - share), because the result that there is has 1 - share of it
     return share * largest / (1.0 - share) if share < 1.0 and largest > 0 else math.inf
 
 
@@ -319,6 +335,7 @@ def _carried(
     if not errors:
         return _EXACT
     estimated = step.node.hooks.estimated or any(error.estimated for error in errors)
+    # without statistics no hook can bound it
     if hook is None or result is None or any(math.isinf(error.rms) for error in errors):
         return ErrorBound(math.inf, estimated=estimated)
     return _passed_apart(step, inputs, result, hook, estimated)
@@ -335,13 +352,16 @@ def _passed_apart(
     from all others.
     """
     hooks = step.node.hooks
-    alike = _passed(step, hook, _parts(inputs, scattered=False), result)
-    noise = _passed(step, hooks.propagate_scattered or hook, _parts(inputs, scattered=True), result)
+    other_error = _passed(step, hook, _parts(inputs, scattered=False), result)
+    noise_error = _passed(
+        step, hooks.propagate_scattered or hook, _parts(inputs, scattered=True), result
+    )
     return ErrorBound(
-        alike.rms + noise.rms,
-        peak=alike.peak if noise.rms == 0.0 else None,
+        other_error.rms + noise_error.rms,
+        # noise has no largest value
+        peak=other_error.peak if noise_error.rms == 0.0 else None,
         estimated=estimated,
-        scattered=alike.scattered + noise.rms,
+        scattered=other_error.scattered + noise_error.rms,
     )
 
 
@@ -360,6 +380,7 @@ def _passed(
     return (
         error
         if isinstance(error, ErrorBound)
+        # a number is a root mean square; its largest value is not known
         else ErrorBound(float(error), peak=0.0 if error == 0 else None)
     )
 
@@ -371,6 +392,7 @@ def _parts(inputs: list[_Input], *, scattered: bool) -> list[_Input]:
         rms = error.scattered if scattered else max(error.rms - error.scattered, 0.0)
         return replace(error, rms=rms, scattered=0.0)
 
+    # a list input has a list of errors
     return [
         [part(error) for error in errors] if isinstance(errors, list) else errors and part(errors)
         for errors in inputs
@@ -378,12 +400,14 @@ def _parts(inputs: list[_Input], *, scattered: bool) -> list[_Input]:
 
 
 def _gathered(wire: Wire, bounds: Mapping[str, ErrorBound]) -> _Input:
+    """Return the error of the result behind a wire, a list of them, or None for no wire."""
     if wire is None or isinstance(wire, str):
         return None if wire is None else bounds.get(wire, _EXACT)
     return [bounds.get(name, _EXACT) for name in wire]
 
 
 def _flat(inputs: Iterable[_Input]) -> Iterator[ErrorBound]:
+    """Yield each error, also those in lists."""
     for error in inputs:
         if isinstance(error, list):
             yield from error
@@ -413,13 +437,13 @@ def expected_excess(recipe: Recipe, outputs: Iterable[str], share: float = 1.0) 
     outputs = tuple(outputs)
     order = needed(recipe, outputs)
     order = needed(recipe, tolerance_frontier(recipe, order, outputs))
-    within = {
+    expected_errors = {
         substitution.instead: share * substitution.within
         for substitution in recipe.substitutions
         if substitution.instead
     }
     ranges = _Ranges(recipe, order)
-    records = {name: _record(recipe.steps[name], within, ranges) for name in order}
+    records = {name: _record(recipe.steps[name], expected_errors, ranges) for name in order}
     try:
         return proof(recipe, order, outputs, records.__getitem__, ranges.known.get).over(recipe)
     except RunError:  # a rule that needs more than a range
@@ -433,9 +457,10 @@ def _record(step: Step, within: Mapping[str, float], ranges: _Ranges) -> StepRec
     bound = ranges.left_out.get(step.name)
     if bound is not None:
         return StepRecord(step.name, "left out", "", 0.0, "", bound=bound)
+    # a cheaper step itself, and the cheaper form that it reads
     error = within.get(step.name, 0.0) + sum(within.get(source, 0.0) for source in step.sources)
-    stated = error and step.node.hooks.approximation_error is not None
-    return StepRecord(step.name, "run", "", 0.0, "", error=(error, error) if stated else None)
+    states_error = error and step.node.hooks.approximation_error is not None
+    return StepRecord(step.name, "run", "", 0.0, "", error=(error, error) if states_error else None)
 
 
 class _Ranges:
@@ -452,6 +477,9 @@ class _Ranges:
             self._add(recipe.steps[name])
 
     def _add(self, step: Step) -> None:
+        """Add the expected range of the result of a step, if its node tells one, and whether the
+        step is left out.
+        """
         hooks = step.node.hooks
         if hooks.expected_range is None:
             self._budget.pass_on(step)
@@ -466,14 +494,20 @@ class _Ranges:
                 )
                 return
         try:
-            low, high = hooks.expected_range(*inputs, **step.params)
+            smallest, largest = hooks.expected_range(*inputs, **step.params)
         except LookupError:
             return
         tensors = tensors_of(self._forms[step.name])
-        shape = tuple(tensors[0].shape) if tensors else ()
-        self.known[step.name] = TensorStats(shape, "float32", low, high, math.nan, 0, True)
+        result_shape = tuple(tensors[0].shape) if tensors else ()
+        # the sum and the number of elements that are not zero are not known
+        self.known[step.name] = TensorStats(
+            result_shape, "float32", smallest, largest, math.nan, 0, True
+        )
 
     def _of(self, wire: Wire) -> Any:
+        """Return the statistics of the result behind a wire, or a list of them; an unknown one
+        raises `LookupError` where it is read.
+        """
         if wire is None:
             return None
         return (

@@ -40,24 +40,28 @@ def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
     """Disconnect steps whose result must be 0 and return the recipe; ``order`` lists each step
     after its inputs.
     """
-    dark: dict[str, None] = {}
-    changed: dict[str, Step] = {}
+    zero_steps: dict[str, None] = {}
+    rewired_steps: dict[str, Step] = {}
     for name in order:
         step = recipe.steps[name]
-        if _nothing(step, dark):
-            dark[name] = None
-        elif step.node.additive_inputs and not dark.keys().isdisjoint(step.sources):
-            changed[name] = replace(step, wires=without(step, dark))
-    if not changed:
+        # its result is 0, since its parameters say so or its inputs are
+        if _nothing(step, zero_steps):
+            zero_steps[name] = None
+        elif step.node.additive_inputs and not zero_steps.keys().isdisjoint(step.sources):
+            rewired_steps[name] = replace(step, wires=without(step, zero_steps))
+    if not rewired_steps:
         return recipe
-    already = {substitution.step for substitution in recipe.substitutions}
-    why = "its parameters make its result 0"
-    new = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in already)
-    steps, unsubstituted = {**recipe.steps, **changed}, recipe.unsubstituted or recipe
+    removed_before = {substitution.step for substitution in recipe.substitutions}
+    reason = "its parameters make its result 0"
+    # a step in whose place stands nothing, with an error of 0
+    new_substitutions = tuple(
+        Substitution(name, "", 0.0, reason) for name in zero_steps if name not in removed_before
+    )
+    steps, unsubstituted = {**recipe.steps, **rewired_steps}, recipe.unsubstituted or recipe
     return replace(
         recipe,
         steps=steps,
-        substitutions=(*recipe.substitutions, *new),
+        substitutions=(*recipe.substitutions, *new_substitutions),
         unsubstituted=unsubstituted,
     )
 
@@ -68,14 +72,16 @@ def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
     """
     if step.node.hooks.zero_bound is None:
         return False
-    inputs = [_known(step.wires.get(name), dark) for name in step.node.inputs]
+    input_stats = [_known(step.wires.get(name), dark) for name in step.node.inputs]
     try:
-        return float(step.node.hooks.zero_bound(*inputs, **step.params)) == 0.0
+        return float(step.node.hooks.zero_bound(*input_stats, **step.params)) == 0.0
+    # the bound needs statistics that only a run gives
     except LookupError:
         return False
 
 
 def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
+    """Return statistics of 0 for a step in ``dark``, and unknown ones for any other step."""
     if wire is None:
         return None
     if isinstance(wire, str):
@@ -92,13 +98,16 @@ def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
     for group in step.node.additive_inputs:
         wire = wires.get(group[0])
         if isinstance(wire, str) and wire in dark:
+            # the whole group has no wire
             wires |= dict.fromkeys(group)
         elif isinstance(wire, tuple):
             remaining = [i for i, name in enumerate(wire) if name not in dark]
             for name in group:
-                listed = wires.get(name)
+                group_wire = wires.get(name)
                 wires[name] = (
-                    tuple(listed[i] for i in remaining) if isinstance(listed, tuple) else listed
+                    tuple(group_wire[i] for i in remaining)
+                    if isinstance(group_wire, tuple)
+                    else group_wire
                 )
     return wires
 
@@ -148,37 +157,41 @@ def judge(
     """Decide whether ``step`` may be left out; ``facts_of`` returns the statistics of the result
     of a named step.
     """
-    node, first = step.node, step.wires.get(step.node.inputs[0])
-    if node.hooks.skip_bound is None or not isinstance(first, str):
+    node, first_wire = step.node, step.wires.get(step.node.inputs[0])
+    if node.hooks.skip_bound is None or not isinstance(first_wire, str):
         return SkipDecision(
             _NO_BOUND, False, "the step has no input that could replace its result", ""
         )
-    asked: list[TensorStats] = []
-    facts = [_facts(step.wires.get(name), facts_of, asked) for name in node.inputs]
+    stats_read: list[TensorStats] = []
+    input_stats = [_facts(step.wires.get(name), facts_of, stats_read) for name in node.inputs]
     try:
         bound = float(
             node.hooks.skip_bound(
-                *facts, **{name: _number(value) for name, value in params.items()}
+                *input_stats, **{name: _number(value) for name, value in params.items()}
             )
         )
     except RunError:
         raise
     except Exception as error:
         raise RunError(step, [], error) from error
-    if not all(f.finite for f in asked):
+    # only what the bound has read counts
+    if not all(stats.finite for stats in stats_read):
         return SkipDecision(
-            _NO_BOUND, False, "its input is not finite, so its effect has no bound", first
+            _NO_BOUND, False, "its input is not finite, so its effect has no bound", first_wire
         )
     has_bound = bound < _NO_BOUND
-    why = (
+    reason = (
         f"changes at most {bound:.2g}, tolerance {tolerance:.2g}"
         if has_bound
         else "its effect has no bound"
     )
-    return SkipDecision(bound, bound <= tolerance, why, first)
+    return SkipDecision(bound, bound <= tolerance, reason, first_wire)
 
 
 def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, asked: list[TensorStats]) -> Any:
+    """Return the statistics behind a wire, found when they are read and noted in ``asked``; a
+    list for a list of wires.
+    """
     if wire is None:
         return None
     if isinstance(wire, str):
@@ -187,6 +200,7 @@ def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, asked: list[Te
 
 
 def _number(value: Any) -> Any:
+    """Return the number in a tensor of one element, and any other value as it is."""
     return value.item() if isinstance(value, Tensor) and value.numel() == 1 else value
 
 
@@ -219,19 +233,20 @@ class ErrorBudget:
     """
 
     def __init__(self, recipe: Recipe) -> None:
+        # the share of the tolerance that omitted steps may use
         self._recipe, self._share = recipe, skip_share(recipe)
         # by step: bound by omitted step; equal dicts are one object
         self._spent: dict[str, dict[str, float]] = {}
 
     def copy(self) -> ErrorBudget:
         """Return an independent copy of the error budget."""
-        twin = copy(self)
-        twin._spent = dict(self._spent)
-        return twin
+        budget = copy(self)
+        budget._spent = dict(self._spent)
+        return budget
 
     def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> SkipDecision:
         """Decide whether a step is left out of the run; with ``--exact`` no step is left out."""
-        spent = self.pass_on(step)
+        spent_bounds = self.pass_on(step)
         if self._recipe.exact:
             return SkipDecision(float("inf"), False, "the recipe is exact", "")
         if step.node.hooks.skip_estimated and not self._recipe.estimates:
@@ -240,7 +255,7 @@ class ErrorBudget:
             step,
             params,
             facts_of,
-            self._recipe.allowed(step.name) * self._share - sum(spent.values()),
+            self._recipe.allowed(step.name) * self._share - sum(spent_bounds.values()),
         )
         if decision.left_out:
             self.leave_out(step, decision.bound)
@@ -266,13 +281,14 @@ class ErrorBudget:
         """Return the error bound of each omitted step on which ``step`` depends, by the name of
         the omitted step.
         """
-        parts = list(filter(None, map(self._spent.get, dict.fromkeys(step.sources))))
-        if not parts:
+        bounds_of_sources = list(filter(None, map(self._spent.get, dict.fromkeys(step.sources))))
+        if not bounds_of_sources:
             return {}
-        first, *others = parts
-        if any(other is not first for other in others):
-            first = {}
-            for bounds in parts:
-                first.update(bounds)
-        self._spent[step.name] = first
-        return first
+        joined_bounds, *other_bounds = bounds_of_sources
+        # equal dicts are one object, so that most steps share one
+        if any(bounds_of_other is not joined_bounds for bounds_of_other in other_bounds):
+            joined_bounds = {}
+            for bounds in bounds_of_sources:
+                joined_bounds.update(bounds)
+        self._spent[step.name] = joined_bounds
+        return joined_bounds
