@@ -213,8 +213,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/studies/uncertainty/output_draws.py",
-        "/ (n - 2)",
-        "/ (n - 1)",
+        "/ (count - 2)",
+        "/ (count - 1)",
         within(
             "workflows/studies/uncertainty",
             "uncertainty_study.py::test_the_error_of_a_deviation_is_that_of_leaving_out_one_draw_after_another",
@@ -1482,17 +1482,20 @@ MUTANTS = (
             "exposures.py::test_the_peak_behind_a_mask_is_that_of_its_distance_and_1_nearer_than_the_first",
         ),
         (
-            "np.where(place < rungs[0] - _ROUNDED, 1.0, np.minimum(between, 1.0))",
-            "np.minimum(between, 1.0)",
-        ),
-        ("np.clip(place, rungs[0], rungs[-1])", "np.clip(place, rungs[0], None)"),
-        (
-            "place = np.log(as_wide(nominal, np.asarray(radius, np.float64)))",
-            "place = np.log(np.asarray(radius, np.float64))",
+            "np.where(\n            log_distance < log_distances[0] - _ROUNDED, 1.0, np.minimum(interpolated_ratio, 1.0)\n        )",
+            "np.minimum(interpolated_ratio, 1.0)",
         ),
         (
-            "focused * _at_width(option, beams[0], beam_radius(beam, where))\n",
-            "focused * option.peak\n",
+            "np.clip(log_distance, log_distances[0], log_distances[-1])",
+            "np.clip(log_distance, log_distances[0], None)",
+        ),
+        (
+            "log_distance = np.log(as_wide(nominal, np.asarray(radius, np.float64)))",
+            "log_distance = np.log(np.asarray(radius, np.float64))",
+        ),
+        (
+            "focused_density * _at_width(option, beams[0], beam_radius(beam, distance_row))\n",
+            "focused_density * option.peak\n",
         ),
     ),
     *faults(
@@ -1502,8 +1505,8 @@ MUTANTS = (
             "exposures.py::test_a_drawn_beam_has_the_peak_of_the_nominal_beam_where_that_one_is_as_wide",
         ),
         (
-            "_at_width(option, beams[0], beam_radius(beam, where))",
-            "_at_width(option, beams[0], beam_radius(beams[0], where))",
+            "_at_width(option, beams[0], beam_radius(beam, distance_row))",
+            "_at_width(option, beams[0], beam_radius(beams[0], distance_row))",
         ),
     ),
     *faults(
@@ -1512,14 +1515,14 @@ MUTANTS = (
             "workflows/safety",
             "exposures.py::test_defocus_is_that_of_the_distance_and_of_the_lens_by_the_square_of_a_stop",
         ),
-        ("stopped = (aperture / lens.diameter) ** 2", "stopped = aperture / lens.diameter"),
-        ("lens.defocus * _DEFOCUS * stopped", "lens.defocus * _DEFOCUS"),
+        ("path_factor = (aperture / lens.diameter) ** 2", "path_factor = aperture / lens.diameter"),
+        ("lens.defocus * _DEFOCUS * path_factor", "lens.defocus * _DEFOCUS"),
         (
             "else torch.minimum(diameter",
             "else torch.maximum(diameter",
         ),
         (
-            "waves = _waves(safety.settings.lens, beam, where, aperture)",
+            "waves = _waves(safety.settings.lens, beam, distance_row, aperture)",
             (
                 "waves = _waves(safety.settings.lens, beam, torch.tensor([safety.laser.distance]),"
                 " aperture)"
@@ -1537,29 +1540,32 @@ MUTANTS = (
             'if lens.focus == "infinity":\n        return torch',
         ),
         (
-            "_air(safety, draws, places) * _uneven(safety, draws, places)",
-            "_air(safety, draws, places)",
+            "_air(safety, draws, sampled_distances) * _uneven(safety, draws, sampled_distances)",
+            "_air(safety, draws, sampled_distances)",
         ),
         (
-            "at_lens = axis_density(beam, where, air).numpy()",
-            "at_lens = axis_density(beam, where).numpy()",
+            "lens_density = axis_density(beam, distance_row, air_factor).numpy()",
+            "lens_density = axis_density(beam, distance_row).numpy()",
         ),
-        ("passing = lens * option.passing * air", "passing = lens * option.passing"),
+        (
+            "transmittance = lens_transmittance * option.passing * air_factor",
+            "transmittance = lens_transmittance * option.passing",
+        ),
         (
             "np.power(transmittance, distances / laser.distance)",
             "transmittance * np.ones_like(distances)",
         ),
         (
-            "aperture**2 / (4 * beam_radius(beam, where) ** 2)",
-            "aperture**2 / beam_radius(beam, where) ** 2",
+            "aperture**2 / (4 * beam_radius(beam, distance_row) ** 2)",
+            "aperture**2 / beam_radius(beam, distance_row) ** 2",
         ),
     ),
     *faults(
         "workflows/safety/exposures.py",
         within("workflows/safety", "exposures.py::test_a_stop_narrows_and_never_widens_the_lens"),
         (
-            "(share_through(beam, where, aperture) * passing).numpy()",
-            "(share_through(beam, where, diameter) * passing).numpy()",
+            "(\n            share_through(beam, distance_row, aperture) * transmittance\n        ).numpy()",
+            "(share_through(beam, distance_row, diameter) * transmittance).numpy()",
         ),
     ),
     *faults(
@@ -1569,8 +1575,8 @@ MUTANTS = (
             "exposures.py::test_air_of_a_visibility_leaves_two_per_cent_of_green_contrast_there",
         ),
         (
-            "np.power(np.array([per_metre[v] for v in visible])[:, None], distances)",
-            "np.array([per_metre[v] for v in visible])[:, None] * distances",
+            "np.power(\n            np.array([per_metre[visibility] for visibility in visibilities])[:, None], distances\n        )",
+            "np.array([per_metre[visibility] for visibility in visibilities])[:, None] * distances",
         ),
     ),
     *faults(
@@ -1620,8 +1626,11 @@ MUTANTS = (
             "workflows/safety",
             "distance_ladder.py::test_a_distant_laser_fills_the_lens_to_two_per_cent_with_three_hundredths_of_a_wave",
         ),
-        ("return max(filled, plane)", "return min(filled, plane)"),
-        ("width = diameter / (2 * math.sqrt(FAR_FILL))", "width = diameter / math.sqrt(FAR_FILL)"),
+        ("return max(overfilled_from, plane_from)", "return min(overfilled_from, plane_from)"),
+        (
+            "least_radius = diameter / (2 * math.sqrt(FAR_FILL))",
+            "least_radius = diameter / math.sqrt(FAR_FILL)",
+        ),
         (
             "diameter**2 / (8 * beam.wavelength * waves)",
             "diameter**2 / (2 * beam.wavelength * waves)",
@@ -1633,9 +1642,9 @@ MUTANTS = (
             "workflows/safety",
             "distance_ladder.py::test_no_step_of_the_ladder_is_wider_than_it_may_be_and_both_ends_are_on_it",
         ),
-        ("max(waves, step * abs(defocus(here)))", "max(waves, abs(defocus(here)))"),
-        ("here, factor = rungs[-1], 1 + step", "here, factor = rungs[-1], 1 + 2 * step"),
-        ("rungs.append(max(here / factor, nearest))", "rungs.append(here / factor)"),
+        ("max(waves, step * abs(defocus(rung)))", "max(waves, abs(defocus(rung)))"),
+        ("rung, factor = rungs[-1], 1 + step", "rung, factor = rungs[-1], 1 + 2 * step"),
+        ("rungs.append(max(rung / factor, nearest))", "rungs.append(rung / factor)"),
         ("focus_of(lens), lens.defocus * _DEFOCUS)", "math.inf, lens.defocus * _DEFOCUS)"),
     ),
     *faults(
@@ -1644,7 +1653,7 @@ MUTANTS = (
             "workflows/safety",
             "distance_ladder.py::test_the_ladder_ends_where_it_is_asked_before_the_laser_is_distant",
         ),
-        ("last = min(furthest, far_distance(", "last = max(0.0, far_distance("),
+        ("farthest = min(\n        furthest, far_distance(", "farthest = max(0.0, far_distance("),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -1664,8 +1673,8 @@ MUTANTS = (
             "distance_ladder.py::test_a_beam_has_its_width_at_the_distance_that_is_returned",
         ),
         (
-            "distance: FloatArray = 2 * np.sqrt(square) / beam.divergence",
-            "distance: FloatArray = np.sqrt(square) / beam.divergence",
+            "distance: FloatArray = 2 * np.sqrt(reached) / beam.divergence",
+            "distance: FloatArray = np.sqrt(reached) / beam.divergence",
         ),
         ("radius**2 - beam.waist**2, (5e-4", "radius**2 + beam.waist**2, (5e-4"),
     ),
@@ -1694,8 +1703,14 @@ MUTANTS = (
             "workflows/safety",
             "light_levels.py::test_the_veil_lies_beside_the_spot_behind_a_mask_as_well",
         ),
-        ("light = (1 - share) * core + share * scattered", "light = core + share * scattered"),
-        ("light = (1 - share) * core + share * scattered", "light = (1 - share) * core"),
+        (
+            "light = (1 - share) * core_light + share * scattered_light",
+            "light = core_light + share * scattered_light",
+        ),
+        (
+            "light = (1 - share) * core_light + share * scattered_light",
+            "light = (1 - share) * core_light",
+        ),
         ("veil.light(radius) / veil.share[0] if veil", "veil.light(radius) if veil"),
     ),
     *faults(
@@ -1717,14 +1732,17 @@ MUTANTS = (
             "workflows/safety",
             "light_levels.py::test_hidden_light_is_dealt_out_so_that_as_many_pixels_as_can_be_reach_a_level",
         ),
-        ("hidden = hidden_light(groups) if added.any() else 0.0", "hidden = 0.0"),
+        ("hidden = hidden_light(groups) if beyond_window.any() else 0.0", "hidden = 0.0"),
         (
-            "_with_hidden(light, pixels, added, (1 - share) * hidden)",
-            "_with_hidden(light, pixels, added, share * hidden)",
+            "_with_hidden(light, pixels, beyond_window, (1 - share) * hidden)",
+            "_with_hidden(light, pixels, beyond_window, share * hidden)",
         ),
-        ("np.maximum(inside + lit, 1e-9)", "np.maximum(lit, 1e-9)"),
+        ("np.maximum(at_least + lit_beyond, 1e-9)", "np.maximum(lit_beyond, 1e-9)"),
         ("np.unique(np.concatenate([picked, between]))", "np.unique(picked)"),
-        ("order = np.argsort(-light)\n    own, width", "order = np.argsort(light)\n    own, width"),
+        (
+            "order = np.argsort(-light)\n    own_light, group_sizes",
+            "order = np.argsort(light)\n    own_light, group_sizes",
+        ),
     ),
     *faults(
         "workflows/safety/laser_spots.py",
@@ -1766,7 +1784,7 @@ MUTANTS = (
             "np.clip((values - self.points[0]) / step, 0, len(self.points) - 1)",
             "(values - self.points[0]) / step",
         ),
-        ("if high - low < _CERTAIN", "if high - low < 1.0"),
+        ("if largest - smallest < _CERTAIN", "if largest - smallest < 1.0"),
     ),
     *faults(
         "workflows/safety/laser_spots.py",
@@ -1777,10 +1795,10 @@ MUTANTS = (
         ('wavefront, "distance", distance)', 'wavefront, "distance", safety.laser.distance)'),
         ('if lens.focus == "infinity":', 'if lens.focus != "infinity":'),
         (
-            "bend = _bend(safety, distance) if lens",
-            "bend = _bend(safety, safety.laser.distance) if lens",
+            "curvature = _bend(safety, distance) if lens",
+            "curvature = _bend(safety, safety.laser.distance) if lens",
         ),
-        ('pupil.params["defocus"] - bend', 'pupil.params["defocus"] + bend'),
+        ('pupil.params["defocus"] - curvature', 'pupil.params["defocus"] + curvature'),
         ("lens.diameter**2 / 8 / _DEFOCUS", "lens.diameter**2 / 8 / safety.laser.wavelength"),
         ("lens.diameter**2 / 8 / _DEFOCUS", "lens.diameter**2 / 2 / _DEFOCUS"),
     ),
@@ -1835,7 +1853,10 @@ MUTANTS = (
             "spots_along.py::test_spots_are_added_where_interpolation_misses_them_and_the_miss_is_said",
         ),
         ("and misses[gap] > close", "and misses[gap] < close"),
-        ("np.abs(values[middle] - guess).max())", "np.abs(values[middle] - guess).max()) / 1e9"),
+        (
+            "np.abs(values[middle] - interpolated_value).max())",
+            "np.abs(values[middle] - interpolated_value).max()) / 1e9",
+        ),
     ),
     *faults(
         "workflows/safety/dazzled_area.py",
@@ -1846,8 +1867,8 @@ MUTANTS = (
         ("most=-np.log(area.ranks),", "most=None,"),
         ("most=-np.log(area.ranks),", "most=np.log(area.ranks),"),
         (
-            "place = np.log(as_wide(exposures.beams[0], widths))",
-            "place = np.log(exposures.distances[None])",
+            "log_distance = np.log(as_wide(exposures.beams[0], beam_radii))",
+            "log_distance = np.log(exposures.distances[None])",
         ),
     ),
     *faults(
@@ -1857,8 +1878,8 @@ MUTANTS = (
             "area_over_distance.py::test_an_option_has_its_own_spots_or_says_why_it_has_none",
         ),
         (
-            'plain = arms.get("plain") if option.diameter is None else None',
-            'plain = arms.get("plain")',
+            'plain_spots = arms.get("plain") if option.diameter is None else None',
+            'plain_spots = arms.get("plain")',
         ),
         ('if not math.isfinite(arms["mask"].error):', 'if math.isfinite(arms["mask"].error):'),
     ),
@@ -1879,10 +1900,10 @@ MUTANTS = (
             "workflows/safety",
             "area_over_distance.py::test_the_number_of_pixels_with_a_light_is_the_inverse_of_the_level",
         ),
-        ("return np.where(needed > levels[0], 0.0, number)", "return number"),
+        ("return np.where(log_light > levels[0], 0.0, pixel_number)", "return pixel_number"),
         (
-            "np.interp(needed, levels[::-1], np.log(ranks)[::-1])",
-            "np.interp(needed, levels, np.log(ranks))",
+            "np.interp(log_light, levels[::-1], np.log(ranks)[::-1])",
+            "np.interp(log_light, levels, np.log(ranks))",
         ),
     ),
     *faults(
@@ -1891,13 +1912,16 @@ MUTANTS = (
             "workflows/safety",
             "area_over_distance.py::test_the_faintest_lost_pixel_is_that_of_a_direct_sum",
         ),
-        ("spread = colour * focal / aperture /", "spread = colour * focal / aperture**2 * 12e-3 /"),
+        (
+            "spread = wavelength * focal_length / aperture /",
+            "spread = wavelength * focal_length / aperture**2 * 12e-3 /",
+        ),
         (
             "return min(self.option.diameter or math.inf, self.safety.settings.lens.diameter)",
             "return self.safety.settings.lens.diameter",
         ),
         ("fill = fill_at(beam, diameter, distance)", "fill = fill_at(beam, diameter, rungs[-1])"),
-        ("waves = _SOFT * math.sinh(nominal + offset)", "waves = 0.0 * offset"),
+        ("waves = _SOFT * math.sinh(nominal_bend + bend_of_point)", "waves = 0.0 * bend_of_point"),
     ),
     *faults(
         "workflows/safety/dazzled_area.py",
@@ -1905,10 +1929,13 @@ MUTANTS = (
             "workflows/safety",
             "area_over_distance.py::test_drawn_colours_and_focal_lengths_have_spots_of_their_own_size",
         ),
-        ("spread = colour * focal / aperture /", "spread = laser.wavelength * focal / aperture /"),
         (
-            "spread = colour * focal / aperture /",
-            "spread = colour * lens.focal_length / aperture /",
+            "spread = wavelength * focal_length / aperture /",
+            "spread = laser.wavelength * focal_length / aperture /",
+        ),
+        (
+            "spread = wavelength * focal_length / aperture /",
+            "spread = wavelength * lens.focal_length / aperture /",
         ),
     ),
     *faults(
@@ -1950,8 +1977,8 @@ MUTANTS = (
             "workflows/safety",
             "distance_zones.py::test_zones_lie_between_the_asked_distances_wherever_the_laser_of_the_recipe_is",
         ),
-        ("shown = (distances >= asked[0] * (1 - _ROUNDED)) & ", "shown = "),
-        ("far[i] >= distances[-1] * (1 - _ROUNDED)", "far[i] > distances[-1]"),
+        ("is_asked = (distances >= asked[0] * (1 - _ROUNDED)) & ", "is_asked = "),
+        ("far_ends[zone] >= distances[-1] * (1 - _ROUNDED)", "far_ends[zone] > distances[-1]"),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -1959,7 +1986,7 @@ MUTANTS = (
             "workflows/safety",
             "distance_zones.py::test_an_exposure_that_just_reaches_the_limit_exceeds_it_there",
         ),
-        ("height >= 0", "height > 0"),
+        ("log_ratio >= 0", "log_ratio > 0"),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -1967,10 +1994,13 @@ MUTANTS = (
             "workflows/safety", "distance_zones.py::test_the_end_of_a_falling_exposure_is_its_root"
         ),
         (
-            "inner / np.where(other == column, 1.0, inner - outer)",
-            "0.5 * inner / np.where(other == column, 1.0, inner - outer)",
+            "inner_height / np.where(neighbour == column, 1.0, inner_height - outer_height)",
+            "0.5 * inner_height / np.where(neighbour == column, 1.0, inner_height - outer_height)",
         ),
-        ("_placed(place, height, begins, -1)", "_placed(place, height, begins, 1)"),
+        (
+            "_placed(log_distance, log_ratio, begins_here, -1)",
+            "_placed(log_distance, log_ratio, begins_here, 1)",
+        ),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -1979,14 +2009,14 @@ MUTANTS = (
             "distance_zones.py::test_the_ends_and_the_probability_of_none_follow_the_law",
         ),
         (
-            "within = _at(distances, drawn, distance) >= 1",
-            "within = _at(distances, drawn, distances[0]) >= 1",
+            "exceeded_here = _at(distances, drawn, distance) >= 1",
+            "exceeded_here = _at(distances, drawn, distances[0]) >= 1",
         ),
-        ("near[i] <= distances[0] * (1 + _ROUNDED)", "near[i] < distances[0]"),
+        ("near_ends[zone] <= distances[0] * (1 + _ROUNDED)", "near_ends[zone] < distances[0]"),
         ("QUANTILES = (0.05, 0.95)", "QUANTILES = (0.1, 0.9)"),
         (
-            "float((count == 0).mean()), float(alike.mean())",
-            "float(alike.mean()), float((count == 0).mean())",
+            "float((zone_counts == 0).mean()),\n        float(has_as_many_zones.mean())",
+            "float(has_as_many_zones.mean()), float((zone_counts == 0).mean())",
         ),
     ),
     *faults(
@@ -2070,7 +2100,7 @@ MUTANTS = (
             "workflows/safety",
             "counted_parts.py::test_hot_spots_and_turbulence_are_counted_with_their_value_or_said_not_to_be",
         ),
-        ("if quality > 1 + 1e-6", "if quality < 1 + 1e-6"),
+        ("if m_squared > 1 + 1e-6", "if m_squared < 1 + 1e-6"),
         ("100 * (1 - beam.worst)", "100 * beam.worst"),
         ("if beam.hot_spots > 1 or", "if beam.hot_spots > 3 or"),
     ),
@@ -2120,8 +2150,8 @@ MUTANTS = (
         within(
             "workflows/safety", "exposures.py::test_hot_spots_and_turbulence_multiply_each_other"
         ),
-        ("factor * moments.numpy()", "moments.numpy()"),
-        ("factor * moments.numpy()", "factor + moments.numpy()"),
+        ("factor * scintillation_factor.numpy()", "scintillation_factor.numpy()"),
+        ("factor * scintillation_factor.numpy()", "factor + scintillation_factor.numpy()"),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -2230,8 +2260,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/studies/accuracy/work_precision_points.py",
-        "point.most < line",
-        "point.most > line",
+        "point.most < front",
+        "point.most > front",
         within(
             "workflows/studies/accuracy",
             "accuracy_study.py::test_the_pareto_line_has_what_no_other_point_beats",
@@ -2260,8 +2290,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/evaluation/confidence_intervals.py",
-        ", count - 1)) * spread",
-        ", count)) * spread",
+        ", count - 1)) * standard_error",
+        ", count)) * standard_error",
         within(
             "workflows/evaluation", "run_evaluation.py::test_an_interval_is_that_of_students_table"
         ),
@@ -2291,15 +2321,15 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/safety/what_helps.py",
-        "np.logical_and.accumulate(np.flip(below, 0), 0)",
-        "np.flip(below, 0)",
+        "np.logical_and.accumulate(np.flip(within, 0), 0)",
+        "np.flip(within, 0)",
         within(
             "workflows/safety", "what_helps.py::test_the_crossing_is_where_the_ratio_passes_one"
         ),
     ),
     Mutant(
         "workflows/safety/what_helps.py",
-        "or dazzle.background * scene >= well",
+        "or dazzle.background * scene_share >= well",
         "",
         within(
             "workflows/safety",
@@ -2575,7 +2605,7 @@ MUTANTS = (
     *faults(
         "workflows/safety/what_helps.py",
         within("workflows/safety", "what_helps.py::test_few_draws_have_a_safe_value_too"),
-        ("min(len(ordered) - 1, math.ceil", "min(len(ordered), math.ceil"),
+        ("min(len(ordered_factors) - 1, math.ceil", "min(len(ordered_factors), math.ceil"),
     ),
     *faults(
         "workflows/safety/what_helps.py",
@@ -2611,7 +2641,7 @@ MUTANTS = (
             "workflows/safety",
             "what_helps.py::test_a_notch_helps_contrast_by_as_much_as_it_takes_from_the_laser_alone",
         ),
-        ("passing=x, scene=left", "passing=x"),
+        ("passing=x, scene=scene_left", "passing=x"),
     ),
     *faults(
         "workflows/safety/what_helps.py",
@@ -2619,7 +2649,7 @@ MUTANTS = (
             "workflows/safety",
             "what_helps.py::test_the_cost_is_the_light_of_the_scene_over_its_noise",
         ),
-        ("looks = looks[:1]", "looks = looks[1:]"),
+        ("exposure_ways = exposure_ways[:1]", "exposure_ways = exposure_ways[1:]"),
         ("optical_density(1 / factor)", "optical_density(factor)"),
     ),
     *faults(
@@ -2627,8 +2657,11 @@ MUTANTS = (
         within(
             "workflows/safety", "what_helps.py::test_the_crossing_is_where_the_ratio_passes_one"
         ),
-        ("first = np.maximum(last - 1, 0)", "first = np.maximum(last - 2, 0)"),
-        ("    below = ratio <= 1\n", "    below = ratio < 1\n"),
+        (
+            "one_before = np.maximum(first_within - 1, 0)",
+            "one_before = np.maximum(first_within - 2, 0)",
+        ),
+        ("    within = ratio <= 1\n", "    within = ratio < 1\n"),
     ),
     Mutant(
         "workflows/safety/what_helps.py",

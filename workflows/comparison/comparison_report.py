@@ -37,7 +37,8 @@ _NONE = "–"
 def report(comparison: RunComparison) -> StudyReport:
     """Return the page of a comparison with its pictures and its table of numbers."""
     rows = [
-        [n.name, n.index, n.left, n.right, n.difference, n.relative] for n in comparison.numbers
+        [number.name, number.index, number.left, number.right, number.difference, number.relative]
+        for number in comparison.numbers
     ]
     drawings = [file for file in (*comparison.figures, *comparison.data) if file.drawing]
     sections = [
@@ -59,18 +60,18 @@ def report(comparison: RunComparison) -> StudyReport:
 
 def summary(comparison: RunComparison) -> list[str]:
     """Return sentences that count what differs between two runs."""
-    drawn, data = (
+    differing_figures, data = (
         [file for file in files if file.state != "same"]
         for files in (comparison.figures, comparison.data)
     )
-    code = "The code is the same."
+    code_sentence = "The code is the same."
     if comparison.code is None:
-        code = "The left or the right folder records no digests of code."
+        code_sentence = "The left or the right folder records no digests of code."
     elif comparison.code:
-        code = f"{_counted(len(comparison.code), 'difference')} in the code."
+        code_sentence = f"{_counted(len(comparison.code), 'difference')} in the code."
     return [
         *_compared(comparison.numbers),
-        f"{len(drawn)} of {_counted(len(comparison.figures), 'picture')} differ.",
+        f"{len(differing_figures)} of {_counted(len(comparison.figures), 'picture')} differ.",
         f"{len(data)} of {_counted(len(comparison.data), 'data file')} and tensors differ.",
         (
             f"{_counted(len(comparison.recipe), 'value')} of the recipe"
@@ -78,21 +79,21 @@ def summary(comparison: RunComparison) -> list[str]:
             if comparison.recipe
             else "The recipe is the same."
         ),
-        code,
+        code_sentence,
     ]
 
 
 def _compared(numbers: Sequence[NumberDifference]) -> list[str]:
     """Return how many numbers of both runs differ, and how many numbers only one run has."""
-    both = [number for number in numbers if number.left is not None and number.right is not None]
+    in_both = [number for number in numbers if number.left is not None and number.right is not None]
     sentences = ["The runs have no number in common."]
-    if both or not numbers:
-        sentences = [_differ(both)]
-    alone = {
+    if in_both or not numbers:
+        sentences = [_differ(in_both)]
+    only_in = {
         "left": sum(number.right is None for number in numbers),
         "right": sum(number.left is None for number in numbers),
     }
-    for side, count in alone.items():
+    for side, count in only_in.items():
         if count:
             sentences.append(f"Only the {side} run has {_counted(count, 'further number')}.")
     return sentences
@@ -100,11 +101,11 @@ def _compared(numbers: Sequence[NumberDifference]) -> list[str]:
 
 def _differ(both: Sequence[NumberDifference]) -> str:
     """Return how many of the numbers that both runs have differ, and by how much."""
-    differ = [number for number in both if number.relative > 0]
-    counted = _counted(len(both), "number")
-    if not differ:
-        return f"All {counted} are the same."
-    return f"{len(differ)} of {counted} differ{_by(differ)}."
+    differing = [number for number in both if number.relative > 0]
+    count_text = _counted(len(both), "number")
+    if not differing:
+        return f"All {count_text} are the same."
+    return f"{len(differing)} of {count_text} differ{_by(differing)}."
 
 
 def difference_text(number: NumberDifference) -> list[str]:
@@ -112,64 +113,81 @@ def difference_text(number: NumberDifference) -> list[str]:
     a table.
     """
     sides = [_NONE if side is None else f"{side:.6g}" for side in (number.left, number.right)]
-    change = _NONE if number.difference is None else f"{number.difference:+.3g}"
-    return [number.name, str(number.index), *sides, change, _relative(number.relative)]
+    difference_cell = _NONE if number.difference is None else f"{number.difference:+.3g}"
+    return [number.name, str(number.index), *sides, difference_cell, _relative(number.relative)]
 
 
 def _relative(value: float) -> str:
+    """Return a relative difference as text, or a dash where none is defined."""
     return f"{value:.2g}" if value < float("inf") else _NONE
 
 
 def _by(differ: Sequence[NumberDifference]) -> str:
-    worst = max(number.relative for number in differ)
+    """Return by how much numbers differ at most, or nothing where one difference is infinite."""
+    largest_relative = max(number.relative for number in differ)
     return (
-        f", by at most {worst:.2g} relative to the larger of both" if worst < float("inf") else ""
+        f", by at most {largest_relative:.2g} relative to the larger of both"
+        if largest_relative < float("inf")
+        else ""
     )
 
 
 def _counted(count: int, word: str) -> str:
+    """Return a number with a word, in the plural unless it is 1."""
     return f"{count} {word}{'s' * (count != 1)}"
 
 
 def _runs(comparison: RunComparison) -> str:
+    """Return command and start of both runs in one sentence."""
     sides = (("Left", comparison.left), ("right", comparison.right))
     return (
         "; ".join(
-            f"{word}: `{run.document.command}`, {run.document.started}" for word, run in sides
+            f"{side_name}: `{run.document.command}`, {run.document.started}"
+            for side_name, run in sides
         )
         + "."
     )
 
 
 def _results(comparison: RunComparison) -> Section:
+    """Return the section with the result tables of both runs."""
     header, rows = comparison.table
     text = "The result table of both runs." if rows else "Neither run has a result table."
     return Section("Results", text, header, rows)
 
 
 def _numbers(comparison: RunComparison) -> Section:
-    differ = largest(comparison.numbers)
+    """Return the section with the numbers that differ most, one for each result."""
+    differing = largest(comparison.numbers)
     text = """Each result with a number that differs; of several numbers, such as one for each band,
         the one with the largest relative difference. Relative means: divided by the larger of both.
         `numbers.csv` has all numbers."""
-    if not differ:
+    if not differing:
         text = "Every number of both runs is the same. `numbers.csv` has all numbers."
     return Section(
-        "Numbers", text, _COLUMNS if differ else (), [difference_text(number) for number in differ]
+        "Numbers",
+        text,
+        _COLUMNS if differing else (),
+        [difference_text(number) for number in differing],
     )
 
 
 def _drawing(file: FileDifference) -> Section:
-    said = (
+    """Return the section of a file with a drawing of both sides."""
+    difference_text_of_file = (
         f"Root mean square difference {file.rms:.3g}."
         if file.rms is not None
         else f"{file.state}.".capitalize()
     )
-    scale = f" Largest value of both {file.scale:.4g}." if file.scale not in (None, 255.0) else ""
-    return Section(file.name, said + scale, picture=file.drawing)
+    # 255 is the scale of every figure
+    scale_text = (
+        f" Largest value of both {file.scale:.4g}." if file.scale not in (None, 255.0) else ""
+    )
+    return Section(file.name, difference_text_of_file + scale_text, picture=file.drawing)
 
 
 def _files(comparison: RunComparison) -> Section:
+    """Return the section with the difference of each figure and data file."""
     files = [*comparison.figures, *comparison.data]
     rows = [[file.name, file.state, file.largest, file.rms, file.scale] for file in files]
     text = """Differences of figures are in levels of 0 to 255, those of data files in the unit of
@@ -180,6 +198,7 @@ def _files(comparison: RunComparison) -> Section:
 
 
 def _text_of_code(comparison: RunComparison) -> str:
+    """Return what the comparison of the code says, in a sentence."""
     if comparison.code is None:
         return (
             "The folder of a run of an earlier version records no digests of code, so that the"
@@ -191,6 +210,9 @@ def _text_of_code(comparison: RunComparison) -> str:
 
 
 def _causes(comparison: RunComparison) -> list[Section]:
+    """Return the sections on what may have caused the differences: recipe, code, steps,
+    environment.
+    """
     return [
         _table("Recipe", "The final values of both recipes", comparison.recipe, sources=True),
         Section(
@@ -211,6 +233,7 @@ def _causes(comparison: RunComparison) -> list[Section]:
 def _table(
     heading: str, subject: str, rows: Iterable[ValueDifference], sources: bool = False
 ) -> Section:
+    """Return the section with entries that differ, and with ``sources`` where each was written."""
     cells: list[list[Any]] = [
         [
             row.name,
@@ -235,10 +258,12 @@ def _table(
 
 
 def _sentences(lines: list[str]) -> str:
+    """Return lines as paragraphs, each as a sentence."""
     return "\n\n".join(f"{line[0].upper()}{line[1:]}." for line in lines)
 
 
 def _stem(file: FileDifference) -> str:
+    """Return the name of the picture of a file, without its suffix and without spaces."""
     return file.name.rpartition(".")[0].replace(" ", "_")
 
 
@@ -301,14 +326,14 @@ def document(comparison: RunComparison) -> dict[str, Any]:
         "largest": comparison.largest,
         "numbers": [
             {
-                "name": n.name,
-                "index": n.index,
-                "left": n.left,
-                "right": n.right,
-                "difference": n.difference,
-                "relative": n.relative,
+                "name": number.name,
+                "index": number.index,
+                "left": number.left,
+                "right": number.right,
+                "difference": number.difference,
+                "relative": number.relative,
             }
-            for n in comparison.numbers
+            for number in comparison.numbers
         ],
         "recipe": [asdict(value) for value in comparison.recipe],
         "code": comparison.code,
@@ -331,7 +356,7 @@ def write_comparison(comparison: RunComparison, out: Path, command: Sequence[str
     with new_run(
         out / "comparisons", "_and_".join(names), digest(content["left"], content["right"])
     ) as folder:
-        about = {
+        description = {
             "study": "compare",
             "recipe": names[0],
             "title": f"Comparison of {comparison.left.name} and {comparison.right.name}.",
@@ -339,12 +364,13 @@ def write_comparison(comparison: RunComparison, out: Path, command: Sequence[str
             "date": timestamp(),
             "versions": versions(),
         }
-        folder.said = about | {"began": comparison.began}
-        report(comparison).write(folder, about | content)
+        folder.said = description | {"began": comparison.began}
+        report(comparison).write(folder, description | content)
     return folder.path
 
 
 def _of_file(file: FileDifference) -> dict[str, Any]:
+    """Return the difference of a file as JSON values, without its drawing."""
     return {name: value for name, value in asdict(file).items() if name != "drawing"}
 
 
@@ -358,8 +384,8 @@ _MOST = 12  #: rows of each table
 
 def lines(comparison: RunComparison) -> list[str]:
     """Return lines with the tables of a comparison; the page has what is cut here."""
-    head = [f"left   {comparison.left.folder}", f"right  {comparison.right.folder}"]
-    head += summary(comparison)
+    printed = [f"left   {comparison.left.folder}", f"right  {comparison.right.folder}"]
+    printed += summary(comparison)
     files = [file for file in (*comparison.figures, *comparison.data) if file.state != "same"]
     blocks = {
         "numbers": _number_table(comparison),
@@ -371,15 +397,15 @@ def lines(comparison: RunComparison) -> list[str]:
     }
     for title, rows in blocks.items():
         if rows:
-            head += ["", title, *_cut(rows)]
-    return head
+            printed += ["", title, *_cut(rows)]
+    return printed
 
 
 def _number_table(comparison: RunComparison) -> list[str]:
     """Return the lines of the numbers that differ; none without any."""
-    differ = largest(comparison.numbers)
+    differing = largest(comparison.numbers)
     header = ["number", "index", "left", "right", "right - left", "relative"]
-    return _text_table([header, *map(difference_text, differ)]) if differ else []
+    return _text_table([header, *map(difference_text, differing)]) if differing else []
 
 
 def _indented(texts: Iterable[str]) -> list[str]:
@@ -396,6 +422,7 @@ def _cut(rows: list[str]) -> list[str]:
 
 
 def _value(value: ValueDifference) -> str:
+    """Return an entry that differs as a line: its text and source in both runs."""
     sides = [
         (text or "none") + (f" ({source})" if source else "")
         for text, source in ((value.left, value.left_source), (value.right, value.right_source))
@@ -404,6 +431,7 @@ def _value(value: ValueDifference) -> str:
 
 
 def _file(file: FileDifference) -> str:
+    """Return the difference of a file as a line."""
     if file.largest is None:
         return f"{file.name}: {file.state}"
     return (

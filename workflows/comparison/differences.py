@@ -83,8 +83,12 @@ class ValueDifference:
 def numbers(left: RunRecord, right: RunRecord) -> list[NumberDifference]:
     """Return every number of two runs, in the order of the first run and then of the second."""
     sides = [
-        {(s, f, i): math.nan if x is None else x for s, f, i, x in r.document.metrics}
-        for r in (left, right)
+        # the document writes NaN and infinity as null
+        {
+            (step, field, index): math.nan if value is None else value
+            for step, field, index, value in record.document.metrics
+        }
+        for record in (left, right)
     ]
     names = dict.fromkeys([*sides[0], *sides[1]])
     return [NumberDifference(*name, sides[0].get(name), sides[1].get(name)) for name in names]
@@ -94,12 +98,14 @@ def largest(numbers: list[NumberDifference]) -> list[NumberDifference]:
     """Return, for each result that differs, its number with the largest relative difference; the
     largest first.
     """
-    worst: dict[str, NumberDifference] = {}
+    largest_of_result: dict[str, NumberDifference] = {}
     for number in numbers:
-        before = worst[number.name].relative if number.name in worst else 0.0
-        if number.relative > before:
-            worst[number.name] = number
-    return sorted(worst.values(), key=lambda number: -number.relative)
+        largest_so_far = (
+            largest_of_result[number.name].relative if number.name in largest_of_result else 0.0
+        )
+        if number.relative > largest_so_far:
+            largest_of_result[number.name] = number
+    return sorted(largest_of_result.values(), key=lambda number: -number.relative)
 
 
 def table(left: RunRecord, right: RunRecord) -> tuple[list[str], list[list[str]]]:
@@ -112,7 +118,7 @@ def table(left: RunRecord, right: RunRecord) -> tuple[list[str], list[list[str]]
     names = dict.fromkeys(str(row.get("name", "")) for row in rows_of_both)
     rows = []
     for name in names:
-        for side, word in zip(sides, ("left", "right"), strict=True):
+        for side, run_word in zip(sides, ("left", "right"), strict=True):
             cells = next(
                 (
                     dict(zip(side.columns, r.get("cells", []), strict=False))
@@ -122,7 +128,7 @@ def table(left: RunRecord, right: RunRecord) -> tuple[list[str], list[list[str]]
                 None,
             )
             if cells is not None:
-                rows.append([name, word, *(str(cells.get(column, "")) for column in columns)])
+                rows.append([name, run_word, *(str(cells.get(column, "")) for column in columns)])
     return ["", "run", *columns], rows
 
 
@@ -132,9 +138,13 @@ def recipe(left: RunRecord, right: RunRecord) -> list[ValueDifference]:
     """
     differing = []
     for name in dict.fromkeys([*left.values, *right.values]):
-        old, new = (record.values.get(name, _NO_VALUE) for record in (left, right))
-        if old.text != new.text:
-            differing.append(ValueDifference(name, old.text, new.text, old.source, new.source))
+        left_value, right_value = (record.values.get(name, _NO_VALUE) for record in (left, right))
+        if left_value.text != right_value.text:
+            differing.append(
+                ValueDifference(
+                    name, left_value.text, right_value.text, left_value.source, right_value.source
+                )
+            )
     return differing
 
 
@@ -150,11 +160,15 @@ def code(left: RunRecord, right: RunRecord) -> list[str] | None:
         for node in left_nodes.keys() & right_nodes.keys()
         if left_nodes[node] != right_nodes[node]
     )
-    only = [
+    only_one_uses = [
         f"only the {side} run uses the node {node}" for side, node in _only(left_nodes, right_nodes)
     ]
     nodes = [f"the code of {_listed(changed)} differs"] if changed else []
-    return [*nodes, *only, *_definitions(left.code.parts, right.code.parts, complete=not only)]
+    return [
+        *nodes,
+        *only_one_uses,
+        *_definitions(left.code.parts, right.code.parts, complete=not only_one_uses),
+    ]
 
 
 def environment(left: RunRecord, right: RunRecord) -> list[ValueDifference]:
@@ -185,11 +199,13 @@ def steps(left: RunRecord, right: RunRecord) -> list[str]:
     """Return lines that count the steps with other cache keys, and name the steps that only one
     run has.
     """
-    left_keys, right_keys = ({row.step: row.key for row in r.document.steps} for r in (left, right))
-    both = left_keys.keys() & right_keys.keys()
-    differ = [name for name in left_keys if name in both and left_keys[name] != right_keys[name]]
+    left_keys, right_keys = (
+        {row.step: row.key for row in record.document.steps} for record in (left, right)
+    )
+    common = left_keys.keys() & right_keys.keys()
+    differ = [name for name in left_keys if name in common and left_keys[name] != right_keys[name]]
     lines = (
-        [f"{len(differ)} of {len(both)} common steps have another cache key: {_listed(differ)}"]
+        [f"{len(differ)} of {len(common)} common steps have another cache key: {_listed(differ)}"]
         if differ
         else []
     )
@@ -229,31 +245,38 @@ def _changes(
     left: Mapping[str, Mapping[str, str]], right: Mapping[str, Mapping[str, str]], module: str
 ) -> Iterator[str]:
     """Yield what differs in a module, or in the values that it holds, that both runs use."""
-    old, new = left[module], right[module]
+    left_definitions, right_definitions = left[module], right[module]
     if module.startswith(_STATE):
         name = module.removeprefix(_STATE)
-        if old != new and left.get(name) == right.get(name):
+        if left_definitions != right_definitions and left.get(name) == right.get(name):
             yield f"a value that {name} holds differs: a constant, a table or a default"
         return
-    for label in sorted(old.keys() | new.keys()):
-        if old.get(label) != new.get(label):
-            yield f"{module}: {label} {_how(old, new, label)}"
+    for label in sorted(left_definitions.keys() | right_definitions.keys()):
+        if left_definitions.get(label) != right_definitions.get(label):
+            yield f"{module}: {label} {_how(left_definitions, right_definitions, label)}"
 
 
 def _how(old: Mapping[str, str], new: Mapping[str, str], label: str) -> str:
+    """Return how a definition differs: in both runs, or only in one of them."""
     if label in old and label in new:
         return "differs"
     return f"is only in the {'left' if label in old else 'right'} run"
 
 
 def _only(left: Mapping[str, object], right: Mapping[str, object]) -> Iterator[tuple[str, str]]:
+    """Yield (``left`` or ``right``, name) for each name that only one side has."""
     yield from (("left", name) for name in left if name not in right)
     yield from (("right", name) for name in right if name not in left)
 
 
 def _listed(names: list[str]) -> str:
-    hidden = len(names) - _SEVERAL
-    return ", ".join(names) if hidden <= 0 else f"{', '.join(names[:_SEVERAL])} and {hidden} more"
+    """Return names as text, at most `_SEVERAL` of them, and how many more there are."""
+    more_names = len(names) - _SEVERAL
+    return (
+        ", ".join(names)
+        if more_names <= 0
+        else f"{', '.join(names[:_SEVERAL])} and {more_names} more"
+    )
 
 
 # --- picture differences --------------------------------------------------------------------------
@@ -333,14 +356,17 @@ def only_one_has(left: Path, right: Path) -> list[str]:
 
 
 def _counts(name: str) -> bool:
+    """Return True for a file that shows results, not times."""
     return Path(name).stem not in _TIMES
 
 
 def _names(folder: Path) -> set[str]:
+    """Return the names of the files in a folder; none without the folder."""
     return {path.name for path in folder.iterdir() if path.is_file()} if folder.is_dir() else set()
 
 
 def _common(left: Path, right: Path, suffix: str = "") -> list[str]:
+    """Return the names with a suffix that both folders have, in alphabetical order."""
     return sorted(name for name in _names(left) & _names(right) if name.endswith(suffix))
 
 
@@ -352,24 +378,31 @@ def _figure(name: str, left: Path, right: Path) -> FileDifference:
         return FileDifference(name, "same")
     left_levels, right_levels = _levels(left), _levels(right)
     if left_levels.shape != right_levels.shape:
-        sizes = " and ".join(f"{x.shape[1]} x {x.shape[0]}" for x in (left_levels, right_levels))
+        sizes = " and ".join(
+            f"{levels.shape[1]} x {levels.shape[0]}" for levels in (left_levels, right_levels)
+        )
         return FileDifference(
             name,
             f"drawn in two sizes, {sizes} pixels",
             drawing=drawing(left_levels, right_levels, None, ""),
         )
-    change = np.abs(left_levels.astype(np.int16) - right_levels).max(-1)
-    largest = int(change.max())
+    # int16, because the difference of two bytes may be negative; the largest of R, G, B
+    differences_of_pixels = np.abs(left_levels.astype(np.int16) - right_levels).max(-1)
+    largest = int(differences_of_pixels.max())
     if not largest:
         return FileDifference(name, "same")
-    rms = float(np.sqrt(np.mean(change.astype(float) ** 2)))
-    shown = drawing(
-        left_levels, right_levels, change, f"difference, at most {largest} of 255 levels"
+    rms = float(np.sqrt(np.mean(differences_of_pixels.astype(float) ** 2)))
+    drawing_of_both = drawing(
+        left_levels,
+        right_levels,
+        differences_of_pixels,
+        f"difference, at most {largest} of 255 levels",
     )
-    return FileDifference(name, "differs", largest, rms, 255.0, shown)
+    return FileDifference(name, "differs", largest, rms, 255.0, drawing_of_both)
 
 
 def _levels(path: Path) -> Any:
+    """Return a picture file as RGB (y, x, 3) from 0 to 255; raise `NotComparable` for a bad one."""
     import numpy as np
     from PIL import Image, UnidentifiedImageError
 
@@ -385,29 +418,40 @@ def _levels(path: Path) -> Any:
 
 
 def _exr(name: str, left: Path, right: Path) -> FileDifference:
+    """Return the difference of two EXR files, drawn if they have few channels."""
     import numpy as np
 
     left_channels, right_channels = _channels(left), _channels(right)
     if left_channels.keys() != right_channels.keys() or any(
-        left_channels[c].shape != right_channels[c].shape for c in left_channels
+        left_channels[channel].shape != right_channels[channel].shape for channel in left_channels
     ):
         return FileDifference(
             name, f"differs in channels or size: {_form(left_channels)} and {_form(right_channels)}"
         )
-    a, b = (
-        np.stack([channels[c] for c in left_channels]).astype(np.float64)
+    left_values, right_values = (
+        np.stack([channels[channel] for channel in left_channels]).astype(np.float64)
         for channels in (left_channels, right_channels)
     )
-    compared = _numbers(name, a, b)
-    if compared.largest and len(left_channels) <= _COLOURS:
-        top = float(np.nanpercentile(np.maximum(np.abs(a), np.abs(b)), 99.9)) or 1.0
-        one_view, other_view = (_viewed(x / top, list(left_channels)) for x in (a, b))
-        text = f"difference, at most {compared.largest:.4g}"
-        return replace(compared, drawing=drawing(one_view, other_view, np.abs(a - b).max(0), text))
-    return compared
+    difference = _numbers(name, left_values, right_values)
+    if difference.largest and len(left_channels) <= _COLOURS:
+        # not the maximum, which a single bright pixel decides
+        white = (
+            float(np.nanpercentile(np.maximum(np.abs(left_values), np.abs(right_values)), 99.9))
+            or 1.0
+        )
+        one_view, other_view = (
+            _viewed(values / white, list(left_channels)) for values in (left_values, right_values)
+        )
+        text = f"difference, at most {difference.largest:.4g}"
+        return replace(
+            difference,
+            drawing=drawing(one_view, other_view, np.abs(left_values - right_values).max(0), text),
+        )
+    return difference
 
 
 def _channels(path: Path) -> dict[str, Any]:
+    """Return the channels of an EXR file by name; raise `NotComparable` for a damaged one."""
     import OpenEXR
 
     try:
@@ -419,8 +463,9 @@ def _channels(path: Path) -> dict[str, Any]:
 
 
 def _form(channels: Mapping[str, Any]) -> str:
-    first = next(iter(channels.values()))
-    return f"{len(channels)} channels of {first.shape[1]} x {first.shape[0]}"
+    """Return number and size of the channels of a file as text."""
+    first_channel = next(iter(channels.values()))
+    return f"{len(channels)} channels of {first_channel.shape[1]} x {first_channel.shape[0]}"
 
 
 def _viewed(image: Any, names: list[str]) -> Any:
@@ -429,7 +474,10 @@ def _viewed(image: Any, names: list[str]) -> Any:
     """
     import numpy as np
 
-    order = [names.index(c) for c in "RGB"] if {"R", "G", "B"} <= set(names) else [0, 0, 0]
+    order = (
+        [names.index(colour) for colour in "RGB"] if {"R", "G", "B"} <= set(names) else [0, 0, 0]
+    )
+    # 1 / 2.2 is the gamma of a screen
     return np.clip(np.nan_to_num(image[order]), 0, 1).transpose(1, 2, 0) ** (1 / 2.2)
 
 
@@ -458,6 +506,9 @@ def _tensors(name: str, left: Path, right: Path) -> Iterator[FileDifference]:
 
 
 def _loaded(path: Path) -> dict[str, Any]:
+    """Return the tensors of a safetensors file by name, in float64; raise `NotComparable` for a bad
+    one.
+    """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -475,19 +526,23 @@ def _numbers(name: str, left: Any, right: Any) -> FileDifference:
     import numpy as np
 
     with np.errstate(invalid="ignore"):
-        change = np.where(
+        absolute_difference = np.where(
             (left == right) | (np.isnan(left) & np.isnan(right)), 0.0, np.abs(left - right)
         )
-    if not change.size or not change.any():
+    if not absolute_difference.size or not absolute_difference.any():
         return FileDifference(name, "same")
-    if not np.isfinite(change).all():
-        places = int((~np.isfinite(change)).sum())
+    if not np.isfinite(absolute_difference).all():
+        place_count = int((~np.isfinite(absolute_difference)).sum())
         return FileDifference(
-            name, f"differs, with NaN or infinity in one run alone at {places} places"
+            name, f"differs, with NaN or infinity in one run alone at {place_count} places"
         )
-    scale = float(max(np.nanmax(np.abs(x)) for x in (left, right)))
+    scale = float(max(np.nanmax(np.abs(values)) for values in (left, right)))
     return FileDifference(
-        name, "differs", float(change.max()), float(np.sqrt(np.mean(change**2))), scale
+        name,
+        "differs",
+        float(absolute_difference.max()),
+        float(np.sqrt(np.mean(absolute_difference**2))),
+        scale,
     )
 
 
@@ -498,25 +553,37 @@ def drawing(left: Any, right: Any, change: Any, title: str) -> Any:
     """
     height, width = left.shape[:2]
     panels = 2 if change is None else 3
-    wide = width / height > _WIDE
-    long, rows, columns = (
+    is_wide = width / height > _WIDE
+    panel_height, rows, columns = (
         9.6 * min(1.0, height / width) + 0.5,
-        panels if wide else 1,
-        1 if wide else panels,
+        panels if is_wide else 1,
+        1 if is_wide else panels,
     )
     figure, axes = canvas(
-        9.6 if wide else 3.7 * panels + 0.5, panels * long if wide else 4.2, rows, columns
+        9.6 if is_wide else 3.7 * panels + 0.5,
+        panels * panel_height if is_wide else 4.2,
+        rows,
+        columns,
     )
-    places = axes.ravel()
-    for place, image, name in zip(places, (left, right), ("left", "right"), strict=False):
-        picture(place, image, name, interpolation="antialiased")
+    panels_in_order = axes.ravel()
+    for panel, image, name in zip(panels_in_order, (left, right), ("left", "right"), strict=False):
+        picture(panel, image, name, interpolation="antialiased")
     if change is not None:
-        top = _upper_end(change)
-        shown = picture(
-            places[2], change, title, cmap="magma", vmin=0.0, vmax=top, interpolation="antialiased"
+        upper_end = _upper_end(change)
+        colour_image = picture(
+            panels_in_order[2],
+            change,
+            title,
+            cmap="magma",
+            vmin=0.0,
+            vmax=upper_end,
+            interpolation="antialiased",
         )
         figure.colorbar(
-            shown, ax=places[2], shrink=0.8, extend="max" if change.max() > top else "neither"
+            colour_image,
+            ax=panels_in_order[2],
+            shrink=0.8,
+            extend="max" if change.max() > upper_end else "neither",
         )
     return figure
 

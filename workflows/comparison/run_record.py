@@ -115,11 +115,11 @@ def read_record(where: str, root: Path) -> RunRecord:
     except FileNotFoundError as error:
         raise NotComparable(str(error)) from None
     provenance = _json(folder / "provenance.json")
-    kind = (
+    other_kind = (
         provenance.get("study") or provenance.get("stage") if isinstance(provenance, dict) else None
     )
-    if kind:
-        text = f"{folder} is the folder of `{kind}`: compare reads folders of `neusee run`"
+    if other_kind:
+        text = f"{folder} is the folder of `{other_kind}`: compare reads folders of `neusee run`"
         raise NotComparable(
             f"{text}; the numbers of this folder are in its tables and its page report.html"
         )
@@ -130,6 +130,9 @@ def read_record(where: str, root: Path) -> RunRecord:
 
 
 def _json(path: Path) -> Any:
+    """Return the content of a JSON file; raise `NotComparable` with the place of a
+    mistake in it.
+    """
     try:
         return json.loads(text_of(path))
     except json.JSONDecodeError as error:
@@ -143,12 +146,15 @@ def _json(path: Path) -> Any:
 
 
 def _checked(path: Path, model: type[M], content: Any) -> M:
+    """Return content as a model; raise `NotComparable` with the place of the first mistake."""
     try:
         return TypeAdapter(model).validate_python(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the top"
-        raise NotComparable(f"{path}: {place}: {first['msg'].lower()}: {_AGAIN}") from None
+        first_mistake = error.errors()[0]
+        mistake_path = ".".join(map(str, first_mistake["loc"])) or "the top"
+        raise NotComparable(
+            f"{path}: {mistake_path}: {first_mistake['msg'].lower()}: {_AGAIN}"
+        ) from None
 
 
 def _values(path: Path) -> dict[str, FinalValue]:
@@ -160,10 +166,11 @@ def _values(path: Path) -> dict[str, FinalValue]:
     except RecipeError as error:
         raise NotComparable(str(error)) from None
     lines = text_of(path, "utf-8-sig").splitlines()
+    # text before and after the comment of each line
     sources = [line.rpartition(" # ")[::2] for line in lines]
     values = {}
     for leaf in document.root.leaves():
-        before, source = sources[leaf.key.line - 1]
-        if before:  # a block of which every value is a default has no source
+        line_before_comment, source = sources[leaf.key.line - 1]
+        if line_before_comment:  # a block of which every value is a default has no source
             values[leaf.name] = FinalValue(flow(leaf.plain), source.strip())
     return values

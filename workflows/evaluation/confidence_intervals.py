@@ -82,6 +82,7 @@ class MetricTable:
 
 def sums_by_photograph(values: Numbers, photographs: Numbers) -> Numbers:
     """Return the sum of the values of the pictures of each photograph."""
+    # numbers from 0 on, as `bincount` needs
     _, number = np.unique(photographs, return_inverse=True)
     return np.bincount(number.reshape(-1), weights=values).astype(np.float64)
 
@@ -96,17 +97,25 @@ def mean(
     photograph of its own. The interval is over photographs: several scenes of one photograph count
     as one draw.
     """
-    x = np.asarray(values, dtype=np.float64)
-    owner = np.asarray(range(len(x)) if photographs is None else photographs, dtype=np.float64)
-    centre, count = float(x.mean()) if len(x) else math.nan, len(np.unique(owner))
+    scene_values = np.asarray(values, dtype=np.float64)
+    photograph_of_scene = np.asarray(
+        range(len(scene_values)) if photographs is None else photographs, dtype=np.float64
+    )
+    mean_value, count = (
+        float(scene_values.mean()) if len(scene_values) else math.nan,
+        len(np.unique(photograph_of_scene)),
+    )
     if count < 2:
-        return Interval(centre, math.nan, math.nan)
+        return Interval(mean_value, math.nan, math.nan)
     from scipy.stats import t
 
-    residuals = sums_by_photograph(x - centre, owner)
-    spread = math.sqrt(float((residuals**2).sum()) * count / (count - 1)) / len(x)
-    half = float(t.ppf((1 + CONFIDENCE) / 2, count - 1)) * spread
-    return Interval(centre, centre - half, centre + half)
+    residuals = sums_by_photograph(scene_values - mean_value, photograph_of_scene)
+    # sandwich: residuals of a photograph are added before they are squared
+    standard_error = math.sqrt(float((residuals**2).sum()) * count / (count - 1)) / len(
+        scene_values
+    )
+    half_width = float(t.ppf((1 + CONFIDENCE) / 2, count - 1)) * standard_error
+    return Interval(mean_value, mean_value - half_width, mean_value + half_width)
 
 
 def metric_table(
@@ -121,12 +130,15 @@ def metric_table(
     """
     values = {
         metric: np.array(
-            [[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points]
+            [
+                [point.get(strength, {}).get(metric, math.nan) for strength in strengths]
+                for point in points
+            ]
         )
         for metric in METRICS
     }
-    owner = range(len(points)) if photographs is None else photographs
-    return MetricTable(tuple(strengths), values, np.array(owner, dtype=np.float64))
+    photograph_of_scene = range(len(points)) if photographs is None else photographs
+    return MetricTable(tuple(strengths), values, np.array(photograph_of_scene, dtype=np.float64))
 
 
 # --- paired intervals -----------------------------------------------------------------------------
@@ -160,20 +172,37 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
     Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), section 5.2.1,
             studentized bootstrap.
     """
-    a, b = sums_by_photograph(top, photographs), sums_by_photograph(bottom, photographs)
-    value, count = float(a.sum() / b.sum()), len(a)
+    top_sums, bottom_sums = (
+        sums_by_photograph(top, photographs),
+        sums_by_photograph(bottom, photographs),
+    )
+    ratio_of_sums, count = float(top_sums.sum() / bottom_sums.sum()), len(top_sums)
     if count < FEW:
-        return Interval(value, math.nan, math.nan)
-    residuals = a - value * b
-    error = _standard_error((residuals**2).sum(), b.sum(), count)
-    low, high = np.quantile(_drawn_errors(residuals, b, seed), _LIMITS, method="inverted_cdf")
+        return Interval(ratio_of_sums, math.nan, math.nan)
+    residuals = top_sums - ratio_of_sums * bottom_sums
+    standard_error = _standard_error((residuals**2).sum(), bottom_sums.sum(), count)
+    # of the error in units of the standard error in each drawn set
+    low_error, high_error = np.quantile(
+        _drawn_errors(residuals, bottom_sums, seed), _LIMITS, method="inverted_cdf"
+    )
     if count < _SMALL:
-        quantile, wider = _student(count - 1), math.sqrt(count / (count - 1))
-        low, high = wider * min(low, -quantile), wider * max(high, quantile)
-    return Interval(value, *(float(value - q * error) if error else value for q in (high, low)))
+        quantile, widening = _student(count - 1), math.sqrt(count / (count - 1))
+        low_error, high_error = (
+            widening * min(low_error, -quantile),
+            widening * max(high_error, quantile),
+        )
+    # the high quantile of the error is the low end of the interval
+    return Interval(
+        ratio_of_sums,
+        *(
+            float(ratio_of_sums - drawn_error * standard_error) if standard_error else ratio_of_sums
+            for drawn_error in (high_error, low_error)
+        ),
+    )
 
 
 def _student(freedom: int) -> float:
+    """Return the upper end of Student's t distribution for `CONFIDENCE`."""
     from scipy.stats import t
 
     return float(t.ppf(_LIMITS[1], freedom))
@@ -193,17 +222,34 @@ def _standard_error(squares: Numbers, total: Numbers, count: int) -> Numbers:
 def _drawn_errors(residuals: Numbers, b: Numbers, seed: int) -> Numbers:
     """Return the error of the ratio in each drawn set of photographs, in units of the standard
     error in that set.
+
+    ``residuals`` are those of the numerators (photograph,), ``b`` the denominators.
     """
     rng, count = np.random.default_rng(seed), len(residuals)
+    # sums that each drawn set needs, so that one product of matrices gives all
     products = np.stack([residuals, b, residuals * residuals, residuals * b, b * b], 1)
     errors: list[Numbers] = []
     for _ in range(0, _DRAWS, _AT_ONCE):
-        times = rng.multinomial(count, np.full(count, 1 / count), _AT_ONCE).astype(np.float64)
-        r, total, rr, rb, bb = (times @ products).T
-        moved = r / total
-        squares = np.maximum(rr - 2 * moved * rb + moved**2 * bb, 0.0)
+        draw_counts = rng.multinomial(count, np.full(count, 1 / count), _AT_ONCE).astype(np.float64)
+        residual_sum, denominator_sum, residual_squares, mixed_products, denominator_squares = (
+            draw_counts @ products
+        ).T
+        ratio_errors = residual_sum / denominator_sum
+        # sum of (residual - moved x denominator)^2; rounding may make it negative
+        squares = np.maximum(
+            residual_squares
+            - 2 * ratio_errors * mixed_products
+            + ratio_errors**2 * denominator_squares,
+            0.0,
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
-            errors.append(np.where(moved == 0, 0.0, moved / _standard_error(squares, total, count)))
+            errors.append(
+                np.where(
+                    ratio_errors == 0,
+                    0.0,
+                    ratio_errors / _standard_error(squares, denominator_sum, count),
+                )
+            )
     return np.concatenate(errors)
 
 
@@ -218,20 +264,27 @@ def gain(values: Numbers, reference: Numbers, photographs: Numbers, seed: int) -
     """Return by which fraction the mean of a metric lies below the mean of the reference, such
     as 0.101 for 10.1 %.
     """
-    x = ratio(values, reference, photographs, seed)
-    return Interval(1.0 - x.mean, 1.0 - x.high, 1.0 - x.low)
+    ratio_to_reference = ratio(values, reference, photographs, seed)
+    # the fraction falls as the ratio rises: the ends change places
+    return Interval(
+        1.0 - ratio_to_reference.mean, 1.0 - ratio_to_reference.high, 1.0 - ratio_to_reference.low
+    )
 
 
 def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
     """Return the decrease of L1 error against the reference: absolute, relative, and relative
     for small pictures.
     """
-    own, other, photographs = values.scenes("l1"), reference.scenes("l1"), values.photographs
-    small = values.scenes("l1 small"), reference.scenes("l1 small")
+    own_l1, reference_l1, photographs = (
+        values.scenes("l1"),
+        reference.scenes("l1"),
+        values.photographs,
+    )
+    small_l1 = values.scenes("l1 small"), reference.scenes("l1 small")
     return {
-        "l1 less": less(own, other, photographs, seed),
-        "l1 gain": gain(own, other, photographs, seed),
-        "l1 small gain": gain(*small, photographs, seed),
+        "l1 less": less(own_l1, reference_l1, photographs, seed),
+        "l1 gain": gain(own_l1, reference_l1, photographs, seed),
+        "l1 small gain": gain(*small_l1, photographs, seed),
     }
 
 
@@ -240,8 +293,13 @@ def gains_by_strength(values: MetricTable, reference: MetricTable, seed: int) ->
     strength.
     """
     gains = []
-    for i in range(len(values.strengths)):
-        own, other = values.values["l1 small"][:, i], reference.values["l1 small"][:, i]
-        both = ~np.isnan(own + other)
-        gains.append(gain(own[both], other[both], values.photographs[both], seed))
+    for strength_index in range(len(values.strengths)):
+        own_l1, reference_l1 = (
+            values.values["l1 small"][:, strength_index],
+            reference.values["l1 small"][:, strength_index],
+        )
+        has_both = ~np.isnan(own_l1 + reference_l1)
+        gains.append(
+            gain(own_l1[has_both], reference_l1[has_both], values.photographs[has_both], seed)
+        )
     return gains

@@ -67,7 +67,7 @@ def protect(
             asked, before any scene.
     """
     shades: dict[str, EqualShade] = {}
-    wrong: dict[str, None] = {}
+    faults: dict[str, None] = {}
     for pipeline in pipelines:
         front = pipeline.pipeline.front
         if front in shades:
@@ -79,13 +79,16 @@ def protect(
                 f" {shades[front].alone:.3g}{shades[front].said or ', without a filter'}"
             )
         except ValueError as error:
-            wrong[f"--equal-protection {asked.level:g}: {front} {error}"] = None
-    if wrong:
-        raise EvaluationRefused("\n".join(wrong))
+            faults[f"--equal-protection {asked.level:g}: {front} {error}"] = None
+    if faults:
+        raise EvaluationRefused("\n".join(faults))
     return compose_pipelines(
         recipe,
         changes,
-        [replace(p.pipeline, shade=shades[p.pipeline.front]) for p in pipelines],
+        [
+            replace(composed.pipeline, shade=shades[composed.pipeline.front])
+            for composed in pipelines
+        ],
         folder,
     )
 
@@ -98,20 +101,26 @@ def _shade(
     store: Store,
     folder: Path,
 ) -> EqualShade:
-    dark = pipeline.recipe(NONE)
-    if dark.steps["pupil[mask]"].wires.get("shade"):
+    """Return the stop and the filter with which the mask of a pipeline has the wanted peak.
+
+    Raises `EvaluationRefused` for a mask that is shaded already.
+    """
+    without_laser = pipeline.recipe(NONE)
+    if without_laser.steps["pupil[mask]"].wires.get("shade"):
         raise EvaluationRefused(
             "has a filter or a stop of its own: leave it out, because every pipeline gets one"
         )
-    camera = ProtectionCamera.of(dark, store, _BANDS)
+    camera = ProtectionCamera.of(without_laser, store, _BANDS)
 
     def peak_of(shade: EqualShade) -> float:
         shaded = replace(pipeline.pipeline, shade=shade)
-        (other,) = compose_pipelines(recipe, changes, [shaded], folder)
-        return float(run(other.recipe(NONE), store, ["lsr[mask]"]).values["lsr[mask]"].max())
+        (shaded_recipes,) = compose_pipelines(recipe, changes, [shaded], folder)
+        return float(
+            run(shaded_recipes.recipe(NONE), store, ["lsr[mask]"]).values["lsr[mask]"].max()
+        )
 
     return shade_equally(
-        camera, store, asked.level, asked.way, partial(_scene_light, dark, store), peak_of
+        camera, store, asked.level, asked.way, partial(_scene_light, without_laser, store), peak_of
     )
 
 
@@ -128,7 +137,9 @@ def as_document(result: EvaluationResult) -> dict[str, Any]:
     """
     if result.protection is None:
         return {}
-    shades = {p.name: p.shade for p in result.pipelines if p.shade is not None}
+    shades = {
+        pipeline.name: pipeline.shade for pipeline in result.pipelines if pipeline.shade is not None
+    }
     protections = {name: {**asdict(shade), "words": shade.words} for name, shade in shades.items()}
     return {
         "equal protection": {

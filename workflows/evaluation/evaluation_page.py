@@ -67,8 +67,11 @@ def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """
     count = len(_COLOURS)
     return {
-        name: {"color": _COLOURS[i % count], "linestyle": _STYLES[i // count % len(_STYLES)]}
-        for i, name in enumerate(names)
+        name: {
+            "color": _COLOURS[number % count],
+            "linestyle": _STYLES[number // count % len(_STYLES)],
+        }
+        for number, name in enumerate(names)
     }
 
 
@@ -82,20 +85,23 @@ def cases(panels: Sequence[Panel]) -> Any:
     rows = list(panels[0].pictures)
     white = high(panels[0].pictures["truth"])
     figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
-    for i, panel in enumerate(panels):
-        for j, (name, shown) in enumerate(panel.pictures.items()):
+    for column, panel in enumerate(panels):
+        for row, (name, picture_of_row) in enumerate(panel.pictures.items()):
             title = f"{panel.case}, {_power(panel.strength)}" if panel.strength else "no laser"
-            picture(axes[j, i], encoded(shown / white), "" if j else title)
-            if i == 0:
-                axes[j, i].set_ylabel(_broken(name), fontsize=10)
+            # a title above the first row alone
+            picture(axes[row, column], encoded(picture_of_row / white), "" if row else title)
+            if column == 0:
+                axes[row, column].set_ylabel(_broken(name), fontsize=10)
     return figure
 
 
 def _power(strength: float) -> str:
+    """Return a strength as a power of ten, for a figure."""
     return f"$10^{{{np.log10(strength):.3g}}}$"
 
 
 def _broken(name: str) -> str:
+    """Return a name in several lines if it is long, for the label of an axis."""
     return (
         name
         if len(name) <= _LETTERS
@@ -118,8 +124,11 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
             _line(ax, table, metric, looks[name], name)
         ax.set_title(f"L1, {title}")
         ax.set_xlabel("laser strength (multiples of saturation)")
-        values = next(iter(tables.values())).strengths
-        ax.set_xticks(_places(values), ["none" if k == 0 else _power(k) for k in values])
+        tick_strengths = next(iter(tables.values())).strengths
+        ax.set_xticks(
+            _places(tick_strengths),
+            ["none" if strength == 0 else _power(strength) for strength in tick_strengths],
+        )
         ax.set_ylim(0, _top(tables.values(), metric))
     axes[0, 0].set_ylabel("L1 (sRGB, 0 to 1)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -128,19 +137,23 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
 
 
 def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
-    intervals = [table.at(metric, i) for i in range(len(table.strengths))]
-    places = _places(table.strengths)
+    """Draw the mean of a metric over the laser strength, with its interval."""
+    intervals = [table.at(metric, strength_index) for strength_index in range(len(table.strengths))]
+    positions = _places(table.strengths)
     ax.plot(
-        places,
-        [x.mean for x in intervals],
+        positions,
+        [interval.mean for interval in intervals],
         marker="o",
         markersize=4,
         linewidth=1.4,
         label=name,
         **look,
     )
-    low, up = [x.low for x in intervals], [x.high for x in intervals]
-    ax.fill_between(places, low, up, color=look["color"], alpha=0.15, linewidth=0)
+    low_ends, high_ends = (
+        [interval.low for interval in intervals],
+        [interval.high for interval in intervals],
+    )
+    ax.fill_between(positions, low_ends, high_ends, color=look["color"], alpha=0.15, linewidth=0)
 
 
 def _top(tables: Iterable[MetricTable], metric: str) -> float:
@@ -149,12 +162,18 @@ def _top(tables: Iterable[MetricTable], metric: str) -> float:
     """
     intervals: list[Interval] = []
     for table in tables:
-        intervals += [table.at(metric, i) for i in range(len(table.strengths))]
-    largest = max((x.mean for x in intervals if x.mean > 0), default=0.0)
+        intervals += [
+            table.at(metric, strength_index) for strength_index in range(len(table.strengths))
+        ]
+    largest = max((interval.mean for interval in intervals if interval.mean > 0), default=0.0)
     return (
         1.05
         * max(
-            largest, min(3 * largest, max([x.high for x in intervals if x.high > 0], default=0.0))
+            largest,
+            min(
+                3 * largest,
+                max([interval.high for interval in intervals if interval.high > 0], default=0.0),
+            ),
         )
         or 1.0
     )
@@ -164,9 +183,9 @@ def _places(values: Sequence[float]) -> list[float]:
     """Return the positions of laser strengths on a logarithmic axis, with strength 0 one decade
     below the others.
     """
-    logs = [float(np.log10(k)) for k in values if k > 0]
-    below = min(logs) - 1 if logs else 0.0
-    return [float(np.log10(k)) if k > 0 else below for k in values]
+    logarithms = [float(np.log10(strength)) for strength in values if strength > 0]
+    place_of_none = min(logarithms) - 1 if logarithms else 0.0
+    return [float(np.log10(strength)) if strength > 0 else place_of_none for strength in values]
 
 
 @drawn
@@ -175,12 +194,27 @@ def wavelengths(result: EvaluationResult) -> Any:
     wavelength of each scene.
     """
     figure, axes = canvas(11.0, 4.2)
-    ax, looks = axes[0, 0], _looks([p.name for p in result.pipelines])
-    x = np.array([math.nan if metres is None else metres * 1e9 for metres in result.wavelengths])
-    for p in result.pipelines:
-        y = result.tables[p.name].values["l1 small"][:, -1]
-        ax.plot(x, y, ".", markersize=5, alpha=0.6, color=looks[p.name]["color"])
-        ax.plot(*_means(x, y), linewidth=1.6, label=p.name, **looks[p.name])
+    ax, looks = axes[0, 0], _looks([pipeline.name for pipeline in result.pipelines])
+    wavelengths_nm = np.array(
+        [math.nan if metres is None else metres * 1e9 for metres in result.wavelengths]
+    )
+    for pipeline in result.pipelines:
+        # the last strength is the largest
+        errors = result.tables[pipeline.name].values["l1 small"][:, -1]
+        ax.plot(
+            wavelengths_nm,
+            errors,
+            ".",
+            markersize=5,
+            alpha=0.6,
+            color=looks[pipeline.name]["color"],
+        )
+        ax.plot(
+            *_means(wavelengths_nm, errors),
+            linewidth=1.6,
+            label=pipeline.name,
+            **looks[pipeline.name],
+        )
     ax.set_xlabel("wavelength of the laser (nm)")
     ax.set_ylabel("L1 (sRGB, 0 to 1)")
     ax.set_ylim(bottom=0)
@@ -191,14 +225,15 @@ def wavelengths(result: EvaluationResult) -> Any:
 
 def _means(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
     """Return the mean of x and y in each sixth of the range of x that has a value."""
-    valid = ~np.isnan(x + y)
-    x, y = x[valid], y[valid]
+    has_both = ~np.isnan(x + y)
+    x, y = x[has_both], y[has_both]
     if not len(x):
         return x, y
+    # six bins; the largest x belongs to the last
     bin_numbers = np.minimum((6 * (x - x.min()) / max(float(np.ptp(x)), 1e-9)).astype(int), 5)
-    filled = [i for i in range(6) if (bin_numbers == i).any()]
-    return np.array([x[bin_numbers == i].mean() for i in filled]), np.array(
-        [y[bin_numbers == i].mean() for i in filled]
+    filled = [bin_number for bin_number in range(6) if (bin_numbers == bin_number).any()]
+    return np.array([x[bin_numbers == bin_number].mean() for bin_number in filled]), np.array(
+        [y[bin_numbers == bin_number].mean() for bin_number in filled]
     )
 
 
@@ -209,27 +244,27 @@ def curves(masks: Mapping[str, MaskOptics]) -> Any:
     """
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(masks))
-    left, right = axes[0]
+    lsr_axis, bsr_axis = axes[0]
     for name, mask in masks.items():
-        left.plot(mask.wavelengths, mask.lsr, linewidth=1.6, label=name, **looks[name])
-        right.plot(mask.wavelengths, mask.bsr, linewidth=1.6, **looks[name])
-    first = next(iter(masks.values()))
-    left.plot(
-        first.wavelengths,
-        first.floor,
+        lsr_axis.plot(mask.wavelengths, mask.lsr, linewidth=1.6, label=name, **looks[name])
+        bsr_axis.plot(mask.wavelengths, mask.bsr, linewidth=1.6, **looks[name])
+    first_mask = next(iter(masks.values()))
+    lsr_axis.plot(
+        first_mask.wavelengths,
+        first_mask.floor,
         color=_GREY,
         linewidth=1.2,
         linestyle=(0, (1, 2)),
         label="energy floor",
     )
-    left.set_yscale("log")
-    left.set_title("laser suppression ratio: less is better")
-    right.set_title("background suppression ratio: 1 is best")
-    right.set_ylim(0, max(1.1, 1.05 * max(float(mask.bsr.max()) for mask in masks.values())))
-    for ax, name in ((left, "LSR"), (right, "BSR")):
+    lsr_axis.set_yscale("log")
+    lsr_axis.set_title("laser suppression ratio: less is better")
+    bsr_axis.set_title("background suppression ratio: 1 is best")
+    bsr_axis.set_ylim(0, max(1.1, 1.05 * max(float(mask.bsr.max()) for mask in masks.values())))
+    for ax, name in ((lsr_axis, "LSR"), (bsr_axis, "BSR")):
         ax.set_xlabel("wavelength (nm)")
         ax.set_ylabel(name)
-    handles, labels = left.get_legend_handles_labels()
+    handles, labels = lsr_axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
     return figure
 
@@ -243,19 +278,19 @@ def plane(masks: Mapping[str, MaskOptics]) -> Any:
     ax = axes[0, 0]
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))
     smallest = min(floor, *(float(mask.lsr.mean()) for mask in masks.values()))
-    x = np.geomspace(smallest / 3, 1.6, 200)
+    laser_ratios = np.geomspace(smallest / 3, 1.6, 200)
     unsuppressed = float(next(iter(masks.values())).unsuppressed.mean())
-    bound = most_contrast(unsuppressed, torch.from_numpy(x)).numpy()
-    ax.fill_between(x, bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
+    contrast_bound = most_contrast(unsuppressed, torch.from_numpy(laser_ratios)).numpy()
+    ax.fill_between(laser_ratios, contrast_bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
     ax.plot(
-        x,
-        bound,
+        laser_ratios,
+        contrast_bound,
         color=_GREY,
         linewidth=1.2,
         label="rms contrast: no mask that keeps its light is above (Parseval)",
     )
     ax.axvspan(
-        x[0],
+        laser_ratios[0],
         floor,
         color=BLUE,
         alpha=0.12,
@@ -264,26 +299,27 @@ def plane(masks: Mapping[str, MaskOptics]) -> Any:
     )
     looks = _looks(list(masks))
     for name, mask in masks.items():
-        laser_ratio, colour, mark = (
+        laser_ratio, colour, marker = (
             float(mask.lsr.mean()),
             looks[name]["color"],
             _MARKERS[looks[name]["linestyle"]],
         )
         ax.plot(
+            # a line from the median to the rms of each mask
             [laser_ratio, laser_ratio],
             [mask.median.mean(), mask.rms.mean()],
             color=colour,
             linewidth=0.8,
         )
         ax.plot(
-            laser_ratio, mask.rms.mean(), mark, markersize=6, markerfacecolor="none", color=colour
+            laser_ratio, mask.rms.mean(), marker, markersize=6, markerfacecolor="none", color=colour
         )
-        ax.plot(laser_ratio, mask.median.mean(), mark, markersize=7, color=colour, label=name)
+        ax.plot(laser_ratio, mask.median.mean(), marker, markersize=7, color=colour, label=name)
     ax.set_xscale("log")
     ax.set_yscale("log")
-    ax.set_xlim(x[0], x[-1])
+    ax.set_xlim(laser_ratios[0], laser_ratios[-1])
     lowest = min(float(mask.median.mean()) for mask in masks.values())
-    ax.set_ylim(max(min(lowest, float(bound[0])) / 2, 1e-6), 1.2)
+    ax.set_ylim(max(min(lowest, float(contrast_bound[0])) / 2, 1e-6), 1.2)
     ax.set_xlabel("mean LSR: to the left, lasers are weaker")
     ax.set_ylabel("contrast: dot median, ring rms")
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
@@ -311,8 +347,8 @@ _DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "above
 
 def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
     """Draw the figures of the evaluation page, and return the PNG files by name."""
-    waves = {"wavelengths": wavelengths(result)} if _drawn(result) else {}
-    return waves | {
+    wavelength_figure = {"wavelengths": wavelengths(result)} if _drawn(result) else {}
+    return wavelength_figure | {
         "cases": cases(result.panels),
         "strengths": strengths(result.tables, result.small),
         "curves": curves(result.masks),
@@ -325,13 +361,15 @@ def summary(result: EvaluationResult) -> dict[str, Any]:
     each mask and restorer.
     """
     return {
-        p.name: {
-            "mask": p.front,
-            "restorer": p.back,
-            **{metric: asdict(result.tables[p.name].mean(metric)) for metric in METRICS},
-            "against": {name: asdict(x) for name, x in result.against[p.name].items()},
+        pipeline.name: {
+            "mask": pipeline.front,
+            "restorer": pipeline.back,
+            **{metric: asdict(result.tables[pipeline.name].mean(metric)) for metric in METRICS},
+            "against": {
+                name: asdict(interval) for name, interval in result.against[pipeline.name].items()
+            },
         }
-        for p in result.pipelines
+        for pipeline in result.pipelines
     }
 
 
@@ -339,32 +377,32 @@ def rows(result: EvaluationResult) -> list[Sequence[Any]]:
     """Return the rows of ``table.csv``, one for each mask and restorer, with the numbers from
     `summary`.
     """
-    listed: list[Sequence[Any]] = []
-    for p in result.pipelines:
-        intervals = [result.tables[p.name].mean(metric) for metric in METRICS] + list(
-            result.against[p.name].values()
+    table_rows: list[Sequence[Any]] = []
+    for pipeline in result.pipelines:
+        intervals = [result.tables[pipeline.name].mean(metric) for metric in METRICS] + list(
+            result.against[pipeline.name].values()
         )
         numbers = itertools.chain(*map(astuple, intervals))
-        listed.append(
+        table_rows.append(
             (
-                p.name,
-                p.front,
-                p.back,
+                pipeline.name,
+                pipeline.front,
+                pipeline.back,
                 len(result.scenes),
-                *("" if math.isnan(x) else x for x in numbers),
+                *("" if math.isnan(number) else number for number in numbers),
             )
         )
-    return listed
+    return table_rows
 
 
 def lead(result: EvaluationResult) -> str:
     """Return a few sentences with the main result of the evaluation."""
-    best = min(result.pipelines, key=lambda p: float(result.tables[p.name].scenes("l1").mean()))
-    lowest = _with_interval(result.tables[best.name].mean("l1"), "l1")
+    leader = min(result.pipelines, key=lambda p: float(result.tables[p.name].scenes("l1").mean()))
+    lowest = _with_interval(result.tables[leader.name].mean("l1"), "l1")
     strengths = ", ".join(_strength_names(result))
     return f"""{len(result.scenes)} scenes, laser strengths {strengths} (1 saturates a pixel of the
         plain lens), {len(result.pipelines)} pipelines of a mask and a restorer. Lowest L1:
-        {best.name}, {lowest}. {_few_text(result)}{_drawn_text(result)}{_equal_text(result)}"""
+        {leader.name}, {lowest}. {_few_text(result)}{_drawn_text(result)}{_equal_text(result)}"""
 
 
 def _few_text(result: EvaluationResult) -> str:
@@ -376,13 +414,19 @@ def _few_text(result: EvaluationResult) -> str:
 
 def _drawn_text(result: EvaluationResult) -> str:
     """Return which values are drawn for each scene."""
-    laser = ""
+    laser_sentence = ""
     if _drawn(result):
-        laser = " The wavelength of the laser of each scene is drawn by the law of the recipe."
+        laser_sentence = (
+            " The wavelength of the laser of each scene is drawn by the law of the recipe."
+        )
     uncertain = result.recipe.uncertain
-    drawn = uncertain.names if uncertain else ()
-    names = [name for name in drawn if not name.startswith("lasers.")]
-    return f"{laser} These values are drawn for each scene: {', '.join(names)}." if names else laser
+    drawn_names = uncertain.names if uncertain else ()
+    names = [name for name in drawn_names if not name.startswith("lasers.")]
+    return (
+        f"{laser_sentence} These values are drawn for each scene: {', '.join(names)}."
+        if names
+        else laser_sentence
+    )
 
 
 def _equal_text(result: EvaluationResult) -> str:
@@ -390,21 +434,27 @@ def _equal_text(result: EvaluationResult) -> str:
     level = result.protection.level if result.protection else 0.0
     if not level:
         return ""
-    which = "every pipeline" if all(p.shade for p in result.pipelines) else "each of them once more"
-    return f" Filters and stops bring {which} to a peak of {level:g} of the plain lens's."
+    which_pipelines = (
+        "every pipeline"
+        if all(pipeline.shade for pipeline in result.pipelines)
+        else "each of them once more"
+    )
+    return f" Filters and stops bring {which_pipelines} to a peak of {level:g} of the plain lens's."
 
 
 def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
     """Return all sections of the report page of an evaluation."""
-    compared = (_compared(result, name) for name in dict.fromkeys(result.references.values()))
-    gained = (_gained(result, name) for name in dict.fromkeys(result.references.values()))
+    comparison_tables = (
+        _compared(result, name) for name in dict.fromkeys(result.references.values())
+    )
+    gain_tables = (_gained(result, name) for name in dict.fromkeys(result.references.values()))
     parts = [
         *protection_section(result),
         _crossed(result),
         _by_strength(result),
-        *gained,
+        *gain_tables,
         _numbers(result),
-        *compared,
+        *comparison_tables,
     ]
     parts += _mistold(result)
     text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the
@@ -429,71 +479,85 @@ def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Secti
 
 
 def _crossed(result: EvaluationResult) -> Section:
-    masks = list(dict.fromkeys(p.front for p in result.pipelines))
-    restorers = list(dict.fromkeys(p.back for p in result.pipelines))
-    l1 = {
-        (p.front, p.back): _with_interval(result.tables[p.name].mean("l1"), "l1")
-        for p in result.pipelines
+    """Return the section with the L1 of each mask (row) with each restorer (column)."""
+    masks = list(dict.fromkeys(pipeline.front for pipeline in result.pipelines))
+    restorers = list(dict.fromkeys(pipeline.back for pipeline in result.pipelines))
+    l1_texts = {
+        (pipeline.front, pipeline.back): _with_interval(
+            result.tables[pipeline.name].mean("l1"), "l1"
+        )
+        for pipeline in result.pipelines
     }
-    listed = [(mask, *(l1.get((mask, back)) for back in restorers)) for mask in masks]
+    table_rows = [
+        (mask, *(l1_texts.get((mask, restorer)) for restorer in restorers)) for mask in masks
+    ]
     text = """L1 at full size (sRGB from 0 to 1, as a display shows it): the mean over the strengths
         of each scene, then mean and 95 % confidence interval (Student's t). Scenes of one
         photograph count as one draw."""
-    return Section("Mask by restorer", text, ("mask", *restorers), listed)
+    return Section("Mask by restorer", text, ("mask", *restorers), table_rows)
 
 
 def _drawn(result: EvaluationResult) -> bool:
+    """Return True if the wavelength of the laser is drawn for each scene."""
     return any(scene.case == DRAWN for scene in result.scenes)
 
 
 def _strength_names(result: EvaluationResult) -> list[str]:
-    return ["none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in result.strengths]
+    """Return the strengths as text, such as ``none`` and ``1e4``."""
+    return [
+        "none" if strength == 0 else f"{strength:g}".replace("e+0", "e")
+        for strength in result.strengths
+    ]
 
 
 def _by_strength(result: EvaluationResult) -> Section:
+    """Return the section with the L1 of the reduced pictures at each strength."""
     text = f"""L1 of the pictures reduced to {result.small} pixels of their shorter side, at each
         laser strength: mean and 95 % interval."""
     columns = ("pipeline", *_strength_names(result))
-    listed = [
+    table_rows = [
         (
-            p.name,
+            pipeline.name,
             *(
-                _with_interval(result.tables[p.name].at("l1 small", i), "l1")
-                for i in range(len(columns) - 1)
+                _with_interval(result.tables[pipeline.name].at("l1 small", strength_index), "l1")
+                for strength_index in range(len(columns) - 1)
             ),
         )
-        for p in result.pipelines
+        for pipeline in result.pipelines
     ]
-    return Section(f"L1 by strength, {result.small} pixels", text, columns, listed)
+    return Section(f"L1 by strength, {result.small} pixels", text, columns, table_rows)
 
 
 def _gained(result: EvaluationResult, reference: str) -> Section:
+    """Return the section with the gain of each pipeline over one reference, at each strength."""
     text = f"""By which fraction the L1 of the reduced pictures lies below that of {reference} on
         the same pictures, at each laser strength, with 95 % intervals as below. A colour marks an
         interval without zero."""
-    listed: list[Sequence[Any]] = []
+    table_rows: list[Sequence[Any]] = []
     for name in (name for name, other in result.references.items() if other == reference != name):
         gains = gains_by_strength(result.tables[name], result.tables[reference], result.recipe.seed)
-        listed.append((name, *(_judged(x, ".1%") for x in gains)))
+        table_rows.append((name, *(_judged(interval, ".1%") for interval in gains)))
     columns = ("pipeline", *_strength_names(result))
-    return Section(f"Gain by strength over {reference}", text, columns, listed)
+    return Section(f"Gain by strength over {reference}", text, columns, table_rows)
 
 
 def _judged(x: Interval, digits: str) -> Marked:
     """Return an interval as a cell, which is marked if the interval excludes zero."""
-    text = _between(x, digits)
+    interval_text = _between(x, digits)
     if not x.excludes_zero:
-        return Marked(text)
-    return Marked(text, "pass" if x.mean > 0 else "fail")
+        return Marked(interval_text)
+    return Marked(interval_text, "pass" if x.mean > 0 else "fail")
 
 
 def _with_interval(x: Interval, metric: str) -> str:
+    """Return a mean with the half-width of its interval as text, with the digits of the metric."""
     digits = _DIGITS.get(metric.partition(" ")[0], ".3g")
-    half = "" if math.isnan(x.half) else f" ±\N{NO-BREAK SPACE}{x.half:{digits}}"
-    return f"{x.mean:{digits}}{half}"
+    half_text = "" if math.isnan(x.half) else f" ±\N{NO-BREAK SPACE}{x.half:{digits}}"
+    return f"{x.mean:{digits}}{half_text}"
 
 
 def _numbers(result: EvaluationResult) -> Section:
+    """Return the section with the mean of every metric for each pipeline."""
     text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced
         to {result.small} pixels of its shorter side in linear light, antialiased. Saturated: number
         of saturated pixels of the raw picture. Above: fraction of the points whose brightest pixel
@@ -502,14 +566,17 @@ def _numbers(result: EvaluationResult) -> Section:
         nothing that is known. PSNR is a mean of decibels."""
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(_column(metric) for metric in metrics))
-    listed = [
+    table_rows = [
         (
-            p.name,
-            *(_with_interval(result.tables[p.name].mean(metric), metric) for metric in metrics),
+            pipeline.name,
+            *(
+                _with_interval(result.tables[pipeline.name].mean(metric), metric)
+                for metric in metrics
+            ),
         )
-        for p in result.pipelines
+        for pipeline in result.pipelines
     ]
-    return Section("All numbers", text, columns, listed)
+    return Section("All numbers", text, columns, table_rows)
 
 
 def _mistold(result: EvaluationResult) -> list[Section]:
@@ -521,7 +588,7 @@ def _mistold(result: EvaluationResult) -> list[Section]:
     errors = list(dict.fromkeys(point.error for point in result.mistold))
     names = dict.fromkeys(point.pipeline for point in result.mistold)
     strength = result.mistold[0].strength
-    listed = [_mistold_row(result.mistold, name, errors) for name in names]
+    table_rows = [_mistold_row(result.mistold, name, errors) for name in names]
     text = f"""PSNR in dB of the restored picture at the strength {strength:g}, in the first scenes
         with a laser: mean and 95 % interval. In every other table the restorer is told the exact
         PSF and the exact pattern of the laser, which no camera knows. Here it is told one of them
@@ -529,7 +596,7 @@ def _mistold(result: EvaluationResult) -> list[Section]:
         mistold.csv has every point."""
     return [
         Section(
-            "What the restorer is not told", text, ("pipeline", "told exactly", *errors), listed
+            "What the restorer is not told", text, ("pipeline", "told exactly", *errors), table_rows
         )
     ]
 
@@ -538,11 +605,12 @@ def _mistold_row(
     points: Sequence[MistoldPoint], name: str, errors: Sequence[str]
 ) -> tuple[str, ...]:
     """Return the PSNR of one pipeline that is told the truth, and that with each error."""
-    own = [point for point in points if point.pipeline == name]
-    exact = {point.scene.number: point.true["psnr"] for point in own}
-    cells = [_with_interval(mean(list(exact.values())), "psnr")]
+    points_of_pipeline = [point for point in points if point.pipeline == name]
+    # once for each scene: the points of all errors repeat it
+    exact_psnr = {point.scene.number: point.true["psnr"] for point in points_of_pipeline}
+    cells = [_with_interval(mean(list(exact_psnr.values())), "psnr")]
     for error in errors:
-        values = [point.wrong["psnr"] for point in own if point.error == error]
+        values = [point.wrong["psnr"] for point in points_of_pipeline if point.error == error]
         cells.append(_with_interval(mean(values), "psnr") if values else "")
     return (name, *cells)
 
@@ -555,45 +623,62 @@ def _column(metric: str) -> str:
 
 
 def _compared(result: EvaluationResult, reference: str) -> Section:
+    """Return the section with the differences of each pipeline from one reference."""
     text = f"""Differences from {reference} in the same scenes. L1 less: by how much L1 is lower.
         Gain: the same as a fraction of the mean L1 of the reference. Intervals of 95 % come from 10
         000 draws of the photographs (bootstrap-t); fewer than five photographs have no interval. A
         colour marks an interval without zero. If many pipelines are compared with one reference,
         about one in twenty is marked by chance."""
-    listed: list[Sequence[Any]] = []
-    for p in result.pipelines:
-        if p.name == reference or result.references[p.name] != reference:
+    table_rows: list[Sequence[Any]] = []
+    for pipeline in result.pipelines:
+        if pipeline.name == reference or result.references[pipeline.name] != reference:
             continue
-        less, share, small = result.against[p.name].values()
-        listed.append((p.name, _judged(less, ".4f"), _judged(share, ".1%"), _judged(small, ".1%")))
+        lower_l1, relative_gain, small_gain = result.against[pipeline.name].values()
+        table_rows.append(
+            (
+                pipeline.name,
+                _judged(lower_l1, ".4f"),
+                _judged(relative_gain, ".1%"),
+                _judged(small_gain, ".1%"),
+            )
+        )
     columns = ("pipeline", "L1 less", "gain", "gain, small")
-    return Section(f"Against {reference}", text, columns, listed)
+    return Section(f"Against {reference}", text, columns, table_rows)
 
 
 def _between(x: Interval, digits: str) -> str:
+    """Return a mean with its interval as text, without one for too few photographs."""
     return f"{x.mean:{digits}}" + (
         "" if math.isnan(x.low) else f" ({x.low:{digits}} to {x.high:{digits}})"
     )
 
 
 def _suppression(result: EvaluationResult, picture: bytes) -> Section:
-    own = next(p.front for p in result.pipelines if p.name == result.reference)
+    """Return the section with the suppression ratios of each mask, and the figure of both."""
+    base_mask = next(p.front for p in result.pipelines if p.name == result.reference)
     text = f"""LSR: the brightest pixel of a laser with the mask, divided by the brightest pixel
         without the mask; BSR: share of the scene's light that stays in the field, at most 1, mean
         over scenes. Energy floor: the LSR of light that is spread evenly over the window of the
-        PSF. Stronger: the mean LSR of {own} divided by the mean LSR of the mask. The file
+        PSF. Stronger: the mean LSR of {base_mask} divided by the mean LSR of the mask. The file
         suppression.csv has LSR and BSR by wavelength."""
-    base = float(result.masks[own].lsr.mean())
-    listed: list[Sequence[Any]] = []
-    for name, m in result.masks.items():
-        middle = float(m.lsr.mean())
-        numbers = (m.lsr.min(), m.lsr.max(), base / middle, m.floor.mean(), m.bsr.mean())
-        listed.append((name, middle, *map(float, numbers)))
+    reference_lsr = float(result.masks[base_mask].lsr.mean())
+    table_rows: list[Sequence[Any]] = []
+    for name, mask_optics in result.masks.items():
+        mean_lsr = float(mask_optics.lsr.mean())
+        numbers = (
+            mask_optics.lsr.min(),
+            mask_optics.lsr.max(),
+            reference_lsr / mean_lsr,
+            mask_optics.floor.mean(),
+            mask_optics.bsr.mean(),
+        )
+        table_rows.append((name, mean_lsr, *map(float, numbers)))
     columns = ("mask", "mean LSR", "least", "greatest", "stronger", "floor", "mean BSR")
-    return Section("Suppression by wavelength", text, columns, listed, picture)
+    return Section("Suppression by wavelength", text, columns, table_rows, picture)
 
 
 def _plane(result: EvaluationResult, picture: bytes) -> Section:
+    """Return the section that compares suppression and contrast of each mask with their bound."""
     text = """Means over wavelengths, with the contrast within the band that the clear aperture
         passes. A low peak costs contrast: by Parseval the rms over all sampled frequencies is at
         most sqrt(LSR p0), where p0 is the fraction of light in the brightest pixel of the clear
@@ -601,54 +686,66 @@ def _plane(result: EvaluationResult, picture: bytes) -> Section:
         / 2; the median is at most 1.41 times the rms. If a mask sends light out of the window, the
         contrast is that of the remaining light, and the bound of the mask, in the table, is
         higher."""
-    listed: list[Sequence[Any]] = []
-    for name, m in result.masks.items():
-        bound_holds = bool((m.rms <= _COARSE * m.most).all())
-        bound = Marked(float(m.most.mean()), "pass" if bound_holds else "fail")
-        listed.append((name, *(float(x.mean()) for x in (m.lsr, m.median, m.rms)), bound))
+    table_rows: list[Sequence[Any]] = []
+    for name, mask_optics in result.masks.items():
+        bound_holds = bool((mask_optics.rms <= _COARSE * mask_optics.most).all())
+        bound_cell = Marked(float(mask_optics.most.mean()), "pass" if bound_holds else "fail")
+        table_rows.append(
+            (
+                name,
+                *(
+                    float(values_of_bands.mean())
+                    for values_of_bands in (mask_optics.lsr, mask_optics.median, mask_optics.rms)
+                ),
+                bound_cell,
+            )
+        )
     columns = ("mask", "mean LSR", "median", "rms", "rms at most")
-    return Section("Suppression and contrast", text, columns, listed, picture)
+    return Section("Suppression and contrast", text, columns, table_rows, picture)
 
 
 def _commands(result: EvaluationResult) -> list[Section]:
     """Return the section with the command of one point of each pipeline, beside the numbers that
     it gives.
     """
-    listed: list[Sequence[Any]] = []
-    for name, place, strength, command in shown_commands(result.commands):
-        point = result.points[name][place][strength]
+    table_rows: list[Sequence[Any]] = []
+    for name, scene_index, strength, command in shown_commands(result.commands):
+        point = result.points[name][scene_index][strength]
         numbers = (
             f"{point['l1']:.6g}",
             f"{point['psnr']:.6g}",
             f"{point['ssim']:.6g}",
             f"{point['saturated']:.0f}",
         )
-        said = (
+        command_text = (
             command
             or "no command: a random part of the camera, such as dirt, has "
             "the seed of the evaluation"
         )
-        listed.append((name, result.scenes[place].number, f"{strength:g}", *numbers, said))
-    if not listed:
+        table_rows.append(
+            (name, result.scenes[scene_index].number, f"{strength:g}", *numbers, command_text)
+        )
+    if not table_rows:
         return []
     text = """One point of each pipeline, with the command that gives its numbers at full size, in
         the folder in which this evaluation was started: `metrics.csv` of the run has them. Each
         point has its command in `points.csv`. The same recipe with another seed, another part of
         the photograph, or another direction of the laser gives other numbers."""
     columns = ("pipeline", "scene", "strength", "L1", "PSNR", "SSIM", "saturated", "command")
-    return [Section("The same numbers again", text, columns, listed)]
+    return [Section("The same numbers again", text, columns, table_rows)]
 
 
 def _data(result: EvaluationResult) -> list[Section]:
+    """Return the sections with the scenes, the commands and the photographs that were not read."""
     text = """Scenes in the order of their numbers. The seed of the recipe chooses part of a
         photograph for each scene. The seed of a scene decides the direction of the laser and the
         noise, which are the same for every pipeline."""
-    listed = [(s.number, s.name, s.case, s.seed) for s in result.scenes]
+    listed = [(scene.number, scene.name, scene.case, scene.seed) for scene in result.scenes]
     parts = [
         Section("Scenes", text, ("scene", "photograph", "laser", "seed"), listed),
         *_commands(result),
     ]
     if result.broken:
-        broken = [(path.name, reason) for path, reason in result.broken]
-        parts.append(Section("Photographs that cannot be read", "", ("file", "why"), broken))
+        unreadable = [(path.name, reason) for path, reason in result.broken]
+        parts.append(Section("Photographs that cannot be read", "", ("file", "why"), unreadable))
     return parts

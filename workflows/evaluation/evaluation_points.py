@@ -66,26 +66,29 @@ def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]
     told_steps = known(recipe, _readers(recipe))
     if not told_steps:
         return {}
-    steps = needed(recipe, told_steps)
-    return _laser_errors(recipe, mismatch, steps) | _pupil_errors(recipe, mismatch, steps)
+    steps_of_knowledge = needed(recipe, told_steps)
+    return _laser_errors(recipe, mismatch, steps_of_knowledge) | _pupil_errors(
+        recipe, mismatch, steps_of_knowledge
+    )
 
 
 def _laser_errors(
     recipe: Recipe, mismatch: Mismatch, steps: Sequence[str]
 ) -> dict[str, Mapping[str, Any]]:
     """Return the errors in direction and wavelength of a laser whose direction ``steps`` read."""
-    direction, line = f"direction[{BEAM}]", f"line[{BEAM}]"
-    glare = [name for name in steps if direction in recipe.steps[name].sources]
-    if not glare:
+    direction, line_step = f"direction[{BEAM}]", f"line[{BEAM}]"
+    steps_with_direction = [name for name in steps if direction in recipe.steps[name].sources]
+    if not steps_with_direction:
         return {}
     errors: dict[str, Mapping[str, Any]] = {}
     if mismatch.pixels:
-        lens = recipe.steps[glare[0]].params
-        angle = mismatch.pixels * lens["pixel_pitch"] / lens["focal_length"]
+        lens_params = recipe.steps[steps_with_direction[0]].params
+        # pixels on the sensor as a direction
+        angle = mismatch.pixels * lens_params["pixel_pitch"] / lens_params["focal_length"]
         errors[f"direction {mismatch.pixels:g} px off"] = {f"{direction}.angle": (angle, angle)}
-    if mismatch.wavelength and "wavelength" in recipe.steps[line].params:
-        text = f"wavelength {mismatch.wavelength * 1e9:g} nm off"
-        errors[text] = {f"{line}.wavelength": mismatch.wavelength}
+    if mismatch.wavelength and "wavelength" in recipe.steps[line_step].params:
+        error_text = f"wavelength {mismatch.wavelength * 1e9:g} nm off"
+        errors[error_text] = {f"{line_step}.wavelength": mismatch.wavelength}
     return errors
 
 
@@ -97,8 +100,8 @@ def _pupil_errors(
     dirty = [name for name in pupils if recipe.steps[name].wires.get("dirt") is not None]
     errors: dict[str, Mapping[str, Any]] = {}
     if mismatch.defocus and pupils:
-        text = f"defocus {mismatch.defocus:g} waves off"
-        errors[text] = _of_each(pupils, "defocus", mismatch.defocus)
+        error_text = f"defocus {mismatch.defocus:g} waves off"
+        errors[error_text] = _of_each(pupils, "defocus", mismatch.defocus)
     if mismatch.dirt and dirty:
         errors["dirt not told"] = _of_each(dirty, "dirt", None)
     return errors
@@ -113,23 +116,23 @@ def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
     """Return the recipe with a copy of each step that the error changes, from which alone the
     restorer knows.
     """
-    added = {
+    errors_of_steps = {
         name: value for name, value in error.items() if name.rpartition(".")[0] in recipe.steps
     }
-    changed = {name.rpartition(".")[0] for name in added}
+    changed = {name.rpartition(".")[0] for name in errors_of_steps}
     readers = _readers(recipe)
     copied = {
         name
         for name in dependents(recipe, changed) & set(needed(recipe, known(recipe, readers)))
         if not recipe.steps[name].node.random or name in changed  # another name would draw anew
     }
-    return with_copies(recipe, readers, copied, lambda step: _changed(step, added))
+    return with_copies(recipe, readers, copied, lambda step: _changed(step, errors_of_steps))
 
 
 def shifted(value: Any, by: Any) -> Any:
     """Return a parameter to which an error is added: a number, or the two angles of a direction."""
     return (
-        tuple(a + b for a, b in zip(value, by, strict=True))
+        tuple(component + added for component, added in zip(value, by, strict=True))
         if isinstance(by, tuple)
         else value + by
     )
@@ -141,15 +144,18 @@ def _readers(recipe: Recipe) -> list[str]:
 
 
 def _changed(step: Step, error: Mapping[str, Any]) -> Step:
+    """Return a step with the errors, by ``step.parameter``, added to its parameters; an error of
+    None removes the input of this name.
+    """
     params, wires = dict(step.params), dict(step.wires)
-    for full, by in error.items():
-        name, _, param = full.rpartition(".")
+    for parameter_path, added_error in error.items():
+        name, _, param = parameter_path.rpartition(".")
         if name != step.name:
             continue
-        if by is None:
+        if added_error is None:
             wires[param] = None
         elif params[param] is not None:  # a direction is drawn for each scene
-            params[param] = shifted(params[param], by)
+            params[param] = shifted(params[param], added_error)
     return replace(step, params=params, wires=wires)
 
 
@@ -183,6 +189,7 @@ class EvaluationPoints:
     """
 
     def __init__(self, store: Store, small: int, device: str = "cpu") -> None:
+        """Prepare points whose reduced pictures have ``small`` pixels on their shorter side."""
         self.store, self.small, self.device = store, small, device
         self.computed = 0  #: evaluation points that were not in the store
         self.seconds = 0.0  #: computing time of these evaluation points
@@ -205,6 +212,7 @@ class EvaluationPoints:
         )
 
     def _measure(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
+        """Compute the metrics of a point, and count it with its time."""
         began = time.perf_counter()
         numbers = self._numbers(pipeline, self.values(pipeline, point))
         self.seconds += time.perf_counter() - began
@@ -221,13 +229,17 @@ class EvaluationPoints:
         function = self._function(pipeline, point.lit, outputs)
         self._kept.turn(point)
         with torch.no_grad():
-            changed = self._changed(pipeline, point, outputs)
-            free_values = {name: value for name, value in changed.items() if name in function.free}
+            parameter_values = self._changed(pipeline, point, outputs)
+            # parameters that the function takes as arguments
+            free_values = {
+                name: value for name, value in parameter_values.items() if name in function.free
+            }
             values: dict[str, Any] = function({"scene": point.scene.picture, **free_values})
         return values
 
     def forget(self) -> None:
         """Remove all results that depend on the laser from memory."""
+        # the second part of the name is the laser
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
         in_use = set[int]()
         for function in self._functions.values():
@@ -248,20 +260,20 @@ class EvaluationPoints:
         """
         recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         keys = self.point_keys(pipeline, point, outputs)
-        within = [
+        tolerances_and_settings = [
             recipe.tolerance,
             recipe.exact,
             recipe.estimates,
             device_kind(self.device),
             self.small,
         ]
-        own = [self._code.digest(function.__module__) for function in (quality, resize)]
+        code_of_metrics = [self._code.digest(function.__module__) for function in (quality, resize)]
         return digest(
             "evaluate",
             engine("evaluation.evaluation_points"),
             [keys[name] for name in outputs],
-            within,
-            own,
+            tolerances_and_settings,
+            code_of_metrics,
         )
 
     def point_keys(
@@ -286,15 +298,20 @@ class EvaluationPoints:
         depend on the scene.
         """
         keys = {"scene": scene.key(self._code)} if scene else {}
-        live = dependents(recipe, keys)
+        depends_on_scene = dependents(recipe, keys)
         for name in needed(recipe, outputs):
             if name not in keys:
                 step = recipe.steps[name]
-                seed = scene.seed if scene and name in live else recipe.seed
+                seed = scene.seed if scene and name in depends_on_scene else recipe.seed
                 keys[name], _ = key_of(step, keys, seed, self._code, place(step, self.device))
         return keys
 
     def _function(self, pipeline: PipelineRecipes, case: str, outputs: tuple[str, ...]) -> Any:
+        """Return the recipe as a function of what differs from point to point, built once.
+
+        Free are the scene, the uncertain inputs that the outputs need, and with a laser (``case``)
+        its direction and its strength; also their copies from which a restorer is told.
+        """
         name = (f"{pipeline.name} {outputs}", case, id(pipeline.recipe))
         if name not in self._functions:
             recipe = replace(pipeline.recipe(case), estimates=False)  # one PSF for all scenes
@@ -305,7 +322,11 @@ class EvaluationPoints:
             inputs = self.inputs(pipeline, case, outputs)
             free = [
                 "scene",
-                *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps),
+                *(
+                    reader
+                    for reader in (inputs.readers if inputs else ())
+                    if reader.rpartition(".")[0] in steps
+                ),
             ]
             if case != NONE:
                 free += [
@@ -313,11 +334,16 @@ class EvaluationPoints:
                     *(f"{spot}.strength" for spot in spots(recipe, outputs)),
                 ]
             free += [TOLD + name for name in free if TOLD + name.rpartition(".")[0] in steps]
-            caller = self._kept.caller(
+            # results before the laser's strength are shared by scene
+            shared_caller = self._kept.caller(
                 dependents(full_recipe, list(filter(_is_moved, full_recipe.steps)))
             )
-            ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
-            self._functions[name] = as_function(full_recipe, *free, outputs=outputs, **ways)
+            options: dict[str, Any] = {
+                "store": self.store,
+                "device": self.device,
+                "caller": shared_caller,
+            }
+            self._functions[name] = as_function(full_recipe, *free, outputs=outputs, **options)
             self._share(self._functions[name], full_recipe)
         return self._functions[name]
 
@@ -341,9 +367,9 @@ class EvaluationPoints:
             for name, value in changed.items()
             if TOLD + name.rpartition(".")[0] in recipe.steps
         }
-        wrong = {name: value for name, value in pipeline.error.items() if value is not None}
+        added_errors = {name: value for name, value in pipeline.error.items() if value is not None}
         told_values = {
-            TOLD + name: shifted(x, wrong[name]) if name in wrong else x
+            TOLD + name: shifted(x, added_errors[name]) if name in added_errors else x
             for name, x in copies.items()
         }
         return changed | told_values
@@ -374,17 +400,22 @@ class EvaluationPoints:
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
 
     def _numbers(self, pipeline: PipelineRecipes, values: Mapping[str, Any]) -> PointNumbers:
-        line, truth = pipeline.pipeline, values["truth"]
-        small = full = values[line.quality]
+        """Return the metrics of a point from its outputs: at full size and, where the picture is
+        larger, of the reduced picture.
+        """
+        pipeline_names, truth = pipeline.pipeline, values["truth"]
+        small_quality = full_quality = values[pipeline_names.quality]
         if min(truth.shape[-2:]) > self.small:
-            domain = pipeline.recipe(NONE).steps[line.quality].params["domain"]
-            small = quality(
-                reduced(values[line.picture], self.small), reduced(truth, self.small), domain=domain
+            domain = pipeline.recipe(NONE).steps[pipeline_names.quality].params["domain"]
+            small_quality = quality(
+                reduced(values[pipeline_names.picture], self.small),
+                reduced(truth, self.small),
+                domain=domain,
             )
         peak, saturated = values["peak[mask]"], values["saturated[mask]"]
         return {
-            **{name: float(value) for name, value in full._asdict().items()},
-            **{f"{name} small": float(value) for name, value in small._asdict().items()},
+            **{name: float(value) for name, value in full_quality._asdict().items()},
+            **{f"{name} small": float(value) for name, value in small_quality._asdict().items()},
             "saturated": float(saturated.pixels),
             "peak": float(peak.irradiance),
             "above": float(peak.above),
@@ -431,9 +462,14 @@ class _SharedResults:
             step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str
         ) -> Any:
             results = self._of_strength if step.name in moved else self._of_scene
-            own = (step.name, self._seed) if step.node.random else ()
-            identities = [tuple(map(id, x)) if type(x) is list else id(x) for x in inputs]
-            key = (own, step.node.path, repr(sorted(params.items())), device, *identities)
+            # a random step has other results in a scene of another seed
+            random_key = (step.name, self._seed) if step.node.random else ()
+            # equal inputs are the same objects: they were computed once
+            identities = [
+                tuple(map(id, argument)) if type(argument) is list else id(argument)
+                for argument in inputs
+            ]
+            key = (random_key, step.node.path, repr(sorted(params.items())), device, *identities)
             # the inputs are kept too, so that no other object gets their identity
             if key not in results:
                 results[key] = (inputs, call(step, inputs, params, self._seed, device))
@@ -456,9 +492,9 @@ def reduced(picture: Tensor, side: int) -> Tensor:
     """Clip a picture to [0, 1], and resize it, antialiased, so that its shorter side has
     ``side`` pixels.
     """
-    y, x = picture.shape[-2:]
-    scale = side / min(y, x)
-    return resize(picture.clamp(0, 1), round(y * scale), round(x * scale))
+    height, width = picture.shape[-2:]
+    scale = side / min(height, width)
+    return resize(picture.clamp(0, 1), round(height * scale), round(width * scale))
 
 
 # --- point commands -------------------------------------------------------------------------------
@@ -494,25 +530,29 @@ class PointCommands:
         One point of each pipeline is proved, and one beyond the scene 0, which has the seed of the
         evaluation: the command loads a recipe whose steps have the same keys.
         """
-        proved: dict[tuple[str, bool], bool] = {}
-        listed: dict[str, list[dict[float, str]]] = {}
+        has_same_keys: dict[tuple[str, bool], bool] = {}
+        commands_by_pipeline: dict[str, list[dict[float, str]]] = {}
         for pipeline in pipelines:
-            listed[pipeline.name] = []
+            commands_by_pipeline[pipeline.name] = []
             for scene in scenes:
                 points = [
-                    PointRequest(scene, k) for k in (strengths if scene.case != NONE else (0.0,))
+                    PointRequest(scene, strength)
+                    for strength in (strengths if scene.case != NONE else (0.0,))
                 ]
-                kind = (pipeline.name, scene.number == 0)
-                if kind not in proved:
-                    proved[kind] = self.is_same(pipeline, points[-1])
-                own = {
-                    point.strength: self._command(pipeline, point) if proved[kind] else ""
+                kind_of_scene = (pipeline.name, scene.number == 0)
+                if kind_of_scene not in has_same_keys:
+                    has_same_keys[kind_of_scene] = self.is_same(pipeline, points[-1])
+                commands_by_strength = {
+                    point.strength: self._command(pipeline, point)
+                    if has_same_keys[kind_of_scene]
+                    else ""
                     for point in points
                 }
-                listed[pipeline.name].append(own)
-        return listed
+                commands_by_pipeline[pipeline.name].append(commands_by_strength)
+        return commands_by_pipeline
 
     def _command(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
+        """Return the command of a point."""
         return shlex.join(["neusee", "run", self.recipe, *self.words(pipeline, point)])
 
     def words(
@@ -521,19 +561,21 @@ class PointCommands:
         """Return the arguments of `neusee run` after the recipe; ``strength`` replaces that of
         the laser.
         """
-        scene, line = point.scene, pipeline.pipeline
+        scene, pipeline_names = point.scene, pipeline.pipeline
         recipe = pipeline.recipe(point.lit)
-        drawn = self._drawn(pipeline, point)
-        wavelength = drawn.pop(_WAVELENGTH, None)
-        words = [change if isinstance(change, str) else change.text for change in self.changes]
-        words += [
+        drawn_values = self._drawn(pipeline, point)
+        wavelength = drawn_values.pop(_WAVELENGTH, None)
+        arguments = [change if isinstance(change, str) else change.text for change in self.changes]
+        arguments += [
             *pipeline.words,
             *_scene_words(recipe, scene),
             _laser_word(pipeline, point, wavelength, strength),
         ]
-        words += [f"{path}={value}" for path, value in drawn.items()]
-        outputs = ", ".join(f'"{name}"' for name in (line.quality, "saturated[mask]", "peak[mask]"))
-        return [*words, f"seed={scene.seed}", "estimates=false", f"outputs=[{outputs}]"]
+        arguments += [f"{path}={value}" for path, value in drawn_values.items()]
+        outputs = ", ".join(
+            f'"{name}"' for name in (pipeline_names.quality, "saturated[mask]", "peak[mask]")
+        )
+        return [*arguments, f"seed={scene.seed}", "estimates=false", f"outputs=[{outputs}]"]
 
     def _drawn(self, pipeline: PipelineRecipes, point: PointRequest) -> dict[str, str]:
         """Return the values that were drawn for a scene, as they are written in a recipe."""
@@ -541,10 +583,10 @@ class PointCommands:
         if inputs is None:
             return {}
         laws, units = inputs.uncertain.laws, inputs.uncertain.units
-        drawn = point.scene.draw(inputs)
+        drawn_values = point.scene.draw(inputs)
         return {
             path: str(written(value, laws[path].unit if path in laws else units[path]))
-            for path, value in drawn.items()
+            for path, value in drawn_values.items()
         }
 
     def is_same(self, pipeline: PipelineRecipes, point: PointRequest) -> bool:
@@ -555,6 +597,7 @@ class PointCommands:
         this comparison. A random step that no scene reaches, such as dirt on the lens, has the seed
         of the evaluation, which the command gives only for the scene 0.
         """
+        # the command does not output the contrast by wavelength
         outputs = [name for name in pipeline.pipeline.outputs if name != "bsr[mask]"]
         try:
             recipe = load(self.recipe, self.words(pipeline, point, 1.0), self.folder)
@@ -570,6 +613,7 @@ class PointCommands:
             steps[name] = replace(
                 steps[name], params={**steps[name].params, "strength": point.strength}
             )
+        # the scene carries its own seed: `keys` gives it to the steps after it
         same_seed = replace(recipe, seed=scene.recipe.seed, steps=steps)
         return self.bench.keys(same_seed, outputs, scene) == self.bench.point_keys(
             pipeline, point, outputs
@@ -577,9 +621,10 @@ class PointCommands:
 
 
 def _has_fixed_noise(recipe: Recipe, outputs: Sequence[str]) -> bool:
+    """Return True if an output depends on a random step that neither scene nor laser reaches."""
     order = needed(recipe, outputs)
-    moved = dependents(recipe, ["scene"], order) | {_DIRECTION}
-    return any(recipe.steps[name].node.random for name in order if name not in moved)
+    varying = dependents(recipe, ["scene"], order) | {_DIRECTION}
+    return any(recipe.steps[name].node.random for name in order if name not in varying)
 
 
 def _shows(recipe: Recipe, scene: Scene) -> bool:
@@ -618,6 +663,7 @@ def _laser_word(
     """Return the word that sets the laser of a scene, with its direction and strength."""
     if point.lit == NONE:
         return "lasers={}"
+    # direction cosines, written as angles in rad
     y, x = point.scene.angle(pipeline.recipe(point.lit))
     if wavelength is None:
         line = laser_line(WAVELENGTHS[point.lit], pipeline.fwhm)
@@ -628,6 +674,7 @@ def _laser_word(
 
 
 def _quoted(path: Path) -> str:
+    """Return a path in the quotes of YAML, where a single quote is written twice."""
     return "'" + str(path.absolute()).replace("'", "''") + "'"
 
 
@@ -639,8 +686,15 @@ def shown_commands(
     """
     rows: list[tuple[str, int, float, str]] = []
     for pipeline, scenes in commands.items():
-        lit = [(place, max(own)) for place, own in enumerate(scenes) if own]
-        if lit:
-            place, strength = max(lit, key=lambda point: (point[1], -point[0]))
-            rows.append((pipeline, place, strength, scenes[place][strength]))
+        places_and_strengths = [
+            (scene_index, max(commands_of_scene))
+            for scene_index, commands_of_scene in enumerate(scenes)
+            if commands_of_scene
+        ]
+        if places_and_strengths:
+            # the strongest laser, and the first scene with it
+            scene_index, strength = max(
+                places_and_strengths, key=lambda point: (point[1], -point[0])
+            )
+            rows.append((pipeline, scene_index, strength, scenes[scene_index][strength]))
     return rows

@@ -72,12 +72,16 @@ def masks(
     optics: dict[str, MaskOptics] = {}
     for pipeline in pipelines:
         if pipeline.pipeline.front not in optics:
-            bsr = [next(iter(point.values()))["bsr"] for point in points[pipeline.name]]
-            optics[pipeline.pipeline.front] = _mask(pipeline, store, device, np.mean(bsr, axis=0))
+            # a point has the same contrast at every strength: the first counts
+            contrasts = [next(iter(point.values()))["bsr"] for point in points[pipeline.name]]
+            optics[pipeline.pipeline.front] = _mask(
+                pipeline, store, device, np.mean(contrasts, axis=0)
+            )
     return optics
 
 
 def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) -> MaskOptics:
+    """Return the optics of the mask of a pipeline; ``bsr`` is its mean contrast over scenes."""
     names = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
     values = run(pipeline.recipe(NONE), store, names, device=device).values
     bands, lsr, mtf, psf = (values[name] for name in names)
@@ -94,6 +98,7 @@ def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) ->
 
 
 def _numbers(tensor: Tensor) -> Numbers:
+    """Return a tensor as an array of float64."""
     array: Numbers = tensor.double().cpu().numpy()
     return array
 
@@ -136,16 +141,21 @@ def panels(
     """
     columns = []
     lasers = [case for case in figure or CASES if case != NONE]
-    top = max(max(strengths), _WEAKEST)
-    steps = [_WEAKEST * (top / _WEAKEST) ** (i / (len(lasers) - 1)) for i in range(len(lasers))]
-    for case, strength in zip((*lasers, NONE), (*steps, 0.0), strict=True):
+    largest_strength = max(max(strengths), _WEAKEST)
+    # equal ratios from 1e4 to the largest
+    rising_strengths = [
+        _WEAKEST * (largest_strength / _WEAKEST) ** (number / (len(lasers) - 1))
+        for number in range(len(lasers))
+    ]
+    # the last column is without a laser
+    for case, strength in zip((*lasers, NONE), (*rising_strengths, 0.0), strict=True):
         bench.forget()
         point = PointRequest(replace(scene, case=case), strength)
         key = digest(
             "evaluate pictures",
             _SIDE,
             bool(figure),
-            [[p.name, bench.key(p, point)] for p in pipelines],
+            [[composed.name, bench.key(composed, point)] for composed in pipelines],
         )
         compute = partial(_develop, bench, pipelines, point, bool(figure))
         columns.append(
@@ -168,20 +178,28 @@ def _develop(
     pictures: dict[str, Tensor] = {}
     restored: dict[str, Tensor] = {}
     for pipeline in pipelines:
-        line = pipeline.pipeline
-        sensor = sensors and line.mask != FLAT and f"{line.front}, sensor" not in pictures
-        further = (_MASKED,) if sensor else ()
-        values = bench.values(pipeline, point, (_PLAIN, *further) if not pictures else further)
+        pipeline_names = pipeline.pipeline
+        needs_sensor = (
+            sensors
+            and pipeline_names.mask != FLAT
+            and f"{pipeline_names.front}, sensor" not in pictures
+        )
+        further_steps = (_MASKED,) if needs_sensor else ()
+        # truth and plain lens are the same for all pipelines: once
+        values = bench.values(
+            pipeline, point, (_PLAIN, *further_steps) if not pictures else further_steps
+        )
         if not pictures:
             pictures = {"truth": _shrink(values["truth"]), "plain lens": _shrink(values[_PLAIN])}
-        if sensor:
-            pictures[f"{line.front}, sensor"] = _shrink(values[_MASKED])
-        if not sensors or line.restorer != NONE:
-            restored[pipeline.name] = _shrink(values[line.picture])
+        if needs_sensor:
+            pictures[f"{pipeline_names.front}, sensor"] = _shrink(values[_MASKED])
+        if not sensors or pipeline_names.restorer != NONE:
+            restored[pipeline.name] = _shrink(values[pipeline_names.picture])
     return pictures | restored
 
 
 def _shrink(picture: Tensor) -> Tensor:
+    """Return a picture whose shorter side has `_SIDE` pixels at most, on the CPU."""
     side = min(_SIDE, *picture.shape[-2:])
     return reduced(picture.detach().cpu().float(), side).contiguous()
 
@@ -261,12 +279,12 @@ def told_with_errors(
     strength = _mismatch_strength(mismatch, strengths)
     if not strength:
         return []
-    lit = [PointRequest(scene, strength) for scene in shown if scene.case != NONE]
+    laser_points = [PointRequest(scene, strength) for scene in shown if scene.case != NONE]
     points: list[MistoldPoint] = []
-    for pipeline in (p for p in pipelines if p.pipeline.restorer != NONE):
+    for pipeline in (composed for composed in pipelines if composed.pipeline.restorer != NONE):
         variants = _variants(pipeline, mismatch)
         if variants:
-            points += _mistold_points(bench, pipeline, variants, lit[: mismatch.scenes])
+            points += _mistold_points(bench, pipeline, variants, laser_points[: mismatch.scenes])
             progress(f"{pipeline.name}, told with errors: {bench.computed} points computed")
     return points
 
@@ -292,16 +310,25 @@ def _mistold_points(
     points = []
     for request in requests:
         bench.forget()
-        true = bench.point(pipeline, request)
+        exact_numbers = bench.point(pipeline, request)
         for text, variant in variants.items():
-            wrong = bench.point(variant, request)
+            wrong_numbers = bench.point(variant, request)
             points.append(
-                MistoldPoint(pipeline.name, text, request.scene, request.strength, true, wrong)
+                MistoldPoint(
+                    pipeline.name,
+                    text,
+                    request.scene,
+                    request.strength,
+                    exact_numbers,
+                    wrong_numbers,
+                )
             )
     return points
 
 
 def _variant(pipeline: PipelineRecipes, text: str, error: Mapping[str, Any]) -> PipelineRecipes:
+    """Return a pipeline whose restorer is told an error (``text`` and values); its camera stays."""
+
     @cache
     def recipe(case: str, *laser: Any) -> Recipe:
         return mistold(pipeline.recipe(case, *laser), error)
@@ -312,17 +339,18 @@ def _variant(pipeline: PipelineRecipes, text: str, error: Mapping[str, Any]) -> 
 def mistold_rows(points: Sequence[MistoldPoint]) -> list[Sequence[Any]]:
     """Return the rows of ``mistold.csv``, with the truth and with each error."""
     rows: dict[Any, Sequence[Any]] = {}
-    for p in points:
-        for error, numbers in (("exactly", p.true), (p.error, p.wrong)):
-            place = (
-                p.pipeline,
+    for point in points:
+        for error, metrics_of_point in (("exactly", point.true), (point.error, point.wrong)):
+            first_cells = (
+                point.pipeline,
                 error,
-                p.scene.number,
-                p.scene.name,
-                p.scene.case,
-                f"{p.strength:g}",
+                point.scene.number,
+                point.scene.name,
+                point.scene.case,
+                f"{point.strength:g}",
             )
-            rows[place] = (*place, *(numbers[metric] for metric in METRICS))
+            # the exact values of a scene belong to each of its errors: one row is enough
+            rows[first_cells] = (*first_cells, *(metrics_of_point[metric] for metric in METRICS))
     return list(rows.values())
 
 
@@ -369,18 +397,18 @@ def measure(
     optics = masks(pipelines, asked.store, bench.device, points)
     if figure_changes := asked.settings.figure:
         bench.release()
-        lines = [p.pipeline for p in pipelines]
+        asked_pipelines = [composed.pipeline for composed in pipelines]
         pipelines = compose_pipelines(
-            asked.recipe, [*asked.changes, *figure_changes], lines, asked.folder
+            asked.recipe, [*asked.changes, *figure_changes], asked_pipelines, asked.folder
         )
-    figure = SIX if asked.settings.lasers == "drawn" else None
+    figure_lasers = SIX if asked.settings.lasers == "drawn" else None
     return Measured(
         points,
         readable,
         broken,
         mistold,
         optics,
-        panels(bench, pipelines, readable[0], strengths, figure),
+        panels(bench, pipelines, readable[0], strengths, figure_lasers),
     )
 
 
@@ -398,20 +426,23 @@ def _points(
     """
     points: dict[int, dict[str, dict[float, PointNumbers]]] = {}
     broken: list[tuple[Path, str]] = []
-    before = ""
-    for done, scene in enumerate(_laser_by_laser(shown), 1):
-        if before not in ("", scene.case):
+    previous_laser = ""
+    for count, scene in enumerate(_laser_by_laser(shown), 1):
+        if previous_laser not in ("", scene.case):
             bench.forget()
-        before, own = scene.case, {p.name: dict[float, PointNumbers]() for p in pipelines}
+        previous_laser, points_of_scene = (
+            scene.case,
+            {pipeline.name: dict[float, PointNumbers]() for pipeline in pipelines},
+        )
         try:
-            _scene_points(bench, pipelines, scene, strengths, own)
+            _scene_points(bench, pipelines, scene, strengths, points_of_scene)
         except UnreadablePhotograph as error:
             broken.append((scene.path or Path(scene.name), str(error)))
             progress(f"not read, and left out: {scene.name}")
             continue
-        points[scene.number] = own
+        points[scene.number] = points_of_scene
         progress(
-            f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points"
+            f"scene {count} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points"
             " computed"
         )
     readable = [scene for scene in shown if scene.number in points]
@@ -441,7 +472,9 @@ def _scene_points(
     points: dict[str, dict[float, PointNumbers]],
 ) -> None:
     """Compute the points of one scene into ``points``, by pipeline."""
-    alone = replace(scene)  # a copy, which releases the picture when it is deleted
+    scene_copy = replace(scene)  # a copy, which releases the picture when it is deleted
     for strength in strengths if scene.case != NONE else (0.0,):
         for pipeline in pipelines:
-            points[pipeline.name][strength] = bench.point(pipeline, PointRequest(alone, strength))
+            points[pipeline.name][strength] = bench.point(
+                pipeline, PointRequest(scene_copy, strength)
+            )

@@ -63,8 +63,8 @@ class Scene:
     def picture(self) -> Tensor:
         """Return the picture of the scene in linear sRGB (3, y, x)."""
         if self.path is None:
-            own: Tensor = run(self.recipe, self.store, ("scene",))["scene"]
-            return own
+            own_picture: Tensor = run(self.recipe, self.store, ("scene",))["scene"]
+            return own_picture
         try:
             return crop_photograph(self.path, self.shape, self.recipe.seed, self.number)
         except (ParameterError, OSError, ValueError, SyntaxError) as error:
@@ -78,10 +78,10 @@ class Scene:
             return digest(
                 "own scene", key_of(self.recipe.steps["scene"], {}, self.recipe.seed, code)[0]
             )
-        own = code.digest(crop_photograph.__module__)
+        code_of_crop = code.digest(crop_photograph.__module__)
         return digest(
             "photograph",
-            own,
+            code_of_crop,
             file_digest(self.path),
             list(self.shape),
             self.recipe.seed,
@@ -94,17 +94,20 @@ class Scene:
         """
         import numpy as np
 
-        z = [
+        # a stream of random numbers for each name, whatever other values are drawn
+        standard_normal = [
             np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal()
             for name in inputs.names
         ]
-        return dict(zip(inputs.names, map(float, inputs.at(np.array([z]))[0]), strict=True))
+        return dict(
+            zip(inputs.names, map(float, inputs.at(np.array([standard_normal]))[0]), strict=True)
+        )
 
     def angle(self, recipe: Recipe) -> tuple[float, float]:
         """Sample the direction cosines (y, x) of the laser from the distribution in the paper."""
         step = recipe.steps[f"direction[{BEAM}]"]
-        drawn = call(step, [], step.params, self.seed, "cpu")
-        return float(drawn[0]), float(drawn[1])
+        direction = call(step, [], step.params, self.seed, "cpu")
+        return float(direction[0]), float(direction[1])
 
     def wavelength(self, recipe: Recipe, inputs: Inputs | None) -> float:
         """Return the wavelength of the laser in m, drawn if the recipe has a law."""
@@ -122,29 +125,33 @@ def scenes(
 
     Without ``count`` every photograph is in one scene.
     """
-    own, shape = recipe.steps["scene"], _shape(recipe)
-    paths, broken = _photographs(own, root)
-    shown = []
-    for i in range(max(1, len(paths)) if count is None else count):
-        path = choose_photograph(paths, recipe.seed, i) if paths else None
-        name = _scene_name(own, path, root)
-        shown.append(Scene(i, cases[i % len(cases)], name, path, shape, recipe, store))
-    return shown, broken
+    scene_step, shape = recipe.steps["scene"], _shape(recipe)
+    paths, unreadable = _photographs(scene_step, root)
+    listed_scenes = []
+    for number in range(max(1, len(paths)) if count is None else count):
+        path = choose_photograph(paths, recipe.seed, number) if paths else None
+        name = _scene_name(scene_step, path, root)
+        listed_scenes.append(
+            Scene(number, cases[number % len(cases)], name, path, shape, recipe, store)
+        )
+    return listed_scenes, unreadable
 
 
 def _photographs(own: Step, root: Path | None) -> tuple[Sequence[Path], list[tuple[Path, str]]]:
-    """Return the photographs of a folder, or that of the recipe, and those that are unreadable."""
+    """Return the photographs of the folder ``root``, or that of the recipe's step ``own``; and
+    those that are unreadable, with the reason.
+    """
     if root is None:
         return ([own.params["file"]] if own.node.path == PHOTOGRAPH else []), []
     if not root.is_dir():
         raise EvaluationRefused(f"--data {root}: this folder does not exist")
-    paths, broken = list_photographs(root)
+    paths, unreadable = list_photographs(root)
     if not paths:
-        reason = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
+        reason = f"; {unreadable[0][0].name}: {unreadable[0][1]}" if unreadable else ""
         raise EvaluationRefused(
             f"--data {root}: the folder contains no readable PNG or JPEG file{reason}"
         )
-    return paths, broken
+    return paths, unreadable
 
 
 def _scene_name(own: Step, path: Path | None, root: Path | None) -> str:
@@ -161,10 +168,10 @@ def photographs(shown: Sequence[Scene]) -> list[int]:
     differ in laser and noise only; each then counts as one draw.
     """
     contents = [scene.name if scene.path is None else file_digest(scene.path) for scene in shown]
-    different = list(dict.fromkeys(contents))
+    contents_once = list(dict.fromkeys(contents))
     return (
-        [different.index(content) for content in contents]
-        if len(different) > 1
+        [contents_once.index(content) for content in contents]
+        if len(contents_once) > 1
         else list(range(len(shown)))
     )
 
@@ -194,16 +201,22 @@ def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None
     """
     numbers = (scene.number for scene in shown)
     wavelength_of = dict(zip(numbers, wavelengths(pipeline, shown), strict=True))
-    wrong: dict[str, None] = {}
+    fault_lines: dict[str, None] = {}
     for case in dict.fromkeys(scene.case for scene in shown if scene.case != NONE):
-        lit = [(scene, scene.angle(pipeline.recipe(case))) for scene in shown if scene.case == case]
+        scenes_and_directions = [
+            (scene, scene.angle(pipeline.recipe(case))) for scene in shown if scene.case == case
+        ]
         for axis in (0, 1):
+            # the largest shift of phase from sample to sample of the pupil
             scene, direction = max(
-                lit, key=lambda pair: abs(pair[1][axis]) / (wavelength_of[pair[0].number] or 1.0)
+                scenes_and_directions,
+                key=lambda pair: abs(pair[1][axis]) / (wavelength_of[pair[0].number] or 1.0),
             )
-            wrong |= _direction_faults(pipeline, scene, direction, wavelength_of[scene.number])
-    if wrong:
-        text = "\n".join(wrong)
+            fault_lines |= _direction_faults(
+                pipeline, scene, direction, wavelength_of[scene.number]
+            )
+    if fault_lines:
+        text = "\n".join(fault_lines)
         raise EvaluationRefused(
             f"{text}\nThe directions are drawn over the sensor: choose a smaller sensor.shape"
         )
@@ -217,10 +230,11 @@ def _direction_faults(
 ) -> dict[str, None]:
     """Return a line for each mistake of the recipe with the laser of a scene."""
     try:
+        # composing the recipe refuses a direction that the pupil does not carry
         pipeline.recipe(scene.case, direction, wavelength)
     except RecipeError as error:
-        start = f"scene {scene.number + 1} ({scene.case})"
-        return dict.fromkeys(f"{start}: {one_line(p)}" for p in error.diagnostics)
+        scene_text = f"scene {scene.number + 1} ({scene.case})"
+        return dict.fromkeys(f"{scene_text}: {one_line(problem)}" for problem in error.diagnostics)
     return {}
 
 

@@ -86,15 +86,15 @@ class Pipeline:
         """Return the name of the mask with that of its file, or in words with the filter and the
         stop that it has.
         """
-        file = f"@{self.height_name or self.height_file.name}" if self.height_file else ""
+        file_text = f"@{self.height_name or self.height_file.name}" if self.height_file else ""
         if self.shade is None:
-            return self.mask + file
-        spoken = (
+            return self.mask + file_text
+        mask_in_words = (
             "plain lens"
             if self.mask == FLAT
             else self.mask.replace("half_ring", "half-ring").replace("_", " ")
         )
-        return spoken + file + self.shade.said
+        return mask_in_words + file_text + self.shade.said
 
     @property
     def back(self) -> str:
@@ -149,22 +149,22 @@ def read_pipelines(text: str, folder: Path, mark: Location | None = None) -> lis
 
     ``mark`` is the place of the text, if it stands in a recipe.
     """
-    words = [word for word in map(str.strip, text.split(",")) if word]
+    pipeline_words = [word for word in map(str.strip, text.split(",")) if word]
     pipelines: list[Pipeline] = []
-    wrong: list[str] = []
-    for word in words:
+    mistakes: list[str] = []
+    for word in pipeline_words:
         try:
             pipelines.append(_pipeline(word, folder))
         except ValueError as error:
-            wrong.append(f"{word}: {error}")
+            mistakes.append(f"{word}: {error}")
         else:
-            wrong += [f"{word}: {fault}" for fault in _faults(pipelines[-1], mark)]
+            mistakes += [f"{word}: {file_fault}" for file_fault in _faults(pipelines[-1], mark)]
     pipelines = named_apart(pipelines)
-    wrong += [f"{name} is listed twice: remove one" for name in _twice(pipelines)]
-    if not words:
-        wrong = [f"there is no pipeline: {_HOW}"]
-    if wrong:
-        raise EvaluationRefused("\n".join(wrong))
+    mistakes += [f"{name} is listed twice: remove one" for name in _twice(pipelines)]
+    if not pipeline_words:
+        mistakes = [f"there is no pipeline: {_HOW}"]
+    if mistakes:
+        raise EvaluationRefused("\n".join(mistakes))
     return pipelines
 
 
@@ -173,8 +173,10 @@ def _pipeline(word: str, folder: Path) -> Pipeline:
     match = _PIPELINE.fullmatch(word)
     if match is None:
         raise ValueError(_HOW)
-    height, weights = (_named_file(match[group], folder) for group in ("height", "weights"))
-    return Pipeline(match["mask"], match["restorer"], height, weights)
+    height_file, weights_file = (
+        _named_file(match[group], folder) for group in ("height", "weights")
+    )
+    return Pipeline(match["mask"], match["restorer"], height_file, weights_file)
 
 
 def _faults(pipeline: Pipeline, mark: Location | None) -> list[str]:
@@ -209,26 +211,38 @@ def named_apart(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
     that needs.
     """
     files: list[Path | None] = []
-    for p in pipelines:
-        files += [p.height_file, p.weights]
+    for pipeline in pipelines:
+        files += [pipeline.height_file, pipeline.weights]
     names = _shortest_names([file for file in files if file is not None])
     return [
-        replace(p, height_name=names.get(p.height_file, ""), weights_name=names.get(p.weights, ""))
-        for p in pipelines
+        replace(
+            pipeline,
+            height_name=names.get(pipeline.height_file, ""),
+            weights_name=names.get(pipeline.weights, ""),
+        )
+        for pipeline in pipelines
     ]
 
 
 def _shortest_names(files: Sequence[Path]) -> dict[Path | None, str]:
     """Return the shortest end of each path that no other file has; equal paths are one file."""
-    places = {file: Path(os.path.abspath(file)) for file in files}
+    absolute_paths = {file: Path(os.path.abspath(file)) for file in files}
     names: dict[Path | None, str] = {}
-    for file, place in places.items():
-        others = [other for other in places.values() if other != place]
-        ends = (Path(*place.parts[-count:]) for count in range(1, len(place.parts) + 1))
+    for file, absolute_path in absolute_paths.items():
+        other_paths = [
+            other_path for other_path in absolute_paths.values() if other_path != absolute_path
+        ]
+        # the file's name, then with one folder more each time
+        path_ends = (
+            Path(*absolute_path.parts[-count:]) for count in range(1, len(absolute_path.parts) + 1)
+        )
         shortest = next(
-            end
-            for end in ends
-            if not any(other.parts[-len(end.parts) :] == end.parts for other in others)
+            path_end
+            for path_end in path_ends
+            if not any(
+                other_path.parts[-len(path_end.parts) :] == path_end.parts
+                for other_path in other_paths
+            )
         )
         names[file] = shortest.as_posix()
     return names
@@ -240,24 +254,27 @@ def compose_pipelines(
     """Return each pipeline (mask and restorer) with its recipes; raise `EvaluationRefused` with
     all mistakes.
     """
-    own = _own_laser(recipe, changes, folder)
+    own_laser = _own_laser(recipe, changes, folder)
     composed: list[PipelineRecipes] = []
-    wrong: dict[str, None] = {}
+    mistakes: dict[str, None] = {}
     for pipeline in pipelines:
         try:
             words = _words(pipeline, partial(_takes, recipe, changes, folder))
-            recipe_of = cache(partial(_with_laser, recipe, [*changes, *words], own, folder))
+            recipe_of = cache(partial(_with_laser, recipe, [*changes, *words], own_laser, folder))
+            # without a laser and with the first one
             for case in (NONE, next(iter(CASES))):
                 _check(recipe_of(case), pipeline)
-            composed.append(PipelineRecipes(pipeline, recipe_of, words=tuple(words), fwhm=own.fwhm))
+            composed.append(
+                PipelineRecipes(pipeline, recipe_of, words=tuple(words), fwhm=own_laser.fwhm)
+            )
         except RecipeError as error:
-            wrong |= dict.fromkeys(
+            mistakes |= dict.fromkeys(
                 f"{pipeline.name}: {one_line(problem)}" for problem in error.diagnostics
             )
         except EvaluationRefused as error:
-            wrong[f"{pipeline.name}: {error}"] = None
-    if wrong:
-        raise EvaluationRefused("\n".join(wrong))
+            mistakes[f"{pipeline.name}: {error}"] = None
+    if mistakes:
+        raise EvaluationRefused("\n".join(mistakes))
     return composed
 
 
@@ -292,7 +309,12 @@ def _takes(
     composed = compose(recipe, [*changes, f"{group}={option}"], folder) if option != NONE else None
     if composed and (
         problem := next(
-            (p for p in composed.diagnostics if p.message.startswith("no option")), None
+            (
+                diagnostic
+                for diagnostic in composed.diagnostics
+                if diagnostic.message.startswith("no option")
+            ),
+            None,
         )
     ):
         raise EvaluationRefused(problem.message)
@@ -317,10 +339,13 @@ def _with_laser(
     """
     laser = ""
     if case != NONE:
-        metres = wavelength or WAVELENGTHS.get(case)
-        line = own.drawn if metres is None else laser_line(metres, own.fwhm)
+        laser_wavelength = wavelength or WAVELENGTHS.get(case)
+        # no wavelength of its own: that of the recipe, with its law
+        laser_text = (
+            own.drawn if laser_wavelength is None else laser_line(laser_wavelength, own.fwhm)
+        )
         angle = "null" if direction is None else f"[{direction[0]!r} rad, {direction[1]!r} rad]"
-        laser = f"{BEAM}: {{{line}, strength: 1, angle: {angle}}}"
+        laser = f"{BEAM}: {{{laser_text}, strength: 1, angle: {angle}}}"
     return load(recipe, [*words, f"lasers={{{laser}}}"], folder)
 
 
@@ -339,13 +364,20 @@ class _OwnLaser(NamedTuple):
 def _own_laser(recipe: str, changes: Sequence[str | Override], folder: Path) -> _OwnLaser:
     """Return the first laser of a recipe."""
     steps = base_recipe(recipe, changes, folder).steps
-    widths = [step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")]
-    fwhm = float(widths[0]) if widths else 10e-9
-    written = compose(recipe, changes, folder).root.below(["lasers"])
-    laser = next(iter(written.items.values()), None) if written else None
+    spectral_widths = [
+        step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")
+    ]
+    fwhm = float(spectral_widths[0]) if spectral_widths else 10e-9
+    written_lasers = compose(recipe, changes, folder).root.below(["lasers"])
+    laser = next(iter(written_lasers.items.values()), None) if written_lasers else None
     texts = {"fwhm": f"{fwhm * 1e9:g} nm", **(laser.plain if laser else {})}
     return _OwnLaser(
-        fwhm, ", ".join(f"{k}: '{texts[k]}'" for k in ("wavelength", "fwhm") if k in texts)
+        fwhm,
+        ", ".join(
+            f"{field_name}: '{texts[field_name]}'"
+            for field_name in ("wavelength", "fwhm")
+            if field_name in texts
+        ),
     )
 
 
@@ -363,10 +395,11 @@ def refuse_fixed_laser(recipe: Recipe) -> None:
     """Raise `EvaluationRefused` if the first laser of a recipe has no law from which its
     wavelength is drawn.
     """
-    first = next(
+    # the laser's name in line[name]
+    first_laser = next(
         (name.partition("[")[2][:-1] for name in recipe.steps if name.startswith("line[")), None
     )
-    if recipe.uncertain is None or f"lasers.{first}.wavelength" not in recipe.uncertain.names:
+    if recipe.uncertain is None or f"lasers.{first_laser}.wavelength" not in recipe.uncertain.names:
         raise EvaluationRefused(
             "evaluate.lasers is drawn, but no law says which wavelength the first laser of the"
             ' recipe has: add laser=drawn, or write a law such as wavelength: "uniform(400 nm, 700'
@@ -375,6 +408,7 @@ def refuse_fixed_laser(recipe: Recipe) -> None:
 
 
 def _check(recipe: Recipe, pipeline: Pipeline) -> None:
+    """Raise `EvaluationRefused` if the recipe lacks a step that an evaluation needs."""
     missing = [
         name
         for name in ("scene", *pipeline.outputs, "lsr[mask]", "mtf[mask]")

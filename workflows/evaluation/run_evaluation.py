@@ -111,37 +111,48 @@ def evaluate(
     line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
-    place = folder or Path.cwd()
-    base, settings = base_recipe(recipe, changes, place), read_settings(recipe, changes, place)
-    asked = AskedCamera(recipe, changes, place, store or open_store(), settings, progress)
+    recipe_folder = folder or Path.cwd()
+    base, settings = (
+        base_recipe(recipe, changes, recipe_folder),
+        read_settings(recipe, changes, recipe_folder),
+    )
+    asked_camera = AskedCamera(
+        recipe, changes, recipe_folder, store or open_store(), settings, progress
+    )
     pipelines = named_apart(pipelines)
-    bare = compose_pipelines(recipe, changes, pipelines, place)
+    # without the filters and stops of equal protection
+    bare_pipelines = compose_pipelines(recipe, changes, pipelines, recipe_folder)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
     study_run = StudyRun("evaluate", base, command)
     if settings.lasers == "drawn":
         refuse_fixed_laser(base)
-    shown, broken = scenes(
-        base, asked.store, data, count, [DRAWN] if settings.lasers == "drawn" else list(CASES)
+    shown_scenes, unreadable = scenes(
+        base,
+        asked_camera.store,
+        data,
+        count,
+        [DRAWN] if settings.lasers == "drawn" else list(CASES),
     )
-    refuse_directions(bare[0], shown)
-    composed, references = _equalled(asked, bare, reference, equal)
-    _report_scenes(shown, broken, strengths, composed, progress)
-    bench = EvaluationPoints(asked.store, small, device)
-    measured = measure(asked, bench, composed, shown, strengths)
-    waves = tuple(wavelengths(bare[0], measured.scenes))
+    # one pipeline is enough: all have the same lens and sensor
+    refuse_directions(bare_pipelines[0], shown_scenes)
+    final_pipelines, references = _equalled(asked_camera, bare_pipelines, reference, equal)
+    _report_scenes(shown_scenes, unreadable, strengths, final_pipelines, progress)
+    bench = EvaluationPoints(asked_camera.store, small, device)
+    measured = measure(asked_camera, bench, final_pipelines, shown_scenes, strengths)
+    laser_wavelengths = tuple(wavelengths(bare_pipelines[0], measured.scenes))
     result = _result(
         base,
         strengths,
         small,
         references,
         measured,
-        [p.pipeline for p in composed],
+        [composed_pipeline.pipeline for composed_pipeline in final_pipelines],
         equal,
-        broken,
-        waves,
+        unreadable,
+        laser_wavelengths,
     )
-    commands = PointCommands(recipe, changes, place, bench).commands(
-        composed, measured.scenes, strengths
+    commands = PointCommands(recipe, changes, recipe_folder, bench).commands(
+        final_pipelines, measured.scenes, strengths
     )
     result = replace(result, commands=commands)
     document = study_run.document(_document(result, bench))
@@ -167,14 +178,18 @@ def options_of(
     """Return arguments of `evaluate`: those that are given, and else those of the settings of
     the recipe.
     """
-    lines = settings.pipelines if pipelines is None else pipelines
-    mark = Location("evaluate.pipelines", 1, folder=str(folder)) if pipelines is None else None
-    level = settings.equal_protection if equal_protection is None else equal_protection
+    pipelines_text = settings.pipelines if pipelines is None else pipelines
+    written_at = (
+        Location("evaluate.pipelines", 1, folder=str(folder)) if pipelines is None else None
+    )
+    peak_level = settings.equal_protection if equal_protection is None else equal_protection
     return {
-        "pipelines": read_pipelines(lines, folder, mark) if isinstance(lines, str) else lines,
+        "pipelines": read_pipelines(pipelines_text, folder, written_at)
+        if isinstance(pipelines_text, str)
+        else pipelines_text,
         "count": scenes or (None if settings.scenes == "all" else settings.scenes),
         "reference": reference or (settings.reference if pipelines is None else ""),
-        "equal": read_protection(level, by or settings.by),
+        "equal": read_protection(peak_level, by or settings.by),
     }
 
 
@@ -185,15 +200,21 @@ def _equalled(
     reference of each.
     """
     if equal is None:
-        return bare, dict.fromkeys((p.name for p in bare), reference)
-    shaded = protect(
+        return bare, dict.fromkeys((composed.name for composed in bare), reference)
+    shaded_pipelines = protect(
         asked.recipe, asked.changes, bare, equal, asked.store, asked.folder, asked.progress
     )
-    rival = {old.name: new.name for old, new in zip(bare, shaded, strict=True)}[reference]
-    references = dict.fromkeys((p.name for p in shaded), rival)
+    shaded_reference = {
+        bare_pipeline.name: shaded_pipeline.name
+        for bare_pipeline, shaded_pipeline in zip(bare, shaded_pipelines, strict=True)
+    }[reference]
+    references = dict.fromkeys((composed.name for composed in shaded_pipelines), shaded_reference)
     if not asked.settings.beside:
-        return shaded, references
-    return [*bare, *shaded], {**dict.fromkeys((p.name for p in bare), reference), **references}
+        return shaded_pipelines, references
+    return [*bare, *shaded_pipelines], {
+        **dict.fromkeys((composed.name for composed in bare), reference),
+        **references,
+    }
 
 
 def _result(
@@ -208,12 +229,17 @@ def _result(
     waves: Sequence[float | None],
 ) -> EvaluationResult:
     """Return the result of an evaluation with its statistics over scenes."""
-    owners = photographs(measured.scenes)
-    tables = {name: metric_table(own, strengths, owners) for name, own in measured.points.items()}
+    photograph_numbers = photographs(measured.scenes)
+    tables = {
+        name: metric_table(pipeline_metrics, strengths, photograph_numbers)
+        for name, pipeline_metrics in measured.points.items()
+    }
+    # the reduced pictures are no larger than the true picture
     if "truth" in base.steps:
         small = min(small, min(base.steps["truth"].params["shape"]))
-    against = {
-        name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()
+    comparisons = {
+        name: compare_with(pipeline_metrics, tables[references[name]], base.seed)
+        for name, pipeline_metrics in tables.items()
     }
     return EvaluationResult(
         recipe=base,
@@ -224,7 +250,7 @@ def _result(
         references=references,
         points=measured.points,
         tables=tables,
-        against=against,
+        against=comparisons,
         masks=measured.masks,
         panels=measured.panels,
         pipelines=pipelines,
@@ -235,6 +261,7 @@ def _result(
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
+    """Return the strengths in rising order, each once; raise `EvaluationRefused` for wrong ones."""
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
         raise EvaluationRefused(
             "--strengths: write finite multiples of saturation that are not negative, such as"
@@ -244,6 +271,9 @@ def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
 
 
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
+    """Return the name of the reference, by default the first pipeline; raise `EvaluationRefused`
+    for one that is not evaluated.
+    """
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
         raise EvaluationRefused(
@@ -259,6 +289,9 @@ def _report_scenes(
     pipelines: Sequence[PipelineRecipes],
     progress: Progress,
 ) -> None:
+    """Print how many scenes, strengths and pipelines there are, and which photographs were not
+    read.
+    """
     names = ", ".join(pipeline.name for pipeline in pipelines)
     progress(
         f"{len(shown)} scenes, {len(strengths)} strengths, {len(pipelines)} pipelines: {names}"
@@ -273,8 +306,9 @@ def _report_scenes(
 
 
 def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
+    """Return the result of an evaluation as JSON values."""
     return {
-        "scenes": [[s.number, s.name, s.case, s.seed] for s in result.scenes],
+        "scenes": [[scene.number, scene.name, scene.case, scene.seed] for scene in result.scenes],
         "not read": [[str(path), reason] for path, reason in result.broken],
         "strengths": list(result.strengths),
         "small": result.small,
@@ -288,11 +322,13 @@ def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, An
 
 
 def _report(result: EvaluationResult) -> StudyReport:
+    """Return the page of an evaluation with its tables."""
     pictures = draw_pictures(result)
     tables: dict[str, CsvTable] = {
         "points.csv": ((*_POINT, *METRICS, "command"), _point_rows(result)),
         "table.csv": (COLUMNS, rows(result)),
         "mistold.csv": (
+            # columns pipeline, told, scene, photograph, laser, strength
             (*_POINT[:1], "told", *_POINT[3:6], *_POINT[7:], *METRICS),
             mistold_rows(result.mistold),
         ),
@@ -306,10 +342,18 @@ def _report(result: EvaluationResult) -> StudyReport:
             equal_protection.COLUMNS,
             equal_protection.protection_rows(result),
         )
-    shown = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")
+    shown_facts = (
+        "command",
+        "date",
+        "seconds",
+        "computed",
+        "seconds a point",
+        "reference",
+        "versions",
+    )
     title = f"{result.recipe.name}: evaluated"
     return StudyReport(
-        title, lead(result), sections(result, pictures), pictures, tables, shown=shown
+        title, lead(result), sections(result, pictures), pictures, tables, shown=shown_facts
     )
 
 
@@ -326,22 +370,45 @@ _POINT = (
 
 
 def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    waves = ["" if metres is None else f"{metres * 1e9:.6g}" for metres in result.wavelengths]
+    """Return the rows of points.csv: one for each pipeline, scene and strength."""
+    wavelengths_nm = [
+        "" if metres is None else f"{metres * 1e9:.6g}" for metres in result.wavelengths
+    ]
     rows: list[Sequence[Any]] = []
-    for p in result.pipelines:
-        scenes = zip(
-            result.scenes, result.points[p.name], waves, result.commands[p.name], strict=True
+    for pipeline in result.pipelines:
+        rows_of_scenes = zip(
+            result.scenes,
+            result.points[pipeline.name],
+            wavelengths_nm,
+            result.commands[pipeline.name],
+            strict=True,
         )
-        for s, points, nm, commands in scenes:
-            start = (p.name, p.front, p.back, s.number, s.name, s.case, nm)
-            for k, point in points.items():
-                rows.append((*start, f"{k:g}", *(point[m] for m in METRICS), commands[k]))
+        for scene, points, wavelength_nm, commands in rows_of_scenes:
+            first_cells = (
+                pipeline.name,
+                pipeline.front,
+                pipeline.back,
+                scene.number,
+                scene.name,
+                scene.case,
+                wavelength_nm,
+            )
+            for strength, point in points.items():
+                rows.append(
+                    (
+                        *first_cells,
+                        f"{strength:g}",
+                        *(point[metric] for metric in METRICS),
+                        commands[strength],
+                    )
+                )
     return rows
 
 
 def _curve_rows(result: EvaluationResult) -> list[Sequence[Any]]:
+    """Return the rows of suppression.csv: one for each mask and wavelength in nm."""
     rows: list[Sequence[Any]] = []
     for name, mask in result.masks.items():
         columns = zip(mask.wavelengths, mask.lsr, mask.bsr, mask.floor, strict=True)
-        rows += [(name, f"{x:.6g}", *row) for x, *row in columns]
+        rows += [(name, f"{wavelength_nm:.6g}", *row) for wavelength_nm, *row in columns]
     return rows

@@ -95,6 +95,7 @@ def quiet_picture(
     light in e- a pixel.
     """
     amplitude = electrons * transmittance
+    # 0.0: no glare
     noise: Tensor = noise_variance(
         amplitude * measures.spectrum.light, 0.0, pixel.read_noise, pixel.prnu
     )[None]
@@ -102,9 +103,11 @@ def quiet_picture(
     values = {
         "error": -decibels(float(remaining_error(measures.spectrum, amplitude, noise).mean())),
         "information": decibels(max(bits, 1e-30)),
+        # a natural logarithm in dB
         "NEQ": float(mean_log_neq(measures.spectrum, amplitude, noise).mean()) * decibels(math.e),
     }
     for name, energy in measures.energy.items():
+        # an SNR is an amplitude: 20 log10
         values[name] = 2 * decibels(
             max(float(detection_snr(energy, amplitude, CONTRAST, noise)), 1e-30)
         )
@@ -123,10 +126,12 @@ def best(
     """
     leaders: dict[str, tuple[float, Rival]] = {}
     for candidate in candidates:
-        grey = candidate.transmittance(protection)
-        for measure, value in quiet_picture(candidate.found, grey, electrons, pixel).items():
+        transmittance = candidate.transmittance(protection)
+        for measure, value in quiet_picture(
+            candidate.found, transmittance, electrons, pixel
+        ).items():
             if measure not in leaders or value > leaders[measure][0]:
-                leaders[measure] = value, Rival(name, candidate.front, grey)
+                leaders[measure] = value, Rival(name, candidate.front, transmittance)
     return leaders
 
 
@@ -140,8 +145,10 @@ def gains(
     """Return by how many dB the best with the mask exceeds the best stop-and-filter of equal
     protection, by measure.
     """
-    mask, rival = (best(candidates, protection, electrons, pixel) for candidates in (masked, plain))
-    return {measure: mask[measure][0] - rival[measure][0] for measure in MEASURES}
+    best_masked, best_plain = (
+        best(candidates, protection, electrons, pixel) for candidates in (masked, plain)
+    )
+    return {measure: best_masked[measure][0] - best_plain[measure][0] for measure in MEASURES}
 
 
 def neq_curve(
@@ -154,16 +161,17 @@ def neq_curve(
             amplitude * measures.spectrum.light.mean(), 0.0, pixel.read_noise, pixel.prnu
         )
     )
+    # NEQ = (light |OTF|)^2 / noise, without glare (0.0 above)
     curve: Tensor = amplitude**2 * measures.square / noise
-    return [float(x) for x in torch.clamp(curve, min=1e-12)]
+    return [float(neq) for neq in torch.clamp(curve, min=1e-12)]
 
 
 def colour_shift(measures: FrontMeasures) -> float:
     """Return the ratio of the largest to the smallest share of light that the channels receive;
     1: no tint.
     """
-    light = measures.spectrum.light
-    return float(light.max() / light.min().clamp_min(1e-12))
+    light_of_channels = measures.spectrum.light
+    return float(light_of_channels.max() / light_of_channels.min().clamp_min(1e-12))
 
 
 # --- equal shade ----------------------------------------------------------------------------------
@@ -245,16 +253,19 @@ def stop_diameter(camera: ProtectionCamera, level: float) -> float:
     def peak(diameter: float) -> float:
         return float(metrics.lsr(camera.psf(True, diameter, camera.bands)).max())
 
-    low, high = _LEAST_SAMPLES / int(camera.stop.samples), 1.0
-    if (smallest := peak(low)) > level:
+    # relative diameters: the peak falls with the diameter
+    too_small, large_enough = _LEAST_SAMPLES / int(camera.stop.samples), 1.0
+    if (smallest := peak(too_small)) > level:
         raise ValueError(
             f"needs a smaller stop than the samples of the pupil carry: ask for {smallest:.2g} or"
             " more, or take filters with --by filter"
         )
     for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if peak(middle) >= level else (middle, high)
-    return high
+        middle = (too_small + large_enough) / 2
+        too_small, large_enough = (
+            (too_small, middle) if peak(middle) >= level else (middle, large_enough)
+        )
+    return large_enough
 
 
 def best_diameter(camera: ProtectionCamera, store: Store, level: float, electrons: float) -> float:
@@ -263,16 +274,22 @@ def best_diameter(camera: ProtectionCamera, store: Store, level: float, electron
 
     ``electrons`` is the mean light of the scene in e- a pixel behind the plain lens.
     """
-    side = min(int(n) for n in camera.lens["shape"])
-    bench = FrontBench(camera, store, FrontSettings(0.1, 0.12, min(14.0, side / 4), (side,), None))
-    usual, smallest = usual_condition(), stop_diameter(camera, level)
-    diameters = [_RATIO**k for k in range(40) if _RATIO**k > smallest]
+    window_side = min(int(pixels) for pixels in camera.lens["shape"])
+    # contrast variance 0.1, NEQ up to 0.12 cycles a pixel, targets 14 pixels high, one field as
+    # wide as the window, and the peak as the harm (no heat)
+    bench = FrontBench(
+        camera, store, FrontSettings(0.1, 0.12, min(14.0, window_side / 4), (window_side,), None)
+    )
+    usual_values, smallest = usual_condition(), stop_diameter(camera, level)
+    # 40 steps are more than any pupil carries: from the open lens down
+    diameters = [_RATIO**step for step in range(40) if _RATIO**step > smallest]
     fronts = [Front(True, diameter) for diameter in (*diameters, smallest)]
-    measured = [bench.measure(front, usual) for front in fronts]
+    measured = [bench.measure(front, usual_values) for front in fronts]
     candidates = [
         Candidate(front, measures, measures.peak)
         for front, measures in zip(fronts, measured, strict=True)
     ]
+    # the rival of least error: (value, rival)
     return best(candidates, level, electrons, camera.pixel(0.0, 0.0))["error"][1].front.diameter
 
 
@@ -291,6 +308,7 @@ def shade_equally(
     clear lens.
     """
     alone = peak_of(EqualShade(1.0))
+    # 1e-6 is rounding
     if level > alone * (1 + 1e-6):
         raise ValueError(
             f"lowers the peak to {alone:.4g} already: ask for at most that, or leave this mask out"
@@ -300,5 +318,5 @@ def shade_equally(
         diameter = stop_diameter(camera, level)
     elif way == "best":
         diameter = best_diameter(camera, store, level, electrons())
-    reached = alone if diameter == 1 else peak_of(EqualShade(alone, diameter))
-    return EqualShade(alone, diameter, min(1.0, level / reached))
+    peak_with_stop = alone if diameter == 1 else peak_of(EqualShade(alone, diameter))
+    return EqualShade(alone, diameter, min(1.0, level / peak_with_stop))

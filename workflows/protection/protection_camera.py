@@ -72,18 +72,35 @@ class ProtectionCamera:
         unsuitable recipe.
         """
         _refuse_unsuitable(recipe)
-        pupil, plain = (recipe.steps[f"pupil[{arm}]"].wires for arm in ("mask", "plain"))
-        names = [str(w) for w in (pupil["height"], plain["height"], pupil["stop"], pupil["bands"])]
+        mask_wires, plain_wires = (recipe.steps[f"pupil[{arm}]"].wires for arm in ("mask", "plain"))
+        names = [
+            str(wire)
+            for wire in (
+                mask_wires["height"],
+                plain_wires["height"],
+                mask_wires["stop"],
+                mask_wires["bands"],
+            )
+        ]
         names += ["illuminant", "responses"]
         result = run(recipe, store, dict.fromkeys(names))
         height, flat, stop, bands, illuminant, responses = (result.values[name] for name in names)
-        which = (
+        # evenly spaced, from the first band to the last
+        chosen_indices = (
             torch.linspace(0, len(bands.centres) - 1, min(count, len(bands.centres))).round().long()
         )
-        few = Bands(*(values[which] for values in bands))
+        chosen_bands = Bands(*(values[chosen_indices] for values in bands))
         keys = tuple(result.keys[name] for name in names)
         return cls(
-            recipe, height, flat, stop, few, bands, illuminant[which], responses[:, which], keys
+            recipe,
+            height,
+            flat,
+            stop,
+            chosen_bands,
+            bands,
+            illuminant[chosen_indices],
+            responses[:, chosen_indices],
+            keys,
         )
 
     @property
@@ -97,8 +114,13 @@ class ProtectionCamera:
     @property
     def noise(self) -> Mapping[str, float]:
         """Return the read noise and the full well of the recipe's sensor, in e-."""
-        read, well = (self.recipe.steps[name].params for name in ("read[mask]", "well[mask]"))
-        return {"read_noise": float(read["read_noise"]), "full_well": float(well["capacity"])}
+        read_params, well_params = (
+            self.recipe.steps[name].params for name in ("read[mask]", "well[mask]")
+        )
+        return {
+            "read_noise": float(read_params["read_noise"]),
+            "full_well": float(well_params["capacity"]),
+        }
 
     def pixel(self, prnu: float, residual_glare: float) -> PixelNoise:
         """Return the noise of a pixel of the recipe's sensor."""
@@ -115,6 +137,7 @@ class ProtectionCamera:
         """Return the PSF with or without the mask, in a stop of a relative ``diameter``, under a
         condition.
         """
+        # options of the shade; all others are parameters of the PSF
         notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
         psf: Psf = optics.psf(
             self._front(masked, diameter, bands, condition, **notches), **{**self.lens, **options}
@@ -127,6 +150,7 @@ class ProtectionCamera:
         """Return the PSF of a laser from the ``angle`` of its direction, with the light that the
         lens scatters.
         """
+        # options of the shade; all others are parameters of the PSF
         notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
         front = self._front(masked, diameter, line, condition, **notches)
         lens = {**self.lens, **options}
@@ -149,27 +173,32 @@ class ProtectionCamera:
         condition: Condition | None,
         **notches: Any,
     ) -> Pupil:
-        pupil = self.recipe.steps["pupil[mask]"]
-        index = self.recipe.steps[str(pupil.wires["index"])]
+        """Return the pupil of a lens with or without the mask, in a stop of a relative diameter.
+
+        A condition adds its defocus and its film of grease; ``notches`` are options of `doe.shade`.
+        """
+        pupil_step = self.recipe.steps["pupil[mask]"]
+        index_step = self.recipe.steps[str(pupil_step.wires["index"])]
         height = self.height if masked else self.flat
-        params = dict(pupil.params)
-        film = None
+        params = dict(pupil_step.params)
+        grease_film = None
         if condition is not None:
             params["defocus"] = float(params.get("defocus", 0.0)) + condition.defocus
-            film = self._film(condition)
+            grease_film = self._film(condition)
         shaded = shade(self.stop, diameter=diameter, **notches)
         front: Pupil = optics.pupil(
             height,
-            index.node(bands, **index.params),
+            index_step.node(bands, **index_step.params),
             bands,
             self.stop,
-            film,
+            grease_film,
             shade=shaded,
             **params,
         )
         return front
 
     def _film(self, condition: Condition) -> Any:
+        """Return the film of grease on the window under a condition, or None for a clean one."""
         if not condition.grease:
             return None
         return dirt(
@@ -179,6 +208,7 @@ class ProtectionCamera:
     def laser_line(self, wavelength: float) -> Bands:
         """Return one narrow band at the wavelength of a laser."""
         unit = torch.ones(1, dtype=torch.float64)
+        # centre, width of 1 nm, weight
         return Bands(unit * wavelength, unit * 1e-9, unit)
 
     def laser_colour(self, line: Bands) -> Tensor:
@@ -192,8 +222,8 @@ class ProtectionCamera:
     @property
     def nodes(self) -> tuple[Node, ...]:
         """Return the nodes whose code determines a PSF, or a measure of it."""
-        index = self.recipe.steps[str(self.recipe.steps["pupil[mask]"].wires["index"])].node
-        own = (
+        index_node = self.recipe.steps[str(self.recipe.steps["pupil[mask]"].wires["index"])].node
+        own_nodes = (
             optics.psf,
             optics.pupil,
             shade,
@@ -203,7 +233,7 @@ class ProtectionCamera:
             metrics.heat_ratio,
             metrics.filtered_picture,
         )
-        return (*own, index, self.recipe.steps["responses"].node)
+        return (*own_nodes, index_node, self.recipe.steps["responses"].node)
 
 
 def _refuse_unsuitable(recipe: Recipe) -> None:
@@ -288,18 +318,24 @@ class FrontBench:
     """Measures fronts of one camera, each only once, because the store keeps the result."""
 
     def __init__(self, camera: ProtectionCamera, store: Store, settings: FrontSettings) -> None:
+        """Prepare measurements of fronts; the store keeps each under a key of camera, code and
+        settings.
+        """
         self.camera, self.store, self.settings = camera, store, settings
         self._psfs: dict[Front, Psf] = {}
         self._harms: dict[Front, dict[str, Tensor]] = {}
         code = Code(store.code_memo)
         files = [file_digest(Path(inspect.getfile(source))) for source in _SOURCES]
         files += [file_digest(Path(__file__)), file_digest(Path(inspect.getfile(ProtectionCamera)))]
-        steps = [
+        steps_with_params = [
             camera.recipe.steps[name]
             for name in ("psf[mask]", "pupil[mask]", "index", "responses")
             if name in camera.recipe.steps
         ]
-        params = [{name: plain(value) for name, value in step.params.items()} for step in steps]
+        params = [
+            {name: plain(value) for name, value in step.params.items()}
+            for step in steps_with_params
+        ]
         self._key = [
             camera.keys,
             [code.of(node) for node in camera.nodes],
@@ -319,15 +355,24 @@ class FrontBench:
         return _measures(measures)
 
     def _measure(self, front: Front, condition: Condition) -> dict[str, Tensor]:
-        camera, s = self.camera, self.settings
-        light = camera.illuminant, camera.responses, camera.bands
-        assumed, true = self._known(front), self._psf(front, camera.bands, condition)
-        spectrum = picture_spectrum(true, assumed, *light, s.variance, s.up_to)
-        radius, square = radial_contrast(true, *light)
+        """Measure a front under a condition, as tensors by name that the store can save.
+
+        The filter assumes the PSF without the condition, and the picture has the true one.
+        """
+        camera, settings = self.camera, self.settings
+        light_of_scene = camera.illuminant, camera.responses, camera.bands
+        assumed_psf, true_psf = self._known(front), self._psf(front, camera.bands, condition)
+        spectrum = picture_spectrum(
+            true_psf, assumed_psf, *light_of_scene, settings.variance, settings.up_to
+        )
+        radius, square = radial_contrast(true_psf, *light_of_scene)
         measures: dict[str, Tensor] = {
-            f"spectrum.{name}": x for name, x in spectrum._asdict().items()
+            f"spectrum.{name}": values for name, values in spectrum._asdict().items()
         }
-        measures |= {f"energy.{name}": x for name, x in detail_energy(true, *light, s.size).items()}
+        measures |= {
+            f"energy.{name}": values
+            for name, values in detail_energy(true_psf, *light_of_scene, settings.size).items()
+        }
         measures |= {"radius": radius, "square": square, **self._harm(front)}
         return measures | self._glare(front, condition)
 
@@ -338,9 +383,10 @@ class FrontBench:
         """
         if front not in self._harms:
             bands = self.camera.laser_bands
-            columns = (torch.split(values, 1) for values in bands)
-            single = (Bands(*values) for values in zip(*columns, strict=True))
-            peaks, heats = zip(*(self._harm_in(front, band) for band in single), strict=True)
+            # bands of one element each
+            split_columns = (torch.split(values, 1) for values in bands)
+            single_bands = (Bands(*values) for values in zip(*split_columns, strict=True))
+            peaks, heats = zip(*(self._harm_in(front, band) for band in single_bands), strict=True)
             self._harms[front] = {
                 "peak": torch.stack(peaks).max(),
                 "heat": torch.stack(heats).max(),
@@ -353,11 +399,11 @@ class FrontBench:
         peak = metrics.lsr(psf).max()
         if self.settings.dwell is None:
             return peak, torch.tensor(torch.nan, dtype=torch.float64)
-        clear = self._psf(Front(False), band, None)
+        clear_psf = self._psf(Front(False), band, None)
         pitch = self.camera.lens["pixel_pitch"]
         return (
             peak,
-            metrics.heat_ratio(psf, clear, pixel_pitch=pitch, dwell=self.settings.dwell).max(),
+            metrics.heat_ratio(psf, clear_psf, pixel_pitch=pitch, dwell=self.settings.dwell).max(),
         )
 
     def _known(self, front: Front) -> Psf:
@@ -369,11 +415,13 @@ class FrontBench:
         return self._psfs[front]
 
     def _psf(self, front: Front, bands: Bands, condition: Condition | None, **options: Any) -> Psf:
+        """Return the PSF of a front in bands, under a condition or without one."""
         return self.camera.psf(
             front.masked, front.diameter, bands, condition, **front.notches, **options
         )
 
     def _laser_psf(self, front: Front, line: Bands, condition: Condition, **options: Any) -> Psf:
+        """Return the PSF of a laser behind a front, with the light that the lens scatters."""
         return self.camera.laser_psf(
             front.masked, front.diameter, line, condition, **front.notches, **options
         )
@@ -386,25 +434,35 @@ class FrontBench:
         carry.
         """
         camera = self.camera
-        line = camera.laser_line(condition.wavelength)
-        glare = {"colour": camera.laser_colour(line)}
-        reach = min(self.settings.fields)
-        spot = (condition.direction[0] * reach, condition.direction[1] * reach)
-        scale = camera.lens["pixel_pitch"] / camera.lens["focal_length"]
-        for side in self.settings.fields if condition.direction == (0.0, 0.0) else (reach,):
-            shape, angle = (side, side), (spot[0] * scale, spot[1] * scale)
+        laser_band = camera.laser_line(condition.wavelength)
+        glare = {"colour": camera.laser_colour(laser_band)}
+        smallest_field = min(self.settings.fields)
+        spot_pixels = (
+            condition.direction[0] * smallest_field,
+            condition.direction[1] * smallest_field,
+        )
+        radians_per_pixel = camera.lens["pixel_pitch"] / camera.lens["focal_length"]
+        # other directions are shares of the smallest field
+        for side in (
+            self.settings.fields if condition.direction == (0.0, 0.0) else (smallest_field,)
+        ):
+            shape, angle = (
+                (side, side),
+                (spot_pixels[0] * radians_per_pixel, spot_pixels[1] * radians_per_pixel),
+            )
             try:
-                light = self._laser_psf(front, line, condition, shape=shape, angle=angle)
+                laser_psf = self._laser_psf(front, laser_band, condition, shape=shape, angle=angle)
             except ValueError:  # the pupil is too coarse
-                if side == reach:
+                if side == smallest_field:
                     raise
                 continue
-            levels = glare_levels(light.intensity[0], float(light.clear_peak))
+            levels = glare_levels(laser_psf.intensity[0], float(laser_psf.clear_peak))
             glare |= {f"level.{side}": levels.level, f"share.{side}": levels.share}
         return glare
 
 
 def _measures(stored: Mapping[str, Any]) -> FrontMeasures:
+    """Return measures from how the store keeps them, by name."""
     sides = [int(name.removeprefix("level.")) for name in stored if name.startswith("level.")]
     return FrontMeasures(
         PictureSpectrum(*(stored[f"spectrum.{name}"] for name in PictureSpectrum._fields)),

@@ -84,46 +84,71 @@ def measure_protection(
     """Measure mask, filters and stops of equal protection, in quiet frames and under attack, for
     each condition.
     """
-    usual = usual_condition()
+    usual_values = usual_condition()
 
-    def candidate(front: Front, condition: Condition = usual) -> Candidate:
-        measures, harm = bench.measure(front, condition), bench.measure(front, usual)
+    def candidate(front: Front, condition: Condition = usual_values) -> Candidate:
+        # harm is judged at the usual condition, as the filter is chosen before
+        measures, harm = bench.measure(front, condition), bench.measure(front, usual_values)
         protection = harm.peak if bench.settings.dwell is None else harm.heat
         return Candidate(front, measures, protection)
 
     mask = candidate(Front(True))
-    own = mask.protection
-    refuse_no_mask(own)
-    progress(f"the mask lowers the harm of a laser to {own:.3g} of that behind the clear lens")
-    clear = [candidate(Front(False, d)) for d in _diameters(bench, own)]
-    masked = [candidate(Front(True, d)) for d in _MASK_STOPS]
-    progress(f"{len(clear)} stops and {len(masked)} stops with the mask are measured")
-    gain = {level: _gains(masked, clear, level, pixel) for level in (own, *LEVELS)}
-    stops = {n: best(clear, own, n, pixel, "stop and filter")["error"][1] for n in LIGHTS}
-    rivals = _rivals(clear, masked, own, pixel, stops)
-    rivals["notch"] = Rival("notch", Front(False, 1.0, usual.wavelength, 1 - own), 1.0)
+    own_protection = mask.protection
+    refuse_no_mask(own_protection)
+    progress(
+        f"the mask lowers the harm of a laser to {own_protection:.3g} of that behind the clear lens"
+    )
+    clear_fronts = [
+        candidate(Front(False, diameter)) for diameter in _diameters(bench, own_protection)
+    ]
+    masked_fronts = [candidate(Front(True, diameter)) for diameter in _MASK_STOPS]
+    progress(f"{len(clear_fronts)} stops and {len(masked_fronts)} stops with the mask are measured")
+    gain = {
+        level: _gains(masked_fronts, clear_fronts, level, pixel)
+        for level in (own_protection, *LEVELS)
+    }
+    stops = {
+        scene_light: best(clear_fronts, own_protection, scene_light, pixel, "stop and filter")[
+            "error"
+        ][1]
+        for scene_light in LIGHTS
+    }
+    rivals = _rivals(clear_fronts, masked_fronts, own_protection, pixel, stops)
+    # a notch at the usual wavelength that passes as much as the mask's peak
+    rivals["notch"] = Rival(
+        "notch", Front(False, 1.0, usual_values.wavelength, 1 - own_protection), 1.0
+    )
     measured = {name: candidate(rival.front) for name, rival in rivals.items()}
     quiet = _quiet_frames(rivals, measured, pixel)
-    quiet["best stop and filter"] = _best_quiet(clear, own, pixel)
-    pairs = {n: (best(masked, own, n, pixel), best(clear, own, n, pixel)) for n in LIGHTS}
-    drawn = _drawn_gains(conditions, candidate, pairs, pixel, progress)
-    attack, lost = _attacks(conditions, candidate, rivals, pixel, progress)
+    quiet["best stop and filter"] = _best_quiet(clear_fronts, own_protection, pixel)
+    best_fronts = {
+        scene_light: (
+            best(masked_fronts, own_protection, scene_light, pixel),
+            best(clear_fronts, own_protection, scene_light, pixel),
+        )
+        for scene_light in LIGHTS
+    }
+    drawn_gains = _drawn_gains(conditions, candidate, best_fronts, pixel, progress)
+    attack, half_strengths = _attacks(conditions, candidate, rivals, pixel, progress)
     bound, forbidden = _bounds(bench, pixel)
     return ProtectionResult(
-        own=own,
+        own=own_protection,
         rivals=rivals,
         quiet=quiet,
         stops=stops,
         gain=gain,
-        drawn=drawn,
+        drawn=drawn_gains,
         curves=_curves(rivals, measured, pixel),
-        radius=[float(x) for x in mask.found.radius],
+        radius=[float(frequency) for frequency in mask.found.radius],
         bound=bound,
         forbidden=forbidden,
         attack=attack,
         fields=_fields(rivals, measured, pixel),
-        lost=lost,
-        tint={name: colour_shift(judged.found) for name, judged in measured.items()},
+        lost=half_strengths,
+        tint={
+            name: colour_shift(measured_candidate.found)
+            for name, measured_candidate in measured.items()
+        },
     )
 
 
@@ -151,14 +176,17 @@ def _gains(
     masked: Sequence[Candidate], clear: Sequence[Candidate], level: float, pixel: PixelNoise
 ) -> dict[float, dict[str, float]]:
     """Return the gain of the mask at each light, at one level of protection."""
-    return {n: gains(masked, clear, level, n, pixel) for n in LIGHTS}
+    return {scene_light: gains(masked, clear, level, scene_light, pixel) for scene_light in LIGHTS}
 
 
 def _quiet(
     measures: FrontMeasures, transmittance: float, pixel: PixelNoise
 ) -> dict[float, dict[str, float]]:
     """Return the measures of a frame without a laser at each light."""
-    return {n: quiet_picture(measures, transmittance, n, pixel) for n in LIGHTS}
+    return {
+        scene_light: quiet_picture(measures, transmittance, scene_light, pixel)
+        for scene_light in LIGHTS
+    }
 
 
 def _best_quiet(
@@ -166,9 +194,9 @@ def _best_quiet(
 ) -> dict[float, dict[str, float]]:
     """Return the best of each measure over all stops and filters, at each light."""
     values = {}
-    for n in LIGHTS:
-        leaders = best(clear, own, n, pixel)
-        values[n] = {measure: value for measure, (value, _) in leaders.items()}
+    for scene_light in LIGHTS:
+        leaders = best(clear, own, scene_light, pixel)
+        values[scene_light] = {measure: value for measure, (value, _) in leaders.items()}
     return values
 
 
@@ -178,17 +206,18 @@ def _diameters(bench: FrontBench, own: float) -> list[float]:
 
     The best rival is often a stop without a filter, so that each wanted protection has such a stop.
     """
-    alone = {_stop_alone(bench, level) for level in (own, *LEVELS)}
-    series = {_RATIO**k for k in range(40) if _RATIO**k > min(alone)}
-    return sorted(alone | series, reverse=True)
+    stops_alone = {_stop_alone(bench, level) for level in (own, *LEVELS)}
+    series = {_RATIO**step for step in range(40) if _RATIO**step > min(stops_alone)}
+    return sorted(stops_alone | series, reverse=True)
 
 
 def _stop_alone(bench: FrontBench, level: float) -> float:
     """Return the diameter of the stop whose peak, or heat, is ``level`` without a filter."""
     if bench.settings.dwell is not None:
+        # the heat of a spot goes with the third power of the diameter
         return math.pow(level, 1 / 3)
-    lens = bench.camera.psf(False, 1.0, bench.camera.laser_bands, shape=_SMALL)
-    return float(metrics.stop_diameter(lens, level).min())
+    small_psf = bench.camera.psf(False, 1.0, bench.camera.laser_bands, shape=_SMALL)
+    return float(metrics.stop_diameter(small_psf, level).min())
 
 
 def _rivals(
@@ -201,16 +230,22 @@ def _rivals(
     """Return the rivals whose protection is that of the mask alone, and the open lens, which
     protects nothing.
     """
-    alone = min((c for c in clear if c.protection >= own), key=lambda c: c.protection)
-    both = best(masked, own, ATTACKED_AT, pixel)["error"][1]
+    # the smallest stop that does not protect more than the mask
+    stop_alone = min(
+        (candidate for candidate in clear if candidate.protection >= own),
+        key=lambda c: c.protection,
+    )
+    mask_and_stop = best(masked, own, ATTACKED_AT, pixel)["error"][1]
     rivals = {
         "open lens": Rival("open lens", Front(False), 1.0),
         "grey filter": Rival("grey filter", Front(False), min(1.0, own / clear[0].protection)),
-        "smaller stop": Rival("smaller stop", alone.front, alone.transmittance(own)),
+        "smaller stop": Rival("smaller stop", stop_alone.front, stop_alone.transmittance(own)),
         "stop and filter": stops[ATTACKED_AT],
         "mask": Rival("mask", Front(True), 1.0),
     }
-    return rivals if both.front == Front(True) else {**rivals, "mask and stop": both}
+    return (
+        rivals if mask_and_stop.front == Front(True) else {**rivals, "mask and stop": mask_and_stop}
+    )
 
 
 def _drawn_gains(
@@ -228,12 +263,16 @@ def _drawn_gains(
         measures = candidate(rival.front, condition).found
         return quiet_picture(measures, rival.transmittance, n, pixel)[measure]
 
-    drawn: dict[float, dict[str, list[float]]] = {n: {m: [] for m in DRAWN} for n in LIGHTS}
+    drawn: dict[float, dict[str, list[float]]] = {
+        scene_light: {m: [] for m in DRAWN} for scene_light in LIGHTS
+    }
     for number, condition in enumerate(conditions, 1):
-        for n, (masked, plain) in pairs.items():
+        for scene_light, (best_masked, best_plain) in pairs.items():
             for measure in DRAWN:
-                own = value(masked[measure][1], condition, n, measure)
-                drawn[n][measure].append(own - value(plain[measure][1], condition, n, measure))
+                masked_value = value(best_masked[measure][1], condition, scene_light, measure)
+                drawn[scene_light][measure].append(
+                    masked_value - value(best_plain[measure][1], condition, scene_light, measure)
+                )
         progress(f"draw {number} of {len(conditions)}: quiet frames")
     return drawn
 
@@ -245,36 +284,42 @@ def _attacks(
     pixel: PixelNoise,
     progress: Callable[[str], None],
 ) -> tuple[dict[str, dict[str, list[list[float]]]], dict[str, list[float]]]:
-    """Return error, information and share of seen pixels by strength in each draw, and when the
-    picture is lost.
+    """Return what is left of the picture under attack, in each draw.
+
+    The first maps each rival to error, information and share of seen pixels (draw, strength), the
+    second to the strength at which half of its information is lost (draw,).
     """
     names = [name for name in rivals if name != "notch"]
     attack: dict[str, dict[str, list[list[float]]]] = {
-        n: {"error": [], "information": [], "seen": []} for n in names
+        rival_name: {"error": [], "information": [], "seen": []} for rival_name in names
     }
     lost: dict[str, list[float]] = {name: [] for name in names}
     for number, condition in enumerate(conditions, 1):
         for name in names:
             measures = candidate(rivals[name].front, condition).found
-            field = min(measures.glare)
-            under = attacked_picture(
+            # the field of the recipe; wider ones are for a laser on the axis
+            field_side = min(measures.glare)
+            under_attack = attacked_picture(
                 measures.spectrum,
-                measures.glare[field],
+                measures.glare[field_side],
                 pixel,
                 electrons=ATTACKED_AT,
                 transmittance=rivals[name].transmittance,
                 colour=measures.colour,
                 strengths=torch.tensor(STRENGTHS, dtype=torch.float64),
             )
-            for quantity, values in under._asdict().items():
+            for quantity, values in under_attack._asdict().items():
                 attack[name][quantity].append(values.tolist())
-            quiet = 10 ** (
+            # from dB to bits a pixel
+            quiet_bits = 10 ** (
                 quiet_picture(measures, rivals[name].transmittance, ATTACKED_AT, pixel)[
                     "information"
                 ]
                 / 10
             )
-            lost[name].append(_crossing([x / quiet for x in under.information.tolist()]))
+            lost[name].append(
+                _crossing([bits / quiet_bits for bits in under_attack.information.tolist()])
+            )
         progress(f"draw {number} of {len(conditions)}: under attack")
     return attack, lost
 
@@ -285,10 +330,13 @@ def _crossing(share: Sequence[float]) -> float:
     """
     if share[0] < _HALF:
         return float(STRENGTHS[0])
-    for i in range(1, len(share)):
-        if share[i] < _HALF:
-            position = (share[i - 1] - _HALF) / (share[i - 1] - share[i])
-            return float(STRENGTHS[i - 1] * (STRENGTHS[i] / STRENGTHS[i - 1]) ** position)
+    for index in range(1, len(share)):
+        if share[index] < _HALF:
+            fraction = (share[index - 1] - _HALF) / (share[index - 1] - share[index])
+            # linear in the logarithm of the strength
+            return float(
+                STRENGTHS[index - 1] * (STRENGTHS[index] / STRENGTHS[index - 1]) ** fraction
+            )
     return float(STRENGTHS[-1])
 
 
@@ -302,7 +350,7 @@ def _fields(
     for name, rival in rivals.items():
         measures = measured[name].found
         for side, glare in measures.glare.items():
-            under: Any = attacked_picture(
+            under_attack: Any = attacked_picture(
                 measures.spectrum,
                 glare,
                 pixel,
@@ -311,7 +359,7 @@ def _fields(
                 transmittance=rival.transmittance,
                 strengths=torch.tensor(STRENGTHS, dtype=torch.float64),
             )
-            shares.setdefault(name, {})[side] = under.seen.tolist()
+            shares.setdefault(name, {})[side] = under_attack.seen.tolist()
     return shares
 
 
@@ -322,11 +370,21 @@ def _bounds(
     forbidding glare.
     """
     bands = bench.camera.bands
-    middle = len(bands.centres) // 2
-    psf = bench.camera.psf(True, 1.0, type(bands)(*(x[middle : middle + 1] for x in bands)))
+    middle_band = len(bands.centres) // 2
+    # the one middle band
+    psf = bench.camera.psf(
+        True, 1.0, type(bands)(*(values[middle_band : middle_band + 1] for values in bands))
+    )
     bound = {}
-    for n in LIGHTS:
-        limits = metrics.protection_bounds(psf, electrons=n, read_noise=pixel.read_noise)
-        bound[n] = float(limits.over_both), float(limits.over_both_bound)
+    for scene_light in LIGHTS:
+        protection_bounds = metrics.protection_bounds(
+            psf, electrons=scene_light, read_noise=pixel.read_noise
+        )
+        bound[scene_light] = (
+            float(protection_bounds.over_both),
+            float(protection_bounds.over_both_bound),
+        )
     peak = float(metrics.lsr(psf))
-    return bound, {n: largest_glare(peak, n, pixel.read_noise) for n in LIGHTS}
+    return bound, {
+        scene_light: largest_glare(peak, scene_light, pixel.read_noise) for scene_light in LIGHTS
+    }

@@ -72,19 +72,19 @@ def draw_conditions(
     )
     return [
         Condition(
-            wavelength=columns["wavelength"][i],
-            direction=(columns["direction_y"][i], columns["direction_x"][i]),
-            defocus=columns["defocus"][i],
-            grease=columns["grease"][i],
-            scatter=min(columns["scatter"][i], _MOST_SCATTER),
-            seed=seed + first + i,
+            wavelength=columns["wavelength"][draw],
+            direction=(columns["direction_y"][draw], columns["direction_x"][draw]),
+            defocus=columns["defocus"][draw],
+            grease=columns["grease"][draw],
+            scatter=min(columns["scatter"][draw], _MOST_SCATTER),
+            seed=seed + first + draw,
         )
-        for i in range(count)
+        for draw in range(count)
     ]
 
 
 def usual_condition(laws: UnknownLaws | None = None) -> Condition:
     """Return the condition with every value at its median, and a clean window."""
     texts: Mapping[str, str] = asdict(laws or UnknownLaws())
-    middle = {name: read_law(text).median for name, text in texts.items()}
-    return Condition(middle["wavelength"], (0.0, 0.0), 0.0, 0.0, middle["scatter"], 0)
+    medians = {name: read_law(text).median for name, text in texts.items()}
+    return Condition(medians["wavelength"], (0.0, 0.0), 0.0, 0.0, medians["scatter"], 0)

@@ -51,19 +51,33 @@ class Family:
         """Return the records of the copies of the step that the run computed, loaded or left
         out.
         """
-        return [d for d in self.done if d.state != "not needed"]
+        return [copy for copy in self.done if copy.state != "not needed"]
 
     def cells(self) -> tuple[str, ...]:
         """Return the table row of all copies of a step, with the columns of `HEADER`."""
-        done, count = self.needed, len(self.members)
+        needed_copies, count = self.needed, len(self.members)
         name = f"{self.name} ×{count}" if count > 1 else self.members[0]
-        if not done:
+        if not needed_copies:
             return name, "", "…" if self.begun else "", "", "", ""
-        ran = sum(d.seconds for d in done if d.state == "run")
-        last = max(done, key=lambda d: (d.facts is not None, self.members.index(d.step)))
-        shown = next((d for d in done if not all(c.ok for c in d.checks)), last)
-        seconds = f"{ran:.3f}" if ran else ""
-        return name, shown.device, self.state(), seconds, self._output(last), self._check(shown)
+        seconds_run = sum(copy.seconds for copy in needed_copies if copy.state == "run")
+        # of the copies with a known result the last, in the order of the recipe
+        last_copy = max(
+            needed_copies, key=lambda d: (d.facts is not None, self.members.index(d.step))
+        )
+        # a copy with a failed check comes first
+        shown_copy = next(
+            (copy for copy in needed_copies if not all(check.ok for check in copy.checks)),
+            last_copy,
+        )
+        seconds = f"{seconds_run:.3f}" if seconds_run else ""
+        return (
+            name,
+            shown_copy.device,
+            self.state(),
+            seconds,
+            self._output(last_copy),
+            self._check(shown_copy),
+        )
 
     def _output(self, last: StepRecord) -> str:
         """Return the shape of a result with its unit, or an empty text."""
@@ -72,20 +86,24 @@ class Family:
 
     def _check(self, shown: StepRecord) -> str:
         """Return the texts of the checks of a copy, and why the first copy ran or was left out."""
-        texts = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in shown.checks)
-        reasons = (d.why for d in self.needed if d.state in ("run", "left out") and d.why)
-        why = next(reasons, "")
-        return f"{texts}  ({why})" if texts and why else texts or why
+        check_texts = "; ".join(
+            ("" if check.ok else "LOOK: ") + check.text for check in shown.checks
+        )
+        reasons = (
+            copy.why for copy in self.needed if copy.state in ("run", "left out") and copy.why
+        )
+        reason = next(reasons, "")
+        return f"{check_texts}  ({reason})" if check_texts and reason else check_texts or reason
 
     def state(self) -> str:
         """Return the common state of all copies of a step, such as ``run``, or the number of
         copies in each state.
         """
-        states = Counter(str(d.state) for d in self.done)
+        states = Counter(str(copy.state) for copy in self.done)
         return (
             "".join(states)
             if len(states) == 1
-            else ", ".join(f"{n} {s}" for s, n in states.items())
+            else ", ".join(f"{count} {state_name}" for state_name, count in states.items())
         )
 
 
@@ -135,12 +153,13 @@ class ProgressTable(ABC):
         if self.mode != "plain":
             return
         columns = zip(self.header, cells, self.widths, strict=True)
-        padded = [
+        padded_cells = [
             f"{cell:{'>' if name in self.numbers else '<'}{width}}" for name, cell, width in columns
         ]
-        self._print("  " + "  ".join(padded).rstrip())
+        self._print("  " + "  ".join(padded_cells).rstrip())
 
     def _print(self, line: str) -> None:
+        """Print a line, and keep it for `printed`."""
         self._lines.append(line)
         print(line, flush=True)
 
@@ -202,7 +221,7 @@ class RunTable(ProgressTable):
         self._left = dict(predicted or {})
         self.families = families(recipe, names)
         self.widths = (
-            max((len(f.cells()[0]) for f in self.families.values()), default=0),
+            max((len(family.cells()[0]) for family in self.families.values()), default=0),
             *_WIDTHS,
         )
 
@@ -224,14 +243,16 @@ class RunTable(ProgressTable):
         for family in self.families.values():
             if family.begun or family.needed:
                 cells = family.cells()
+                # cell 5: the checks; cell 2: the state
                 yield cells, "failed" if "LOOK" in cells[5] else cells[2]
 
     @property
     def finished(self) -> int:
         """Return the number of steps that the run has computed or loaded so far."""
-        return sum(d.state in ("run", "cached") for d in self._done())
+        return sum(copy.state in ("run", "cached") for copy in self._done())
 
     def _done(self) -> Iterator[StepRecord]:
+        """Yield the records of the finished copies of all steps."""
         for family in self.families.values():
             yield from family.done
 
@@ -239,9 +260,9 @@ class RunTable(ProgressTable):
         """Return the time that is left, or how many steps were neither computed nor loaded in
         the end.
         """
-        if (left := sum(self._left.values())) >= 1:
-            return f"about {lasts(left)} left, as earlier runs took"
-        count = sum(d.state == "not needed" for d in self._done())
+        if (seconds_left := sum(self._left.values())) >= 1:
+            return f"about {lasts(seconds_left)} left, as earlier runs took"
+        count = sum(copy.state == "not needed" for copy in self._done())
         steps = "1 step was" if count == 1 else f"{count} steps were"
         return f"{steps} not needed: the results that need them are in the cache" if count else ""
 
@@ -262,14 +283,15 @@ def note(families: dict[str, Family], event: Event) -> Family:
 
     A second attempt of a run may have steps that the first attempt did not have.
     """
-    short = event.step.partition("[")[0]
-    family = families.setdefault(short, Family(short, [], ""))
+    family_name = event.step.partition("[")[0]
+    family = families.setdefault(family_name, Family(family_name, [], ""))
     if event.step not in family.members:
         family.members.append(event.step)
     if event.done is None:
         family.begun = True
     else:
-        family.done = [*(d for d in family.done if d.step != event.step), event.done]
+        # a second attempt replaces the record of the first
+        family.done = [*(copy for copy in family.done if copy.step != event.step), event.done]
     return family
 
 
@@ -294,11 +316,13 @@ def opening(recipe: Recipe, command: str) -> list[str]:
     parameters, and notes.
     """
     counts = contents_of(recipe)
-    sizes = f"{counts['steps']} steps of {counts['nodes']} nodes, {counts['parameters']} parameters"
+    sizes_text = (
+        f"{counts['steps']} steps of {counts['nodes']} nodes, {counts['parameters']} parameters"
+    )
     notes = [f"note     {line}" for line in (*recipe.notes, *consequences(recipe.config.values))]
     return [
         f"neusee {command}: {recipe.title or recipe.name}",
-        f"checked  {sizes}: all right",
+        f"checked  {sizes_text}: all right",
         *notes,
     ]
 
@@ -330,8 +354,8 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str =
     ]
     lines += [f"  {line}" for line in unchecked_lines(doc["unchecked"])]
     lines += [f"warning  {line}" for line in doc["warnings"]]
-    shown = any(figure["name"] == "overview" for figure in doc["figures"])
-    lines += [f"pictures {Path(path).parent / 'figures' / 'overview.png'}"] if shown else []
+    has_overview = any(figure["name"] == "overview" for figure in doc["figures"])
+    lines += [f"pictures {Path(path).parent / 'figures' / 'overview.png'}"] if has_overview else []
     return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
 
 
@@ -339,6 +363,7 @@ def _error_lines(doc: Mapping[str, Any]) -> list[str]:
     """Return the lines on cheaper steps, steps left out, and the errors of outputs and of bands."""
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [left_out_line(doc)] if doc["left_out"] else []
+    # errors of outputs, where something was saved at their cost
     lines += [said_of_errors(doc["spent"])] if lines else []
     lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
     return lines
@@ -368,15 +393,19 @@ def left_out_line(doc: Mapping[str, Any]) -> str:
     """Return one line with the steps that a run left out, and the bounds or estimates of what
     each changes.
     """
-    named: dict[str, float] = {}
+    bound_of_family: dict[str, float] = {}
     estimated = {
-        row["step"].partition("[")[0] for row in doc["spent"]["left_out"] if row["estimated"]
+        omission["step"].partition("[")[0]
+        for omission in doc["spent"]["left_out"]
+        if omission["estimated"]
     }
-    for row in doc["left_out"]:
-        short = row["step"].partition("[")[0]
-        named[short] = max(named.get(short, 0.0), row["bound"] or 0.0)
-    steps = [
+    for omission in doc["left_out"]:
+        family_name = omission["step"].partition("[")[0]
+        bound_of_family[family_name] = max(
+            bound_of_family.get(family_name, 0.0), omission["bound"] or 0.0
+        )
+    steps_with_bounds = [
         f"{name} ({'estimated' if name in estimated else 'at most'} {bound:.1e})"
-        for name, bound in named.items()
+        for name, bound in bound_of_family.items()
     ]
-    return f"left out {', '.join(steps)}; tolerance {doc['tolerance']:g}"
+    return f"left out {', '.join(steps_with_bounds)}; tolerance {doc['tolerance']:g}"

@@ -91,8 +91,10 @@ def keep_variants(recipe: Recipe, step: str, rows: Sequence[Row], store: Store) 
     inputs and machine.
     """
     if rows:
-        about = {"step": f"variants of {step}", "date": timestamp(), "seconds": 0.0}
-        store.put(_key(recipe, step, Code(store.code_memo)), [list(row) for row in rows], about)
+        description = {"step": f"variants of {step}", "date": timestamp(), "seconds": 0.0}
+        store.put(
+            _key(recipe, step, Code(store.code_memo)), [list(row) for row in rows], description
+        )
 
 
 def variants_of(recipe: Recipe, family: str, store: Store, code: Code) -> list[Row]:
@@ -104,8 +106,8 @@ def variants_of(recipe: Recipe, family: str, store: Store, code: Code) -> list[R
             with suppress(KeyError):
                 rows = store.get(_key(recipe, name, code), list)
                 return [
-                    (str(line), str(label), float(error), float(took))
-                    for line, label, error, took in rows
+                    (str(property_name), str(new_value), float(error), float(seconds))
+                    for property_name, new_value, error, seconds in rows
                 ]
     return []
 
@@ -114,9 +116,10 @@ def _key(recipe: Recipe, step: str, code: Code) -> str:
     """Return the key of the variants of a step: its code, and the parameters of the step and of
     all steps before it.
     """
-    before = [recipe.steps[name] for name in needed(recipe, (step,))]
+    steps_before = [recipe.steps[name] for name in needed(recipe, (step,))]
     params = [
-        [s.node.path, {name: plain(value) for name, value in s.params.items()}] for s in before
+        [step_before.node.path, {name: plain(value) for name, value in step_before.params.items()}]
+        for step_before in steps_before
     ]
     return digest("variants of a step", step, code_of(recipe.steps[step], code), params, machine())
 
@@ -178,6 +181,7 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code, store: 
     """
     if need.startswith(_MEASURED):
         return _variants(need.removeprefix(_MEASURED), recipe, code, store)
+    # the node of a step, as a function
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         params = [[name, plain(value)] for name, value in step.params.items()]
@@ -185,6 +189,7 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code, store: 
     if match := _PARAMETER.fullmatch(need):
         value = _parameter(match["step"], match["name"], recipe)
         return Found((), lambda values: value, plain(value))
+    # all copies of a step
     if need.endswith("*]"):
         return _items(need[:-2], recipe, keys)
     _step(need, recipe)
@@ -215,9 +220,9 @@ def _parameter(step: str, name: str, recipe: Recipe) -> Any:
         return _step(step, recipe).params.get(name)
     prefix = step[:-2]
     return {
-        n[len(prefix) : -1]: s.params.get(name)
-        for n, s in recipe.steps.items()
-        if n.startswith(prefix)
+        copy_name[len(prefix) : -1]: copy.params.get(name)
+        for copy_name, copy in recipe.steps.items()
+        if copy_name.startswith(prefix)
     }
 
 
@@ -231,6 +236,7 @@ def is_table(value: Any) -> bool:
 
 
 def _step(name: str, recipe: Recipe) -> Step:
+    """Return a step of the recipe; raise `Missing` if it has none of this name."""
     if name not in recipe.steps:
         raise Missing(f"the recipe has no step {name}")
     return recipe.steps[name]
@@ -238,12 +244,16 @@ def _step(name: str, recipe: Recipe) -> Step:
 
 def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
     """Find all copies of a step from the beginning of their names, such as ``spot[mask,``."""
-    names = {n[len(prefix) : -1]: n for n in recipe.steps if n.startswith(prefix) and n in keys}
-    if not names:
+    copy_of_item = {
+        copy_name[len(prefix) : -1]: copy_name
+        for copy_name in recipe.steps
+        if copy_name.startswith(prefix) and copy_name in keys
+    }
+    if not copy_of_item:
         raise Missing(f"the recipe has no step {prefix}…]")
-    identity = [[item, keys[name]] for item, name in names.items()]
+    identity = [[item, keys[name]] for item, name in copy_of_item.items()]
     return Found(
-        tuple(names.values()),
-        lambda values: {item: values[name] for item, name in names.items()},
+        tuple(copy_of_item.values()),
+        lambda values: {item: values[name] for item, name in copy_of_item.items()},
         identity,
     )

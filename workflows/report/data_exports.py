@@ -42,11 +42,13 @@ def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[
 
 def data_files(recipe: Recipe) -> Iterator[DerivedFile]:
     """Yield the data files that a recipe asks for."""
-    for name, (form, needs) in contents.files_of(recipe).items():
-        half = recipe.exports is not None and recipe.exports[name]
-        kind = ("file", form, _VERSION, *(["half"] if half else []))
-        write = partial(_WRITERS[form], half=True) if half else _WRITERS[form]
-        yield DerivedFile(name, Path(name).suffix, kind, needs, write, copied=form in _COPIED)
+    for name, (file_format, needs) in contents.files_of(recipe).items():
+        in_16_bits = recipe.exports is not None and recipe.exports[name]
+        kind = ("file", file_format, _VERSION, *(["half"] if in_16_bits else []))
+        write = partial(_WRITERS[file_format], half=True) if in_16_bits else _WRITERS[file_format]
+        yield DerivedFile(
+            name, Path(name).suffix, kind, needs, write, copied=file_format in _COPIED
+        )
 
 
 def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = False) -> None:
@@ -66,22 +68,26 @@ def safetensors(path: Path, /, **values: Any) -> None:
     for name, value in values.items():
         fields = value._asdict() if hasattr(value, "_asdict") else {"": value}
         tensors |= {
-            f"{name}.{k}".rstrip("."): v for k, v in fields.items() if isinstance(v, Tensor)
+            f"{name}.{field_name}".rstrip("."): field_value
+            for field_name, field_value in fields.items()
+            if isinstance(field_value, Tensor)
         }
-    header, end = dict[str, Any](), 0
-    for name, x in tensors.items():
+    header, offset = dict[str, Any](), 0
+    for name, tensor in tensors.items():
         header[name] = {
-            "dtype": tensor_kind(x),
-            "shape": list(x.shape),
-            "data_offsets": [end, end + x.nbytes],
+            "dtype": tensor_kind(tensor),
+            "shape": list(tensor.shape),
+            "data_offsets": [offset, offset + tensor.nbytes],
         }
-        end += x.nbytes
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
+        offset += tensor.nbytes
+    header_text = json.dumps(header, separators=(",", ":")).encode()
+    # the data begin at a multiple of 8 bytes
+    header_text += b" " * (-len(header_text) % 8)
     with path.open("wb") as file:
-        file.write(len(text).to_bytes(8, "little") + text)
-        for x in tensors.values():
-            file.write(bytes_of(x))
+        # length of the header in 8 bytes, header, then the data
+        file.write(len(header_text).to_bytes(8, "little") + header_text)
+        for tensor in tensors.values():
+            file.write(bytes_of(tensor))
 
 
 def exr(path: Path, /, *, image: Tensor, half: bool = False) -> None:
@@ -119,20 +125,29 @@ def png16(path: Path, /, *, image: Tensor) -> None:
 
 
 def _png16(image: Tensor) -> bytes:
-    low, high = (float(x) for x in image.aminmax()) if image.numel() else (0.0, 0.0)
-    if image.ndim != 3 or image.shape[0] not in (1, 3) or not (low >= 0 and round(high) <= 65535):
+    """Return an image as the bytes of a PNG of 16 bits; raise `ValueError` for an unsuitable image.
+
+    A PNG is a signature and chunks: header (IHDR), compressed lines (IDAT) and end (IEND).
+    """
+    smallest, largest = (float(limit) for limit in image.aminmax()) if image.numel() else (0.0, 0.0)
+    if (
+        image.ndim != 3
+        or image.shape[0] not in (1, 3)
+        or not (smallest >= 0 and round(largest) <= 65535)
+    ):
         raise ValueError(
             "a 16-bit PNG needs shape (3, y, x) or (1, y, x) and values in [0, 65535]; this image"
             f" has shape {tuple(image.shape)}"
         )
     height, width = image.shape[1:]
-    head = struct.pack(">IIBBBBB", width, height, 16, 2 if len(image) == 3 else 0, 0, 0, 0)
+    # size, 16 bits, colour type 2 (RGB) or 0 (grey), and the usual methods
+    header = struct.pack(">IIBBBBB", width, height, 16, 2 if len(image) == 3 else 0, 0, 0, 0)
     chunks = (
-        (b"IHDR", head),
+        (b"IHDR", header),
         (b"IDAT", b"".join(_compressed(image.detach().cpu()))),
         (b"IEND", b""),
     )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*c) for c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*chunk) for chunk in chunks)
 
 
 def _compressed(image: Tensor) -> Iterator[bytes]:
@@ -145,14 +160,16 @@ def _compressed(image: Tensor) -> Iterator[bytes]:
     """
     import numpy as np
 
-    pack, (planes, height, width) = (
+    # level 6, largest window and memory, runs only
+    compressor, (planes, height, width) = (
         zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE),
         image.shape,
     )
     rows = max(1, _AT_ONCE // (planes * width))
-    for top in range(0, height, rows):
-        words = (
-            image[:, top : top + rows]
+    for first_row in range(0, height, rows):
+        # PNG has two bytes a value, the higher one first
+        big_endian_rows = (
+            image[:, first_row : first_row + rows]
             .double()
             .round()
             .permute(1, 2, 0)
@@ -161,12 +178,16 @@ def _compressed(image: Tensor) -> Iterator[bytes]:
             .numpy()
             .astype(">u2")
         )
-        pixels = words.view(np.uint8).reshape(len(words), width, 2 * planes)
+        bytes_of_pixels = big_endian_rows.view(np.uint8).reshape(
+            len(big_endian_rows), width, 2 * planes
+        )
         # 1: difference from the left
-        lines = np.ones((len(words), 1 + 2 * planes * width), np.uint8)
-        lines[:, 1:] = np.diff(pixels, axis=1, prepend=np.uint8(0)).reshape(len(words), -1)
-        yield pack.compress(lines.data)
-    yield pack.flush()
+        filtered_lines = np.ones((len(big_endian_rows), 1 + 2 * planes * width), np.uint8)
+        filtered_lines[:, 1:] = np.diff(bytes_of_pixels, axis=1, prepend=np.uint8(0)).reshape(
+            len(big_endian_rows), -1
+        )
+        yield compressor.compress(filtered_lines.data)
+    yield compressor.flush()
 
 
 def srgb(path: Path, /, *, image: Tensor, source: Path, draws: int) -> None:
@@ -188,7 +209,8 @@ def _named(png: bytes, source: Path, draws: int, coding: bytes = b"") -> bytes:
 
     ``coding`` is a chunk that says how the numbers are encoded.
     """
-    header = 8 + 12 + 13
+    # signature, and the chunk IHDR: 12 bytes around its 13
+    header_end = 8 + 12 + 13
     texts = {
         b"Source": source.name,
         b"Comment": f"restored by neusee; interval of each pixel from {draws} draws",
@@ -197,10 +219,11 @@ def _named(png: bytes, source: Path, draws: int, coding: bytes = b"") -> bytes:
         _chunk(b"tEXt", name + b"\0" + text.encode("latin-1", "replace"))
         for name, text in texts.items()
     )
-    return png[:header] + coding + b"".join(chunks) + png[header:]
+    return png[:header_end] + coding + b"".join(chunks) + png[header_end:]
 
 
 def _chunk(name: bytes, body: bytes) -> bytes:
+    """Return a chunk of a PNG: length, name, body, and the checksum of name and body."""
     return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
 
 

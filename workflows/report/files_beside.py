@@ -74,6 +74,9 @@ class DrawingProcess:
 
     def __init__(self) -> None:
         # a second thread waits until the file of the first is written
+        """Fork the process that draws; raise `OSError` where no memory or no permission is left for
+        it.
+        """
         self._turn = threading.Lock()
         self._next = threading.Lock()  # and is the next then, before the first thread asks again
         context = multiprocessing.get_context("fork")
@@ -123,7 +126,7 @@ class DrawingProcess:
 
 def _sent(path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> bytes:
     """Return a job as bytes; raise `NotDrawn` for arguments that are large or that are no data."""
-    if sum(x.nbytes for x in tensors_in(list(arguments.values()))) > MOST:
+    if sum(tensor.nbytes for tensor in tensors_in(list(arguments.values()))) > MOST:
         raise NotDrawn("the arguments are large")
     try:
         packed = {name: _packed(value) for name, value in arguments.items()}
@@ -142,16 +145,18 @@ def _packed(value: Any) -> tuple[Any, list[Any], Any]:
     if not isinstance(value, _WORDS):
         try:
             layout, tensors = pack(value)
-            return layout, [x.cpu().numpy() for x in tensors], None
+            return layout, [tensor.cpu().numpy() for tensor in tensors], None
         except TypeError:
             if tensors_in(value):
                 raise
+    # no arrays: the value goes as it is
     return pack(None)[0], [], value
 
 
 def _serve(pipe: Connection, other_end: Connection) -> None:
     """Make the files that the pipe asks for, until its other end closes."""
     other_end.close()  # else the pipe stays open when the run is killed
+    # open files of the run would stay open as long as this process
     _close_all_but(pipe.fileno())
     gc.freeze()  # a search for garbage among the objects of the run would copy their memory
     ignore_interrupts()
@@ -180,8 +185,10 @@ def _made(job: bytes) -> str:
     try:
         path, make, packed = pickle.loads(job)
         values = {
-            name: unpack(layout, [torch.from_numpy(x) for x in arrays]) if word is None else word
-            for name, (layout, arrays, word) in packed.items()
+            name: unpack(layout, [torch.from_numpy(array) for array in arrays])
+            if plain_value is None
+            else plain_value
+            for name, (layout, arrays, plain_value) in packed.items()
         }
         make(path, **values)
     except Exception as error:  # the run meets the error again when it draws the picture itself
@@ -254,11 +261,13 @@ class FilesBeside:
             return  # the report makes the files of this result
         self._held.update(dict.fromkeys(names, value))
         self._submit_complete(recipe, keys)
-        no_room = size > self._large or _bytes_of(list(self._held.values())) > self._room
-        self._let_go(names if no_room else ())
+        is_full = size > self._large or _bytes_of(list(self._held.values())) > self._room
+        # a large result is not held for files that need others too
+        self._let_go(names if is_full else ())
 
     def _submit_complete(self, recipe: Recipe, keys: Mapping[str, Key]) -> None:
         """Begin the files of which all results are held."""
+        # job[1]: the steps that the file shows
         for file, steps in [job for job in self._open if job[1] <= self._held.keys()]:
             self._open.remove((file, steps))
             self._submit(file, recipe, {name: keys[name] for name in steps})
@@ -289,13 +298,13 @@ class FilesBeside:
         another, or failed.
         """
         drawer = self._drawer
-        begun = None if drawer is None else self._draws.submit(drawer.make, path, make, arguments)
+        future = None if drawer is None else self._draws.submit(drawer.make, path, make, arguments)
 
         def wait() -> None:
             if (
-                begun is None
-                or (_draws_at_once() and begun.cancel())
-                or begun.exception() is not None
+                future is None
+                or (_draws_at_once() and future.cancel())
+                or future.exception() is not None
             ):
                 make(path, **arguments)
 
@@ -306,25 +315,32 @@ class FilesBeside:
 
         The last pictures are drawn here while the process that draws is busy with others.
         """
-        for begun, job in reversed(self._begun):
-            if isinstance(job.make, Drawing) and _draws_at_once() and begun.cancel():
+        # from the last, which would be waited for longest
+        for future, job in reversed(self._begun):
+            if isinstance(job.make, Drawing) and _draws_at_once() and future.cancel():
                 try:
                     self._make(job, None)
                 except MemoryLimit:
                     raise
                 except Exception:  # the report meets the error again
                     continue
-        for begun, _ in self._begun:
+        for future, _ in self._begun:
             with suppress(Exception, CancelledError):
-                begun.result()
+                future.result()
         self._begun, self._open, self._held = [], [], {}
 
     def _begin(self, recipe: Recipe) -> None:
+        """Find the files of a recipe and the steps that they show, and start the process that
+        draws.
+        """
         self._recipe, self._held, self._open = recipe, {}, []
-        no_keys = dict.fromkeys(needed(recipe, wanted(recipe)), "")
+        # keys are not known yet, and only the steps are asked for
+        empty_keys = dict.fromkeys(needed(recipe, wanted(recipe)), "")
         for file in self._files(recipe):
             with suppress(Missing):
-                sources = arguments_of(file.needs, recipe, no_keys, self._code, self._shelf.store)
+                sources = arguments_of(
+                    file.needs, recipe, empty_keys, self._code, self._shelf.store
+                )
                 steps = steps_of(sources)
                 if steps and not file.only_tables:
                     self._open.append((file, steps))
@@ -334,15 +350,17 @@ class FilesBeside:
 
     def _let_go(self, names: Iterable[str]) -> None:
         """Hold no result longer that no file needs, and none of the steps ``names``."""
-        still = self._shown() - set(names)
-        self._held = {name: value for name, value in self._held.items() if name in still}
+        needed_later = self._shown() - set(names)
+        self._held = {name: value for name, value in self._held.items() if name in needed_later}
 
     def _submit(self, file: DerivedFile, recipe: Recipe, keys: Mapping[str, Key]) -> None:
+        """Begin a file whose results are all held; one for the report if it cannot be made here."""
         sources = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
         arguments = {name: source.make(self._held) for name, source in sources.items()}
-        large = _bytes_of(list(arguments.values())) > MOST
-        drawing = isinstance(file.make, Drawing)
-        if drawing and (large or self._drawer is None):
+        is_large = _bytes_of(list(arguments.values())) > MOST
+        is_drawing = isinstance(file.make, Drawing)
+        # a large picture would take the pipe too long: the report draws it
+        if is_drawing and (is_large or self._drawer is None):
             return
         job = _Job(
             file.name,
@@ -350,17 +368,18 @@ class FilesBeside:
             file.suffix,
             file.make,
             arguments,
-            large or file.copied,
+            is_large or file.copied,
         )
-        begun = self._start(job, self._draws if drawing else self._writes)
-        if large:
+        future = self._start(job, self._draws if is_drawing else self._writes)
+        if is_large:
             self._busy.add(file.name)
-            begun.add_done_callback(lambda _: self._busy.discard(file.name))
+            future.add_done_callback(lambda _: self._busy.discard(file.name))
 
     def _start(self, job: _Job, threads: ThreadPoolExecutor) -> Future[None]:
-        begun = threads.submit(self._make, job, None if job.here else self._drawer)
-        self._begun.append((begun, job))
-        return begun
+        """Begin a job in a thread, and keep it for `finish`."""
+        future = threads.submit(self._make, job, None if job.here else self._drawer)
+        self._begun.append((future, job))
+        return future
 
     def _make(self, job: _Job, drawer: DrawingProcess | None) -> None:
         """Write a file here, or let a process write it."""
@@ -398,7 +417,8 @@ def _draws_at_once() -> bool:
 
 
 def _bytes_of(value: Any) -> int:
-    return sum(x.nbytes for x in tensors_in(value))
+    """Return the bytes of all tensors in a value."""
+    return sum(tensor.nbytes for tensor in tensors_in(value))
 
 
 # --- graph ahead ----------------------------------------------------------------------------------
@@ -436,10 +456,13 @@ class GraphAhead:
         """Return the state of each step at the end: what is not stored runs, and equal results
         are computed once.
         """
-        ended = states_of({name: self._done[name] for name in self._order if name in self._done})
+        ended_states = states_of(
+            {name: self._done[name] for name in self._order if name in self._done}
+        )
         earlier_keys, states = set[Key](), dict[str, str]()
         for name in self._order:
             stored = keys[name] in earlier_keys or self._store.has(keys[name])
-            states[name] = ended.get(name) or ("cached" if stored else "run")
+            states[name] = ended_states.get(name) or ("cached" if stored else "run")
+            # a step with the key of an earlier one takes its result
             earlier_keys.add(keys[name])
         return states

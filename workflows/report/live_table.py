@@ -43,7 +43,10 @@ class LastRows:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         lines = console.render_lines(self.table, options, pad=False)
-        over = len(lines) - max(console.size.height, _HEAD + 1)
-        for line in lines if over <= 0 else [*lines[:_HEAD], *lines[_HEAD + over :]]:
+        # at least one row is shown
+        hidden_lines = len(lines) - max(console.size.height, _HEAD + 1)
+        for line in (
+            lines if hidden_lines <= 0 else [*lines[:_HEAD], *lines[_HEAD + hidden_lines :]]
+        ):
             yield from line
             yield Segment.line()

@@ -51,6 +51,7 @@ def result_html(result: Result) -> str:
 
 
 def _failed_checks(result: Result) -> list[str]:
+    """Return step and text of each check that failed."""
     texts = []
     for done in result.done.values():
         texts += [f"{done.step}: {check.text}" for check in done.checks if not check.ok]
@@ -58,11 +59,17 @@ def _failed_checks(result: Result) -> list[str]:
 
 
 def _of_table(result: Result) -> list[str]:
+    """Return the steps that the result table reads."""
     cells = itertools.chain.from_iterable(row.values() for row in TABLE.values())
-    return [BANDS, *[n for n in result.keys if n.startswith(LINES.removesuffix("*]"))], *cells]
+    return [
+        BANDS,
+        *[name for name in result.keys if name.startswith(LINES.removesuffix("*]"))],
+        *cells,
+    ]
 
 
 def _of_overview() -> dict[str, str]:
+    """Return the steps of the pictures of the overview, by picture."""
     return {
         name: need.removeprefix("?") for name, need in FIGURES[0].needs.items() if "*" not in need
     }
@@ -79,16 +86,21 @@ def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
 
 def _affordable(result: Result, steps: Iterable[str]) -> list[str]:
     """Return those ``steps`` of a run whose results need at most 2 s together."""
-    held = _held(result)
+    held_steps = _held(result)
     sources = {
-        name: () if name in held else result.recipe.steps[name].sources for name in result.keys
+        name: () if name in held_steps else result.recipe.steps[name].sources
+        for name in result.keys
     }
     affordable: list[str] = []
     for name in steps:
         if name not in sources:
             continue
-        missing = [n for n in in_order(sources, [*affordable, name]) if n not in held]
-        if sum(_took(result, n) for n in missing) <= _LONGEST_WAIT:
+        missing_steps = [
+            needed_step
+            for needed_step in in_order(sources, [*affordable, name])
+            if needed_step not in held_steps
+        ]
+        if sum(_took(result, needed_step) for needed_step in missing_steps) <= _LONGEST_WAIT:
             affordable.append(name)
     return affordable
 
@@ -101,11 +113,12 @@ def _held(result: Result) -> set[str]:
 
 
 def _took(result: Result, step: str) -> float:
+    """Return the seconds in which a result was computed, now or earlier; infinite if unknown."""
     done = result.done[step]
     if done.state == "run":
         return done.seconds
-    about = result.store.about(result.keys[step]) or {}
-    return float(about.get("seconds", math.inf))
+    metadata = result.store.about(result.keys[step]) or {}
+    return float(metadata.get("seconds", math.inf))
 
 
 def _results(result: Result, values: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -118,8 +131,8 @@ def _results(result: Result, values: Mapping[str, Any]) -> list[dict[str, Any]]:
     if not rows:
         return []
     title = ". ".join(["Results", *results["legend"]])
-    shown, cells = _without_empty_columns(columns, rows)
-    return [_table(title, shown, cells, numbers=columns[1:])]
+    shown_columns, cells = _without_empty_columns(columns, rows)
+    return [_table(title, shown_columns, cells, numbers=columns[1:])]
 
 
 def _without_empty_columns(
@@ -128,12 +141,17 @@ def _without_empty_columns(
     """Return the columns with a text in any row, and the rows with – for each empty cell; the first
     column stays.
     """
-    shown = [0, *(i for i in range(1, len(columns)) if any(row[i] for row in rows))]
-    cells = [[row[i] or "–" for i in shown] for row in rows]
-    return [columns[i] for i in shown], cells
+    # column 0 has the names of the rows
+    shown_columns = [
+        0,
+        *(column for column in range(1, len(columns)) if any(row[column] for row in rows)),
+    ]
+    cells = [[row[column] or "–" for column in shown_columns] for row in rows]
+    return [columns[column] for column in shown_columns], cells
 
 
 def _outputs(result: Result) -> dict[str, Any]:
+    """Return the table of the outputs: shape, type and range."""
     rows = [
         [name, result.recipe.steps[name].node.path, *_looks(value)]
         for name, value in result.values.items()
@@ -151,14 +169,18 @@ def _looks(value: Any) -> tuple[str, str, str]:
     if hasattr(value, "_asdict"):
         fields = {name: TensorStats.of(item) for name, item in value._asdict().items()}
         numbers = ", ".join(
-            f"{name} {f.max:.5g}" for name, f in fields.items() if f and not f.shape
+            f"{name} {facts_of_field.max:.5g}"
+            for name, facts_of_field in fields.items()
+            if facts_of_field and not facts_of_field.shape
         )
         return ", ".join(fields) if not numbers else "", type(value).__name__, numbers
-    span = dict.fromkeys(f"{end:.5g}" for end in (facts.min, facts.max))
-    return " × ".join(map(str, facts.shape)) or "number", facts.dtype, " … ".join(span)
+    # one text where both ends are equal
+    ends = dict.fromkeys(f"{end:.5g}" for end in (facts.min, facts.max))
+    return " × ".join(map(str, facts.shape)) or "number", facts.dtype, " … ".join(ends)
 
 
 def _steps(result: Result) -> dict[str, Any]:
+    """Return the table of the steps, closed if there are many."""
     rows = []
     for done in result.done.values():
         state = "cached" if done.state == "not needed" else done.state
@@ -178,12 +200,15 @@ def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Encode the truth, raw and restored pictures of a run as PNG, or up to four other images if
     one is missing.
     """
-    shown = _shown_pictures(values)
-    edge = _EDGES.get(len(shown), 280)
+    linear_pictures = _shown_pictures(values)
+    edge = _EDGES.get(len(linear_pictures), 280)
     while True:
-        pictures = [_picture(_NAMES.get(name, name), image, edge) for name, image in shown.items()]
-        if sum(len(p["png"]) for p in pictures) <= _WEIGHT:
+        pictures = [
+            _picture(_NAMES.get(name, name), image, edge) for name, image in linear_pictures.items()
+        ]
+        if sum(len(encoded_picture["png"]) for encoded_picture in pictures) <= _WEIGHT:
             return pictures
+        # smaller until all fit into a page
         edge = edge * 3 // 4
 
 
@@ -192,12 +217,12 @@ def _shown_pictures(values: Mapping[str, Any]) -> dict[str, Tensor]:
     others.
     """
     if all(need in values for need in FIGURES[0].needs.values() if not need.startswith("?")):
-        needs = _of_overview()
-        truth = values[needs["truth"]]
+        step_of_picture = _of_overview()
+        truth = values[step_of_picture["truth"]]
         white = high(truth)
         return {
             name: centre(values[need], truth) / white
-            for name, need in needs.items()
+            for name, need in step_of_picture.items()
             if need in values
         }
     pictures = [(name, value) for name, value in values.items() if _is_picture(value)]
@@ -205,6 +230,7 @@ def _shown_pictures(values: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def _is_picture(value: Any) -> bool:
+    """Return True for a tensor that can be shown as a grey or an RGB picture."""
     from torch import Tensor
 
     if not isinstance(value, Tensor) or value.is_complex() or value.ndim not in (2, 3):
@@ -219,25 +245,31 @@ def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
 
     image = linear.detach().cpu().float()
     image = image.expand(3, *image.shape[-2:])
-    small = [max(1, round(n * edge / max(image.shape[-2:]))) for n in image.shape[-2:]]
+    small_shape = [max(1, round(side * edge / max(image.shape[-2:]))) for side in image.shape[-2:]]
     if max(image.shape[-2:]) > edge:
-        image = resize(image[None], (small[0], small[1]), antialias=True)[0]
-    out = io.BytesIO()
-    Image.fromarray((encoded(image) * 255).round().astype("uint8")).save(out, "PNG")
+        image = resize(image[None], (small_shape[0], small_shape[1]), antialias=True)[0]
+    buffer = io.BytesIO()
+    Image.fromarray((encoded(image) * 255).round().astype("uint8")).save(buffer, "PNG")
+    # the longer side is 250 pixels wide on the page
     width = 250 * image.shape[-1] // max(image.shape[-2:])
-    return {"name": name, "png": base64.b64encode(out.getvalue()).decode(), "width": width}
+    return {"name": name, "png": base64.b64encode(buffer.getvalue()).decode(), "width": width}
 
 
 def recipe_html(recipe: Recipe) -> str:
     """Return an HTML page with the outputs, the steps, and the changed and all other parameters
     of a recipe.
     """
-    written = {
-        name: s
-        for name, s in recipe.config.settings.items()
-        if not s.default and not name.startswith("steps.")
+    written_settings = {
+        name: setting
+        for name, setting in recipe.config.settings.items()
+        if not setting.default and not name.startswith("steps.")
     }
-    changed = {name: s for name, s in recipe.config.settings.items() if "argument " in s.source}
+    # set by an argument of the command
+    changed = {
+        name: setting
+        for name, setting in recipe.config.settings.items()
+        if "argument " in setting.source
+    }
     lines = [recipe.title, f"gives {', '.join(by_family(recipe.outputs))}"]
     return filled(
         "notebook.html.j2",
@@ -252,7 +284,7 @@ def recipe_html(recipe: Recipe) -> str:
         tables=[
             *([_settings("Changes", changed, True)] if changed else []),
             _graph(recipe),
-            _settings(f"{len(written)} values", written, False),
+            _settings(f"{len(written_settings)} values", written_settings, False),
         ],
     )
 
@@ -273,13 +305,14 @@ def _graph(recipe: Recipe) -> dict[str, Any]:
 def _copies(recipe: Recipe, family: str, names: Sequence[str]) -> list[str]:
     """Return the row of all copies of a step: name, node, what they read, and where they run."""
     steps = [recipe.steps[name] for name in names]
-    reads = by_family(itertools.chain.from_iterable(step.sources for step in steps))
+    families_read = by_family(itertools.chain.from_iterable(step.sources for step in steps))
     title = f"{family} ×{len(names)}" if len(names) > 1 else names[0]
     devices = dict.fromkeys(step.device for step in steps if step.device)
-    return [title, steps[0].node.path, ", ".join(reads), ", ".join(devices)]
+    return [title, steps[0].node.path, ", ".join(families_read), ", ".join(devices)]
 
 
 def _settings(title: str, settings: Mapping[str, Setting], shown: bool) -> dict[str, Any]:
+    """Return the table of settings: path, value and where it was written."""
     rows = []
     for name, setting in settings.items():
         text = flow(setting.value)
@@ -296,4 +329,5 @@ def _table(
     numbers: Sequence[str] = (),
     shown: bool = True,
 ) -> dict[str, Any]:
+    """Return a table as values of the template; ``shown`` is False for one that is folded."""
     return {"title": title, "columns": columns, "rows": rows, "numbers": numbers, "open": shown}

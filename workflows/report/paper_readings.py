@@ -62,24 +62,29 @@ def in_force(values: Mapping[str, object]) -> Iterable[tuple[Reading, str]]:
     The choice is ``coherent``, ``as printed`` or the recipe's own value. ``values`` are the
     recipe's values by key.
     """
-    for row in READINGS:
-        if row.path in values:
-            value = values[row.path]
-            choices = {str(row.coherent): "coherent", str(row.as_printed): "as printed"}
-            yield row, choices.get(str(value), str(value))
+    for contradiction in READINGS:
+        if contradiction.path in values:
+            value = values[contradiction.path]
+            # values of any type are compared as the text that a recipe writes
+            choices = {
+                str(contradiction.coherent): "coherent",
+                str(contradiction.as_printed): "as printed",
+            }
+            yield contradiction, choices.get(str(value), str(value))
 
 
 def consequences(values: Mapping[str, object]) -> list[str]:
     """Return a sentence on the visible effect of each printed value that is in force in a
     recipe.
     """
-    visible = (
-        (row, row.consequence)
-        for row, state in in_force(values)
-        if state == "as printed" and row.consequence
+    visible_contradictions = (
+        (contradiction, contradiction.consequence)
+        for contradiction, state in in_force(values)
+        if state == "as printed" and contradiction.consequence
     )
     return [
-        f"{row.path} as printed ({row.number}): {_filled(text, values)}" for row, text in visible
+        f"{contradiction.path} as printed ({contradiction.number}): {_filled(text, values)}"
+        for contradiction, text in visible_contradictions
     ]
 
 

@@ -43,24 +43,27 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
     row for each.
     """
     rows = []
-    for e in compared(recipe)[0]:
-        result: Any = value(e.step)
-        for key in e.at:
+    for expected_number in compared(recipe)[0]:
+        result: Any = value(expected_number.step)
+        # a text is a field, or a key of a dictionary; a number is an index
+        for key in expected_number.at:
             result = (
                 getattr(result, key)
                 if isinstance(key, str) and not isinstance(result, dict)
                 else result[key]
             )
         number = float(result)
-        ok = abs(number - e.value) <= e.rtol * abs(e.value)
+        is_within = abs(number - expected_number.value) <= expected_number.rtol * abs(
+            expected_number.value
+        )
         rows.append(
             {
-                "name": e.name,
-                "step": e.step,
-                "wanted": e.value,
+                "name": expected_number.name,
+                "step": expected_number.step,
+                "wanted": expected_number.value,
                 "found": number,
-                "rtol": e.rtol,
-                "ok": ok,
+                "rtol": expected_number.rtol,
+                "ok": is_within,
             }
         )
     return rows
@@ -70,15 +73,17 @@ def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
     """Return the table for plain lens, mask and restored picture, with the rows and columns that
     have numbers.
     """
-    _, where = _band(recipe, keys, value)
-    numbers = arms(recipe, keys, value)
-    columns = [column for column in _COLUMNS if any(column in cells for cells in numbers.values())]
+    _, band_name = _band(recipe, keys, value)
+    numbers_by_arm = arms(recipe, keys, value)
+    columns = [
+        column for column in _COLUMNS if any(column in cells for cells in numbers_by_arm.values())
+    ]
     rows = [
         {"name": name, "cells": [_text(cells, c) for c in columns]}
-        for name, cells in numbers.items()
+        for name, cells in numbers_by_arm.items()
         if cells
     ]
-    legend = [text.format(band=where) for column, text in _LEGEND.items() if column in columns]
+    legend = [text.format(band=band_name) for column, text in _LEGEND.items() if column in columns]
     return {"columns": columns, "rows": rows, "legend": legend}
 
 
@@ -91,6 +96,7 @@ def arms(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, dic
     for name, cells in TABLE.items():
         results = {column: value(step) for column, step in cells.items() if step in keys}
         numbers[name] = {}
+        # (result in `TABLE`, field, function that gives the number, format)
         for column, (source, field, number, _) in _COLUMNS.items():
             result = _field(results.get(source), field)
             if result is not None:
@@ -103,6 +109,7 @@ def lines_of(recipe: Recipe, keys: Container[str]) -> list[str]:
     not 0.
     """
     strengths = {
+        # line[green] has the strength of the laser green
         name: recipe.config.values.get(f"lasers.{name[5:-1]}.strength")
         for name in _lines(recipe, keys)
     }
@@ -120,6 +127,7 @@ def suppressed(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[st
     bands_of_lasers = (
         nearest(centres, mean_wavelength(value(line))) for line in lines_of(recipe, keys)
     )
+    # an LSR of one band is that of every laser
     return {name: float(lsr[min(band, lsr.numel() - 1)]) for band, name in bands_of_lasers}
 
 
@@ -135,6 +143,7 @@ def _text(cells: Mapping[str, float], column: str) -> str:
     """Return a number of the result table as text, or an empty text if the table has no number
     there.
     """
+    # the format is the last entry
     return _COLUMNS[column][3].format(cells[column]) if column in cells else ""
 
 

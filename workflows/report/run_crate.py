@@ -50,11 +50,11 @@ def tools(said: Mapping[str, Any]) -> list[Entity]:
     """Return neusee and the libraries that it computed with; neusee is the first."""
     versions = dict(said.get("versions") or _of_facts(said.get("facts") or ()))
     libraries = [
-        _library(*library)
-        for library in versions.items()
-        if library[0] != "neusee" and library[1] != "none"
+        _library(*name_and_version)
+        for name_and_version in versions.items()
+        if name_and_version[0] != "neusee" and name_and_version[1] != "none"
     ]
-    ours = {
+    own_entity = {
         "@id": f"#neusee-{__version__}",
         "@type": "SoftwareApplication",
         "name": "neusee",
@@ -62,21 +62,21 @@ def tools(said: Mapping[str, Any]) -> list[Entity]:
         "description": "A simulator of what a laser does to a camera.",
         **({"softwareRequirements": references(libraries)} if libraries else {}),
     }
-    return [ours, *libraries]
+    return [own_entity, *libraries]
 
 
 def _library(name: str, version: str) -> Entity:
     """Return the entity of Python or of a package, whose address at the package index has no
     local version.
     """
-    home = f"https://pypi.org/project/{name}/{version.partition('+')[0]}/"
-    home = "https://www.python.org/" if name.lower() == "python" else home
-    about = {
+    home_page = f"https://pypi.org/project/{name}/{version.partition('+')[0]}/"
+    home_page = "https://www.python.org/" if name.lower() == "python" else home_page
+    properties = {
         "name": name.capitalize() if name == "python" else name,
         "softwareVersion": version,
-        "url": home,
+        "url": home_page,
     }
-    return {"@id": home, "@type": "SoftwareApplication", **about}
+    return {"@id": home_page, "@type": "SoftwareApplication", **properties}
 
 
 def _of_facts(facts: Iterable[Iterable[str]]) -> Iterator[tuple[str, str]]:
@@ -94,17 +94,24 @@ def inputs(rows: Iterable[Any]) -> tuple[list[Entity], list[Entity]]:
     known licence.
     """
     entities: dict[str, Entity] = {}
-    users: dict[str, list[str]] = {}
+    parameters_of_file: dict[str, list[str]] = {}
     licences: list[Entity] = []
     for row in rows:
         if not isinstance(row, Mapping) or not row.keys() >= {"file", "digest", "parameter"}:
             continue  # the inputs of a study of uncertainty are parameters
-        name, entry = f"#input-{row['digest']}", _sample(row["file"], row["digest"])
-        users.setdefault(name, []).append(row["parameter"])
-        entities[name] = _input_file(name, row, users[name], entry)
-        if entry:
+        entity_id, known_sample = f"#input-{row['digest']}", _sample(row["file"], row["digest"])
+        # one entity for equal files, whatever parameters they have
+        parameters_of_file.setdefault(entity_id, []).append(row["parameter"])
+        entities[entity_id] = _input_file(
+            entity_id, row, parameters_of_file[entity_id], known_sample
+        )
+        if known_sample:
             licences.append(
-                {"@id": entry["address"], "@type": "CreativeWork", "name": entry["licence"]}
+                {
+                    "@id": known_sample["address"],
+                    "@type": "CreativeWork",
+                    "name": known_sample["licence"],
+                }
             )
     return list(entities.values()), licences
 
@@ -127,11 +134,12 @@ def _input_file(
 
 def _sample(file: str, digest: str) -> dict[str, str] | None:
     """Return what is known of a file that neusee ships, or None for any other file."""
-    row = _samples().get(file)
+    known_row = _samples().get(file)
     try:
         return (
-            row
-            if row and file_digest(Path(str(files("neusee.recipes") / "samples" / file))) == digest
+            known_row
+            if known_row
+            and file_digest(Path(str(files("neusee.recipes") / "samples" / file))) == digest
             else None
         )
     except OSError:
@@ -147,14 +155,15 @@ def _samples() -> dict[str, dict[str, str]]:
     samples = {}
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split(" | ")]
+        # a row of the table: files, what, author, licence with its link
         if len(cells) == 5 and (link := _LINK.fullmatch(cells[3])):
-            row = {
+            sample = {
                 "what": cells[1],
                 "author": cells[2],
                 "licence": link["name"],
                 "address": link["address"],
             }
-            samples.update({name: row for name in re.findall("`([^`]+)`", cells[0])})
+            samples.update({name: sample for name in re.findall("`([^`]+)`", cells[0])})
     return samples
 
 
@@ -173,12 +182,14 @@ def licence() -> Entity:
     text = os.environ.get(LICENCE, "").strip()
     if _ADDRESS.fullmatch(text):
         return {"@id": text, "@type": "CreativeWork", "name": text}
-    none = f"The owner of these results has stated no licence; set {LICENCE} to state one."
+    no_licence_text = (
+        f"The owner of these results has stated no licence; set {LICENCE} to state one."
+    )
     return {
         "@id": "#licence",
         "@type": "CreativeWork",
         "name": text or "No licence stated",
-        "description": text or none,
+        "description": text or no_licence_text,
     }
 
 
@@ -278,12 +289,14 @@ def restore_crate(folder: Path, crate: Mapping[str, Any]) -> None:
     """Write a crate that `remove_crate` returned, with the present size of each file."""
     sizes = {quoted(name): str(size) for name, size in _sizes(folder)}
     for entity in crate["@graph"]:
+        # only files have a size
         if entity.get("@id") in sizes and "contentSize" in entity:
             entity["contentSize"] = sizes[entity["@id"]]
     _write(folder, crate)
 
 
 def _write(folder: Path, crate: Mapping[str, Any]) -> None:
+    """Write a crate, one entity a line, by an atomic rename."""
     unfinished = folder / f".{CRATE}.part"
     graph = ",\n".join(json.dumps(entity, ensure_ascii=False) for entity in crate["@graph"])
     text = f'{{"@context": {json.dumps(crate["@context"])},\n"@graph": [\n{graph}\n]}}\n'
@@ -292,11 +305,15 @@ def _write(folder: Path, crate: Mapping[str, Any]) -> None:
 
 
 def _graph(folder: Path, name: str, said: Mapping[str, Any], ended: datetime) -> list[Entity]:
-    titles = _titles(said)
-    parts = [_file(path, size, titles.get(path, "")) for path, size in _sizes(folder)]
+    """Return the entities of a crate: the folder, its command, software, files and people.
+
+    ``said`` is what the folder says of its command, and ``ended`` when that ended.
+    """
+    title_of_path = _titles(said)
+    parts = [_file(path, size, title_of_path.get(path, "")) for path, size in _sizes(folder)]
     input_files, licences = inputs(said.get("inputs") or ())
     software = tools(said)
-    creator, terms = person(), licence()
+    creator, licence_entity = person(), licence()
     action = _command_entity(name, said, ended)
     action |= _of_command(parts, input_files, software, creator)
     root = {
@@ -305,16 +322,17 @@ def _graph(folder: Path, name: str, said: Mapping[str, Any], ended: datetime) ->
         "name": name,
         "description": _description(said),
         "datePublished": _time(ended),
-        "license": reference(terms),
+        "license": reference(licence_entity),
         "conformsTo": {"@id": _PROFILE},
         "hasPart": references(parts),
         "mentions": reference(action),
         **({"author": reference(creator)} if creator else {}),
     }
-    about = [_descriptor(), root, _profile(), action, terms]
-    entities = [*about, *software, *parts, *input_files, *licences]
+    about_the_crate = [_descriptor(), root, _profile(), action, licence_entity]
+    entities = [*about_the_crate, *software, *parts, *input_files, *licences]
     if creator:
         entities.append(creator)
+    # an address stands once: a licence of several inputs
     return list({entity["@id"]: entity for entity in entities}.values())
 
 
@@ -325,6 +343,7 @@ def _titles(said: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _descriptor() -> Entity:
+    """Return the entity of the crate's own file."""
     return {
         "@id": CRATE,
         "@type": "CreativeWork",
@@ -340,7 +359,7 @@ def _profile() -> Entity:
 def _command_entity(name: str, said: Mapping[str, Any], ended: datetime) -> Entity:
     """Return the entity of the command that wrote the folder, with its times and its state."""
     command = _command(said)
-    stopped = said.get("state") in ("stopped", "interrupted")
+    is_stopped = said.get("state") in ("stopped", "interrupted")
     began = _began(said, ended)
     return {
         "@id": f"#{quoted(name)}",
@@ -349,7 +368,7 @@ def _command_entity(name: str, said: Mapping[str, Any], ended: datetime) -> Enti
         **({"description": f"Computed on {said['device']}."} if said.get("device") else {}),
         **({"startTime": _time(began)} if began else {}),
         "endTime": _time(ended),
-        "actionStatus": _FAILED if stopped else _COMPLETED,
+        "actionStatus": _FAILED if is_stopped else _COMPLETED,
     }
 
 
@@ -361,11 +380,11 @@ def _of_command(
 ) -> Entity:
     """Return what a command ran, who gave it, what it read and what it wrote."""
     recipe = [file for file in parts if file["@id"] == "recipe.yaml"]
-    objects = [*recipe, *input_files]
+    inputs_of_command = [*recipe, *input_files]
     return {
         "instrument": reference(software[0]),
         **({"agent": reference(creator)} if creator else {}),
-        **({"object": references(objects)} if objects else {}),
+        **({"object": references(inputs_of_command)} if inputs_of_command else {}),
         "result": references(file for file in parts if file not in recipe),
     }
 
@@ -388,26 +407,27 @@ def _began(said: Mapping[str, Any], ended: datetime) -> datetime | None:
 
 
 def _description(said: Mapping[str, Any]) -> str:
-    kind = said.get("study") or said.get("stage")
+    """Return the description of the folder: the title of the recipe, and the kind of study."""
+    kind_of_study = said.get("study") or said.get("stage")
     text = (
         str(said.get("title") or "").strip()
         or f"Results of the recipe {said.get('recipe') or 'of a run'}."
     )
-    return f"{text} ({kind})" if kind else text
+    return f"{text} ({kind_of_study})" if kind_of_study else text
 
 
 def _sizes(folder: Path) -> list[tuple[str, int]]:
     """Return the path and the size of each file of a folder, without hidden files and without
     the crate itself.
     """
-    sizes, todo = [], [folder]
-    while todo:
-        with os.scandir(todo.pop()) as entries:
+    sizes, folders = [], [folder]
+    while folders:
+        with os.scandir(folders.pop()) as entries:
             for entry in entries:
                 if entry.name.startswith(".") or entry.name.endswith(".part"):
                     continue
                 if entry.is_dir():
-                    todo.append(Path(entry.path))
+                    folders.append(Path(entry.path))
                 else:
                     sizes.append(
                         (Path(entry.path).relative_to(folder).as_posix(), entry.stat().st_size)
@@ -416,6 +436,7 @@ def _sizes(folder: Path) -> list[tuple[str, int]]:
 
 
 def _file(path: str, size: int, text: str) -> Entity:
+    """Return the entity of a file; ``text`` says what it holds."""
     return {
         "@id": quoted(path),
         "@type": "File",
@@ -427,4 +448,5 @@ def _file(path: str, size: int, text: str) -> Entity:
 
 
 def _time(moment: datetime) -> str:
+    """Return a time as text in UTC, in ms."""
     return moment.astimezone(UTC).isoformat(timespec="milliseconds")

@@ -101,15 +101,16 @@ def writable_folder(out: str | os.PathLike[str]) -> Path:
         if root.is_symlink() and os.environ.get("NEUSEE_NO_CODE"):
             raise ValueError(f"{root} is a link, which --no-code does not follow: {_OTHER_FOLDER}")
         if existing.is_dir():
+            # the only sure test: a folder that is made and removed
             os.rmdir(tempfile.mkdtemp(prefix=".neusee.", dir=existing))
             return root
-        text = f"{existing} is not a folder, so that no results can be written to {root}"
+        problem = f"{existing} is not a folder, so that no results can be written to {root}"
     except OSError as error:
-        text = (
+        problem = (
             f"the folder {existing} cannot be written ({error.strerror}), so that {root} cannot"
             " hold results"
         )
-    raise ValueError(f"{text}: {_OTHER_FOLDER}")
+    raise ValueError(f"{problem}: {_OTHER_FOLDER}")
 
 
 @contextmanager
@@ -132,20 +133,25 @@ def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
 
 @contextmanager
 def _folder(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
+    """Make a folder with a hidden name, yield it, write its crate, and give it its final name.
+
+    An error removes it. ``latest`` points to it at the end.
+    """
     root.mkdir(parents=True, exist_ok=True)
+    # what killed runs have left
     _sweep(root)
     name = f"{date.today().isoformat()}_{recipe}_{key[:8]}"
-    run = RunFolder(root / f".{name}.{os.getpid()}.part")
-    shutil.rmtree(run.path, ignore_errors=True)
-    run.path.mkdir()
+    run_folder = RunFolder(root / f".{name}.{os.getpid()}.part")
+    shutil.rmtree(run_folder.path, ignore_errors=True)
+    run_folder.path.mkdir()
     try:
-        yield run
-        write_crate(run.path, name, run.said)
-        run.path = _rename(run.path, root / name)
+        yield run_folder
+        write_crate(run_folder.path, name, run_folder.said)
+        run_folder.path = _rename(run_folder.path, root / name)
     except BaseException:
-        shutil.rmtree(run.path, ignore_errors=True)
+        shutil.rmtree(run_folder.path, ignore_errors=True)
         raise
-    _point(root, run.path.name)
+    _point(root, run_folder.path.name)
 
 
 def _sweep(root: Path) -> None:
@@ -155,7 +161,8 @@ def _sweep(root: Path) -> None:
             if _is_being_written(unfinished):
                 continue
             if (
-                time.time() - max(p.stat().st_mtime for p in (unfinished, *unfinished.rglob("*")))
+                time.time()
+                - max(changed.stat().st_mtime for changed in (unfinished, *unfinished.rglob("*")))
                 > _ABANDONED
             ):
                 shutil.rmtree(unfinished, ignore_errors=True)
@@ -167,9 +174,13 @@ def _is_being_written(unfinished: Path) -> bool:
     """Return True if the process that made an unfinished folder runs on this machine, whatever
     the clock says.
     """
-    number = unfinished.suffixes[-2].removeprefix(".") if len(unfinished.suffixes) > 1 else ""
+    # .<name>.<process>.part
+    process_number = (
+        unfinished.suffixes[-2].removeprefix(".") if len(unfinished.suffixes) > 1 else ""
+    )
     try:
-        os.kill(int(number), 0)
+        # signal 0 tests whether the process exists
+        os.kill(int(process_number), 0)
     except (ValueError, OverflowError, ProcessLookupError):
         return False
     except OSError:  # of another user
@@ -203,6 +214,7 @@ def _point(root: Path, name: str) -> None:
         link.symlink_to(name, target_is_directory=True)
     except OSError:
         link.write_text(name + "\n", encoding="utf-8")
+    # atomic: a reader never finds half of it
     try:
         link.replace(root / "latest")
     except OSError:
@@ -215,6 +227,7 @@ def find_run(where: str, root: Path) -> Path:
     path.
     """
     for path in (root / where, Path(where)):
+        # `latest` where links are not possible: a file with the name of a folder
         if path.is_file():
             path = path.with_name(head_of(path, _NAME).decode("utf-8", "replace").strip())
         if (path / "provenance.json").is_file():
@@ -249,16 +262,19 @@ def code_text(result: Result) -> str:
     origins = [result.origins[key] for key in result.keys.values() if key in result.origins]
     nodes = {origin["node"]: origin["code"] for origin in origins}
     parts: dict[str, Any] = {}
-    for code in dict.fromkeys(nodes.values()):
-        parts |= result.code.get(code, {})
+    for code_digest in dict.fromkeys(nodes.values()):
+        parts |= result.code.get(code_digest, {})
     return f'{{"nodes": {_lines(nodes)},\n"parts": {_lines(parts)}}}\n'
 
 
 def _lines(values: object) -> str:
+    """Return a dictionary as JSON with one line for each entry, sorted by name."""
     assert isinstance(values, dict)
     return (
         "{\n"
-        + ",\n".join(f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sorted(values.items()))
+        + ",\n".join(
+            f"{json.dumps(name)}: {json.dumps(value)}" for name, value in sorted(values.items())
+        )
         + "\n}"
     )
 
@@ -293,9 +309,12 @@ def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
     """Return the report of a run, from its document and pictures, as one HTML page that loads no
     other file.
     """
-    inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
-    shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
-    return filled(_TEMPLATE, doc=shown, pictures=inline)
+    picture_texts = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
+    shown_document = {
+        **doc,
+        "figures": [figure for figure in doc["figures"] if figure["name"] in picture_texts],
+    }
+    return filled(_TEMPLATE, doc=shown_document, pictures=picture_texts)
 
 
 def rebuild(folder: Path) -> Path:
@@ -304,11 +323,13 @@ def rebuild(folder: Path) -> Path:
     """
     doc = json.loads(text_of(folder / "provenance.json"))
     pictures = {
-        p.stem: bytes_of(p, sys.maxsize) for p in sorted((folder / "figures").glob("*.png"))
+        picture_file.stem: bytes_of(picture_file, sys.maxsize)
+        for picture_file in sorted((folder / "figures").glob("*.png"))
     }
     target = folder / "report.html"
     unfinished = folder / ".report.html.part"
     unfinished.write_text(page(doc, pictures), encoding="utf-8")
+    # the crate states the size of the page, which is about to change
     crate = remove_crate(folder)
     unfinished.replace(target)
     if crate is not None:

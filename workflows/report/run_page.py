@@ -65,33 +65,37 @@ def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, 
 
     Steps with the same result count once.
     """
-    ran, loaded = _in_state(steps, "run"), _in_state(steps, "cached", "not needed")
-    own = {step["key"] for step in ran}
-    served = _once(step for step in loaded if step["key"] not in own)
-    predicted = [step for step in ran if step["predicted"] is not None]
-    took, saved = _total(ran, "seconds"), _total(served, "made_in")
+    steps_run, loaded = _in_state(steps, "run"), _in_state(steps, "cached", "not needed")
+    computed_keys = {step["key"] for step in steps_run}
+    served_once = _once(step for step in loaded if step["key"] not in computed_keys)
+    predicted = [step for step in steps_run if step["predicted"] is not None]
+    seconds_run, seconds_saved = _total(steps_run, "seconds"), _total(served_once, "made_in")
     return {
-        "ran": len(ran),
+        "ran": len(steps_run),
         "served": len(loaded),
         "steps": len(steps),
-        "seconds": took,
-        "span": _span(ran),
-        "planned": planned if ran else None,
+        "seconds": seconds_run,
+        "span": _span(steps_run),
+        "planned": planned if steps_run else None,
         "told": len(predicted),
         "predicted": _total(predicted, "predicted"),
         "actual": _total(predicted, "seconds"),
-        "saved": saved,
-        "share": saved / (saved + took) if saved + took else 0.0,
-        "read": _total(_in_state(served, "cached"), "bytes"),
-        "written": _total([step for step in ran if step["kept"]], "bytes"),
+        "saved": seconds_saved,
+        "share": seconds_saved / (seconds_saved + seconds_run)
+        if seconds_saved + seconds_run
+        else 0.0,
+        "read": _total(_in_state(served_once, "cached"), "bytes"),
+        "written": _total([step for step in steps_run if step["kept"]], "bytes"),
     }
 
 
 def _in_state(steps: Iterable[StepRow], *states: str) -> list[StepRow]:
+    """Return the steps in one of the states."""
     return [step for step in steps if step["state"] in states]
 
 
 def _total(steps: Iterable[StepRow], column: str) -> Any:
+    """Return the sum of a column of the steps."""
     return sum(step[column] for step in steps)
 
 
@@ -99,8 +103,8 @@ def _span(ran: Sequence[StepRow]) -> Any:
     """Return the time in s from the begin of the first step that ran to the end of the last."""
     if not ran:
         return 0.0
-    end = max(step["began"] + step["seconds"] for step in ran)
-    return end - min(step["began"] for step in ran)
+    last_end = max(step["began"] + step["seconds"] for step in ran)
+    return last_end - min(step["began"] for step in ran)
 
 
 def _once(steps: Iterable[StepRow]) -> list[StepRow]:
@@ -133,6 +137,7 @@ def said_of(times: Mapping[str, Any]) -> list[str]:
     if times["planned"] is not None:
         planned, span = _seconds(times["planned"]), _seconds(times["span"])
         lines.append(f"Planned duration, with parallel branches: {planned}; actual: {span}.")
+    # predicted and actual bytes, of which the first may be unknown
     if times["ran"] and times.get("peak", [None])[0]:
         predicted, actual = (format_size(size) for size in times["peak"])
         lines.append(
@@ -153,6 +158,7 @@ def said_of(times: Mapping[str, Any]) -> list[str]:
 
 
 def _seconds(value: float) -> str:
+    """Return a time as text with its unit."""
     return f"{value:.3g} s" if value < 100 else f"{value:.0f} s"
 
 
@@ -190,9 +196,9 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
     """
     recipe, done = result.recipe, list(result.done.values())
     expectations, unchecked = expected(recipe, result.value), _unchecked(recipe)
-    steps = [_step(d, result) for d in done]
+    steps = [_step(record, result) for record in done]
     failed = _failed_checks(steps)
-    time = timing(steps, _planned(result)) | {"peak": [result.predicted_peak, result.peak_memory]}
+    times = timing(steps, _planned(result)) | {"peak": [result.predicted_peak, result.peak_memory]}
     return {
         "recipe": recipe.name,
         "title": recipe.title,
@@ -217,12 +223,14 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
         "readings": _readings(recipe),
         "consequences": consequences(recipe.config.values),
         "left_out": [
-            {"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"
+            {"step": record.step, "bound": record.bound, "why": record.why}
+            for record in done
+            if record.state == "left out"
         ],
         "spent": spent(result),
         "spectral": spectral_error(recipe, result.keys, result.value),
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
-        "timing": {**time, "said": said_of(time)},
+        "timing": {**times, "said": said_of(times)},
         "steps": steps,
         "figures": [],
         "missing": [],
@@ -244,27 +252,35 @@ def with_pictures(
     ``missing`` and ``refused`` have the reason for each missing picture and data file; a picture
     without a reason has nothing to show in this recipe.
     """
-    warned = list(dict.fromkeys(warnings))
-    lacking = [
-        {"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items() if why
+    distinct_warnings = list(dict.fromkeys(warnings))
+    missing_pictures = [
+        {"name": name, "title": _TITLES.get(name, name), "why": reason}
+        for name, reason in missing.items()
+        if reason
     ]
     return {
         **doc,
-        "notes": [*doc["notes"], *warned],
-        "warnings": warned,
+        "notes": [*doc["notes"], *distinct_warnings],
+        "warnings": distinct_warnings,
         "figures": _figures(missing, bool(doc["timing"]["ran"])),
         "missing": [
-            *lacking,
-            *({"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items()),
+            *missing_pictures,
+            *(
+                {"name": name, "title": f"data/{name}", "why": reason}
+                for name, reason in refused.items()
+            ),
         ],
         "files": sorted(files),
     }
 
 
 def _failed_checks(steps: Iterable[StepRow]) -> list[str]:
+    """Return step and text of each check that failed."""
     failed = []
     for step in steps:
-        failed += [f"{step['step']}: {c['text']}" for c in step["checks"] if not c["ok"]]
+        failed += [
+            f"{step['step']}: {check['text']}" for check in step["checks"] if not check["ok"]
+        ]
     return failed
 
 
@@ -278,7 +294,7 @@ def _judgement(
     """
     return {
         "verdict": verdict(expectations, failed, len(unchecked)),
-        "missed": [e["name"] for e in expectations if not e["ok"]],
+        "missed": [expectation["name"] for expectation in expectations if not expectation["ok"]],
         "failed": failed,
         "expected": expectations,
         "unchecked": unchecked,
@@ -294,15 +310,15 @@ def verdict(
     ``unchecked`` is the number of expected numbers whose steps no output needs, so that the run has
     not compared them.
     """
-    met = sum(e["ok"] for e in expectations)
-    some = f"{met} of {len(expectations)} expected numbers within tolerance"
-    some += f", {unchecked} more not checked" if unchecked else ""
-    none = (
+    met_count = sum(expectation["ok"] for expectation in expectations)
+    compared_text = f"{met_count} of {len(expectations)} expected numbers within tolerance"
+    compared_text += f", {unchecked} more not checked" if unchecked else ""
+    nothing_compared_text = (
         f"None of {unchecked} expected numbers checked"
         if unchecked
         else "No expected numbers in this recipe"
     )
-    numbers = some if expectations else none
+    numbers = compared_text if expectations else nothing_compared_text
     checks = (
         "every check held"
         if not failed
@@ -319,21 +335,27 @@ def shape_of(done: StepRecord) -> str:
 
 
 def _step(done: StepRecord, result: Result) -> dict[str, Any]:
+    """Return a step of the document of a run: what its record says, or that of its
+    stored result.
+    """
     node = result.recipe.steps[done.step].node
-    about = result.store.about(done.key) if done.state in ("cached", "not needed") else None
-    done = _remembered(done, about) if about else done
+    stored_metadata = (
+        result.store.about(done.key) if done.state in ("cached", "not needed") else None
+    )
+    done = _remembered(done, stored_metadata) if stored_metadata else done
     return {
         "step": done.step,
         "node": node.path,
         **{name: getattr(done, name) for name in _COPIED},
-        "made_in": about["seconds"] if about else done.seconds,
+        "made_in": stored_metadata["seconds"] if stored_metadata else done.seconds,
         "shape": shape_of(done),
         "unit": unit_of(node.__doc__ or ""),
         "size": format_size(done.bytes) if done.bytes else "",
         "bytes": done.bytes,
         "key": done.key,
+        # JSON has no infinity
         "bound": done.bound if done.bound is None or math.isfinite(done.bound) else None,
-        "checks": [{"text": c.text, "ok": c.ok} for c in done.checks],
+        "checks": [{"text": check.text, "ok": check.ok} for check in done.checks],
     }
 
 
@@ -341,11 +363,14 @@ def _planned(result: Result) -> float | None:
     """Return the predicted duration of a run in s, or None if the time of a step that ran was
     not predicted.
     """
-    ran = [done for done in result.done.values() if done.state == "run"]
-    if result.schedule is None or any(done.predicted is None for done in ran):
+    steps_run = [done for done in result.done.values() if done.state == "run"]
+    if result.schedule is None or any(done.predicted is None for done in steps_run):
         return None
-    placed = {slot.task for slot in result.schedule.slots}
-    return result.schedule.makespan if all(done.step in placed for done in ran) else None
+    # a schedule may lack steps of a second attempt
+    planned_steps = {slot.task for slot in result.schedule.slots}
+    return (
+        result.schedule.makespan if all(done.step in planned_steps for done in steps_run) else None
+    )
 
 
 def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
@@ -365,24 +390,28 @@ def unit_of(docstring: str) -> str:
         .removeprefix("Units:")
         .strip()
     )
-    before, mark, after = units.partition("result ")
-    word = re.split(r"[\s,;:]|\.(?:\s|$)", after if mark else before, maxsplit=1)[0]
-    return word if word in _UNITS else ""
+    # the unit of the result, in a line that may name others before
+    text_before, found_word, text_after = units.partition("result ")
+    first_word = re.split(
+        r"[\s,;:]|\.(?:\s|$)", text_after if found_word else text_before, maxsplit=1
+    )[0]
+    return first_word if first_word in _UNITS else ""
 
 
 def _sampling(recipe: Recipe) -> list[str]:
     """Return a note on the sampling of the PSF, because every LSR depends on the sampling."""
-    kinds = {
+    samplings = {
         step.params.get("sensor")
         for step in recipe.steps.values()
         if step.node.path == "optics.psf"
     }
-    if kinds & {"point", "point_as_printed"}:
+    if samplings & {"point", "point_as_printed"}:
         return [_SAMPLING]
-    return ["The PSF is averaged over each pixel."] if kinds else []
+    return ["The PSF is averaged over each pixel."] if samplings else []
 
 
 def _unchecked(recipe: Recipe) -> list[dict[str, str]]:
+    """Return the expected numbers whose steps no output needs."""
     return [{"name": number.name, "step": number.step} for number in compared(recipe)[1]]
 
 
@@ -407,9 +436,9 @@ def _readings(recipe: Recipe) -> list[dict[str, str]]:
         return []
     texts = ("path", "number", "matter", "reason")
     return [
-        {name: str(getattr(row, name)) for name in texts}
-        | {"value": _written(values[row.path]), "state": state}
-        for row, state in in_force(values)
+        {name: str(getattr(contradiction, name)) for name in texts}
+        | {"value": _written(values[contradiction.path]), "state": state}
+        for contradiction, state in in_force(values)
     ]
 
 
@@ -419,20 +448,30 @@ def _written(value: Any) -> str:
 
 
 def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
-    shown = (
-        [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing]
+    """Return the figures of the document; ``ran`` adds that of the times."""
+    figures_of_run = (
+        [
+            (figure.name, figure.title, figure.caption)
+            for figure in FIGURES
+            if figure.name not in missing
+        ]
         + [GRAPH]
         + [TIMELINE] * ran
     )
-    return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in shown]
+    return [
+        {"name": name, "title": title, "caption": caption, "file": f"figures/{name}.png"}
+        for name, title, caption in figures_of_run
+    ]
 
 
 def _facts(result: Result) -> list[list[str]]:
     """Return a table of the software versions, the machine and the settings of a run."""
     import torch
 
-    counts = {"core": os.cpu_count() or 1, "thread": torch.get_num_threads()}
-    machine = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items())
+    counts_of_machine = {"core": os.cpu_count() or 1, "thread": torch.get_num_threads()}
+    machine = ", ".join(
+        f"{count} {name}{'s' * (count > 1)}" for name, count in counts_of_machine.items()
+    )
     rows = [
         ["neusee", version_of("neusee")],
         ["Python", platform.python_version()],

@@ -36,13 +36,15 @@ def in_turn(groups: Sequence[Sequence[str]], result: Result) -> Iterator[Mapping
     when their group comes, and the few that the store lacks are computed together before the first
     group. A value is deleted after the last group that needs it.
     """
-    uses = Counter(itertools.chain.from_iterable(groups))
-    values = dict(_computed([step for step in uses if _is_lacking(step, result)], result))
+    uses_left = Counter(itertools.chain.from_iterable(groups))
+    # what neither the run nor the store has: in one run
+    values = dict(_computed([step for step in uses_left if _is_lacking(step, result)], result))
     for group in groups:
         values |= _read([step for step in group if step not in values], result)
         yield {step: values[step] for step in group}
-        uses.subtract(group)
-        _drop([step for step in values if uses[step] <= 0], values)
+        uses_left.subtract(group)
+        # no later group needs them
+        _drop([step for step in values if uses_left[step] <= 0], values)
 
 
 def _drop(steps: Sequence[str], values: dict[str, Any]) -> None:
@@ -62,20 +64,21 @@ def _read(steps: Iterable[str], result: Result) -> dict[str, Any]:
     """Return the values of steps from the run, from its store, or computed again if the store
     has lost them.
     """
-    device, values, lost = result.device.partition(",")[0], {}, list[str]()
+    device, values, lost_steps = result.device.partition(",")[0], {}, list[str]()
     for step in steps:
         if step in result.values:
             values[step] = result.values[step]
             continue
-        hint = result.recipe.steps[step].node.hints.get("return", Any)
+        result_type = result.recipe.steps[step].node.hints.get("return", Any)
         with suppress(KeyError):
-            values[step] = to_device(result.store.get(result.keys[step], hint), device)
+            values[step] = to_device(result.store.get(result.keys[step], result_type), device)
         if step not in values:
-            lost.append(step)
-    return {**values, **_computed(lost, result)}
+            lost_steps.append(step)
+    return {**values, **_computed(lost_steps, result)}
 
 
 def _computed(steps: Sequence[str], result: Result) -> Mapping[str, Any]:
+    """Return the values of steps, computed by another run of the recipe."""
     return (
         run(result.recipe, result.store, sorted(steps), device=result.device).values
         if steps
@@ -146,19 +149,21 @@ def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict
     picture that is missing.
     """
     paths, missing = files_of(figure_files(), result, shelf)
-    now, _ = (
+    graph_file, _ = (
         shelf.find(key, ".png")
         or shelf.keep(key, ".png", "graph", partial(GRAPH_DRAWING, **arguments))
         for key, arguments in graphs(result.recipe, states_of(result.done))
     )
-    return {**paths, "graph": now}, missing
+    return {**paths, "graph": graph_file}, missing
 
 
 def figure_files() -> Iterator[DerivedFile]:
     """Yield the pictures that show results of steps."""
-    for f in FIGURES:
-        kind = ("figure", f.draw, _drawing_code())
-        yield DerivedFile(f.name, ".png", kind, f.needs, Drawing(f.draw), f.only_tables)
+    for figure in FIGURES:
+        kind = ("figure", figure.draw, _drawing_code())
+        yield DerivedFile(
+            figure.name, ".png", kind, figure.needs, Drawing(figure.draw), figure.only_tables
+        )
 
 
 def graphs(recipe: Recipe, states: Mapping[str, str]) -> list[tuple[str, Mapping[str, Any]]]:
@@ -167,7 +172,7 @@ def graphs(recipe: Recipe, states: Mapping[str, str]) -> list[tuple[str, Mapping
 
     ``states`` has the state of each step, as `states_of` returns it.
     """
-    again = {
+    states_of_next_run = {
         name: "left out" if state == "left out" else "cached" for name, state in states.items()
     }
     sources = {name: list(recipe.steps[name].sources) for name in states}
@@ -176,7 +181,7 @@ def graphs(recipe: Recipe, states: Mapping[str, str]) -> list[tuple[str, Mapping
             digest("graph", _drawing_code(), sources, step_states),
             {"sources": sources, "states": step_states},
         )
-        for step_states in (states, again)
+        for step_states in (states, states_of_next_run)
     ]
 
 
@@ -191,8 +196,9 @@ def states_of(done: Mapping[str, StepRecord]) -> dict[str, str]:
 
 
 def _drawing_code() -> str:
-    modules = sorted({figure.draw.partition(":")[0] for figure in FIGURES})
-    return engine(*modules, "report.figures.graph_and_timeline")
+    """Return the digest of the code of all modules that draw figures."""
+    module_names = sorted({figure.draw.partition(":")[0] for figure in FIGURES})
+    return engine(*module_names, "report.figures.graph_and_timeline")
 
 
 def files_of(
@@ -207,10 +213,12 @@ def files_of(
     for file in files:
         try:
             sources = arguments_of(file.needs, result.recipe, result.keys, code, result.store)
-        except Missing as why:
-            missing[file.name] = str(why)
+        except Missing as reason:
+            missing[file.name] = str(reason)
             continue
-        if file.only_tables and not any(is_table(x.make({})) for x in sources.values()):
+        if file.only_tables and not any(
+            is_table(argument.make({})) for argument in sources.values()
+        ):
             missing[file.name] = ""
             continue
         jobs.append((file, key_of_file(file, sources), sources))
@@ -224,13 +232,16 @@ def timeline(result: Result) -> dict[str, Any] | None:
 
     None if no step ran.
     """
-    ran = [done for done in result.done.values() if done.state == "run"]
-    if not ran:
+    steps_run = [done for done in result.done.values() if done.state == "run"]
+    if not steps_run:
         return None
-    first = min(done.began for done in ran)
-    rows = [(done.step, done.lane or done.device, done.began - first, done.seconds) for done in ran]
-    plan = result.schedule or Schedule((), 0.0, {}, 0.0)
-    return {"schedule": replace(plan, slots=_planned(ran, plan)), "rows": rows}
+    start_of_run = min(done.began for done in steps_run)
+    bars = [
+        (done.step, done.lane or done.device, done.began - start_of_run, done.seconds)
+        for done in steps_run
+    ]
+    schedule = result.schedule or Schedule((), 0.0, {}, 0.0)
+    return {"schedule": replace(schedule, slots=_planned(steps_run, schedule)), "rows": bars}
 
 
 def _planned(ran: Sequence[StepRecord], plan: Schedule) -> tuple[Slot, ...]:
@@ -250,22 +261,23 @@ def _in_turn(predicted: Iterable[StepRecord]) -> tuple[Slot, ...]:
     """Return a schedule of predicted times in which the steps of each device follow each other
     as they ran.
     """
-    end: dict[str, Slot] = {}
+    last_slot: dict[str, Slot] = {}
     slots = []
     for done in sorted(predicted, key=lambda done: done.began):
         lane = done.lane or done.device
-        before = end.get(lane)
-        start = before.end if before else 0.0
+        slot_before = last_slot.get(lane)
+        start = slot_before.end if slot_before else 0.0
+        # a step begins when the one before it on its device ends
         slots.append(
             Slot(
                 done.step,
                 lane,
                 start,
                 start + (done.predicted or 0.0),
-                after=before.task if before else "",
+                after=slot_before.task if slot_before else "",
             )
         )
-        end[lane] = slots[-1]
+        last_slot[lane] = slots[-1]
     return tuple(slots)
 
 
@@ -294,7 +306,7 @@ def steps_of(sources: Mapping[str, Found]) -> frozenset[str]:
 
 def key_of_file(file: DerivedFile, sources: Mapping[str, Found]) -> str:
     """Return the key of a file: the digest of how it is made and of what it shows."""
-    return digest(*file.kind, [[name, x.identity] for name, x in sources.items()])
+    return digest(*file.kind, [[name, source.identity] for name, source in sources.items()])
 
 
 def _made(
@@ -304,10 +316,11 @@ def _made(
     return all paths.
     """
     paths = _stored(jobs, shelf)
-    new = [job for job in jobs if job[0].name not in paths]
-    needed = [sorted(steps_of(sources)) for _, _, sources in new]
-    for (file, key, sources), values in zip(new, in_turn(needed, result), strict=True):
-        arguments = {name: x.make(values) for name, x in sources.items()}
+    # a job: file, key, sources of its arguments
+    lacking = [job for job in jobs if job[0].name not in paths]
+    steps_of_jobs = [sorted(steps_of(sources)) for _, _, sources in lacking]
+    for (file, key, sources), values in zip(lacking, in_turn(steps_of_jobs, result), strict=True):
+        arguments = {name: source.make(values) for name, source in sources.items()}
         try:
             paths[file.name] = shelf.keep(
                 key, file.suffix, file.name, partial(file.make, **arguments)

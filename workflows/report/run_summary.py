@@ -38,14 +38,16 @@ def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
     """
     numbers = {name: _known(cells) for name, cells in arms(recipe, keys, value).items()}
     lsr = suppressed(recipe, keys, value)
-    said = sentences(numbers, lsr, bool(lines_of(recipe, keys)), element(recipe))
-    judged = any(name.partition("[")[0] == "damage" for name in recipe.steps)
-    said |= irradiance(_laser_peaks(keys, value), judged) if said else {}
-    said |= {} if shade_of(recipe) or not said else rival(lsr, numbers)
+    texts = sentences(numbers, lsr, bool(lines_of(recipe, keys)), element(recipe))
+    has_damage = any(name.partition("[")[0] == "damage" for name in recipe.steps)
+    # without a sentence on the mask no other one is said
+    texts |= irradiance(_laser_peaks(keys, value), has_damage) if texts else {}
+    # a shade is a rival itself
+    texts |= {} if shade_of(recipe) or not texts else rival(lsr, numbers)
     return {
-        **said,
-        "numbers": {name: numbers[name] for name in numbers if said},
-        "lsr": lsr if said else {},
+        **texts,
+        "numbers": {name: numbers[name] for name in numbers if texts},
+        "lsr": lsr if texts else {},
     }
 
 
@@ -53,13 +55,15 @@ def element(recipe: Recipe) -> str:
     """Return what stands in the arm of the mask: a mask, a stop, a filter, several of these, or
     a flat plate.
     """
-    height, shade = recipe.steps.get("height"), recipe.steps.get(shade_of(recipe) or "")
-    parts = [] if height and height.node.path == "doe.flat" else ["mask"]
-    if shade:
-        kinds = {"smaller stop": "diameter", "grey filter": "transmittance"}
-        parts += [kind for kind, name in kinds.items() if shade.params.get(name, 1.0) < 1]
-        parts += ["notch filter"] * bool(shade.params.get("notches"))
-    return " and ".join(parts) or "flat plate"
+    height_step, shade_step = recipe.steps.get("height"), recipe.steps.get(shade_of(recipe) or "")
+    elements = [] if height_step and height_step.node.path == "doe.flat" else ["mask"]
+    if shade_step:
+        parameter_of_kind = {"smaller stop": "diameter", "grey filter": "transmittance"}
+        elements += [
+            kind for kind, name in parameter_of_kind.items() if shade_step.params.get(name, 1.0) < 1
+        ]
+        elements += ["notch filter"] * bool(shade_step.params.get("notches"))
+    return " and ".join(elements) or "flat plate"
 
 
 def sentences(
@@ -88,12 +92,12 @@ def irradiance(peaks: Mapping[str, float], judged: bool) -> dict[str, str]:
     ``peaks`` are in W/m2, by plain lens and mask. ``judged`` is True for a recipe that compares
     them with thresholds.
     """
-    shining = [
+    densities = [
         f"{_density(peaks[name])} {words}"
         for name, words in _WHERE.items()
         if peaks.get(name, 0.0) > 0
     ]
-    if not shining:
+    if not densities:
         return {}
     damage = (
         "the step `damage` compares them"
@@ -101,7 +105,7 @@ def irradiance(peaks: Mapping[str, float], judged: bool) -> dict[str, str]:
         else "`damage: published` and `neusee safety` compare them"
     )
     text = (
-        f"The lasers have {' and '.join(shining)} there: {damage} with the thresholds that are"
+        f"The lasers have {' and '.join(densities)} there: {damage} with the thresholds that are"
         " known"
     )
     return {"irradiance": f"{text}, and a multiple of saturation is not a measure of damage."}
@@ -118,8 +122,9 @@ def _laser_peaks(keys: Mapping[str, str], value: Value) -> dict[str, float]:
 
 def _density(value: float) -> str:
     """Return an irradiance in W/m2 as text in W/cm2 with a prefix."""
-    power = min(max(3 * math.floor(math.log10(value * 1e-4) / 3), -9), 9)
-    return f"{value * 1e-4 / 10.0**power:.3g} {_PREFIXES[power]}W/cm2"
+    # the largest multiple of 3 below the logarithm of the W/cm2
+    exponent = min(max(3 * math.floor(math.log10(value * 1e-4) / 3), -9), 9)
+    return f"{value * 1e-4 / 10.0**exponent:.3g} {_PREFIXES[exponent]}W/cm2"
 
 
 def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str]:
@@ -129,20 +134,20 @@ def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str
     The picture behind this filter has its numbers if the run computed them, and else the command
     that computes them.
     """
-    share = max(lsr.values(), default=1.0)
-    if share >= _LEAST:
+    largest_lsr = max(lsr.values(), default=1.0)
+    if largest_lsr >= _LEAST:
         return {}
-    text = f"A grey filter that passes {share:.3g} of the light weakens the laser as much: "
-    command = f"doe=grey_filter doe.transmittance={share:.3g}"
+    text = f"A grey filter that passes {largest_lsr:.3g} of the light weakens the laser as much: "
+    command = f"doe=grey_filter doe.transmittance={largest_lsr:.3g}"
     grey_filter, restored = numbers.get(RIVAL, {}), numbers.get(RESTORED, {})
     if _QUALITY not in grey_filter:
         return {"rival": f"{text}for its picture, restored alike, run this recipe with {command}."}
-    against = (
+    comparison = (
         f" against {restored[_QUALITY]:.1f} dB behind the mask" if _QUALITY in restored else ""
     )
     picture = (
         "its picture, restored by a Wiener filter, has a PSNR of"
-        f" {grey_filter[_QUALITY]:.1f} dB{against}"
+        f" {grey_filter[_QUALITY]:.1f} dB{comparison}"
     )
     count = (
         "no pixel saturates"
@@ -153,6 +158,7 @@ def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str
 
 
 def _known(cells: Arm) -> dict[str, float]:
+    """Return the numbers of an arm without NaN, which stands for an unknown one."""
     return {name: number for name, number in cells.items() if not math.isnan(number)}
 
 
@@ -162,32 +168,36 @@ def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool, element:
     """
     if not (plain.get(_PEAK, 0.0) > 0 and mask.get(_PEAK, 0.0) > 0):
         return _suppression(lsr, element)
-    less = plain[_PEAK] / mask[_PEAK]
+    peak_ratio = plain[_PEAK] / mask[_PEAK]
     ends = f"{_number(mask[_PEAK])} in place of {_number(plain[_PEAK])} times saturation"
-    if abs(less - 1) < _EQUAL:
+    if abs(peak_ratio - 1) < _EQUAL:
         change = f"the brightest pixel receives as much light as behind the plain lens ({ends}"
     else:
-        word, ratio = ("less", less) if less > 1 else ("more", 1 / less)
-        much = f"{_number(ratio)} times" if ratio >= _TIMES else f"{100 * abs(1 / less - 1):.0f} %"
+        word, ratio = ("less", peak_ratio) if peak_ratio > 1 else ("more", 1 / peak_ratio)
+        amount = (
+            f"{_number(ratio)} times"
+            if ratio >= _TIMES
+            else f"{100 * abs(1 / peak_ratio - 1):.0f} %"
+        )
         change = (
-            f"the brightest pixel receives {much} {word} light than behind the plain lens ({ends}"
+            f"the brightest pixel receives {amount} {word} light than behind the plain lens ({ends}"
         )
     if not laser:
         return f"No laser shines here, whose peak the {element} could lower: {change})."
-    return f"{_lowered(less, element)}: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
+    return f"{_lowered(peak_ratio, element)}: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
 
 
 def _lowered(less: float, element: str) -> str:
     """Return whether a mask lowers the peak on the sensor, for the peak of the plain lens over
     that of the mask.
     """
-    several = _several(element)
+    is_plural = _several(element)
     if abs(less - 1) < _EQUAL:
-        return f"The {element} {'do' if several else 'does'} not change the peak on the sensor"
+        return f"The {element} {'do' if is_plural else 'does'} not change the peak on the sensor"
     if less < 1:
-        return f"The {element} {'raise' if several else 'raises'} the peak on the sensor"
-    little = "" if less >= _TIMES else " a little"
-    return f"The {element} {'lower' if several else 'lowers'} the peak on the sensor{little}"
+        return f"The {element} {'raise' if is_plural else 'raises'} the peak on the sensor"
+    weakly = "" if less >= _TIMES else " a little"
+    return f"The {element} {'lower' if is_plural else 'lowers'} the peak on the sensor{weakly}"
 
 
 def _suppression(lsr: Mapping[str, float], element: str) -> str:
@@ -196,9 +206,9 @@ def _suppression(lsr: Mapping[str, float], element: str) -> str:
     """
     if not lsr:
         return ""
-    bought = "a weaker laser" if max(lsr.values()) < 1 - _EQUAL else "no weaker laser here"
+    gain_text = "a weaker laser" if max(lsr.values()) < 1 - _EQUAL else "no weaker laser here"
     verb = "buy" if _several(element) else "buys"
-    return f"The {element} {verb} {bought}: {_ratios(lsr)} of the peak behind the clear lens."
+    return f"The {element} {verb} {gain_text}: {_ratios(lsr)} of the peak behind the clear lens."
 
 
 def _ratios(lsr: Mapping[str, float]) -> str:
@@ -207,9 +217,9 @@ def _ratios(lsr: Mapping[str, float]) -> str:
     """
     if not lsr:
         return ""
-    ends = sorted(lsr, key=lsr.__getitem__)
-    first, last = (f"{lsr[name]:.3g} at {name}" for name in (ends[0], ends[-1]))
-    return f"LSR {first}" if len(lsr) == 1 else f"LSR from {first} to {last}"
+    wavelengths = sorted(lsr, key=lsr.__getitem__)
+    least, most_text = (f"{lsr[name]:.3g} at {name}" for name in (wavelengths[0], wavelengths[-1]))
+    return f"LSR {least}" if len(lsr) == 1 else f"LSR from {least} to {most_text}"
 
 
 def _costs(plain: Arm, mask: Arm, restored: Arm, laser: bool, element: str) -> str:
@@ -217,13 +227,17 @@ def _costs(plain: Arm, mask: Arm, restored: Arm, laser: bool, element: str) -> s
     mask.
     """
     texts = _picture(plain, mask, restored, element), _saturation(plain, mask, laser, element)
-    parts = [sentence for sentence in texts if sentence]
-    return f"{'; '.join(parts)}." if parts else ""
+    sentences_with_numbers = [sentence for sentence in texts if sentence]
+    return f"{'; '.join(sentences_with_numbers)}." if sentences_with_numbers else ""
 
 
 def _picture(plain: Arm, mask: Arm, restored: Arm, element: str) -> str:
+    """Return the PSNR of plain lens, mask and restored picture, and whether the mask costs quality;
+    empty if a number is unknown.
+    """
     if _QUALITY not in plain or _QUALITY not in mask:
         return ""
+    # PSNR behind the plain lens, behind the mask, and after restoration
     before, behind, after = (arm.get(_QUALITY, -math.inf) for arm in (plain, mask, restored))
     end = f", and {after:.1f} dB after restoration" if _QUALITY in restored else ""
     text = (
@@ -245,20 +259,20 @@ def _saturation(plain: Arm, mask: Arm, laser: bool, element: str) -> str:
     """
     if _LOST not in plain or _LOST not in mask:
         return ""
-    with_mask, without = (f"{arm[_LOST]:,.0f}" for arm in (mask, plain))
-    if with_mask == without == "0":
+    with_mask, without_mask = (f"{arm[_LOST]:,.0f}" for arm in (mask, plain))
+    if with_mask == without_mask == "0":
         return "no pixel saturates"
-    same = f"{with_mask} pixels saturate with and without the {element}"
+    same_text = f"{with_mask} pixels saturate with and without the {element}"
     text = (
-        same
-        if with_mask == without
-        else f"{with_mask} pixels saturate with the {element}, {without} without"
+        same_text
+        if with_mask == without_mask
+        else f"{with_mask} pixels saturate with the {element}, {without_mask} without"
     )
-    wider = mask[_LOST] / plain[_LOST] if laser and plain[_LOST] > 0 else 0.0
+    enlargement = mask[_LOST] / plain[_LOST] if laser and plain[_LOST] > 0 else 0.0
     verb = "enlarge" if _several(element) else "enlarges"
     return (
-        f"{text}: the {element} {verb} the dazzled area {_number(wider)} times"
-        if wider > 1 + _EQUAL
+        f"{text}: the {element} {verb} the dazzled area {_number(enlargement)} times"
+        if enlargement > 1 + _EQUAL
         else text
     )
 
@@ -297,18 +311,19 @@ def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict
     if restored.shape != spread.shape:
         return {}
     invented = clipped.any(0)
-    half = half_width(spread, recipe.steps["restored_spread"].params["draws"])
+    half_widths = half_width(spread, recipe.steps["restored_spread"].params["draws"])
     name = recipe.steps["raw[mask]"].params["file"].name
-    parts = [
+    paragraph = [
         _invented(name, invented),
-        _interval(half, invented),
-        _doubtful(restored, half, invented),
+        _interval(half_widths, invented),
+        _doubtful(restored, half_widths, invented),
     ]
-    parts.append(_limits(recipe))
-    return {"frame": " ".join(sentence for sentence in parts if sentence)}
+    paragraph.append(_limits(recipe))
+    return {"frame": " ".join(sentence for sentence in paragraph if sentence)}
 
 
 def _invented(name: str, invented: Tensor) -> str:
+    """Return how many pixels of a frame are saturated, so that they are invented."""
     count, share = int(invented.sum()), float(invented.double().mean())
     if not count:
         return (
@@ -323,14 +338,16 @@ def _invented(name: str, invented: Tensor) -> str:
 
 
 def _interval(half: Tensor, invented: Tensor) -> str:
+    """Return how well the other pixels are known; empty if there are none."""
     if bool(invented.all()):
         return ""
-    widths = half.mean(0)[~invented].flatten()
-    widths = widths[:: max(1, len(widths) // 1_000_000)].double()
-    middle, upper = (float(torch.quantile(widths, q)) for q in (0.5, 0.95))
+    mean_widths = half.mean(0)[~invented].flatten()
+    # at most about a million pixels, which `quantile` can sort
+    mean_widths = mean_widths[:: max(1, len(mean_widths) // 1_000_000)].double()
+    median, upper_width = (float(torch.quantile(mean_widths, quantile)) for quantile in (0.5, 0.95))
     return (
-        f"Elsewhere a restored pixel is known to ±{middle:.2g} of white in half of the pixels and"
-        f" to ±{upper:.2g} in 95 % of them, with a probability of 90 % under the model of the"
+        f"Elsewhere a restored pixel is known to ±{median:.2g} of white in half of the pixels and"
+        f" to ±{upper_width:.2g} in 95 % of them, with a probability of 90 % under the model of the"
         " interval."
     )
 
@@ -339,9 +356,10 @@ def _doubtful(restored: Tensor, half: Tensor, invented: Tensor) -> str:
     """Return a sentence on the pixels that no scene can explain, if there are more than chance
     makes.
     """
-    wrong = unexplained(restored, half, invented)
-    count = int(wrong.sum())
-    if float(wrong.double().mean()) < 1e-3 and count < 20:
+    unexplained_pixels = unexplained(restored, half, invented)
+    count = int(unexplained_pixels.sum())
+    # chance makes a few
+    if float(unexplained_pixels.double().mean()) < 1e-3 and count < 20:
         return ""
     return (
         f"{count:,} other pixels are restored darker than black or brighter than {BRIGHT:g} times"
@@ -353,22 +371,23 @@ def _doubtful(restored: Tensor, half: Tensor, invented: Tensor) -> str:
 
 
 def _limits(recipe: Recipe) -> str:
-    step = recipe.steps.get("deconvolved")
-    own = (
-        step is not None
-        and step.node.path in _WIENER
+    """Return what the interval of a restored frame includes and what not."""
+    restoring_step = recipe.steps.get("deconvolved")
+    is_own_filter = (
+        restoring_step is not None
+        and restoring_step.node.path in _WIENER
         and "deconvolved" in recipe.steps["restored"].sources
     )
     whose = (
         ""
-        if own
+        if is_own_filter
         else (
             "The interval is that of a Wiener filter, not of the method that restored this"
             " picture. "
         )
     )
-    measured = recipe.steps["restored_spread"].node.path == _MEASURED
-    blur = "blur, the error of the measured PSF" if measured else "blur"
+    has_measured_psf = recipe.steps["restored_spread"].node.path == _MEASURED
+    blur = "blur, the error of the measured PSF" if has_measured_psf else "blur"
     return (
         f"{whose}The interval includes noise, {blur} and saturation. It does not include lasers"
         " that the filter is not told of, errors of the camera's description, and colours that no"

@@ -64,18 +64,20 @@ class StudyReport:
         for name, content in self.files.items():
             content(folder.path / name) if callable(content) else folder.write(name, content)
         folder.write("provenance.json", as_json(document))
-        shown = self._shown_of(document)
-        folder.write("report.html", page(self.title, self.lead, self.sections, shown, self.banner))
+        shown_facts = self._shown_of(document)
+        folder.write(
+            "report.html", page(self.title, self.lead, self.sections, shown_facts, self.banner)
+        )
 
     def _shown_of(self, document: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of a document that the page shows, and its warnings if it has any."""
         names = self.shown
         if names is None:
             names = [name for name in document if name != "config"]
-        shown = {name: document[name] for name in names}
+        shown_facts = {name: document[name] for name in names}
         if document.get("warnings"):
-            shown["warnings"] = "; ".join(document["warnings"])
-        return shown
+            shown_facts["warnings"] = "; ".join(document["warnings"])
+        return shown_facts
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def page(
         title=title,
         banner=banner,
         lead=_paragraphs(lead),
-        sections=[_section(f"s{i}", s) for i, s in enumerate(sections)],
+        sections=[_section(f"s{number}", section) for number, section in enumerate(sections)],
         provenance=[(name, text) for name, text in texts.items() if text],
     )
 
@@ -98,7 +98,8 @@ def _with_breaks(text: str) -> str:
     a new line.
     """
     return " ".join(
-        _BREAK.sub("<wbr>", escape(w)) if len(w) > _SHORT else escape(w) for w in text.split(" ")
+        _BREAK.sub("<wbr>", escape(word)) if len(word) > _SHORT else escape(word)
+        for word in text.split(" ")
     )
 
 
@@ -133,6 +134,7 @@ def with_uncertainty(mean: float, sd: float) -> str:
     """
     if not 0 < sd < math.inf:
         return f"{mean:.6g} ± {sd:g}"
+    # decimals with which two digits of the deviation are written; below 0 left of the point
     digits = 1 - math.floor(math.log10(sd))
     if not -5 <= digits <= 12:
         return f"{mean:.5g} ± {sd:.2g}"
@@ -140,9 +142,12 @@ def with_uncertainty(mean: float, sd: float) -> str:
 
 
 def _section(anchor: str, section: Section) -> dict[str, Any]:
-    rows = [[_with_mark(value) for value in row] for row in section.rows]
+    """Return a section as values of the template; a column of numbers is aligned right."""
+    marked_rows = [[_with_mark(value) for value in row] for row in section.rows]
     numeric = {
-        i for i in range(len(section.columns)) if _holds_numbers([row[i].value for row in rows])
+        column
+        for column in range(len(section.columns))
+        if _holds_numbers([row[column].value for row in marked_rows])
     }
     return {
         "anchor": anchor,
@@ -152,7 +157,10 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
         "picture": base64.b64encode(section.picture).decode() if section.picture else "",
         "columns": section.columns,
         "numeric": numeric,
-        "rows": [[_cell(value, i in numeric) for i, value in enumerate(row)] for row in rows],
+        "rows": [
+            [_cell(value, column in numeric) for column, value in enumerate(row)]
+            for row in marked_rows
+        ],
     }
 
 
@@ -167,17 +175,19 @@ def _alternative(section: Section) -> str:
 
 
 def _with_mark(value: Any) -> Marked:
+    """Return a value of a cell as a `Marked` value, without a mark unless it has one."""
     return value if isinstance(value, Marked) else Marked(value)
 
 
 def _cell(cell: Marked, numeric: bool) -> dict[str, str]:
+    """Return text and classes of a cell: ``n`` aligns right, ``one`` keeps a word in one line."""
     text = said(cell.value)
-    align = ""
+    alignment = ""
     if numeric or _is_number(cell.value):
-        align = "n"
+        alignment = "n"
     elif _is_short_word(text):
-        align = "one"
-    return {"text": text, "kind": " ".join(filter(None, (align, cell.mark)))}
+        alignment = "one"
+    return {"text": text, "kind": " ".join(filter(None, (alignment, cell.mark)))}
 
 
 def _is_short_word(text: str) -> bool:
@@ -195,11 +205,12 @@ def _holds_numbers(cells: Sequence[Any]) -> bool:
     """Return True if a table column contains at least one number and otherwise only numbers and
     empty cells.
     """
-    filled_cells = [c for c in cells if c is not None]
+    filled_cells = [cell for cell in cells if cell is not None]
     return bool(filled_cells) and all(map(_is_number, filled_cells))
 
 
 def _paragraphs(text: str) -> list[str]:
+    """Return the paragraphs of a text, which blank lines part, each in one line."""
     return [" ".join(paragraph.split()) for paragraph in text.split("\n\n") if paragraph.strip()]
 
 
@@ -213,5 +224,6 @@ def _plain(value: Any) -> str:
 
 
 def _inner(value: Any) -> str:
+    """Return an inner value as text, in brackets if it has parts."""
     text = _plain(value)
     return f"({text})" if isinstance(value, Mapping | list | tuple) else text or "–"

@@ -29,7 +29,7 @@ def columns(rows: Rows, numbers: str = "<", gap: str = "  ") -> list[str]:
     ``numbers`` aligns all other columns left (``<``) or right (``>``).
     """
     widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
-    forms = [f"{'<' if i == 0 else numbers}{width}" for i, width in enumerate(widths)]
+    forms = [f"{'<' if column == 0 else numbers}{width}" for column, width in enumerate(widths)]
     return [
         gap.join(f"{cell:{form}}" for cell, form in zip(row, forms, strict=True)).rstrip()
         for row in rows
@@ -40,8 +40,8 @@ def indented(rows: Rows) -> list[str]:
     """Return an indented line of text for each table row, with numbers aligned right and a dash
     for an empty cell.
     """
-    full = [[name, *(cell or "–" for cell in cells)] for name, *cells in rows]
-    return [f"  {line}" for line in columns(full, ">", "  ")]
+    rows_without_gaps = [[name, *(cell or "–" for cell in cells)] for name, *cells in rows]
+    return [f"  {line}" for line in columns(rows_without_gaps, ">", "  ")]
 
 
 def wrapped(text: str) -> list[str]:
@@ -74,6 +74,9 @@ def json_line(document: dict[str, Any]) -> str:
 
 
 def _finite(value: Any) -> Any:
+    """Return a value for JSON: with text as keys, lists, and null for a number that
+    is not finite.
+    """
     if isinstance(value, dict):
         return {str(key): _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -95,7 +98,7 @@ def commands_to_try(
     whether a recipe with its changes can be loaded.
     """
     noise = "sensor.read_noise"
-    changed = {
+    changed_recipes = {
         "only what follows is run": _with(words, f"{noise}=20 e-")
         if noise in recipe.config.settings
         else [],
@@ -103,20 +106,26 @@ def commands_to_try(
         if "height" in recipe.steps
         else [],
     }
-    working = {purpose: again for purpose, again in changed.items() if again and works(again)}
-    shown = [
-        [shlex.join(["neusee", "run", *again]), f"# {purpose}"]
-        for purpose, again in working.items()
+    loadable = {
+        purpose: changed_words
+        for purpose, changed_words in changed_recipes.items()
+        if changed_words and works(changed_words)
+    }
+    commands_with_comments = [
+        [shlex.join(["neusee", "run", *changed_words]), f"# {purpose}"]
+        for purpose, changed_words in loadable.items()
     ]
-    shown += [
+    commands_with_comments += [
         [shlex.join(["neusee", "plan", *words]), "# what would run, how long"],
         ["neusee nodes optics.psf", "# what a step computes, and its source"],
         ["neusee recipes", "# what else there is"],
     ]
-    return columns(shown[:3], gap="   ")
+    # the recipe's own commands first, then general ones
+    return columns(commands_with_comments[:3], gap="   ")
 
 
 def _another_mask(recipe: Recipe) -> str:
+    """Return the name of a mask that the recipe does not have."""
     return "axicon" if recipe.steps["height"].node.path == "doe.vortex" else "vortex"
 
 
@@ -125,5 +134,5 @@ def _with(words: Sequence[str], change: str) -> list[str]:
     or of a part of it.
     """
     path = change.partition("=")[0]
-    same = re.compile(rf"[~+]?{re.escape(path)}([.=]|$)")
-    return [*(word for word in words if not same.match(word)), change]
+    same_value = re.compile(rf"[~+]?{re.escape(path)}([.=]|$)")
+    return [*(word for word in words if not same_value.match(word)), change]

@@ -67,6 +67,9 @@ def _costs(result: Result) -> Costs:
 
 
 def _omission(result: Result, costs: Costs, done: StepRecord) -> dict[str, Any]:
+    """Return a step that was left out, with its bound and the time that it would take, as JSON
+    values.
+    """
     return {
         "step": done.step,
         "bound": done.bound,
@@ -85,13 +88,18 @@ def said_of_economies(account: Mapping[str, Any]) -> str:
     """Return one line of text with the steps that a run replaced or omitted to save time, and
     the resulting errors.
     """
-    summed = [
-        f"{e['step']} ({_within(e['bound'], e['estimated'])})"
-        for e in account["economies"]
-        if e["instead"] and e["bound"] != 0
+    # no cheaper step takes the place of a step that has no effect
+    with_error = [
+        f"{economy['step']} ({_within(economy['bound'], economy['estimated'])})"
+        for economy in account["economies"]
+        if economy["instead"] and economy["bound"] != 0
     ]
-    nothing = [f"{e['step']} (no error)" for e in account["economies"] if not e["instead"]]
-    names = ", ".join([*summed, *nothing])
+    without_error = [
+        f"{economy['step']} (no error)"
+        for economy in account["economies"]
+        if not economy["instead"]
+    ]
+    names = ", ".join([*with_error, *without_error])
     return f"cheaper  {names}; tolerance {account['tolerance']:g}"
 
 
@@ -126,21 +134,24 @@ def _said_of_measured(rows: Sequence[Mapping[str, Any]]) -> str:
     if not measured:
         return ""
     text = f"; measured beside --exact: {_worst(measured, 'measured')}"
-    others = [row["output"] for row in rows if row["measured"] is None]
-    return f"{text}; not measured: {', '.join(others)}" if others else text
+    unmeasured_outputs = [row["output"] for row in rows if row["measured"] is None]
+    return f"{text}; not measured: {', '.join(unmeasured_outputs)}" if unmeasured_outputs else text
 
 
 def _worst(rows: Sequence[Mapping[str, Any]], column: str) -> str:
-    row = max(rows, key=lambda row: float(row[column]))
-    return f"{row[column]:.1e} in {row['output']}"
+    """Return the largest value of a column with the output that it belongs to, as text."""
+    worst_row = max(rows, key=lambda row: float(row[column]))
+    return f"{worst_row[column]:.1e} in {worst_row['output']}"
 
 
 def _output(result: Result, name: str, measured: float | None) -> dict[str, Any]:
+    """Return the stated and the measured error of an output as JSON values."""
     error, kind = result.proof.stated_of(name), result.proof.kind_of(name)
     return {"output": name, "error": error, "kind": kind, "measured": measured}
 
 
 def _within(bound: float | None, estimated: bool) -> str:
+    """Return a bound of an error as text."""
     return (
         "error unknown"
         if bound is None
@@ -151,34 +162,37 @@ def _within(bound: float | None, estimated: bool) -> str:
 def _estimated_roots(result: Result) -> list[str]:
     """Return the steps that add an error which is estimated, and not proved."""
     recipe = result.recipe
-    roots = []
+    estimated_steps = []
     for name in needed(recipe, recipe.outputs):
         hooks, record = recipe.steps[name].node.hooks, result.done.get(name)
         omitted = record is not None and record.state == "left out" and bool(record.bound)
+        # left out by an estimate, or with an error of its own that is an estimate
         if (hooks.skip_estimated and omitted) or (
             hooks.estimated and result.proof.shares.get(name)
         ):
-            roots.append(name)
-    return roots
+            estimated_steps.append(name)
+    return estimated_steps
 
 
 def _left_out(result: Result) -> list[StepRecord]:
+    """Return the records of the steps that a run left out."""
     return [done for done in result.done.values() if done.state == "left out"]
 
 
 def _economy(
     result: Result, costs: Costs, substitution: Substitution, estimated: bool
 ) -> dict[str, Any]:
-    done = result.done.get(substitution.instead) if substitution.instead else None
+    """Return a step that a cheaper one replaced, with times and bound, as JSON values."""
+    cheaper_record = result.done.get(substitution.instead) if substitution.instead else None
     return {
         "step": substitution.step,
         "instead": substitution.instead,
         "why": substitution.why,
-        "seconds": _spent_on(result, substitution) if done else None,
+        "seconds": _spent_on(result, substitution) if cheaper_record else None,
         "estimated": estimated,
         "full_seconds": _seconds(result, costs, substitution.step),
-        "bound": done.error[0] if done and done.error else None,
-        "what": "; ".join(check.text for check in done.checks) if done else "",
+        "bound": cheaper_record.error[0] if cheaper_record and cheaper_record.error else None,
+        "what": "; ".join(check.text for check in cheaper_record.checks) if cheaper_record else "",
     }
 
 
@@ -191,6 +205,7 @@ def _spent_on(result: Result, substitution: Substitution) -> float | None:
     """
     seconds = [
         _made_in(result, done)
+        # names of the steps that replace ``psf`` begin with ``psf.``
         for name, done in result.done.items()
         if name.startswith(f"{substitution.step}.")
     ]
@@ -199,10 +214,13 @@ def _spent_on(result: Result, substitution: Substitution) -> float | None:
 
 
 def _made_in(result: Result, done: StepRecord) -> float | None:
+    """Return the time in s in which a result was computed, now or in an earlier run; None if
+    unknown.
+    """
     if done.state == "run":
         return done.seconds
-    about = result.store.about(done.key)
-    return about["seconds"] if about else None
+    metadata = result.store.about(done.key)
+    return metadata["seconds"] if metadata else None
 
 
 def _seconds(result: Result, costs: Costs, step: str) -> float | None:
@@ -220,22 +238,26 @@ def _measured(result: Result) -> dict[str, float]:
     recipe = result.recipe
     if recipe.exact or not (recipe.substitutions or _left_out(result)):
         return {}
-    full = _full_keys(result)
+    exact_keys = _full_keys(result)
     errors: dict[str, float] = {}
-    compared = False
+    is_compared = False
     for name in recipe.outputs:
-        if name not in full:
+        if name not in exact_keys:
             continue
-        if full[name] == result.keys[name]:
+        if exact_keys[name] == result.keys[name]:
             errors[name] = 0.0
-        elif result.store.has(full[name]):
+        elif result.store.has(exact_keys[name]):
             with suppress(KeyError, ValueError):  # another process has removed the result
-                errors[name] = error_of(result.value(name), result.store.get(full[name]))
-                compared = True
-    return errors if compared else {}
+                errors[name] = error_of(result.value(name), result.store.get(exact_keys[name]))
+                is_compared = True
+    # equal keys alone are no measurement
+    return errors if is_compared else {}
 
 
 def _full_keys(result: Result) -> dict[str, str]:
+    """Return the keys of the outputs and steps of the same run with ``--exact``;
+    none if unknown.
+    """
     exact_recipe: Recipe = replace(
         result.recipe.unsubstituted or result.recipe, exact=True, substitutions=()
     )
@@ -266,8 +288,12 @@ def spectral_error(
             errors[cause] = max(errors.get(cause, 0.0), float(value(name).max()))
     if not errors:
         return {}
-    larger = max(errors.values()) > recipe.tolerance
-    return {"errors": errors, "larger": larger, "said": _said(errors, recipe.tolerance, larger)}
+    exceeds_tolerance = max(errors.values()) > recipe.tolerance
+    return {
+        "errors": errors,
+        "larger": exceeds_tolerance,
+        "said": _said(errors, recipe.tolerance, exceeds_tolerance),
+    }
 
 
 def _said(errors: Mapping[str, float], tolerance: float, larger: bool) -> str:

@@ -62,10 +62,12 @@ def spots_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Spot,
     """Return the spots that the settings name; raise `RecipeError` for a step that does not
     exist.
     """
-    named = {name: step for name, step in safety.settings.protection.spots if step is not None}
+    named_steps = {
+        name: step for name, step in safety.settings.protection.spots if step is not None
+    }
     steps = {
         name: step_of(recipe, safety, f"protection.spots.{name}", step, name)
-        for name, step in named.items()
+        for name, step in named_steps.items()
     }
     results: Any = run(recipe, store, list(steps.values())) if steps else {}
     return tuple(
@@ -90,7 +92,11 @@ def step_of(recipe: Recipe, safety: Safety, setting: str, step: str, arm: str) -
 
 
 def _spot(option: str, intensity: FloatArray, params: Mapping[str, float]) -> Spot:
+    """Return the spot of a PSF (band, y, x), summed over bands; ``params`` has its pixel pitch in
+    m.
+    """
     light, pitch = np.asarray(intensity, np.float64).sum(0), params["pixel_pitch"]
+    # light that the window lacks heats as well
     heated = heated_spot(torch.from_numpy(light), pitch, lost=max(0.0, 1 - float(light.sum())))
     return Spot(option, light / light.max(), pitch, heated or 0.0)
 
@@ -100,11 +106,12 @@ def with_heated_spots(options: Sequence[Option], spots: Sequence[Spot]) -> tuple
     that of the clear lens.
     """
     heated = {spot.option: spot.heated for spot in spots}
-    plain, mask = heated.get(OPTIONS["plain"]), heated.get(OPTIONS["mask"])
-    if not plain or not mask:
+    plain_width, mask_width = heated.get(OPTIONS["plain"]), heated.get(OPTIONS["mask"])
+    if not plain_width or not mask_width:
         return tuple(options)
     return tuple(
-        replace(option, heated=mask / plain) if option.masked else option for option in options
+        replace(option, heated=mask_width / plain_width) if option.masked else option
+        for option in options
     )
 
 
@@ -113,20 +120,26 @@ def damage_patterns(spots: Sequence[Spot], findings: Sequence[Finding]) -> Itera
     is known.
     """
     for spot in spots:
-        judged = [
+        damage_findings = [
             finding
             for finding in findings
             if finding.option == spot.option and finding.limit.effect == "damage"
         ]
-        if not judged:
+        if not damage_findings:
             continue
-        worst = max(judged, key=lambda finding: finding.ratio)
-        ratio = spot.light * worst.ratio
+        worst_finding = max(damage_findings, key=lambda finding: finding.ratio)
+        ratio = spot.light * worst_finding.ratio
         area = float((ratio >= 1).sum()) * (spot.pitch * 1e6) ** 2
-        cut = _cut(spot.light, max(_FAINT, min(_DIM, 0.1 / worst.ratio)))
-        width = cut.shape[0] * spot.pitch
+        # show a tenth of the limit, unless that is too faint or too much of the spot
+        bright_part = _cut(spot.light, max(_FAINT, min(_DIM, 0.1 / worst_finding.ratio)))
+        width = bright_part.shape[0] * spot.pitch
         yield DamagePattern(
-            spot.option, worst.limit.name, cut * worst.ratio, width, worst.ratio, area
+            spot.option,
+            worst_finding.limit.name,
+            bright_part * worst_finding.ratio,
+            width,
+            worst_finding.ratio,
+            area,
         )
 
 
@@ -136,9 +149,9 @@ def _cut(light: FloatArray, faint: float) -> FloatArray:
     """
     middle = np.array(light.shape) // 2
     bright = np.argwhere(light >= faint)
-    reach = int(np.clip(np.abs(bright - middle).max(), _LEAST, min(middle) - 1))
-    y, x = middle
-    return light[y - reach : y + reach + 1, x - reach : x + reach + 1]
+    half_side = int(np.clip(np.abs(bright - middle).max(), _LEAST, min(middle) - 1))
+    row, column = middle
+    return light[row - half_side : row + half_side + 1, column - half_side : column + half_side + 1]
 
 
 # --- dead pixels ----------------------------------------------------------------------------------
@@ -175,18 +188,18 @@ def damaged_frames(
     reached = _reached(damage, exposures)
     if safety.settings.damage is None or not reached:
         return
-    here = exposures.at(safety.laser.distance)
-    index = here if here in reached else max(reached)
+    index_here = exposures.at(safety.laser.distance)
+    index = index_here if index_here in reached else max(reached)
     pitch = safety.settings.sensor.pixel_pitch
     for spot in spots:
         if spot.pitch > pitch:  # samples that miss pixels say nothing of them
             continue
-        hit = _hit(spot, pitch, damage, exposures, index)
+        damage_places = _hit(spot, pitch, damage, exposures, index)
         yield _frame(
             spot.option,
             float(exposures.distances[index]),
-            hit,
-            _half_width(hit),
+            damage_places,
+            _half_width(damage_places),
             safety.settings.damage.device,
         )
 
@@ -197,15 +210,22 @@ def _hit(
     """Return the kinds of damage that are reached behind one protection at a distance, with the
     places of each.
     """
-    behind = [finding for finding in damage if finding.option == spot.option]
-    places = [_above(spot, pitch, float(_ratio(finding, exposures)[index])) for finding in behind]
-    kinds = [finding.limit.kind for finding in behind]
-    return [(kind, pixels) for kind, pixels in zip(kinds, places, strict=True) if len(pixels)]
+    findings_behind = [finding for finding in damage if finding.option == spot.option]
+    pixels_of_findings = [
+        _above(spot, pitch, float(_ratio(finding, exposures)[index])) for finding in findings_behind
+    ]
+    kinds = [finding.limit.kind for finding in findings_behind]
+    return [
+        (kind, pixels)
+        for kind, pixels in zip(kinds, pixels_of_findings, strict=True)
+        if len(pixels)
+    ]
 
 
 def _half_width(hit: Sequence[tuple[str, FloatArray]]) -> int:
     """Return the pixels from the spot to each edge of a picture that holds all damaged places."""
     farthest = max((np.abs(places).max() for _, places in hit), default=0)
+    # half as far again, within the limits of a picture
     return int(np.clip(farthest * 3 // 2, _HALF, _MOST))
 
 
@@ -213,14 +233,15 @@ def _reached(damage: Sequence[Finding], exposures: Exposures) -> set[int]:
     """Return the indices of the distances at which a limit of damage is exceeded behind the
     plain lens.
     """
-    plain = [finding for finding in damage if finding.option == "plain lens"]
-    indices = [np.flatnonzero(_ratio(finding, exposures) >= 1) for finding in plain]
+    plain_findings = [finding for finding in damage if finding.option == "plain lens"]
+    indices = [np.flatnonzero(_ratio(finding, exposures) >= 1) for finding in plain_findings]
     return set(np.concatenate(indices).tolist()) if indices else set()
 
 
 def _ratio(finding: Finding, exposures: Exposures) -> FloatArray:
     """Return the nominal exposure over the limit of the median device (distance,)."""
     emitted = exposures.emitted(finding.limit.quantity)[0]
+    # `curve[0]` is the nominal limit at the lens
     ratio: FloatArray = emitted * exposures.lens[0] / finding.curve[0]
     return ratio
 
@@ -237,20 +258,29 @@ def _above(spot: Spot, pitch: float, ratio: float) -> FloatArray:
 def _frame(
     option: str, distance: float, hit: Sequence[tuple[str, FloatArray]], half: int, device: str
 ) -> DeadPixels:
+    """Return an example of a damaged raw frame of a grey scene.
+
+    ``distance`` is in m, ``hit`` has each kind of damage with the places (pixel, (y, x)) from the
+    spot, and ``half`` is the number of pixels from the spot to each edge.
+    """
     pattern = torch.zeros(2 * half + 1, 2 * half + 1, dtype=torch.uint8)
-    others = any(kind != "frame" for kind, _ in hit)
+    has_other_damage = any(kind != "frame" for kind, _ in hit)
     for kind, places in hit:
-        if kind == "frame" and others:  # a black picture would hide what else is damaged
+        if kind == "frame" and has_other_damage:  # a black picture would hide what else is damaged
             continue
         for y, x in places[(np.abs(places) <= half).all(1)] + half:
+            # one bit for each kind
             pattern[y, x] |= 1 << KINDS.index(kind)
-    none = torch.zeros(0, dtype=torch.float64)
+    unused = torch.zeros(0, dtype=torch.float64)
     raw = torch.full((1, *pattern.shape), float(_GREY))
-    damage = SpotDamage._make([*[none] * 8, pattern])
-    drawn = damaged_pixels(raw, [damage], full_well=float(_WHITE), gain=1.0, bits=10, device=device)
+    # only the pattern is drawn: its eight exposures and thresholds stay empty
+    damage = SpotDamage._make([*[unused] * 8, pattern])
+    damaged = damaged_pixels(
+        raw, [damage], full_well=float(_WHITE), gain=1.0, bits=10, device=device
+    )
     kinds = tuple(kind for kind in KINDS if kind in {kind for kind, _ in hit})
     return DeadPixels(
-        option, distance, kinds, int((pattern > 0).sum()), drawn[0].double().numpy() / _WHITE
+        option, distance, kinds, int((pattern > 0).sum()), damaged[0].double().numpy() / _WHITE
     )
 
 
@@ -275,30 +305,36 @@ def refuse_other_lens(recipe: Recipe, safety: Safety, store: Store | None) -> No
         [*_named_stop(recipe, safety), *_upstream(recipe, safety, "optics.stop")]
     ):
         stop = run(recipe, store, [name])[name]
-        span = float(stop.samples * stop.pitch)
-        passed = f"{min(float(stop.diameter), span) * 1e3:.4g} mm"
-        if float(stop.diameter) > span * (1 + _SAME):
-            text = (
-                f"the step {name} clips its disc to a square of {passed}, and an estimate is of a"
+        grid_width = float(stop.samples * stop.pitch)
+        width = f"{min(float(stop.diameter), grid_width) * 1e3:.4g} mm"
+        if float(stop.diameter) > grid_width * (1 + _SAME):
+            problem_text = (
+                f"the step {name} clips its disc to a square of {width}, and an estimate is of a"
                 " round lens"
             )
             problems.append(
-                _problem(safety, "lens.diameter", f"{text}: choose reading.aperture=stretched")
+                _problem(
+                    safety, "lens.diameter", f"{problem_text}: choose reading.aperture=stretched"
+                )
             )
         elif not math.isclose(float(stop.diameter), lens.diameter, rel_tol=_SAME):
-            text = f"the stop of the recipe ({name}) has {passed}, and the lens of the estimate"
+            problem_text = (
+                f"the stop of the recipe ({name}) has {width}, and the lens of the estimate"
+            )
             fix = "write one diameter in both; reading.aperture=stretched keeps that of the recipe"
             problems.append(
-                _problem(safety, "lens.diameter", f"{text} {lens.diameter * 1e3:.4g} mm: {fix}")
+                _problem(
+                    safety, "lens.diameter", f"{problem_text} {lens.diameter * 1e3:.4g} mm: {fix}"
+                )
             )
     stop_of_protection = safety.settings.protection.stop
     if stop_of_protection is not None and stop_of_protection > lens.diameter * (1 + _SAME):
-        wider = (
+        problem = (
             f"a stop of {stop_of_protection * 1e3:.4g} mm is wider than the lens of"
             f" {lens.diameter * 1e3:.4g} mm"
         )
         problems.append(
-            _problem(safety, "protection.stop", f"{wider} and stops nothing: give a smaller one")
+            _problem(safety, "protection.stop", f"{problem} and stops nothing: give a smaller one")
         )
     if problems:
         raise RecipeError(problems)
@@ -316,10 +352,10 @@ def _other_focal_length(recipe: Recipe, safety: Safety) -> Iterator[Diagnostic]:
     """
     focal_length = safety.settings.lens.focal_length
     for name in _upstream(recipe, safety, "optics.psf"):
-        other = recipe.steps[name].params["focal_length"]
-        if not math.isclose(other, focal_length, rel_tol=_SAME):
+        step_length = recipe.steps[name].params["focal_length"]
+        if not math.isclose(step_length, focal_length, rel_tol=_SAME):
             text = (
-                f"the step {name} has {other * 1e3:.4g} mm, and the lens of the estimate"
+                f"the step {name} has {step_length * 1e3:.4g} mm, and the lens of the estimate"
                 f" {focal_length * 1e3:.4g} mm"
             )
             yield _problem(safety, "lens.focal_length", f"{text}: write one focal length in both")

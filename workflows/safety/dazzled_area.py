@@ -62,10 +62,13 @@ class Area:
 
         It is a share of the light that passes the lens.
         """
-        table, place, others = self._table(exposures, draws, veiled)
-        rank = int(np.searchsorted(self.ranks, self.asked))
-        level: FloatArray = np.exp(table.at(place, others, slice(rank, rank + 1))[..., 0])
-        return level
+        levels, log_distance, grid_values = self._table(exposures, draws, veiled)
+        # the level of the asked number of pixels alone
+        rank_index = int(np.searchsorted(self.ranks, self.asked))
+        faintest_share: FloatArray = np.exp(
+            levels.at(log_distance, grid_values, slice(rank_index, rank_index + 1))[..., 0]
+        )
+        return faintest_share
 
     def beyond(self, exposures: Exposures, draws: SettingDraws) -> float:
         """Return the largest share of the lost pixels that lie beyond the window of a PSF, over
@@ -81,42 +84,52 @@ class Area:
 
         ``light`` (1 + draw or 1, any) is the share of the light that passes the lens.
         """
-        table, place, others = self._table(exposures, draws, veiled=False)
-        columns = [place, *others]
+        levels, log_distance, grid_values = self._table(exposures, draws, veiled=False)
+        columns = [log_distance, *grid_values]
         columns = [
             column[:, index : index + 1] if column.shape[1] > 1 else column for column in columns
         ]
-        levels = table.at(columns[0], columns[1:], slice(None))[:, 0]
-        levels = np.broadcast_to(levels, (max(len(levels), len(light)), levels.shape[1]))
-        light = np.broadcast_to(light, (len(levels), light.shape[1]))
+        # column 0: one distance
+        levels_of_draws = levels.at(columns[0], columns[1:], slice(None))[:, 0]
+        levels_of_draws = np.broadcast_to(
+            levels_of_draws, (max(len(levels_of_draws), len(light)), levels_of_draws.shape[1])
+        )
+        light = np.broadcast_to(light, (len(levels_of_draws), light.shape[1]))
         ranks = self.ranks
-        rows = [_number(row, ranks, needed) for row, needed in zip(levels, light, strict=True)]
+        rows = [
+            _number(row, ranks, needed) for row, needed in zip(levels_of_draws, light, strict=True)
+        ]
         return np.stack(rows)
 
     def _table(
         self, exposures: Exposures, draws: SettingDraws, veiled: bool
     ) -> tuple[Levels, FloatArray, list[FloatArray]]:
-        """Return the levels, and where draws and distances lie among them; both are kept with
-        the exposures.
+        """Return the levels, and where draws and distances lie among them; both are kept with the
+        exposures.
+
+        The second is the logarithm of the distance at which the nominal beam is as wide, the third
+        are the values along the grids of the levels; all are (1 + draw or 1, distance).
         """
-        name = self._diameter, self.ranked.arm if self.ranked else "", veiled
-        if name not in exposures.tables:
+        key = self._diameter, self.ranked.arm if self.ranked else "", veiled
+        if key not in exposures.tables:
+            # one veil for all areas
             if "veil" not in exposures.tables:
                 exposures.tables["veil"] = veil_of(self.safety, draws)
             veil = exposures.tables["veil"]
-            share = np.log(veil.share)[:, None] if veil else np.zeros((1, 1))
+            log_share = np.log(veil.share)[:, None] if veil else np.zeros((1, 1))
             if self.ranked is None:
                 spots = self._round_spots(exposures, draws)
-                levels, place = _of_clear(self, spots, veil, share, veiled), spots.place
-                others = [*spots.others, share]
+                levels, log_distance = _of_clear(self, spots, veil, log_share, veiled), spots.place
+                grid_values = [*spots.others, log_share]
             else:
-                widths = self.safety.settings.lens.diameter / (
+                # the beam's radius at the lens: fill = (D / (2 w))^2
+                beam_radii = self.safety.settings.lens.diameter / (
                     2 * np.sqrt(exposures.fill[self.option.name])
                 )
-                place = np.log(as_wide(exposures.beams[0], widths))
-                levels, others = _of_spots(self, veil, share, veiled), [share]
-            exposures.tables[name] = levels, place, others
-        table: tuple[Levels, FloatArray, list[FloatArray]] = exposures.tables[name]
+                log_distance = np.log(as_wide(exposures.beams[0], beam_radii))
+                levels, grid_values = _of_spots(self, veil, log_share, veiled), [log_share]
+            exposures.tables[key] = levels, log_distance, grid_values
+        table: tuple[Levels, FloatArray, list[FloatArray]] = exposures.tables[key]
         return table
 
     @property
@@ -128,10 +141,10 @@ class Area:
         """Return the spots of a clear round lens; they are kept with the exposures, for each
         diameter.
         """
-        name = "round spots", self._diameter
-        if name not in exposures.tables:
-            exposures.tables[name] = _round_spots(self, exposures, draws)
-        spots: _RoundSpots = exposures.tables[name]
+        key = "round spots", self._diameter
+        if key not in exposures.tables:
+            exposures.tables[key] = _round_spots(self, exposures, draws)
+        spots: _RoundSpots = exposures.tables[key]
         return spots
 
 
@@ -154,37 +167,47 @@ class _RoundSpots:
 
 
 def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _RoundSpots:
-    """Return the spots of a clear round lens, by the integral over its pupil at each rung and
-    each point.
+    """Return the spots of a clear round lens, by the integral over its pupil at each rung and each
+    point of the grids.
     """
     lens, sensor, dazzle = (
         area.safety.settings.lens,
         area.safety.settings.sensor,
         area.safety.settings.dazzle,
     )
-    name, diameter = area.option.name, area._diameter
-    widths = diameter / (2 * np.sqrt(exposures.fill[name]))
-    waist = min(*(beam.waist for beam in exposures.beams), float(widths.min()))
+    option_name, diameter = area.option.name, area._diameter
+    beam_radii = diameter / (2 * np.sqrt(exposures.fill[option_name]))
+    # the narrowest beam drawn, so that every radius has a distance
+    waist = min(*(beam.waist for beam in exposures.beams), float(beam_radii.min()))
     beam = exposures.beams[0]._replace(waist=waist)
-    place = np.log(as_wide(beam, widths))
-    defocus = _defocus(area.safety, beam, diameter)
-    bend = np.arcsinh(exposures.waves[name] / _SOFT) - np.arcsinh(defocus(np.exp(place)) / _SOFT)
-    spread = np.log(_spreads(area.safety, draws, diameter))
-    bends, spreads = Grid.through_zero(bend, 1.5), Grid.around(spread, 4)
-    ends = float(np.exp(place.min())), float(np.exp(place.max()))
-    rungs = ladder(beam, lens, diameter, ends, _STEP, _WAVES)
+    log_distance = np.log(as_wide(beam, beam_radii))
+    nominal_defocus = _defocus(area.safety, beam, diameter)
+    # asinh(defocus / soft): linear near focus and logarithmic far from it
+    bend_offset = np.arcsinh(exposures.waves[option_name] / _SOFT) - np.arcsinh(
+        nominal_defocus(np.exp(log_distance)) / _SOFT
+    )
+    log_spread = np.log(_spreads(area.safety, draws, diameter))
+    # points for each unit of asinh and of the logarithm
+    bend_grid, spread_grid = Grid.through_zero(bend_offset, 1.5), Grid.around(log_spread, 4)
+    distance_range = float(np.exp(log_distance.min())), float(np.exp(log_distance.max()))
+    rungs = ladder(beam, lens, diameter, distance_range, _STEP, _WAVES)
     groups = []
     for distance in rungs.tolist():
         fill = fill_at(beam, diameter, distance)
-        nominal = math.asinh(float(defocus(np.array([distance]))[0]) / _SOFT)
-        for offset, size in itertools.product(bends.points.tolist(), spreads.points.tolist()):
-            waves = _SOFT * math.sinh(nominal + offset)
+        nominal_bend = math.asinh(float(nominal_defocus(np.array([distance]))[0]) / _SOFT)
+        for bend_of_point, log_size in itertools.product(
+            bend_grid.points.tolist(), spread_grid.points.tolist()
+        ):
+            waves = _SOFT * math.sinh(nominal_bend + bend_of_point)
             feature = dazzle.feature if dazzle else 1.0
             phases = [
-                round_pixels(fill, w, math.exp(size), sensor.shape, feature) for w in _phases(waves)
+                round_pixels(fill, phase_waves, math.exp(log_size), sensor.shape, feature)
+                for phase_waves in _phases(waves)
             ]
             groups.append(tuple(phases))
-    return _RoundSpots(rungs, (bends, spreads), tuple(groups), place, (bend, spread))
+    return _RoundSpots(
+        rungs, (bend_grid, spread_grid), tuple(groups), log_distance, (bend_offset, log_spread)
+    )
 
 
 def _phases(waves: float) -> list[float]:
@@ -203,9 +226,9 @@ def _number(levels: FloatArray, ranks: FloatArray, light: FloatArray) -> FloatAr
     """Return the number of pixels with at least each light, from the logarithms of the levels of
     rising ranks.
     """
-    needed = np.log(np.maximum(light, 1e-300))
-    number = np.exp(np.interp(needed, levels[::-1], np.log(ranks)[::-1]))
-    return np.where(needed > levels[0], 0.0, number)
+    log_light = np.log(np.maximum(light, 1e-300))
+    pixel_number = np.exp(np.interp(log_light, levels[::-1], np.log(ranks)[::-1]))
+    return np.where(log_light > levels[0], 0.0, pixel_number)
 
 
 def _defocus(safety: Safety, beam: Beam, diameter: float) -> Callable[[FloatArray], FloatArray]:
@@ -230,9 +253,10 @@ def _spreads(safety: Safety, draws: SettingDraws, diameter: float) -> FloatArray
     """
     lens, laser, pitch = safety.settings.lens, safety.laser, safety.settings.sensor.pixel_pitch
     aperture = np.minimum(draws.column("lens.diameter", lens.diameter), diameter)
-    focal = draws.column("lens.focal_length", lens.focal_length)
-    colour = draws.column("laser.wavelength", laser.wavelength)
-    spread = colour * focal / aperture / draws.column("sensor.pixel_pitch", pitch)
+    focal_length = draws.column("lens.focal_length", lens.focal_length)
+    wavelength = draws.column("laser.wavelength", laser.wavelength)
+    spread = wavelength * focal_length / aperture / draws.column("sensor.pixel_pitch", pitch)
+    # one row where all draws are alike
     return (spread if np.ptp(spread) else spread[:1])[:, None]
 
 
@@ -240,43 +264,44 @@ def _of_clear(
     area: Area, spots: _RoundSpots, veil: Veil | None, share: FloatArray, veiled: bool
 ) -> Levels:
     """Return the levels of a clear round lens, from its spots."""
-    shares, shape = Grid.around(share, 2), area.safety.settings.sensor.shape
+    share_grid, shape = Grid.around(share, 2), area.safety.settings.sensor.shape
 
     def brightest(phases: Sequence[BrightPixels]) -> tuple[FloatArray, FloatArray]:
         phase_levels = [
-            levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled)
+            levels_of(groups, shape, area.ranks, veil, np.exp(share_grid.points), veiled)
             for groups in phases
         ]
         values, beyond = phase_levels[0]
         return (
+            # the few brightest pixels turn with the phase: the brightest of all phases counts
             np.where(
                 area.ranks <= _MIDDLE, np.max([value for value, _ in phase_levels], axis=0), values
             ),
             beyond,
         )
 
-    levels = list(map(brightest, spots.groups))
-    points = [len(grid.points) for grid in (*spots.grids, shares)]
+    levels_at_points = list(map(brightest, spots.groups))
+    grid_sizes = [len(grid.points) for grid in (*spots.grids, share_grid)]
     values, beyond = (
-        np.stack(arrays).reshape(len(spots.rungs), *points, len(area.ranks))
-        for arrays in zip(*levels, strict=True)
+        np.stack(arrays).reshape(len(spots.rungs), *grid_sizes, len(area.ranks))
+        for arrays in zip(*levels_at_points, strict=True)
     )
-    return Levels(np.log(spots.rungs), (*spots.grids, shares), values, beyond)
+    return Levels(np.log(spots.rungs), (*spots.grids, share_grid), values, beyond)
 
 
 def _of_spots(area: Area, veil: Veil | None, share: FloatArray, veiled: bool) -> Levels:
     """Return the levels behind lens or mask, from the pixels of their PSFs at several distances."""
     assert area.ranked is not None
-    shares, shape = Grid.around(share, 3), area.safety.settings.sensor.shape
+    share_grid, shape = Grid.around(share, 3), area.safety.settings.sensor.shape
     spot_levels = [
-        levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled)
+        levels_of(groups, shape, area.ranks, veil, np.exp(share_grid.points), veiled)
         for groups in area.ranked.groups
     ]
     values, beyond = (np.stack(arrays) for arrays in zip(*spot_levels, strict=True))
     rungs = np.log(np.array(area.ranked.distances))
     misses = area.ranked.misses
     return Levels(
-        rungs, (shares,), values, beyond, most=-np.log(area.ranks), misses=misses
+        rungs, (share_grid,), values, beyond, most=-np.log(area.ranks), misses=misses
     )  # N pixels share all light at most
 
 
@@ -295,10 +320,10 @@ def area_of(safety: Safety, option: Option, ranked: Sequence[Ranked]) -> Area | 
                 " of one distance"
             )
         return Area(option, safety, arms["mask"])
-    plain = arms.get("plain") if option.diameter is None else None
-    if plain is not None and not math.isfinite(plain.error):
+    plain_spots = arms.get("plain") if option.diameter is None else None
+    if plain_spots is not None and not math.isfinite(plain_spots.error):
         return (
             "the pupil of safety.protection.pixels.plain has no wavefront, so that its spot is of"
             " one distance"
         )
-    return Area(option, safety, plain)
+    return Area(option, safety, plain_spots)

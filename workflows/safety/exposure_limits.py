@@ -61,23 +61,25 @@ def with_channels(recipe: Recipe, safety: Safety, store: Store | None) -> Safety
 
     Raises `RecipeError` for a step that does not exist or is of another node.
     """
-    named = safety.settings.sensor.responses
-    if named is None:
+    step_name = safety.settings.sensor.responses
+    if step_name is None:
         return safety
-    step = _step(recipe, safety, named)
-    line = recipe.steps[str(step.wires["bands"])]
-    if line.node.path != _LINE:
+    step = _step(recipe, safety, step_name)
+    line_step = recipe.steps[str(step.wires["bands"])]
+    if line_step.node.path != _LINE:
         raise _refused(
             safety, f"the step {step.name} is not of a laser line: name a step that reads one"
         )
     result = run(recipe, store, [step.name])
     largest = float(result[step.name].max())
-    return replace(safety, channels=LaserChannels(line, step, largest, str(result.keys[step.name])))
+    return replace(
+        safety, channels=LaserChannels(line_step, step, largest, str(result.keys[step.name]))
+    )
 
 
 def _step(recipe: Recipe, safety: Safety, named: str) -> Step:
-    """Return the step of responses, completed by the laser if the step has a copy for each
-    laser.
+    """Return the step of responses that the settings name, with the name of the laser added if the
+    step has a copy for each laser.
     """
     name = next(
         (
@@ -98,6 +100,7 @@ def _step(recipe: Recipe, safety: Safety, named: str) -> Step:
 
 
 def _refused(safety: Safety, text: str) -> RecipeError:
+    """Return the error of a setting of responses, at its place in the recipe."""
     value = safety.values[_SETTING]
     return RecipeError([Diagnostic(value.mark, value.name, text)])
 
@@ -115,12 +118,12 @@ def channel_saturation(
 
     ``sensor`` has the quantum efficiency, the pixel pitch and the exposure.
     """
-    line: Bands = channels.line.node(**{**channels.line.params, "wavelength": wavelength})
+    laser_bands: Bands = channels.line.node(**{**channels.line.params, "wavelength": wavelength})
     params = {**channels.responses.params}
     if params.get("quantum_efficiency") is not None:  # what an absolute table is relative to
         params["quantum_efficiency"] = sensor["quantum_efficiency"]
     return line_saturation(
-        line, channels.responses.node(line, **params), electrons=electrons, **sensor
+        laser_bands, channels.responses.node(laser_bands, **params), electrons=electrons, **sensor
     )
 
 
@@ -186,10 +189,11 @@ def limit_parts(
         return ()
     light = light_in_time(safety, option, exposures, draws)
     parts = damage_parts(light, safety.settings.damage.device, safety.laws)
-    single = "incubation" if float(light.pulses.max()) <= 1 else ""
+    # one pulse in the dwell time has no incubation by many
+    needless = "incubation" if float(light.pulses.max()) <= 1 else ""
     if light.pulse_duration is None:
         return tuple(damage_part for damage_part in parts if damage_part.part == "mean")
-    return tuple(damage_part for damage_part in parts if damage_part.part != single)
+    return tuple(damage_part for damage_part in parts if damage_part.part != needless)
 
 
 def light_in_time(
@@ -202,13 +206,16 @@ def light_in_time(
     assert damage is not None
     exponent = draws.column("damage.small_spot_exponent", damage.small_spot_exponent)
     spot = _heated(option, exposures)
-    plain = exponent.max() == 0 and all(spot.max() <= law.spot for law in _with_spot(safety))
+    # spots matter only to laws of a known spot that is narrower, or for a bonus
+    spot_without_effect = exponent.max() == 0 and all(
+        spot.max() <= law.spot for law in _with_spot(safety)
+    )
     return LightInTime(
         wavelength=beams[0].wavelength,
         dwell=_narrow(draws.column("damage.dwell", damage.dwell)),
         pulse_duration=_of_beams([beam.pulse_duration for beam in beams]),
         repetition_rate=_of_beams([beam.repetition_rate for beam in beams]),
-        spot=None if plain else torch.from_numpy(spot),
+        spot=None if spot_without_effect else torch.from_numpy(spot),
         small_spot_exponent=_narrow(exponent),
     )
 
@@ -252,8 +259,8 @@ def _damage_limit(
     """
     assert damage_part.threshold is not None
     low, middle, high = (
-        end.numpy()
-        for end in (
+        bracket_part.numpy()
+        for bracket_part in (
             damage_part.threshold.low,
             damage_part.threshold.middle,
             damage_part.threshold.high,
@@ -261,14 +268,18 @@ def _damage_limit(
     )
     devices = np.ones((1 + draws.count, 1))
     if damage_part.law is not None:
+        # two streams a law: its median, and its devices
         stream = 2 * safety.laws.index(damage_part.law)  # the same devices behind every option
         values = middle * _scattered(damage_part.law.median_factor, draws, stream)
         devices = _scattered(damage_part.law.factor, draws, stream + 1)
     elif damage_part.open_below:
         values = high + np.zeros_like(devices)
     else:
-        place = np.concatenate([[0.0], draws.normal(_BRACKET)])[:, None]
-        values = np.where(place > _THIRD, high, np.where(place < -_THIRD, low, middle))
+        normal_draws = np.concatenate([[0.0], draws.normal(_BRACKET)])[:, None]
+        # below the quantile at 1/3, above that at 2/3, or between both
+        values = np.where(
+            normal_draws > _THIRD, high, np.where(normal_draws < -_THIRD, low, middle)
+        )
     quantity, factor = _stated_as(damage_part, exposures, safety, draws)
     return Limit(
         name=_limit_name(damage_part),
@@ -311,18 +322,21 @@ def _stated_as(
     rates = np.array([[beam.repetition_rate or 0.0] for beam in beams])
     durations = np.array([[beam.pulse_duration or 0.0] for beam in beams])
     dwell = draws.column("damage.dwell", damage.dwell)[:, None]
-    pulses = np.maximum(rates, 1 / dwell) * np.minimum(1.0, dwell / durations)
+    # mean irradiance over the energy of a pulse, in 1/s: pulses in a second (at least one in the
+    # dwell time) times the share of a pulse within the dwell time
+    per_pulse_energy = np.maximum(rates, 1 / dwell) * np.minimum(1.0, dwell / durations)
     if rates[0, 0] * dwell[0, 0] > 1:
-        return "irradiance", rates / pulses
-    return "fluence", 1 / pulses
+        # mean power = rate x energy
+        return "irradiance", rates / per_pulse_energy
+    return "fluence", 1 / per_pulse_energy
 
 
 def _scattered(factor: float | None, draws: SettingDraws, stream: int) -> FloatArray:
     """Return draws (1 + draw, 1) of a lognormal factor around 1; all are 1 for a factor that is
     not known.
     """
-    scattered = np.power(factor or 1.0, draws.normal(stream))
-    return np.concatenate([[1.0], scattered])[:, None]
+    drawn_factors = np.power(factor or 1.0, draws.normal(stream))
+    return np.concatenate([[1.0], drawn_factors])[:, None]
 
 
 def dazzle_limits(
@@ -338,24 +352,25 @@ def dazzle_limits(
     if dazzle is None:
         return
     name = area.option.name
-    full = saturating(safety, draws)[:, None]
+    full_irradiance = saturating(safety, draws)[:, None]
     share = f"{100 * dazzle.share:g} % of the picture"
     well_share = (
         veil_level(dazzle, area.option.scene_share(safety.settings.lens.diameter)) / sensor.fills
     )
-    levels = [("saturated", 1.0)] + ([("veiled", well_share)] if 0 < well_share < 1 else [])
-    for word, well_share in levels:
-        light = area.level(exposures, draws, word == "veiled")
+    shares_of_well = [("saturated", 1.0)] + ([("veiled", well_share)] if 0 < well_share < 1 else [])
+    for effect, well_share in shares_of_well:
+        faintest_share = area.level(exposures, draws, effect == "veiled")
+        # peak exposure at which the faintest of these pixels is full: peak over light per pixel
         values = (
-            full
+            full_irradiance
             * well_share
             * exposures.sensor[name]
             * sensor.pixel_pitch**2
-            / (exposures.through[name] * light)
+            / (exposures.through[name] * faintest_share)
         )
         devices = np.ones((len(values), 1))
         yield Limit(
-            f"{word}: {share}",
+            f"{effect}: {share}",
             "dazzle",
             "irradiance",
             values,
@@ -400,11 +415,12 @@ def saturating(safety: Safety, draws: SettingDraws) -> FloatArray:
     }
     prefixes = {name: "laser" if name == "wavelength" else "sensor" for name in nominal}
     columns = [draws.column(f"{prefixes[name]}.{name}", value) for name, value in nominal.items()]
-    rows, places = np.unique(np.stack(columns, 1), axis=0, return_inverse=True)
+    # equal draws are computed once
+    unique_rows, row_of_draw = np.unique(np.stack(columns, 1), axis=0, return_inverse=True)
     irradiances = [
-        _saturation(safety, dict(zip(nominal, map(float, row), strict=True))) for row in rows
+        _saturation(safety, dict(zip(nominal, map(float, row), strict=True))) for row in unique_rows
     ]
-    return np.array(irradiances)[places.ravel()]
+    return np.array(irradiances)[row_of_draw.ravel()]
 
 
 def _saturation(safety: Safety, values: dict[str, float]) -> float:
@@ -521,11 +537,12 @@ def eye_finding(safety: Safety, exposures: Exposures) -> EyeFinding | str:
     there is none.
     """
     beam, index = exposures.beams[0], exposures.at(safety.laser.distance)
+    # by default the reflex of the lid in visible light, else 10 s
     duration = safety.settings.eye.exposure or (0.25 if beam.wavelength <= 700e-9 else 10.0)
     rule = safety.settings.eye.rule
     try:
         limit, source = eye_limit(beam, duration, rule), eye_limit_source(beam, duration, rule)
-        reach = np.array(
+        hazard_distances = np.array(
             [
                 nominal_ocular_hazard_distance(drawn_beam, duration, rule=rule)
                 for drawn_beam in exposures.beams
@@ -534,11 +551,13 @@ def eye_finding(safety: Safety, exposures: Exposures) -> EyeFinding | str:
     except ParameterError as error:
         return f"Nothing is said of the eye: {error}."
     quantity = "fluence" if beam.is_pulsed else "irradiance"
-    here = (
+    exposure_here = (
         exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0]
         * exposures.lens[:, index]
     )
-    return EyeFinding(duration, limit, quantity, _spread(here), _spread(reach), source)
+    return EyeFinding(
+        duration, limit, quantity, _spread(exposure_here), _spread(hazard_distances), source
+    )
 
 
 def eye_dazzle_finding(safety: Safety, exposures: Exposures) -> EyeDazzleFinding:
@@ -571,23 +590,33 @@ def _tasks(asked: EyeDazzle) -> Sequence[DazzleTask]:
 
 
 def _row(task: DazzleTask, safety: Safety, exposures: Exposures) -> EyeDazzleRow:
-    lux = dazzle_illuminance(task)
+    """Return the dazzle of the eye for one task: the maximum dazzle exposure (MDE), its distance
+    with the interval of the draws, and whether the laser hides the target at the distance of the
+    recipe.
+    """
+    illuminance = dazzle_illuminance(task)
     limits = [
-        lux / (LUMENS_PER_WATT * value) if value > 0 else math.inf
-        for value in _efficiencies(exposures.beams)
+        # 683 lm/W times V(lambda)
+        illuminance / (LUMENS_PER_WATT * efficiency) if efficiency > 0 else math.inf
+        for efficiency in _efficiencies(exposures.beams)
     ]
-    here = float(
+    irradiance_here = float(
         exposures.emitted("irradiance")[0, 0]
         * exposures.lens[0, exposures.at(safety.laser.distance)]
     )
-    reach = None
-    if lux > 0:
+    dazzle_distance = None
+    if illuminance > 0:
         pairs = zip(exposures.beams, limits, strict=True)
-        reach = _spread(
+        dazzle_distance = _spread(
             np.array([nominal_ocular_dazzle_distance(beam, limit) for beam, limit in pairs])
         )
     return EyeDazzleRow(
-        task.background, task.angle, lux, limits[0], reach, lux > 0 and here > limits[0]
+        task.background,
+        task.angle,
+        illuminance,
+        limits[0],
+        dazzle_distance,
+        illuminance > 0 and irradiance_here > limits[0],
     )
 
 

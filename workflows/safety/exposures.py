@@ -58,8 +58,8 @@ class SettingDraws:
 
     def column(self, name: str, nominal: float) -> FloatArray:
         """Return the nominal value of a setting and its draws (1 + draw,)."""
-        drawn = self.values.get(name, np.full(self.count, nominal))
-        return np.concatenate([[nominal], drawn])
+        draws = self.values.get(name, np.full(self.count, nominal))
+        return np.concatenate([[nominal], draws])
 
     def normal(self, stream: int) -> FloatArray:
         """Return a standard normal number for each draw; another ``stream`` has independent
@@ -84,11 +84,12 @@ def draw_settings(recipe: Recipe, safety: Safety) -> SettingDraws:
         if value.name in uncertain.names
     }
     allowed, notes = within_allowed(only_values(uncertain, paths.values()), NEGLIGIBLE)
-    drawn = _draws(allowed, count, recipe.seed)
-    texts = {path: uncertain.said(path) for path in drawn}
+    draws_by_path = _draws(allowed, count, recipe.seed)
+    texts = {path: uncertain.said(path) for path in draws_by_path}
     texts |= {path: f"{texts[path]} ({note})" for path, note in notes.items()}
-    order = sorted(paths, key=lambda setting: list(drawn).index(paths[setting]))
-    values = {setting: drawn[paths[setting]] for setting in order}
+    # in the order in which they were drawn
+    order = sorted(paths, key=lambda setting: list(draws_by_path).index(paths[setting]))
+    values = {setting: draws_by_path[paths[setting]] for setting in order}
     return SettingDraws(
         count, values, {setting: texts[paths[setting]] for setting in order}, recipe.seed
     )
@@ -98,18 +99,23 @@ def _draws(uncertain: Uncertain, count: int, seed: int) -> dict[str, FloatArray]
     """Return ``count`` draws of each uncertain value; those of a table of samples are whole rows
     of the table.
     """
-    z = np.random.default_rng([seed, 1]).standard_normal((count, len(uncertain.names)))
-    drawn = {name: law.at(z[:, i]) for i, (name, law) in enumerate(uncertain.laws.items())}
+    standard_normal = np.random.default_rng([seed, 1]).standard_normal(
+        (count, len(uncertain.names))
+    )
+    draws_by_name = {
+        name: law.at(standard_normal[:, i]) for i, (name, law) in enumerate(uncertain.laws.items())
+    }
     joint = uncertain.joint
     if joint is None:
-        return drawn
+        return draws_by_name
     if joint.draws is None:
-        rows = joint.at(z[:, len(drawn) :])
+        # the last columns of random numbers are those of the joint values
+        rows = joint.at(standard_normal[:, len(draws_by_name) :])
     else:
         rows = joint.draws[
             np.random.default_rng([seed, _ROWS]).integers(0, len(joint.draws), count)
         ]
-    return drawn | dict(zip(joint.names, rows.T, strict=True))
+    return draws_by_name | dict(zip(joint.names, rows.T, strict=True))
 
 
 # --- distance ladder ------------------------------------------------------------------------------
@@ -134,10 +140,12 @@ def far_distance(beam: Beam, diameter: float, waves: float = FAR_WAVES) -> float
     most 0.03 waves, which lowers the spot of a lens in focus by 0.3 %; the power into the lens is
     exact at every distance.
     """
-    width = diameter / (2 * math.sqrt(FAR_FILL))
-    filled = 2 * math.sqrt(max(width**2 - beam.waist**2, 0.0)) / beam.divergence
-    plane = diameter**2 / (8 * beam.wavelength * waves)
-    return max(filled, plane)
+    least_radius = diameter / (2 * math.sqrt(FAR_FILL))
+    # w(R)^2 = waist^2 + (divergence R / 2)^2
+    overfilled_from = 2 * math.sqrt(max(least_radius**2 - beam.waist**2, 0.0)) / beam.divergence
+    # path at the rim D^2 / (8 R), in waves
+    plane_from = diameter**2 / (8 * beam.wavelength * waves)
+    return max(overfilled_from, plane_from)
 
 
 def focus_of(lens: Lens) -> float:
@@ -159,21 +167,26 @@ def ladder(
     nearest, furthest = ends
     follows = lens.focus == "laser"
     focused = follows or (lens.focus == "infinity" and not lens.defocus)
-    last = min(furthest, far_distance(beam, diameter, FAR_WAVES if focused else UNFOCUSED_WAVES))
+    farthest = min(
+        furthest, far_distance(beam, diameter, FAR_WAVES if focused else UNFOCUSED_WAVES)
+    )
 
     def defocus(distance: float) -> float:
         defocused = defocus_at(beam, distance, diameter, focus_of(lens), lens.defocus * _DEFOCUS)
         return 0.0 if follows else float(defocused)
 
-    rungs = [last]
+    # from the farthest rung to the nearest
+    rungs = [farthest]
     while rungs[-1] > nearest:
-        here, factor = rungs[-1], 1 + step
+        rung, factor = rungs[-1], 1 + step
         allowed = (
-            waves if abs(defocus(here)) < FOLLOWED_WAVES else max(waves, step * abs(defocus(here)))
+            waves if abs(defocus(rung)) < FOLLOWED_WAVES else max(waves, step * abs(defocus(rung)))
         )
-        while abs(defocus(here / factor) - defocus(here)) > allowed and factor > 1.002:
+        # smaller steps until the defocus changes little enough
+        while abs(defocus(rung / factor) - defocus(rung)) > allowed and factor > 1.002:
+            # no step below 0.2 % of the distance
             factor = math.sqrt(factor)
-        rungs.append(max(here / factor, nearest))
+        rungs.append(max(rung / factor, nearest))
     return np.array(rungs[::-1])
 
 
@@ -186,8 +199,9 @@ def miss_between(rungs: FloatArray, misses: Sequence[float], place: FloatArray) 
     if not len(misses):
         return np.zeros_like(place)
     gap = np.clip(np.searchsorted(rungs, place, side="right") - 1, 0, len(rungs) - 2)
-    position = np.clip((place - rungs[gap]) / (rungs[gap + 1] - rungs[gap]), 0, 1)
-    missed: FloatArray = np.asarray(misses, np.float64)[gap] * 4 * position * (1 - position)
+    share_of_gap = np.clip((place - rungs[gap]) / (rungs[gap + 1] - rungs[gap]), 0, 1)
+    # a parabola that is 1 in the middle of the gap
+    missed: FloatArray = np.asarray(misses, np.float64)[gap] * 4 * share_of_gap * (1 - share_of_gap)
     return missed
 
 
@@ -199,6 +213,7 @@ def interpolated(rungs: FloatArray, values: FloatArray, place: FloatArray) -> Fl
 
     if len(rungs) == 1:
         return np.broadcast_to(values[0], (*np.shape(place), *values.shape[1:]))
+    # cubic, and monotone where the values are
     between: FloatArray = PchipInterpolator(rungs, values)(place)
     return between
 
@@ -207,8 +222,9 @@ def as_wide(beam: Beam, radius: FloatArray) -> FloatArray:
     """Return the distance in m at which a beam has a 1/e2 radius; 1 mm where it is wider
     everywhere.
     """
-    square = np.maximum(radius**2 - beam.waist**2, (5e-4 * beam.divergence) ** 2)
-    distance: FloatArray = 2 * np.sqrt(square) / beam.divergence
+    # at least the square of divergence times 1 mm / 2
+    reached = np.maximum(radius**2 - beam.waist**2, (5e-4 * beam.divergence) ** 2)
+    distance: FloatArray = 2 * np.sqrt(reached) / beam.divergence
     return distance
 
 
@@ -283,12 +299,14 @@ def crossings(distances: FloatArray, ratio: FloatArray) -> tuple[FloatArray, Flo
     distance as its end.
     """
     with np.errstate(divide="ignore"):
-        height = np.log(np.maximum(ratio, 1e-300))
-    place, inside = np.log(distances), height >= 0
-    edge = np.zeros((len(inside), 1), bool)
-    begins = inside & ~np.concatenate([edge, inside[:, :-1]], 1)
-    ends = inside & ~np.concatenate([inside[:, 1:], edge], 1)
-    return _placed(place, height, begins, -1), _placed(place, height, ends, 1)
+        log_ratio = np.log(np.maximum(ratio, 1e-300))
+    log_distance, inside = np.log(distances), log_ratio >= 0
+    outside = np.zeros((len(inside), 1), bool)
+    begins_here = inside & ~np.concatenate([outside, inside[:, :-1]], 1)
+    ends_here = inside & ~np.concatenate([inside[:, 1:], outside], 1)
+    return _placed(log_distance, log_ratio, begins_here, -1), _placed(
+        log_distance, log_ratio, ends_here, 1
+    )
 
 
 def _placed(
@@ -298,14 +316,20 @@ def _placed(
     the side ``step``.
     """
     row, column = np.nonzero(marks)
-    other = np.clip(column + step, 0, len(place) - 1)
-    inner, outer = height[row, column], height[row, other]
-    share = np.where(other == column, 0.0, inner / np.where(other == column, 1.0, inner - outer))
-    distances = np.exp(place[column] + share * (place[other] - place[column]))
-    count = marks.sum(1)
-    placed = np.full((len(marks), int(count.max(initial=0))), np.nan)
-    placed[row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)] = distances
-    return placed
+    neighbour = np.clip(column + step, 0, len(place) - 1)
+    inner_height, outer_height = height[row, column], height[row, neighbour]
+    # linear between the two samples; 0 at an end of the distances
+    fraction = np.where(
+        neighbour == column,
+        0.0,
+        inner_height / np.where(neighbour == column, 1.0, inner_height - outer_height),
+    )
+    distances = np.exp(place[column] + fraction * (place[neighbour] - place[column]))
+    per_row = marks.sum(1)
+    table = np.full((len(marks), int(per_row.max(initial=0))), np.nan)
+    # the n-th mark of a row goes to column n: its index less that of the row's first mark
+    table[row, np.arange(len(row)) - np.repeat(np.cumsum(per_row) - per_row, per_row)] = distances
+    return table
 
 
 def zones_of(
@@ -322,33 +346,50 @@ def zones_of(
     does. The outer ends, such as the farthest distance, have the interval of all draws that have a
     zone; ends between two zones have that of the draws with as many zones as the nominal values.
     """
-    within = _at(distances, drawn, distance) >= 1
+    exceeded_here = _at(distances, drawn, distance) >= 1
     if asked is not None:
-        shown = (distances >= asked[0] * (1 - _ROUNDED)) & (distances <= asked[1] * (1 + _ROUNDED))
-        distances, nominal, drawn = distances[shown], nominal[shown], drawn[:, shown]
-    near, far = (ends[0] for ends in crossings(distances, nominal[None]))
+        is_asked = (distances >= asked[0] * (1 - _ROUNDED)) & (
+            distances <= asked[1] * (1 + _ROUNDED)
+        )
+        distances, nominal, drawn = distances[is_asked], nominal[is_asked], drawn[:, is_asked]
+    # of the nominal values: (zone,)
+    near_ends, far_ends = (ends[0] for ends in crossings(distances, nominal[None]))
+    # (draw, zone), NaN after the last zone of a draw
     starts, stops = crossings(distances, drawn)
-    count = (~np.isnan(starts)).sum(1)
-    alike = count == len(near)
-    furthest = np.nanmax(stops[count > 0], 1) if (count > 0).any() else np.zeros(0)
+    zone_counts = (~np.isnan(starts)).sum(1)
+    has_as_many_zones = zone_counts == len(near_ends)
+    farthest_ends = np.nanmax(stops[zone_counts > 0], 1) if (zone_counts > 0).any() else np.zeros(0)
     # outer ends are those of every draw with a zone
-    first, last = starts[count > 0, :1].ravel(), len(near) - 1
+    first_ends, last_zone = starts[zone_counts > 0, :1].ravel(), len(near_ends) - 1
     zones = tuple(
         Zone(
-            Spread.of(float(near[i]), _column(starts[alike], i) if i else first),
-            Spread.of(float(far[i]), _column(stops[alike], i) if i < last else furthest),
-            bool(near[i] <= distances[0] * (1 + _ROUNDED)),
-            bool(far[i] >= distances[-1] * (1 - _ROUNDED)),
+            Spread.of(
+                float(near_ends[zone]),
+                _column(starts[has_as_many_zones], zone) if zone else first_ends,
+            ),
+            Spread.of(
+                float(far_ends[zone]),
+                _column(stops[has_as_many_zones], zone) if zone < last_zone else farthest_ends,
+            ),
+            bool(near_ends[zone] <= distances[0] * (1 + _ROUNDED)),
+            bool(far_ends[zone] >= distances[-1] * (1 - _ROUNDED)),
         )
-        for i in range(len(near))
+        for zone in range(len(near_ends))
     )
     reach = (
-        Spread.of(float(far.max()) if len(far) else float(np.median(furthest)), furthest)
-        if furthest.size
+        Spread.of(
+            float(far_ends.max()) if len(far_ends) else float(np.median(farthest_ends)),
+            farthest_ends,
+        )
+        if farthest_ends.size
         else None
     )
     return Zones(
-        zones, float((count == 0).mean()), float(alike.mean()), reach, float(within.mean())
+        zones,
+        float((zone_counts == 0).mean()),
+        float(has_as_many_zones.mean()),
+        reach,
+        float(exceeded_here.mean()),
     )
 
 
@@ -439,8 +480,8 @@ class Exposures:
         """Return the mean power in W, or the energy of a pulse in J, of the nominal values and
         of each draw.
         """
-        field = "power" if quantity == "irradiance" else "pulse_energy"
-        return np.array([getattr(beam, field) for beam in self.beams], np.float64)[:, None]
+        quantity_name = "power" if quantity == "irradiance" else "pulse_energy"
+        return np.array([getattr(beam, quantity_name) for beam in self.beams], np.float64)[:, None]
 
 
 def emission_of(beam: Beam) -> Emission:
@@ -461,14 +502,20 @@ def compute_exposures(
 
     Without ``distances`` they are those of the settings and of the recipe.
     """
-    places = asked_distances(safety) if distances is None else np.asarray(distances, np.float64)
+    sampled_distances = (
+        asked_distances(safety) if distances is None else np.asarray(distances, np.float64)
+    )
     beams = tuple(_beams(safety, draws))
-    beam, where = _stacked(beams), torch.from_numpy(places)
-    air: Any = torch.from_numpy(_air(safety, draws, places) * _uneven(safety, draws, places))
-    lens = _exposure_column(draws, "lens.transmittance", safety.settings.lens.transmittance)
+    beam, distance_row = _stacked(beams), torch.from_numpy(sampled_distances)
+    air_factor: Any = torch.from_numpy(
+        _air(safety, draws, sampled_distances) * _uneven(safety, draws, sampled_distances)
+    )
+    lens_transmittance = _exposure_column(
+        draws, "lens.transmittance", safety.settings.lens.transmittance
+    )
     focal_length = _exposure_column(draws, "lens.focal_length", safety.settings.lens.focal_length)
     diameter = _exposure_column(draws, "lens.diameter", safety.settings.lens.diameter)
-    columns: dict[str, dict[str, FloatArray]] = {
+    by_quantity: dict[str, dict[str, FloatArray]] = {
         name: {} for name in ("sensor", "spot", "through", "fill", "waves")
     }
     for option in options:
@@ -477,35 +524,41 @@ def compute_exposures(
             if option.diameter is None
             else torch.minimum(diameter, torch.tensor(option.diameter))
         )
-        waves = _waves(safety.settings.lens, beam, where, aperture)
-        passing = lens * option.passing * air
-        focused: Any = sensor_density(beam, where, aperture, focal_length, 1.0)
+        waves = _waves(safety.settings.lens, beam, distance_row, aperture)
+        transmittance = lens_transmittance * option.passing * air_factor
+        # the last argument: a lens without losses
+        focused_density: Any = sensor_density(beam, distance_row, aperture, focal_length, 1.0)
         density = (
-            focused * _at_width(option, beams[0], beam_radius(beam, where))
+            focused_density * _at_width(option, beams[0], beam_radius(beam, distance_row))
             if option.masked
-            else (density_in_spot(beam, where, aperture, focal_length, waves, WITHIN))
+            else (density_in_spot(beam, distance_row, aperture, focal_length, waves, WITHIN))
         )
-        columns["sensor"][option.name] = (density * passing).numpy()
-        heated: Any = (
-            heated_diameter(beam, where, aperture, focal_length)
-            * _widened(option, density / focused)
+        by_quantity["sensor"][option.name] = (density * transmittance).numpy()
+        heated_spot: Any = (
+            heated_diameter(beam, distance_row, aperture, focal_length)
+            * _widened(option, density / focused_density)
             if option.masked
-            else heated_in_spot(beam, where, aperture, focal_length, waves, density)
+            else heated_in_spot(beam, distance_row, aperture, focal_length, waves, density)
         )
-        columns["spot"][option.name] = heated.numpy()
-        columns["through"][option.name] = (share_through(beam, where, aperture) * passing).numpy()
-        columns["fill"][option.name] = (aperture**2 / (4 * beam_radius(beam, where) ** 2)).numpy()
-        columns["waves"][option.name] = waves.numpy()
-    at_lens = axis_density(beam, where, air).numpy()
+        by_quantity["spot"][option.name] = heated_spot.numpy()
+        by_quantity["through"][option.name] = (
+            share_through(beam, distance_row, aperture) * transmittance
+        ).numpy()
+        by_quantity["fill"][option.name] = (
+            aperture**2 / (4 * beam_radius(beam, distance_row) ** 2)
+        ).numpy()
+        by_quantity["waves"][option.name] = waves.numpy()
+    # not in the loop: the same for all options
+    lens_density = axis_density(beam, distance_row, air_factor).numpy()
     return Exposures(
-        places,
-        at_lens,
-        columns["sensor"],
-        columns["spot"],
+        sampled_distances,
+        lens_density,
+        by_quantity["sensor"],
+        by_quantity["spot"],
         beams,
-        columns["through"],
-        columns["fill"],
-        columns["waves"],
+        by_quantity["through"],
+        by_quantity["fill"],
+        by_quantity["waves"],
     )
 
 
@@ -516,9 +569,10 @@ def _widened(option: Option, peak: Any) -> Any:
     The width behind a mask at the distance of the recipe is `Option.heated`, so that the rest
     counts here alone.
     """
-    defocused = (peak / option.peak).clamp_max(1.0)
-    widest = widest_heated_diameter(torch.ones_like(defocused), defocused)
-    return widest.where(defocused < 1 - 1e-9, 1.0)
+    ratio_to_focus = (peak / option.peak).clamp_max(1.0)
+    width_ratio = widest_heated_diameter(torch.ones_like(ratio_to_focus), ratio_to_focus)
+    # 1e-9 is rounding: no light is lost from the peak
+    return width_ratio.where(ratio_to_focus < 1 - 1e-9, 1.0)
 
 
 def asked_distances(safety: Safety) -> FloatArray:
@@ -532,8 +586,9 @@ def _waves(lens: Lens, beam: Beam, where: Any, aperture: Any) -> Any:
     if lens.focus == "laser":
         return torch.zeros(1, 1, dtype=torch.float64)
     focus = math.inf if isinstance(lens.focus, str) else lens.focus
-    stopped = (aperture / lens.diameter) ** 2 if lens.defocus else 1.0
-    return defocus_at(beam, where, aperture, focus, lens.defocus * _DEFOCUS * stopped)
+    # the path at the rim grows with the square of the diameter
+    path_factor = (aperture / lens.diameter) ** 2 if lens.defocus else 1.0
+    return defocus_at(beam, where, aperture, focus, lens.defocus * _DEFOCUS * path_factor)
 
 
 def _at_width(option: Option, nominal: Beam, radius: Any) -> Any:
@@ -545,13 +600,19 @@ def _at_width(option: Option, nominal: Beam, radius: Any) -> Any:
     """
     if not option.peaks:
         return option.peak
-    rungs, ratio = np.log(np.array(option.peaks)).T
-    place = np.log(as_wide(nominal, np.asarray(radius, np.float64)))
-    inside = np.clip(place, rungs[0], rungs[-1])
-    between = np.exp(
-        interpolated(rungs, ratio, inside) + miss_between(rungs, option.misses, inside)
+    log_distances, ratio = np.log(np.array(option.peaks)).T
+    # where the nominal beam is as wide
+    log_distance = np.log(as_wide(nominal, np.asarray(radius, np.float64)))
+    clipped_distance = np.clip(log_distance, log_distances[0], log_distances[-1])
+    interpolated_ratio = np.exp(
+        interpolated(log_distances, ratio, clipped_distance)
+        + miss_between(log_distances, option.misses, clipped_distance)
     )
-    return torch.from_numpy(np.where(place < rungs[0] - _ROUNDED, 1.0, np.minimum(between, 1.0)))
+    return torch.from_numpy(
+        np.where(
+            log_distance < log_distances[0] - _ROUNDED, 1.0, np.minimum(interpolated_ratio, 1.0)
+        )
+    )
 
 
 def _uneven(safety: Safety, draws: SettingDraws, distances: FloatArray) -> FloatArray:
@@ -564,24 +625,26 @@ def _uneven(safety: Safety, draws: SettingDraws, distances: FloatArray) -> Float
         factor = factor[:1]
     if beam.cn2 is None:
         return factor
-    turbulence = torch.from_numpy(draws.column("beam.cn2", beam.cn2)[:, None])
-    moments: Any = scintillation(
-        safety.laser.wavelength, torch.from_numpy(distances), turbulence, beam.worst
+    structure_constants = torch.from_numpy(draws.column("beam.cn2", beam.cn2)[:, None])
+    scintillation_factor: Any = scintillation(
+        safety.laser.wavelength, torch.from_numpy(distances), structure_constants, beam.worst
     )
-    return np.asarray(factor * moments.numpy(), np.float64)
+    return np.asarray(factor * scintillation_factor.numpy(), np.float64)
 
 
 def _beams(safety: Safety, draws: SettingDraws) -> list[Beam]:
     """Return the beam of the nominal values and of each draw."""
-    drawn = {
+    draws_by_name = {
         name: draws.values[f"laser.{name}"] for name in BEAM if f"laser.{name}" in draws.values
     }
     beams = [safety.laser.beam()]
     try:
-        for i in range(draws.count):
+        for draw in range(draws.count):
             beams.append(
-                safety.laser.beam({name: float(x[i]) for name, x in drawn.items()})
-                if drawn
+                safety.laser.beam(
+                    {name: float(values[draw]) for name, values in draws_by_name.items()}
+                )
+                if draws_by_name
                 else beams[0]
             )
     except ParameterError as error:
@@ -605,6 +668,7 @@ def _stacked(beams: tuple[Beam, ...]) -> Beam:
 
 def _short(values: FloatArray) -> Any:
     """Return values as a column (1 + draw, 1), or as one row if all are equal."""
+    # `ptp` is 0 where all values are equal
     return torch.from_numpy((values if np.ptp(values) else values[:1])[:, None])
 
 
@@ -625,10 +689,16 @@ def _air(safety: Safety, draws: SettingDraws, distances: FloatArray) -> FloatArr
         return np.asarray(np.power(transmittance, distances / laser.distance), np.float64)
     if laser.visibility is None:
         return np.ones((1, 1))
-    visible = draws.column("laser.visibility", laser.visibility).tolist()
-    per_metre = {v: air_transmittance(1.0, v, laser.wavelength, laser.haze) for v in set(visible)}
+    visibilities = draws.column("laser.visibility", laser.visibility).tolist()
+    per_metre = {
+        visibility: air_transmittance(1.0, visibility, laser.wavelength, laser.haze)
+        for visibility in set(visibilities)
+    }
     return np.asarray(
-        np.power(np.array([per_metre[v] for v in visible])[:, None], distances), np.float64
+        np.power(
+            np.array([per_metre[visibility] for visibility in visibilities])[:, None], distances
+        ),
+        np.float64,
     )
 
 

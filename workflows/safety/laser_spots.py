@@ -90,27 +90,35 @@ def veil_of(safety: Safety, draws: SettingDraws) -> Veil | None:
     def light(radius: FloatArray) -> FloatArray:
         key = hashlib.sha1(radius.tobytes()).digest()
         if key not in computed:
+            # `veil_at` returns the light in pixels, and the scattered share
             computed[key] = veil_at(torch.from_numpy(radius), surfaces=surfaces, **camera)[
                 0
             ].numpy()
         return computed[key]
 
-    total = float(veil_at(torch.zeros(1, dtype=torch.float64), surfaces=surfaces, **camera)[1])
-    share, assumed = _share(safety, draws, scatter, total)
+    total_share = float(
+        veil_at(torch.zeros(1, dtype=torch.float64), surfaces=surfaces, **camera)[1]
+    )
+    share, assumed = _share(safety, draws, scatter, total_share)
     return Veil(share, assumed, light)
 
 
 def _share(
     safety: Safety, draws: SettingDraws, scatter: Scatter, total: float
 ) -> tuple[FloatArray, bool]:
-    """Return the share of the light that is scattered, with draws, and whether it is assumed."""
+    """Return the scattered share of the light (1 + draw or 1,), and whether it is assumed.
+
+    ``total`` is the share that measured surfaces scatter, which is exact.
+    """
     if scatter.surfaces is not None:
         return np.array([total]), False
     if "lens.scatter.share" in safety.values:
-        stated = draws.column("lens.scatter.share", scatter.share)
-        return (stated if np.ptp(stated) else stated[:1]), False
-    factor = np.power(ASSUMED, draws.normal(_STREAM))
-    return np.minimum(scatter.share * np.concatenate([[1.0], factor]), 0.99), True
+        shares = draws.column("lens.scatter.share", scatter.share)
+        # one value is enough where all draws are alike
+        return (shares if np.ptp(shares) else shares[:1]), False
+    factors = np.power(ASSUMED, draws.normal(_STREAM))
+    # a lens cannot scatter all of its light
+    return np.minimum(scatter.share * np.concatenate([[1.0], factors]), 0.99), True
 
 
 @dataclass(frozen=True)
@@ -124,10 +132,14 @@ class Grid:
         """Return a grid that holds values: one point if they are alike, else ``per_unit`` points
         a unit, at least 3.
         """
-        low, high = float(values.min()), float(values.max())
-        if high - low < _CERTAIN:
+        smallest, largest = float(values.min()), float(values.max())
+        if largest - smallest < _CERTAIN:
             return cls(values.ravel()[:1].astype(np.float64))
-        return cls(np.linspace(low, high, max(3, 1 + int(np.ceil((high - low) * per_unit)))))
+        return cls(
+            np.linspace(
+                smallest, largest, max(3, 1 + int(np.ceil((largest - smallest) * per_unit)))
+            )
+        )
 
     @classmethod
     def through_zero(cls, values: FloatArray, per_unit: float) -> Grid:
@@ -136,16 +148,21 @@ class Grid:
         if len(points) == 1:
             return cls(np.zeros(1))
         step = points[1] - points[0]
-        ends = math.floor(points[0] / step + _ROUNDED), math.ceil(points[-1] / step - _ROUNDED)
-        return cls(np.arange(ends[0], ends[1] + 1) * step)
+        # in whole steps from 0, so that 0 is a point
+        end_indices = (
+            math.floor(points[0] / step + _ROUNDED),
+            math.ceil(points[-1] / step - _ROUNDED),
+        )
+        return cls(np.arange(end_indices[0], end_indices[1] + 1) * step)
 
     def weights(self, values: FloatArray) -> list[FloatArray]:
         """Return the weight of each point in the linear interpolation at values."""
         if len(self.points) == 1:
             return [np.ones((1,) * values.ndim)]
         step = self.points[1] - self.points[0]
-        place = np.clip((values - self.points[0]) / step, 0, len(self.points) - 1)
-        return [np.clip(1 - np.abs(place - i), 0, 1) for i in range(len(self.points))]
+        position = np.clip((values - self.points[0]) / step, 0, len(self.points) - 1)
+        # a hat of the width of a step around each point
+        return [np.clip(1 - np.abs(position - i), 0, 1) for i in range(len(self.points))]
 
 
 @dataclass(frozen=True)
@@ -168,26 +185,32 @@ class Levels:
         distance.
         """
         weights = [grid.weights(values) for grid, values in zip(self.grids, others, strict=True)]
-        size = np.broadcast_shapes(
+        full_shape = np.broadcast_shapes(
             place.shape, *(weight.shape for weight in itertools.chain(*weights))
         )
-        clipped = np.broadcast_to(np.clip(place, self.rungs[0], self.rungs[-1]), size)
-        total = np.zeros((*size, len(range(*ranks.indices(self.values.shape[-1])))))
-        for point in itertools.product(*(range(len(grid.points)) for grid in self.grids)):
+        log_distance = np.broadcast_to(np.clip(place, self.rungs[0], self.rungs[-1]), full_shape)
+        # (draw, distance, rank), where a slice of ranks may be shorter than all
+        total = np.zeros((*full_shape, len(range(*ranks.indices(self.values.shape[-1])))))
+        for grid_point in itertools.product(*(range(len(grid.points)) for grid in self.grids)):
             weight = functools.reduce(
                 np.multiply,
-                (grid_weights[index] for grid_weights, index in zip(weights, point, strict=True)),
+                (
+                    grid_weights[index]
+                    for grid_weights, index in zip(weights, grid_point, strict=True)
+                ),
             )
-            weight = np.broadcast_to(weight, size)
+            weight = np.broadcast_to(weight, full_shape)
             # a draw lies between two points of a grid, and needs no others
             rows = np.flatnonzero(weight.any(axis=1))
-            cell: Any = (slice(None), *point, ranks)
+            value_index: Any = (slice(None), *grid_point, ranks)
             total[rows] += weight[rows, :, None] * interpolated(
-                self.rungs, self.values[cell], clipped[rows]
+                self.rungs, self.values[value_index], log_distance[rows]
             )
-        total += miss_between(self.rungs, self.misses, clipped)[..., None]
+        # the interpolation may miss this much: it counts upward
+        total += miss_between(self.rungs, self.misses, log_distance)[..., None]
         if self.most is None:
             return total
+        # nearer than the first rung nothing is computed: the bound counts
         return np.where(place[..., None] < self.rungs[0] - _ROUNDED, self.most[ranks], total)
 
 
@@ -217,29 +240,36 @@ def levels_of(
     """
     framed = with_frame(groups, shape)
     radius, pixels = framed.radius.numpy(), framed.pixels.numpy()
-    core = (framed.smooth if smooth else framed.light).numpy()
-    scattered = veil.light(radius) / veil.share[0] if veil else np.zeros_like(core)
-    added = np.arange(len(core)) >= len(groups.radius)
-    hidden = hidden_light(groups) if added.any() else 0.0
-    levels, beyond = [], []
+    core_light = (framed.smooth if smooth else framed.light).numpy()
+    # the law of the veil is that of the nominal share: here for all light scattered
+    scattered_light = veil.light(radius) / veil.share[0] if veil else np.zeros_like(core_light)
+    # `with_frame` appends the pixels beyond the window to those of the groups
+    beyond_window = np.arange(len(core_light)) >= len(groups.radius)
+    hidden = hidden_light(groups) if beyond_window.any() else 0.0
+    levels, beyond_shares = [], []
     for share in shares if veil else (0.0,):
-        light = (1 - share) * core + share * scattered
+        light = (1 - share) * core_light + share * scattered_light
         if hidden:
-            counted = _with_hidden(light, pixels, added, (1 - share) * hidden)
+            counted = _with_hidden(light, pixels, beyond_window, (1 - share) * hidden)
         else:
-            counted = _as_they_are(light, pixels, added & ((1 - share) * core > _OWN_RIM * light))
+            counted = _as_they_are(
+                light, pixels, beyond_window & ((1 - share) * core_light > _OWN_RIM * light)
+            )
         levels.append(_at_ranks(ranks, counted))
-        beyond.append(np.interp(ranks, counted.count, counted.decided / counted.count))
-    return np.stack(levels), np.stack(beyond)
+        beyond_shares.append(np.interp(ranks, counted.count, counted.decided / counted.count))
+    return np.stack(levels), np.stack(beyond_shares)
 
 
 def _as_they_are(light: FloatArray, pixels: FloatArray, guessed: NDArray[np.bool_]) -> Counted:
-    """Return the counts at the levels of groups of pixels; ``guessed`` marks those of the radial
-    law.
+    """Return the counts of pixels at the levels of their groups, without light from elsewhere.
+
+    ``light`` is that in a pixel of each group and ``pixels`` the number of its pixels; ``guessed``
+    marks the groups whose light is that of the radial law.
     """
     order = np.argsort(-light)
     return Counted(
         light=light[order],
+        # 1e-9 keeps the logarithm of a count finite
         count=np.maximum(np.cumsum(pixels[order]), 1e-9),
         alike=pixels[order],
         decided=np.cumsum(np.where(guessed, pixels, 0.0)[order]),
@@ -249,37 +279,46 @@ def _as_they_are(light: FloatArray, pixels: FloatArray, guessed: NDArray[np.bool
 def _with_hidden(
     light: FloatArray, pixels: FloatArray, added: NDArray[np.bool_], hidden: float
 ) -> Counted:
-    """Return the largest counts when light from elsewhere falls on the pixels that are ``added``
-    to the window.
+    """Return at most how many pixels have each level, when hidden light falls on the pixels beyond.
+
+    ``added`` marks the groups beyond the window, and ``hidden`` is the share of the light that
+    neither the window nor the radial law accounts for.
     """
     levels = _steps(np.sort(light)[::-1])
-    own = np.argsort(-light[~added])
-    rising, total = -light[~added][own], np.append(0.0, np.cumsum(pixels[~added][own]))
-    inside = total[np.searchsorted(rising, -levels, side="right")]
-    brighter = total[np.searchsorted(rising, -levels, side="left")]
-    lit = _lit_at_most(light[added], pixels[added], hidden, levels)
-    return Counted(levels, np.maximum(inside + lit, 1e-9), inside - brighter, lit)
+    inside_order = np.argsort(-light[~added])
+    # negative, because `searchsorted` needs rising numbers
+    negative_light, pixels_so_far = (
+        -light[~added][inside_order],
+        np.append(0.0, np.cumsum(pixels[~added][inside_order])),
+    )
+    at_least = pixels_so_far[np.searchsorted(negative_light, -levels, side="right")]
+    above = pixels_so_far[np.searchsorted(negative_light, -levels, side="left")]
+    lit_beyond = _lit_at_most(light[added], pixels[added], hidden, levels)
+    return Counted(levels, np.maximum(at_least + lit_beyond, 1e-9), at_least - above, lit_beyond)
 
 
 def _steps(levels: FloatArray) -> FloatArray:
-    """Return falling levels: some of the given ones, and others at equal ratios, for gaps
-    between these.
+    """Return about twice `_STEPS` falling levels: some of the given ones (falling), and others at
+    equal ratios, which close the gaps between these.
     """
     picked = levels[np.unique(np.linspace(0, len(levels) - 1, _STEPS).astype(int))]
-    top = max(float(levels[0]), 1e-280)
-    between = np.geomspace(max(float(levels[-1]), _FAINTEST * top), top, _STEPS)
+    # positive, so that ratios exist
+    brightest = max(float(levels[0]), 1e-280)
+    between = np.geomspace(max(float(levels[-1]), _FAINTEST * brightest), brightest, _STEPS)
     rising: FloatArray = np.unique(np.concatenate([picked, between]))
     return rising[::-1]
 
 
 def _at_ranks(ranks: FloatArray, counted: Counted) -> FloatArray:
-    """Return the logarithms of the light at ranks, from the count up to the end of each group; a
-    group is as bright.
+    """Return the logarithms of the light of the pixels of given ranks, 1 for the brightest pixel.
+
+    All pixels of a group are equally bright; between groups the logarithms are interpolated.
     """
-    first = np.minimum(counted.count - counted.alike + 1, counted.count)
-    place = np.maximum.accumulate(np.stack([first, counted.count], 1).ravel())
+    # ranks of the first and of the last pixel of each group
+    first_ranks = np.minimum(counted.count - counted.alike + 1, counted.count)
+    rank_ends = np.maximum.accumulate(np.stack([first_ranks, counted.count], 1).ravel())
     logarithms: FloatArray = np.interp(
-        np.log(ranks), np.log(place), np.repeat(np.log(counted.light + 1e-300), 2)
+        np.log(ranks), np.log(rank_ends), np.repeat(np.log(counted.light + 1e-300), 2)
     )
     return logarithms
 
@@ -287,16 +326,22 @@ def _at_ranks(ranks: FloatArray, counted: Counted) -> FloatArray:
 def _lit_at_most(
     light: FloatArray, pixels: FloatArray, hidden: float, levels: FloatArray
 ) -> FloatArray:
-    """Return how many pixels have at least each level, at most, when light from elsewhere is added
-    to their own.
+    """Return how many pixels have at least each level, at most, when ``hidden`` light is added to
+    their own.
 
     It is dealt out where least of it is needed: to the brightest pixels first.
     """
     order = np.argsort(-light)
-    own, width = light[order], pixels[order]
-    number = np.append(0.0, np.cumsum(width))
-    needed = np.cumsum(np.maximum(levels[:, None] - own, 0.0) * width, 1)
-    return np.array([np.interp(hidden, np.append(0.0, row), number) for row in needed])
+    own_light, group_sizes = light[order], pixels[order]
+    pixels_so_far = np.append(0.0, np.cumsum(group_sizes))
+    # (level, group): light that raises this group and all brighter ones to the level
+    light_needed = np.cumsum(np.maximum(levels[:, None] - own_light, 0.0) * group_sizes, 1)
+    return np.array(
+        [
+            np.interp(hidden, np.append(0.0, needed_up_to_group), pixels_so_far)
+            for needed_up_to_group in light_needed
+        ]
+    )
 
 
 # --- spots along ----------------------------------------------------------------------------------
@@ -381,14 +426,14 @@ def ranked_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Rank
     another kind.
     """
     protection = safety.settings.protection
-    named = {
+    named_steps = {
         arm: step
         for arm, step in protection.pixels
         if step is not None and (arm, protection.mask) != ("mask", None)
     }
-    if safety.settings.dazzle is None or not named:
+    if safety.settings.dazzle is None or not named_steps:
         return ()
-    steps = {arm: _step(recipe, safety, arm, step) for arm, step in named.items()}
+    steps = {arm: _step(recipe, safety, arm, step) for arm, step in named_steps.items()}
     runs = _Runs.begun(recipe, safety, store)
     return tuple(_ranked(runs, arm, step) for arm, step in steps.items())
 
@@ -398,27 +443,44 @@ def peaks_of(recipe: Recipe, safety: Safety, store: Store | None) -> Peaks | Non
     if safety.settings.protection.mask is None:
         return None
     step, runs = _mask_step(recipe, safety), _Runs.begun(recipe, safety, store)
-    plain = step.replace("[mask,", "[plain,")
-    reference = plain if plain != step and plain in recipe.steps else None
-    here = _peak(runs, recipe, step, safety.laser.distance)
-    clear = _peak(runs, recipe, reference, safety.laser.distance).inside if reference else 1.0
+    plain_step = step.replace("[mask,", "[plain,")
+    # without a step of the plain lens, the step states the ratio itself
+    reference = plain_step if plain_step != step and plain_step in recipe.steps else None
+    peak_here = _peak(runs, recipe, step, safety.laser.distance)
+    clear_peak = _peak(runs, recipe, reference, safety.laser.distance).inside if reference else 1.0
     if _wavefront_of(recipe, step) is None:  # the spot of a plane wave, which a distant laser has
-        far = far_distance(safety.laser.beam(), safety.settings.lens.diameter)
-        bounded = ((safety.laser.distance, here.unseen),) if here.most > here.inside else ()
-        return Peaks(here.most / clear, ((far, here.most / clear),), 0.0, outside=bounded)
+        far_end = far_distance(safety.laser.beam(), safety.settings.lens.diameter)
+        counted_here = (
+            ((safety.laser.distance, peak_here.unseen),)
+            if peak_here.most > peak_here.inside
+            else ()
+        )
+        return Peaks(
+            peak_here.most / clear_peak,
+            ((far_end, peak_here.most / clear_peak),),
+            0.0,
+            outside=counted_here,
+        )
     outside: dict[float, float] = {}
 
     def log_ratio(distance: float) -> FloatArray:
         peak = _peak(runs, at_distance(recipe, safety, step, distance), step, distance)
         if peak.most > peak.inside:
             outside[distance] = peak.unseen
+        # as an array, which `_refined` interpolates
         return np.array([math.log(peak.most / peak.focused)])
 
-    spots = _refined(_first(safety, recipe, step), log_ratio, _MOST_PEAKS, _CLOSE_PEAKS)
-    ratios = (math.exp(float(value[0])) for value in spots.values)
-    along = tuple(zip(spots.distances, ratios, strict=True))
-    counted = tuple(sorted(outside.items()))
-    return Peaks(here.most / clear, along, max(spots.misses, default=0.0), spots.misses, counted)
+    refined = _refined(_first(safety, recipe, step), log_ratio, _MOST_PEAKS, _CLOSE_PEAKS)
+    peak_ratios = (math.exp(float(value[0])) for value in refined.values)
+    peaks_at_distances = tuple(zip(refined.distances, peak_ratios, strict=True))
+    counted_outside = tuple(sorted(outside.items()))
+    return Peaks(
+        peak_here.most / clear_peak,
+        peaks_at_distances,
+        max(refined.misses, default=0.0),
+        refined.misses,
+        counted_outside,
+    )
 
 
 @dataclass(frozen=True)
@@ -443,35 +505,40 @@ def _peak(runs: _Runs, recipe: Recipe, step: str, distance: float) -> _Peak:
     """Return the largest value of a step; of `metrics.lsr` that of the spot between its samples.
 
     A window that lacks light which may hold a higher peak is doubled, as far as the samples of the
-    pupil carry it.
+    pupil carry it. Values are over the peak of the clear lens without taper.
     """
     has_taper = _wavefront_of(recipe, step) is not None
     beam, diameter = runs.safety.laser.beam(), runs.safety.settings.lens.diameter
     fill = fill_at(beam, diameter, distance) if has_taper else 0.0
-    psf = _psf_of(recipe, step)
-    if psf is None:
+    psf_step = _psf_of(recipe, step)
+    if psf_step is None:
         return _Peak(float(runs.of(recipe, [step])[step].max()), 0.0, _focused(fill))
-    peak = _peak_of(runs.of(recipe, [psf])[psf], fill)
-    window = next(
-        (source.name for source in _upstream(recipe, psf) if source.node.path == "optics.psf"), None
+    peak = _peak_of(runs.of(recipe, [psf_step])[psf_step], fill)
+    window_step = next(
+        (source.name for source in _upstream(recipe, psf_step) if source.node.path == "optics.psf"),
+        None,
     )
     for _ in range(_WIDENINGS):
-        if window is None or peak.most <= peak.inside:
+        if window_step is None or peak.most <= peak.inside:
             break
-        shape = tuple(2 * size for size in recipe.steps[window].params["shape"])
-        recipe = _with_param(recipe, window, "shape", shape)
+        # double the window, and look whether the light in it rules out a higher peak
+        shape = tuple(2 * size for size in recipe.steps[window_step].params["shape"])
+        recipe = _with_param(recipe, window_step, "shape", shape)
         try:
-            peak = _peak_of(runs.of(recipe, [psf])[psf], fill)
+            peak = _peak_of(runs.of(recipe, [psf_step])[psf_step], fill)
         except RunError:  # beyond the window that the samples of the pupil carry
             break
     return peak
 
 
 def _peak_of(psf: Psf, fill: float) -> _Peak:
-    """Return the peak of a PSF of a beam that fills the lens to (D / (2 w))^2."""
+    """Return the peak of a PSF of a beam that fills the lens to ``fill`` = (D / (2 w))^2, over the
+    peak of the clear lens without taper; of several bands, the highest.
+    """
     passing = _passing(fill)
     bands = list(zip(psf.intensity, psf.clear_peak.tolist(), strict=True))
-    inside = max(float(band.max() * summit_gain(band)) / clear for band, clear in bands)
+    # `summit_gain`: the peak between samples over the largest sample
+    inside = max(float(band.max() * summit_gain(band)) / clear_peak for band, clear_peak in bands)
     return _Peak(
         inside, max(float(unseen_light(band, passing)) for band, _ in bands), _focused(fill)
     )
@@ -479,9 +546,9 @@ def _peak_of(psf: Psf, fill: float) -> _Peak:
 
 def _mask_step(recipe: Recipe, safety: Safety) -> str:
     """Return the name of the step of the peak behind the mask."""
-    named = safety.settings.protection.mask
-    assert named is not None
-    return step_of(recipe, safety, "protection.mask", named, "mask")
+    named_step = safety.settings.protection.mask
+    assert named_step is not None
+    return step_of(recipe, safety, "protection.mask", named_step, "mask")
 
 
 def _psf_of(recipe: Recipe, step: str) -> str | None:
@@ -499,6 +566,7 @@ def _passing(fill: float) -> float:
     """Return the light of a Gaussian beam through the lens over that of an even one with the
     irradiance of its axis.
     """
+    # mean of exp(-2 r^2 / w^2) over the disc of the lens
     return 1.0 if fill < 1e-9 else -math.expm1(-2 * fill) / (2 * fill)
 
 
@@ -506,6 +574,7 @@ def _focused(fill: float) -> float:
     """Return the peak of a Gaussian beam in focus over that of an even one with the irradiance
     of its axis.
     """
+    # squared mean of the amplitude exp(-r^2 / w^2) over the disc of the lens
     return 1.0 if fill < 1e-9 else (-math.expm1(-fill) / fill) ** 2
 
 
@@ -513,33 +582,36 @@ def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
     """Return the pixels behind one arm at the distances between which they change."""
     recipe, safety = runs.recipe, runs.safety
     beam, lens = safety.laser.beam(), safety.settings.lens
-    veil = _nominal_veil(safety)
-    groups: dict[float, BrightPixels] = {}
-    beside = _psf_beside(recipe, safety, arm, step)
+    nominal_veil = _nominal_veil(safety)
+    pixels_at: dict[float, BrightPixels] = {}
+    shared_psf = _psf_beside(recipe, safety, arm, step)
 
     def level(distance: float) -> FloatArray:
         pixels = BrightPixels(
-            *runs.of(at_distance(recipe, safety, step, distance), [step, *beside])[step]
+            *runs.of(at_distance(recipe, safety, step, distance), [step, *shared_psf])[step]
         )
-        passing = _passing(fill_at(beam, lens.diameter, distance))
-        groups[distance] = pixels._replace(
-            light=pixels.light / passing,
-            smooth=pixels.smooth / passing,
-            rim=pixels.rim * pixels.rim.new_tensor([1.0, 1 / passing, 1 / passing]),
+        # from shares of an even beam's light to shares of what passes the lens
+        passing_share = _passing(fill_at(beam, lens.diameter, distance))
+        pixels_at[distance] = pixels._replace(
+            light=pixels.light / passing_share,
+            smooth=pixels.smooth / passing_share,
+            # the rim has a distance, which stays, and two shares of light
+            rim=pixels.rim * pixels.rim.new_tensor([1.0, 1 / passing_share, 1 / passing_share]),
         )
-        return _log_level(groups[distance], safety, veil)
+        return _log_level(pixels_at[distance], safety, nominal_veil)
 
     if _wavefront_of(recipe, step) is None:
+        # a plane wave: one spot for all distances
         level(safety.laser.distance)
-        return Ranked(arm, (safety.laser.distance,), (groups[safety.laser.distance],), math.inf)
-    spots = _refined(_first(safety, recipe, step), level, _MOST)
-    error = max(spots.misses, default=0.0)
+        return Ranked(arm, (safety.laser.distance,), (pixels_at[safety.laser.distance],), math.inf)
+    refined = _refined(_first(safety, recipe, step), level, _MOST)
+    error = max(refined.misses, default=0.0)
     return Ranked(
         arm,
-        spots.distances,
-        tuple(groups[distance] for distance in spots.distances),
+        refined.distances,
+        tuple(pixels_at[distance] for distance in refined.distances),
         error,
-        spots.misses,
+        refined.misses,
     )
 
 
@@ -549,11 +621,12 @@ def _psf_beside(recipe: Recipe, safety: Safety, arm: str, step: str) -> list[str
     """
     if arm != "mask" or safety.settings.protection.mask is None:
         return []
-    psf = _psf_of(recipe, _mask_step(recipe, safety))
-    shares = (
-        psf is not None and _wavefront_of(recipe, psf) == _wavefront_of(recipe, step) is not None
+    peak_psf = _psf_of(recipe, _mask_step(recipe, safety))
+    one_pupil = (
+        peak_psf is not None
+        and _wavefront_of(recipe, peak_psf) == _wavefront_of(recipe, step) is not None
     )
-    return [psf] if psf is not None and shares else []
+    return [peak_psf] if peak_psf is not None and one_pupil else []
 
 
 def _nominal_veil(safety: Safety) -> Veil | None:
@@ -562,11 +635,15 @@ def _nominal_veil(safety: Safety) -> Veil | None:
 
 
 def _log_level(groups: BrightPixels, safety: Safety, veil: Veil | None) -> FloatArray:
-    """Return the logarithm of the level of the asked number of pixels, with the nominal veil."""
+    """Return the logarithm of the level of the asked number of pixels, with the nominal veil.
+
+    The level is the share of the light in the faintest of these pixels; the array is (rank,), one.
+    """
     dazzle, shape = safety.settings.dazzle, safety.settings.sensor.shape
-    asked = (dazzle.share if dazzle else 1.0) * shape[0] * shape[1]
+    asked_pixels = (dazzle.share if dazzle else 1.0) * shape[0] * shape[1]
     shares = veil.share[:1] if veil else np.zeros(1)
-    levels, _ = levels_of(groups, shape, np.array([max(asked, 1.0)]), veil, shares, False)
+    # not smoothed over a feature
+    levels, _ = levels_of(groups, shape, np.array([max(asked_pixels, 1.0)]), veil, shares, False)
     nominal: FloatArray = levels[0]
     return nominal
 
@@ -576,12 +653,13 @@ def _first(safety: Safety, recipe: Recipe, step: str) -> list[float]:
     carry to a far one.
     """
     beam, lens = safety.laser.beam(), safety.settings.lens
-    far = far_distance(beam, lens.diameter)
-    near = min(max(safety.settings.distances[0], _carried(safety, recipe, step)), far)
-    if far / near < _FINEST:
-        return [near, far] if near < far else [far]
-    count = max(3, 1 + math.ceil(math.log(far / near) / math.log(_FACTOR)))
-    return [float(distance) for distance in np.geomspace(near, far, count)]
+    far_end = far_distance(beam, lens.diameter)
+    near_end = min(max(safety.settings.distances[0], _carried(safety, recipe, step)), far_end)
+    if far_end / near_end < _FINEST:
+        return [near_end, far_end] if near_end < far_end else [far_end]
+    # distances by factors of `_FACTOR` at most, three at least
+    count = max(3, 1 + math.ceil(math.log(far_end / near_end) / math.log(_FACTOR)))
+    return [float(distance) for distance in np.geomspace(near_end, far_end, count)]
 
 
 def _carried(safety: Safety, recipe: Recipe, step: str) -> float:
@@ -593,8 +671,9 @@ def _carried(safety: Safety, recipe: Recipe, step: str) -> float:
     pitch = safety.settings.lens.diameter / float(stop["samples"])
     beam, rim = safety.laser.beam(), safety.settings.lens.diameter / 2
     for distance in np.geomspace(*safety.settings.distances, 400):
-        lit = min(rim, _DIM * beam_radius(beam, distance))
-        if lit * pitch / curvature_radius(beam, distance) <= _TURN * beam.wavelength:
+        lit_radius = min(rim, _DIM * beam_radius(beam, distance))
+        # a sphere of radius R has the slope r / R: the path between two samples, in waves
+        if lit_radius * pitch / curvature_radius(beam, distance) <= _TURN * beam.wavelength:
             return float(distance)
     return safety.settings.distances[1]
 
@@ -624,22 +703,26 @@ def _refined(
     values = {distance: value(distance) for distance in distances}
     misses = dict.fromkeys(itertools.pairwise(distances), math.inf)
     while len(values) < limit:
-        wide = [gap for gap in misses if gap[1] / gap[0] > _FINEST and misses[gap] > close]
-        if not wide:
+        open_gaps = [gap for gap in misses if gap[1] / gap[0] > _FINEST and misses[gap] > close]
+        if not open_gaps:
             break
-        near, far = max(wide, key=lambda gap: misses[gap] * math.log(gap[1] / gap[0]))
+        near, far = max(open_gaps, key=lambda gap: misses[gap] * math.log(gap[1] / gap[0]))
         middle = math.sqrt(near * far)
-        rising = sorted(values)
-        guess = interpolated(
-            np.log(rising), np.stack([values[place] for place in rising]), np.log(middle)
+        rising_distances = sorted(values)
+        interpolated_value = interpolated(
+            np.log(rising_distances),
+            np.stack([values[known] for known in rising_distances]),
+            np.log(middle),
         )
         values[middle] = value(middle)
-        miss = float(np.abs(values[middle] - guess).max())
+        miss = float(np.abs(values[middle] - interpolated_value).max())
         del misses[near, far]
         misses |= {(near, middle): miss, (middle, far): miss}
-    rising = sorted(values)
-    gaps = tuple(misses[gap] for gap in itertools.pairwise(rising))
-    return _Refined(tuple(rising), tuple(values[distance] for distance in rising), gaps)
+    rising_distances = sorted(values)
+    gaps = tuple(misses[gap] for gap in itertools.pairwise(rising_distances))
+    return _Refined(
+        tuple(rising_distances), tuple(values[distance] for distance in rising_distances), gaps
+    )
 
 
 def at_distance(recipe: Recipe, safety: Safety, step: str, distance: float) -> Recipe:
@@ -655,10 +738,11 @@ def at_distance(recipe: Recipe, safety: Safety, step: str, distance: float) -> R
     lens = safety.settings.lens
     if lens.focus == "infinity":
         return varied
-    bend = _bend(safety, distance) if lens.focus == "laser" else 1 / float(lens.focus)
+    curvature = _bend(safety, distance) if lens.focus == "laser" else 1 / float(lens.focus)
     for pupil in _pupils(recipe, step):
-        waves = pupil.params["defocus"] - bend * lens.diameter**2 / 8 / _DEFOCUS
-        varied = _with_param(varied, pupil.name, "defocus", waves)
+        # a curvature 1/R is the path D^2 / (8 R) at the rim, in waves of 550 nm
+        defocus = pupil.params["defocus"] - curvature * lens.diameter**2 / 8 / _DEFOCUS
+        varied = _with_param(varied, pupil.name, "defocus", defocus)
     return varied
 
 
@@ -698,23 +782,25 @@ def _step(recipe: Recipe, safety: Safety, arm: str, named: str) -> str:
     """
     setting, sensor = f"protection.pixels.{arm}", safety.settings.sensor
     step = step_of(recipe, safety, setting, named, arm)
-    ranking, params = recipe.steps[step], recipe.steps[step].params
-    value, text = safety.values[setting], ""
-    if ranking.node.path != _RANKS:
-        text = f"the step {step} is of the node {ranking.node.path}: name a step of {_RANKS}"
+    ranking_step, params = recipe.steps[step], recipe.steps[step].params
+    value, problem = safety.values[setting], ""
+    if ranking_step.node.path != _RANKS:
+        problem = (
+            f"the step {step} is of the node {ranking_step.node.path}: name a step of {_RANKS}"
+        )
     elif (
         not math.isclose(params["pixel_pitch"], sensor.pixel_pitch)
         or tuple(params["shape"]) != sensor.shape
     ):
-        text = (
+        problem = (
             f"the step {step} has another sensor: give it safety.sensor.pixel_pitch and"
             " safety.sensor.shape"
         )
     elif any(source.node.path == "flare.stray_light" for source in _upstream(recipe, step)):
-        text = (
+        problem = (
             f"the step {step} has stray light, which the estimate adds itself: rank the PSF before"
             " flare.stray_light"
         )
-    if text:
-        raise RecipeError([Diagnostic(value.mark, value.name, text)])
+    if problem:
+        raise RecipeError([Diagnostic(value.mark, value.name, problem)])
     return step

@@ -55,7 +55,7 @@ class Assessment:
         return StudyReport(
             self.title,
             self.lead,
-            [_section(plain) for plain in self.sections],
+            [_section(stored_section) for stored_section in self.sections],
             self.pictures,
             {"limits.csv": (self.rows[0], self.rows[1:])},
             {"worksheet.html": self.worksheet},
@@ -153,7 +153,7 @@ def _assessed(estimate: Estimate) -> Assessment:
     page = report(estimate)
     pictures = {name: picture for name, picture in page.pictures.items() if picture}
     header, rows = page.tables["limits.csv"]
-    plain = [list(header), *(list(row) for row in rows)]
+    table_rows = [list(header), *(list(row) for row in rows)]
     return Assessment(
         document=document(estimate),
         paragraphs=paragraphs(estimate),
@@ -161,7 +161,7 @@ def _assessed(estimate: Estimate) -> Assessment:
         lead=page.lead,
         sections=[_plain_section(section) for section in page.sections],
         pictures=pictures,
-        rows=plain,
+        rows=table_rows,
         worksheet=worksheet_page(estimate),
     )
 
@@ -206,6 +206,7 @@ def _dead_pixels(dead: DeadPixels) -> dict[str, Any]:
 
 
 def _verdict(verdict: DamageVerdict, estimate: Estimate) -> dict[str, Any]:
+    """Return the verdict of damage behind one protection as JSON values."""
     return {
         "protection": verdict.option,
         "verdict": verdict.state,
@@ -215,6 +216,7 @@ def _verdict(verdict: DamageVerdict, estimate: Estimate) -> dict[str, Any]:
 
 
 def _row(row: DamageRow) -> dict[str, Any]:
+    """Return one part of the light with its limit as JSON values, None where it is not judged."""
     finding = row.finding
     return {
         "part": row.part,
@@ -241,6 +243,7 @@ def _dazzled(area: Dazzled) -> dict[str, Any]:
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
+    """Return what one limit says behind one protection as JSON values."""
     return {
         "protection": finding.option,
         "limit": finding.limit.name,

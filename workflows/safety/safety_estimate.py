@@ -105,32 +105,53 @@ def dazzled(
     """
     if not areas:
         return ()
-    full, index = saturating(safety, draws), exposures.at(safety.laser.distance)
+    full_irradiance, index = saturating(safety, draws), exposures.at(safety.laser.distance)
     pixel_count = safety.settings.sensor.shape[0] * safety.settings.sensor.shape[1]
-    pixel = safety.settings.sensor.pixel_pitch**2
-    here = float(mean[0, 0] * exposures.lens[0, index])
-    filled = [
-        full[:, None] * pixel / exposures.through[area.option.name][:, index : index + 1]
+    pixel_area = safety.settings.sensor.pixel_pitch**2
+    irradiance_here = float(mean[0, 0] * exposures.lens[0, index])
+    # emitted W that would fill a pixel which gets all the light behind the lens
+    filling_powers = [
+        full_irradiance[:, None]
+        * pixel_area
+        / exposures.through[area.option.name][:, index : index + 1]
         for area in areas
     ]
-    levels = [float(area.level(exposures, draws, veiled=False)[0, index]) for area in areas]
-    limits = [
-        needed[0, 0] / level * exposures.lens[0, index]
-        for needed, level in zip(filled, levels, strict=True)
+    faintest_shares = [
+        float(area.level(exposures, draws, veiled=False)[0, index]) for area in areas
     ]
-    lens = np.geomspace(_FAINT * limits[0], max(_STRONG * max(limits), 2 * here), _SAMPLES)
+    # irradiance at the lens that fills all pixels that may be lost
+    limits_at_lens = [
+        filling_power[0, 0] / faintest_share * exposures.lens[0, index]
+        for filling_power, faintest_share in zip(filling_powers, faintest_shares, strict=True)
+    ]
+    irradiances = np.geomspace(
+        _FAINT * limits_at_lens[0],
+        max(_STRONG * max(limits_at_lens), 2 * irradiance_here),
+        _SAMPLES,
+    )
     rows: list[Dazzled] = []
-    for area, needed in zip(areas, filled, strict=True):
+    for area, filling_power in zip(areas, filling_powers, strict=True):
         count = np.minimum(
-            area.saturated(exposures, draws, index, needed / mean)[:, 0], pixel_count
+            area.saturated(exposures, draws, index, filling_power / mean)[:, 0], pixel_count
         )
         pixels = Spread.of(float(count[0]), count[1:])
-        plain = rows[0].pixels if rows else pixels
-        times = pixels.value / plain.value if pixels.value > 0 and plain.value > 0 else None
-        light = needed[:1] * exposures.lens[0, index] / lens[None]
-        curve = np.minimum(area.saturated(exposures, draws, index, light)[0] / pixel_count, 1.0)
-        lost = pixels.value / pixel_count
-        rows.append(Dazzled(area.option.name, area.option.masked, pixels, lost, times, lens, curve))
+        plain_pixels = rows[0].pixels if rows else pixels
+        times = (
+            pixels.value / plain_pixels.value
+            if pixels.value > 0 and plain_pixels.value > 0
+            else None
+        )
+        # share of the passing light that fills a pixel, falling with the irradiance
+        light_shares = filling_power[:1] * exposures.lens[0, index] / irradiances[None]
+        curve = np.minimum(
+            area.saturated(exposures, draws, index, light_shares)[0] / pixel_count, 1.0
+        )
+        lost_share = pixels.value / pixel_count
+        rows.append(
+            Dazzled(
+                area.option.name, area.option.masked, pixels, lost_share, times, irradiances, curve
+            )
+        )
     return tuple(rows)
 
 
@@ -187,6 +208,7 @@ class DamageVerdict:
         rows = [row for row in self.with_limit if row.state == self.state]
         if self.state == "not judged":
             rows = [row for row in self.with_limit if row not in self.unjudged] or rows
+        # incubation is an assumption: another part of the same state goes first
         return rows if self.state == "below" else _measured(rows) or rows
 
     @property
@@ -214,13 +236,15 @@ def damage_verdicts(
 ) -> Iterator[DamageVerdict]:
     """Yield the verdict of damage behind each option; none if damage is not asked for."""
     for option in options:
-        parts = limit_parts(safety, option, exposures, draws)
-        judged = [
+        light_parts = limit_parts(safety, option, exposures, draws)
+        damage_findings = [
             finding
             for finding in findings
             if finding.option == option.name and finding.limit.effect == "damage"
         ]
-        rows = tuple(_rows(parts, judged, continuous=not exposures.beams[0].is_pulsed))
+        rows = tuple(
+            _rows(light_parts, damage_findings, continuous=not exposures.beams[0].is_pulsed)
+        )
         if rows:
             yield DamageVerdict(option.name, worst_state(row.state for row in rows), rows)
 
@@ -231,11 +255,12 @@ def _rows(
     """Yield the row of each part; the findings are those of the parts with a threshold, in their
     order.
     """
-    waiting = iter(findings)
+    findings_in_order = iter(findings)
     for damage_part in parts:
-        finding = next(waiting) if damage_part.threshold is not None else None
+        finding = next(findings_in_order) if damage_part.threshold is not None else None
         state: State = "not judged" if finding is None else state_of_finding(finding)
         reason = damage_part.reason if state == "not judged" else ""
+        # continuous light has one part, which counts as pulse, mean and accumulation
         for name in _CONTINUOUS if continuous else (damage_part.part,):
             yield DamageRow(name, damage_part.kind, state, reason, finding)
 
@@ -297,7 +322,7 @@ def counted(safety: Safety) -> Iterator[str]:
     """Yield one sentence for each property of beam and air: counted with its value, or not
     counted.
     """
-    beam, quality = safety.settings.beam, safety.laser.beam().m_squared
+    beam, m_squared = safety.settings.beam, safety.laser.beam().m_squared
     if beam.hot_spots > 1 or "beam.hot_spots" in safety.values:
         yield (
             f"Hot spots of the beam: counted, factor {beam.hot_spots:g} on the irradiance of an"
@@ -313,9 +338,9 @@ def counted(safety: Safety) -> Iterator[str]:
             f" that is exceeded for {100 * (1 - beam.worst):.2g} % of the time, by Rytov's variance"
             " of a plane wave, an upper bound."
         )
-    if quality > 1 + 1e-6:
+    if m_squared > 1 + 1e-6:
         yield (
-            f"M2 of {quality:.3g}: counted in the width of the beam. Its light is focused as one"
+            f"M2 of {m_squared:.3g}: counted in the width of the beam. Its light is focused as one"
             " Gaussian mode, an upper bound of the peak: a beam of many modes has a wider spot."
         )
     else:
@@ -359,14 +384,14 @@ def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> 
             " exceeds."
         )
     if peaks and peaks.outside:
-        lacking = max(share for _, share in peaks.outside)
-        places = (
+        missing = max(share for _, share in peaks.outside)
+        where_text = (
             f"{len(peaks.outside)} of {len(peaks.along)} distances, the farthest"
             f" {peaks.outside[-1][0]:.3g} m"
         )
         yield (
-            f"At {places}, the window of the spot behind the mask lacks light (up to"
-            f" {100 * lacking:.2g} %) that may be brighter outside: it counts as one spot, as sharp"
+            f"At {where_text}, the window of the spot behind the mask lacks light (up to"
+            f" {100 * missing:.2g} %) that may be brighter outside: it counts as one spot, as sharp"
             " as that of the clear lens. Choose a larger window."
         )
     for spot in ranked:
@@ -453,9 +478,11 @@ def beyond_window(shares: Mapping[str, float]) -> Iterator[str]:
     """Yield one sentence if many of the lost pixels lie beyond the window of a PSF; ``shares``
     are by protection.
     """
-    wide = {name: share for name, share in shares.items() if share > _BEYOND}
-    if wide:
-        parts = ", ".join(f"{100 * share:.2g} % behind the {name}" for name, share in wide.items())
+    shares_to_name = {name: share for name, share in shares.items() if share > _BEYOND}
+    if shares_to_name:
+        parts = ", ".join(
+            f"{100 * share:.2g} % behind the {name}" for name, share in shares_to_name.items()
+        )
         yield (
             "The window of the point-spread function does not hold the dazzled area at every"
             f" distance: of its pixels up to {parts} have the light of a radial law (the third"
@@ -587,14 +614,14 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     findings = tuple(_findings(safety, draws, options, exposures, areas))
     verdicts = tuple(damage_verdicts(safety, options, exposures, draws, findings))
     eye = eye_finding(safety, exposures)
-    faults = (eye,) if isinstance(eye, str) else ()
+    eye_reasons = (eye,) if isinstance(eye, str) else ()
     beyond = {area.option.name: area.beyond(exposures, draws) for area in areas}
     unsaid = (
         *unsaid_of_damage(safety, verdicts),
         *unsaid_of_dazzle(safety, area_behind),
         *beyond_window(beyond),
         *near_text(safety.settings.distances[0], prepared.ranked, prepared.peaks),
-        *faults,
+        *eye_reasons,
     )
     mean = mean_in_frame(exposures, safety.settings.sensor.exposure or 1.0)
     return Estimate(
@@ -652,20 +679,25 @@ def _findings(
 
 
 def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures) -> Finding:
+    """Return what one limit says behind one option, over all distances and at that of the recipe.
+
+    Rows of arrays are the nominal values and then the draws.
+    """
     per_power, index = exposures.sensor[option.name], exposures.at(safety.laser.distance)
-    light = emitted(safety, limit, exposures)
-    limits = limit.values * limit.devices * np.ones((len(light), per_power.shape[1]))
+    emitted_light = emitted(safety, limit, exposures)
+    limit_values = limit.values * limit.devices * np.ones((len(emitted_light), per_power.shape[1]))
     ratio, at_lens = (
         limit_ratio(safety, option.name, limit, exposures),
-        limits * exposures.lens / per_power,
+        limit_values * exposures.lens / per_power,
     )
-    here = light[:, 0] * per_power[:, index]
+    # the exposure at the peak on the sensor: emitted light times exposure per unit of it
+    exposure_here = emitted_light[:, 0] * per_power[:, index]
     return Finding(
         option.name,
         limit,
-        _spread(limits[:, index]),
-        _spread(at_lens[:, index]),
-        _spread(here),
+        _spread(limit_values[:, index]),  # limit on the sensor
+        _spread(at_lens[:, index]),  # limit at the lens
+        _spread(exposure_here),  # exposure
         float(ratio[0, index]),
         _probability(limit, ratio[1:, index] * limit.devices[1:, 0]),
         zones_of(
@@ -695,5 +727,6 @@ def _probability(limit: Limit, ratio: FloatArray) -> Spread | None:
         return None
     from scipy.special import ndtr
 
+    # the thresholds of devices are lognormal around that of the median device
     shares = ndtr(np.log(ratio) / np.log(limit.factor))
     return Spread.of(float(shares.mean()), shares)

@@ -49,19 +49,24 @@ def over_distance(estimate: Estimate) -> Any:
     """Draw the exposure at the lens over the distance, and the limits at the lens behind the
     plain lens.
     """
-    plain = [finding for finding in estimate.findings if finding.option == estimate.options[0].name]
-    kinds = list(
+    plain_findings = [
+        finding for finding in estimate.findings if finding.option == estimate.options[0].name
+    ]
+    quantities = list(
         dict.fromkeys(
             [
                 "fluence" if estimate.exposures.beams[0].is_pulsed else "irradiance",
-                *(finding.limit.quantity for finding in plain if _has_mean(estimate)),
+                *(finding.limit.quantity for finding in plain_findings if _has_mean(estimate)),
             ]
         )
     )
-    figure, axes = canvas(9.0, 4.6 * len(kinds), len(kinds), 1)
-    for axis, kind in zip(axes[:, 0], kinds, strict=True):
+    figure, axes = canvas(9.0, 4.6 * len(quantities), len(quantities), 1)
+    for axis, quantity in zip(axes[:, 0], quantities, strict=True):
         _panel(
-            axis, estimate, kind, [finding for finding in plain if finding.limit.quantity == kind]
+            axis,
+            estimate,
+            quantity,
+            [finding for finding in plain_findings if finding.limit.quantity == quantity],
         )
     return figure
 
@@ -71,13 +76,18 @@ def _has_mean(estimate: Estimate) -> bool:
 
 
 def _panel(axis: Any, estimate: Estimate, kind: Any, findings: list[Finding]) -> None:
+    """Draw one panel: the exposure of the laser over the distance, and the limits of its quantity.
+
+    ``kind`` is ``irradiance`` or ``fluence``; ``findings`` are those of this quantity.
+    """
     distances = estimate.exposures.distances
     curve = estimate.exposures.emitted(kind) * estimate.exposures.lens
-    low, high = np.quantile(curve[1:], QUANTILES, axis=0)
-    axis.fill_between(distances, low, high, color=BLUE, alpha=0.25, linewidth=0)
+    low_curve, high_curve = np.quantile(curve[1:], QUANTILES, axis=0)
+    axis.fill_between(distances, low_curve, high_curve, color=BLUE, alpha=0.25, linewidth=0)
     axis.plot(distances, curve[0], color=BLUE, linewidth=2, label="laser")
-    for i, finding in enumerate(findings):
-        colour, dash = _COLOURS[i % len(_COLOURS)], _DASHES[i % len(_DASHES)]
+    # rows of `curve`: nominal, 5 % and 95 %
+    for number, finding in enumerate(findings):
+        colour, dash = _COLOURS[number % len(_COLOURS)], _DASHES[number % len(_DASHES)]
         axis.fill_between(
             distances, finding.curve[1], finding.curve[2], color=colour, alpha=0.15, linewidth=0
         )
@@ -100,8 +110,8 @@ def _panel(axis: Any, estimate: Estimate, kind: Any, findings: list[Finding]) ->
         ylabel=_NAMES[kind],
         xlim=(distances[0], distances[-1]),
     )
-    shown = np.concatenate([curve[0], *(finding.curve[0] for finding in findings)])
-    axis.set_ylim(shown.min() / 5, shown.max() * 5)
+    nominal_curves = np.concatenate([curve[0], *(finding.curve[0] for finding in findings)])
+    axis.set_ylim(nominal_curves.min() / 5, nominal_curves.max() * 5)
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
@@ -110,14 +120,19 @@ def spots(patterns: Sequence[DamagePattern]) -> Any:
     """Draw the exposure on the sensor over the limit of damage: red above the limit, blue below."""
     figure, axes = canvas(4.6 * len(patterns), 4.0, 1, len(patterns))
     for axis, pattern in zip(axes[0], patterns, strict=True):
-        half, brightest = pattern.width / 2 * 1e6, float(np.log10(pattern.peak))
-        decades = max(1.0, brightest, _BELOW - brightest)  # a spot far below the limit is seen too
-        light = np.log10(np.maximum(pattern.ratio, 10.0**-decades))
+        half_width, log_peak = pattern.width / 2 * 1e6, float(np.log10(pattern.peak))
+        decades = max(1.0, log_peak, _BELOW - log_peak)  # a spot far below the limit is seen too
+        log_ratio = np.log10(np.maximum(pattern.ratio, 10.0**-decades))
         limits = {"vmin": -decades, "vmax": decades}
-        shown = axis.imshow(light, cmap="RdBu_r", extent=(-half, half, -half, half), **limits)
+        image = axis.imshow(
+            log_ratio,
+            cmap="RdBu_r",
+            extent=(-half_width, half_width, -half_width, half_width),
+            **limits,
+        )
         axis.set(title=f"{pattern.option}: {pattern.limit}", xlabel="um", ylabel="um")
         axis.grid(False)
-        figure.colorbar(shown, ax=axis, label="log10 of exposure over limit", shrink=0.8)
+        figure.colorbar(image, ax=axis, label="log10 of exposure over limit", shrink=0.8)
     return figure
 
 
@@ -130,17 +145,22 @@ def zones(estimate: Estimate) -> Any:
     figure, axes = canvas(9.0, 1.2 + 0.32 * (len(rows) + 1))
     axis, distances = axes[0, 0], estimate.exposures.distances
     labels = []
-    for i, finding in enumerate(rows):
+    for row, finding in enumerate(rows):
         labels.append(f"{finding.option}, {finding.limit.name}")
         colour = VERMILION if finding.limit.effect == "damage" else ORANGE
         for zone in finding.zones.zones:
             axis.barh(
-                i, zone.far.value - zone.near.value, left=zone.near.value, height=0.6, color=colour
+                row,
+                zone.far.value - zone.near.value,
+                left=zone.near.value,
+                height=0.6,
+                color=colour,
             )
             for end in (zone.near, zone.far):
-                axis.plot([end.low, end.high], [i, i], color=BLACK, linewidth=1.5)
+                axis.plot([end.low, end.high], [row, row], color=BLACK, linewidth=1.5)
     if estimate.eye:
         labels.append("eye, unaided (NOHD)")
+        # the eye is in the row below all limits
         reach = min(estimate.eye.distance.value, distances[-1])
         axis.barh(
             len(rows), max(reach - distances[0], 0.0), left=distances[0], height=0.6, color=GREEN
@@ -168,10 +188,15 @@ def dazzled_share(estimate: Estimate) -> Any:
     """
     figure, axes = canvas(9.0, 4.4)
     axis = axes[0, 0]
-    for i, area in enumerate(estimate.dazzled):
-        shown = area.curve > 0
-        look = {"color": (BLUE, *_COLOURS)[i], "linestyle": _DASHES[i % len(_DASHES)]}
-        axis.plot(area.at_lens[shown], area.curve[shown], label=area.option, **look)
+    for number, area in enumerate(estimate.dazzled):
+        is_positive = area.curve > 0
+        line_style = {
+            "color": (BLUE, *_COLOURS)[number],
+            "linestyle": _DASHES[number % len(_DASHES)],
+        }
+        axis.plot(
+            area.at_lens[is_positive], area.curve[is_positive], label=area.option, **line_style
+        )
     assert estimate.safety.settings.dazzle is not None
     axis.axhline(estimate.safety.settings.dazzle.share, color=BLACK, linewidth=0.8, linestyle=":")
     axis.axvline(estimate.mean_at_lens, color=BLACK, linewidth=0.8)
@@ -253,23 +278,26 @@ _CSV = (
 
 def report(estimate: Estimate) -> StudyReport:
     """Return the page of an estimate with its pictures and its table of limits."""
-    shown = {"irradiance": over_distance(estimate)}
+    pictures = {"irradiance": over_distance(estimate)}
     if estimate.findings or estimate.eye:
-        shown["distances"] = zones(estimate)
+        pictures["distances"] = zones(estimate)
     if estimate.dazzled:
-        shown["dazzle"] = dazzled_share(estimate)
+        pictures["dazzle"] = dazzled_share(estimate)
     if estimate.patterns:
-        shown["pattern"] = spots(estimate.patterns)
+        pictures["pattern"] = spots(estimate.patterns)
     if estimate.dead:
-        shown["dead_pixels"] = dead_frames(estimate.dead)
+        pictures["dead_pixels"] = dead_frames(estimate.dead)
     sections = [
         _limits(estimate),
-        _distances(estimate, shown.get("distances")),
-        _curve(shown["irradiance"]),
+        _distances(estimate, pictures.get("distances")),
+        _curve(pictures["irradiance"]),
     ]
-    sections += [_dazzled(estimate, shown.get("dazzle")), _pattern(estimate, shown.get("pattern"))]
     sections += [
-        _dead(estimate, shown.get("dead_pixels")),
+        _dazzled(estimate, pictures.get("dazzle")),
+        _pattern(estimate, pictures.get("pattern")),
+    ]
+    sections += [
+        _dead(estimate, pictures.get("dead_pixels")),
         _helps(estimate),
         _eye(estimate),
         _eye_dazzle(estimate),
@@ -286,12 +314,13 @@ def report(estimate: Estimate) -> StudyReport:
             ]
         ),
         [section for section in sections if section],
-        shown,
+        pictures,
         {"limits.csv": (_CSV, [*map(_row, estimate.findings), *_unjudged(estimate)])},
     )
 
 
 def _limits(estimate: Estimate) -> Section | None:
+    """Return the section with the table of limits; None without any limit."""
     rows = limit_rows(estimate)
     if not rows:
         return None
@@ -303,9 +332,10 @@ def _limits(estimate: Estimate) -> Section | None:
         incubation of many pulses. A probability is stated for a law with data of devices alone, and
         is that of a device drawn from all devices. {safety_text.intervals_text(estimate)}
         {CERTIFICATE}"""
-    judged = list(map(_mark, estimate.findings))
-    others: list[Mark] = ["warn"] * (len(rows) - len(judged))
-    marked = marked_column(rows, 3, [*judged, *others])
+    marks_of_limits = list(map(_mark, estimate.findings))
+    marks_of_unjudged: list[Mark] = ["warn"] * (len(rows) - len(marks_of_limits))
+    # column 3 of `LIMIT_COLUMNS` is the ratio
+    marked = marked_column(rows, 3, [*marks_of_limits, *marks_of_unjudged])
     return Section("Limits", text, safety_text.LIMIT_COLUMNS, marked)
 
 
@@ -321,6 +351,7 @@ def _mark(finding: Finding) -> Mark:
 
 
 def _distances(estimate: Estimate, picture: bytes | None) -> Section | None:
+    """Return the section with the zones of distance of each limit; None without any limit."""
     if not estimate.findings:
         return None
     near, far = (safety_text.metres(estimate.exposures.distances[i]) for i in (0, -1))
@@ -340,6 +371,7 @@ def _curve(picture: bytes) -> Section:
 
 
 def _dazzled(estimate: Estimate, picture: bytes | None) -> Section | None:
+    """Return the section on the dazzled area; None if dazzle is not judged."""
     if picture is None or estimate.safety.settings.dazzle is None:
         return None
     text = f"""{safety_text.enlarged_text(estimate)} The figure shows the share of saturated pixels
@@ -381,6 +413,7 @@ def _dead(estimate: Estimate, picture: bytes | None) -> Section | None:
 
 
 def _pattern(estimate: Estimate, picture: bytes | None) -> Section | None:
+    """Return the section on the pattern of damage; None without a picture of it."""
     if picture is None:
         return None
     pitch = estimate.safety.settings.sensor.pixel_pitch
@@ -403,6 +436,7 @@ def _pattern(estimate: Estimate, picture: bytes | None) -> Section | None:
 
 
 def _eye(estimate: Estimate) -> Section | None:
+    """Return the section on the limit of the eye; None if it is not judged."""
     if estimate.eye is None:
         return None
     return Section(
@@ -412,6 +446,7 @@ def _eye(estimate: Estimate) -> Section | None:
 
 
 def _helps(estimate: Estimate) -> Section | None:
+    """Return the section on what helps; None without any means."""
     if not estimate.helps:
         return None
     text = " ".join([safety_text.EXPLAINED, *safety_text.sentences(estimate.helps), CERTIFICATE])
@@ -419,6 +454,7 @@ def _helps(estimate: Estimate) -> Section | None:
 
 
 def _eye_dazzle(estimate: Estimate) -> Section:
+    """Return the section on the dazzle of the eye, or on why it is not judged."""
     dazzle = estimate.eye_dazzle
     text = (
         f"{safety_text.dazzle_text(dazzle, estimate.safety.settings.eye.dazzle)} Source:"
@@ -433,6 +469,9 @@ def _unsaid(estimate: Estimate) -> Section | None:
 
 
 def _assumed(estimate: Estimate) -> Section:
+    """Return the section on what the estimate assumes: beam, air, focus, scatter,
+    spots and damage.
+    """
     laser = estimate.safety.laser
     air = "Clear air."
     if laser.air_transmittance is not None:
@@ -488,6 +527,7 @@ def _damage_assumed(estimate: Estimate) -> str:
 
 
 def _sources(estimate: Estimate) -> Section:
+    """Return the section with the note and the source of each limit."""
     rows = dict.fromkeys(
         (finding.limit.name, finding.limit.note, finding.limit.source)
         for finding in estimate.findings
@@ -500,25 +540,29 @@ def _sources(estimate: Estimate) -> Section:
 
 
 def _row(finding: Finding) -> list[object]:
-    sensor, lens = finding.at_sensor, finding.at_lens
+    """Return the row of a limit in limits.csv, with the columns of `_CSV`."""
+    sensor_limit, lens_limit = finding.at_sensor, finding.at_lens
     probability = finding.probability.value if finding.probability else None
     numbers = [
-        sensor.value,
-        sensor.low,
-        sensor.high,
-        lens.value,
-        lens.low,
-        lens.high,
+        sensor_limit.value,
+        sensor_limit.low,
+        sensor_limit.high,
+        lens_limit.value,
+        lens_limit.low,
+        lens_limit.high,
         finding.ratio,
         probability,
     ]
-    ends = [None, None] if is_bracket(finding) else [finding.zones.none, finding.zones.inside]
-    start = [finding.option, finding.limit.name, finding.limit.effect, finding.limit.quantity]
+    # a bracket has no probabilities
+    zone_shares = (
+        [None, None] if is_bracket(finding) else [finding.zones.none, finding.zones.inside]
+    )
+    names = [finding.option, finding.limit.name, finding.limit.effect, finding.limit.quantity]
     return [
-        *start,
+        *names,
         *numbers,
         safety_text.zones_text(finding.zones),
-        *ends,
+        *zone_shares,
         finding.limit.source,
         *_beside(finding),
     ]
@@ -534,12 +578,18 @@ def _beside(finding: Finding) -> list[object]:
 def _unjudged(estimate: Estimate) -> list[list[object]]:
     """Return the rows of limits.csv for the parts of the light that no law judges."""
     rows = []
-    for judged in estimate.damage:
-        rows += [_unjudged_row(judged.option, row) for row in judged.rows if row.finding is None]
+    for verdict_of_option in estimate.damage:
+        rows += [
+            _unjudged_row(verdict_of_option.option, row)
+            for row in verdict_of_option.rows
+            if row.finding is None
+        ]
     return rows
 
 
 def _unjudged_row(option: str, row: DamageRow) -> list[object]:
-    nothing = [""] * 12
-    start = [option, f"damage: {row.part}", "damage"]
-    return [*start, *nothing, row.reason, "not judged", "", "", ""]
+    """Return the row of an unjudged part of the light in limits.csv, with the columns of `_CSV`."""
+    # from "quantity" to "source", where the reason stands in place of a source
+    empty_cells = [""] * 12
+    names = [option, f"damage: {row.part}", "damage"]
+    return [*names, *empty_cells, row.reason, "not judged", "", "", ""]

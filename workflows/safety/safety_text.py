@@ -54,12 +54,14 @@ def scaled(value: float, unit: str) -> str:
     """Return a positive number with three digits and a prefix of its unit, such as ``20.4 MW``."""
     if not (math.isfinite(value) and value > 0):
         return f"{value:g} {unit}"
-    power = min(max(3 * math.floor(math.log10(value) / 3 + 1e-12), -15), 12)
-    text = f"{value / 10.0**power:.3g}"
-    if float(text) >= 1000 and power < 12:
-        power, text = power + 3, f"{value / 10.0 ** (power + 3):.3g}"
+    # the largest multiple of 3 below the logarithm; 1e-12 is its rounding
+    exponent = min(max(3 * math.floor(math.log10(value) / 3 + 1e-12), -15), 12)
+    text = f"{value / 10.0**exponent:.3g}"
+    # rounding to three digits has reached the next prefix
+    if float(text) >= 1000 and exponent < 12:
+        exponent, text = exponent + 3, f"{value / 10.0 ** (exponent + 3):.3g}"
     return (
-        f"{float(text):g} {_PREFIXES[power]}{unit}"
+        f"{float(text):g} {_PREFIXES[exponent]}{unit}"
         if 0.1 <= float(text) < 1e4
         else f"{value:.3g} {unit}"
     )
@@ -69,12 +71,12 @@ def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
     """Return a number with the interval of its draws in brackets, or alone if nothing is
     uncertain.
     """
-    middle = scaled(factor * spread.value, unit)
+    nominal_text = scaled(factor * spread.value, unit)
     if math.isclose(spread.low, spread.high, rel_tol=_SAME):
-        return middle
-    number, _, prefixed = middle.partition(" ")
-    prefix = factor * spread.value / float(number)
-    low, high = (f"{factor * x / prefix:.3g}" for x in (spread.low, spread.high))
+        return nominal_text
+    number, _, prefixed = nominal_text.partition(" ")
+    prefix_value = factor * spread.value / float(number)
+    low, high = (f"{factor * bound / prefix_value:.3g}" for bound in (spread.low, spread.high))
     return f"{number} ({plain(low)} to {plain(high)}) {prefixed}"
 
 
@@ -133,8 +135,12 @@ def probability(finding: Finding) -> str:
     spread = finding.probability
     if spread is None:
         return "–" if finding.limit.effect == "dazzle" else "not known: no spread published"
-    middle, low, high = map(share, (spread.value, spread.low, spread.high))
-    return middle if low == high == middle else f"{middle} ({low} to {high})"
+    middle_text, low_text, high_text = map(share, (spread.value, spread.low, spread.high))
+    return (
+        middle_text
+        if low_text == high_text == middle_text
+        else f"{middle_text} ({low_text} to {high_text})"
+    )
 
 
 def limit_cells(finding: Finding) -> list[str]:
@@ -142,13 +148,15 @@ def limit_cells(finding: Finding) -> list[str]:
     reached, at the lens.
     """
     unit = UNITS[finding.limit.quantity]
-    now = f"{plain(f'{finding.ratio:.2g}')} times" if finding.ratio >= 1 else f"{finding.ratio:.2g}"
-    sensor = with_ends(finding.at_sensor, f"{unit}/cm²", _PER_CM2)
+    ratio_text = (
+        f"{plain(f'{finding.ratio:.2g}')} times" if finding.ratio >= 1 else f"{finding.ratio:.2g}"
+    )
+    limit_text = with_ends(finding.at_sensor, f"{unit}/cm²", _PER_CM2)
     return [
         finding.option,
         finding.limit.name,
-        sensor,
-        now,
+        limit_text,
+        ratio_text,
         with_ends(finding.at_lens, f"{unit}/m²"),
         probability(finding),
     ]
@@ -170,10 +178,10 @@ def eye_text(eye: EyeFinding) -> str:
     """Return what is said of the eye in two sentences."""
     unit = f"{UNITS[eye.quantity]}/m²"
     per_pulse = " of each pulse" if eye.quantity == "fluence" else ""
-    now = "exceeds" if eye.exposure.value > eye.limit else "does not exceed"
+    verb = "exceeds" if eye.exposure.value > eye.limit else "does not exceed"
     return (
         f"The eye may receive {scaled(eye.limit, unit)}{per_pulse} for {eye.duration:g} s (MPE);"
-        f" here it receives {with_ends(eye.exposure, unit)}, which {now} the limit. The nominal"
+        f" here it receives {with_ends(eye.exposure, unit)}, which {verb} the limit. The nominal"
         f" ocular hazard distance (NOHD) is {end(eye.distance)} in clear air. A distance that is"
         " safe for a camera may blind people."
     )
@@ -182,24 +190,24 @@ def eye_text(eye: EyeFinding) -> str:
 def laser_text(estimate: Estimate) -> str:
     """Return the laser, its distance and its exposure at the lens in one sentence."""
     beam, index = estimate.exposures.beams[0], estimate.at
-    train = f" at {scaled(beam.repetition_rate, 'Hz')}" if beam.repetition_rate else ""
-    light = (
+    rate_text = f" at {scaled(beam.repetition_rate, 'Hz')}" if beam.repetition_rate else ""
+    output = (
         f"{scaled(beam.power, 'W')}"
         if beam.power and not beam.pulse_energy
         else (
             f"pulses of {scaled(beam.pulse_energy or 0.0, 'J')} in "
-            f"{scaled(beam.pulse_duration or 0.0, 's')}{train}"
+            f"{scaled(beam.pulse_duration or 0.0, 's')}{rate_text}"
         )
     )
     quantity = "fluence" if beam.is_pulsed else "irradiance"
-    here = (
+    at_lens = (
         estimate.exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0]
         * estimate.exposures.lens[:, index]
     )
-    spread = Spread.of(float(here[0]), here[1:])
+    spread = Spread.of(float(at_lens[0]), at_lens[1:])
     per_pulse = " a pulse" if beam.is_pulsed else ""
     return (
-        f"{estimate.safety.name}: {estimate.emission}, {light}, {beam.wavelength * 1e9:.4g} nm,"
+        f"{estimate.safety.name}: {estimate.emission}, {output}, {beam.wavelength * 1e9:.4g} nm,"
         f" divergence {scaled(beam.divergence, 'rad')}, at"
         f" {metres(estimate.safety.laser.distance)}:"
         f" {with_ends(spread, UNITS[quantity] + '/m²')}{per_pulse} at the lens."
@@ -209,12 +217,12 @@ def laser_text(estimate: Estimate) -> str:
 def intervals_text(estimate: Estimate) -> str:
     """Return what the numbers in brackets mean."""
     laws = estimate.draws.laws
-    named = f" {', '.join(f'{name} {text}' for name, text in laws.items())};" if laws else ""
+    laws_text = f" {', '.join(f'{name} {text}' for name, text in laws.items())};" if laws else ""
     text = f"In brackets: the middle 90 % of {estimate.draws.count} draws of all that is uncertain"
     if not estimate.damage:
-        return f"{text}:{named.removesuffix(';')}." if named else f"{text}; nothing is."
+        return f"{text}:{laws_text.removesuffix(';')}." if laws_text else f"{text}; nothing is."
     return (
-        f"{text}:{named} the thresholds of damage. A published threshold has a bracket and no"
+        f"{text}:{laws_text} the thresholds of damage. A published threshold has a bracket and no"
         " probability: a third of the draws each takes its lower end, its middle and its upper"
         " end. A law with data of devices is drawn from its spread."
     )
@@ -222,7 +230,7 @@ def intervals_text(estimate: Estimate) -> str:
 
 def dazzled_cells(area: Dazzled) -> list[str]:
     """Return the row of a protection in the table of the dazzled area."""
-    low, high = (_pixels(x) for x in (area.pixels.low, area.pixels.high))
+    low, high = (_pixels(bound) for bound in (area.pixels.low, area.pixels.high))
     number = _pixels(area.pixels.value)
     text = number if low == high else f"{number} ({low} to {high})"
     return [
@@ -251,7 +259,9 @@ def enlarged_text(estimate: Estimate) -> str:
 
 
 def _both(estimate: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
-    """Return the dazzled area behind the plain lens and behind the mask."""
+    """Return the dazzled areas behind the plain lens and behind the mask, each None
+    if not known.
+    """
     return next(iter(estimate.dazzled), None), next(
         (area for area in estimate.dazzled if area.masked), None
     )
@@ -274,27 +284,28 @@ def _sooner_text(estimate: Estimate) -> str:
     """Return by how much less light at the lens the stated share of the picture is lost behind
     the mask.
     """
-    plain, mask = _both(estimate)
-    limits = [
+    plain_area, mask_area = _both(estimate)
+    dazzle_findings = [
         next(
             (
-                f
-                for f in estimate.findings
-                if area and f.option == area.option and f.limit.effect == "dazzle"
+                finding
+                for finding in estimate.findings
+                if area and finding.option == area.option and finding.limit.effect == "dazzle"
             ),
             None,
         )
-        for area in (plain, mask)
+        for area in (plain_area, mask_area)
     ]
-    if limits[0] is None or limits[1] is None:
+    if dazzle_findings[0] is None or dazzle_findings[1] is None:
         return ""
-    factor = limits[0].at_lens.value / limits[1].at_lens.value
+    # limit at the lens behind the plain lens over that behind the mask
+    factor = dazzle_findings[0].at_lens.value / dazzle_findings[1].at_lens.value
     compared = (
         f"{factor:.3g} times less light" if factor > 1 else f"{1 / factor:.3g} times more light"
     )
     return (
         f"Behind the mask {compared} at the lens than behind the plain lens gives:"
-        f" {limits[1].limit.name}."
+        f" {dazzle_findings[1].limit.name}."
     )
 
 
@@ -321,18 +332,20 @@ def verdict(estimate: Estimate) -> list[str]:
     dazzle behind it.
     """
     lens = estimate.options[0].name
-    damage = [
-        damage_sentence(judged, estimate) for judged in estimate.damage if judged.option == lens
+    damage_sentences = [
+        damage_sentence(damage_verdict, estimate)
+        for damage_verdict in estimate.damage
+        if damage_verdict.option == lens
     ]
-    dazzle = [
+    dazzle_findings = [
         finding
         for finding in estimate.findings
         if finding.option == lens and finding.limit.effect != "damage"
     ]
-    return damage + [
+    return damage_sentences + [
         f"{finding.limit.name}: exceeded"
         f" {'from ' if finding.zones.zones else ''}{zones_text(finding.zones)}."
-        for finding in dazzle
+        for finding in dazzle_findings
     ]
 
 
@@ -340,28 +353,30 @@ def damage_sentence(verdict: DamageVerdict, estimate: Estimate) -> str:
     """Return the verdict of damage behind one protection in W/cm2 or J/cm2, with the distances
     of the worst part.
     """
-    where = f"at {metres(estimate.safety.laser.distance)} behind the {verdict.option}"
+    place_text = f"at {metres(estimate.safety.laser.distance)} behind the {verdict.option}"
     nearest = verdict.nearest
     if nearest is None or nearest.finding is None:
-        return f"Damage is not judged {where}: {verdict.rows[0].reason}."
-    near, zones = _compared(nearest, estimate), _zones(verdict, nearest.finding)
+        return f"Damage is not judged {place_text}: {verdict.rows[0].reason}."
+    exposure_text, zones_sentence = _compared(nearest, estimate), _zones(verdict, nearest.finding)
     if verdict.state == "above":
-        return f"Damage is expected {where}: {near} {zones}"
+        return f"Damage is expected {place_text}: {exposure_text} {zones_sentence}"
     if verdict.state == "not judged":
         parts = " and the ".join(dict.fromkeys(row.part for row in verdict.unjudged))
         text = (
-            f"Damage is not judged {where}, because no law judges the {parts}:"
+            f"Damage is not judged {place_text}, because no law judges the {parts}:"
             f" {verdict.unjudged[0].reason}."
         )
         if nearest.state == "not judged":
             return text
-        return f"{text} Of what is judged, {near} {zones}".rstrip()
+        return f"{text} Of what is judged, {exposure_text} {zones_sentence}".rstrip()
     opening = "Damage cannot be excluded" if verdict.state == "within" else "No damage is expected"
-    return f"{opening} {where}: {near} {zones}"
+    return f"{opening} {place_text}: {exposure_text} {zones_sentence}"
 
 
 def _compared(row: DamageRow, estimate: Estimate) -> str:
-    """Return the exposure of one part of the light, and its ratio to the threshold."""
+    """Return as a sentence: the exposure by one part of the light, and its ratio to
+    the threshold.
+    """
     finding = row.finding
     assert finding is not None
     unit = f"{UNITS[finding.limit.quantity]}/cm²"
@@ -450,6 +465,7 @@ def _limit_cells(finding: Finding) -> list[str]:
     cells = limit_cells(finding)
     if finding.limit.effect != "damage" or finding.ratios is None:
         return cells
+    # columns 3 and 5 of `LIMIT_COLUMNS`: the ratio, and the probability
     cells[3] = f"{times(finding)}: {STATES[state_of_finding(finding)]}"
     if is_bracket(finding):
         cells[5] = "none: no device data"
@@ -484,11 +500,11 @@ EYE_DAZZLE_COLUMNS = (
 
 def dazzle_cells(row: EyeDazzleRow) -> list[str]:
     """Return the row of one light of the surroundings and one angle."""
-    start = [f"{row.background:g} cd/m²", f"{row.angle:.3g}°"]
+    first_cells = [f"{row.background:g} cd/m²", f"{row.angle:.3g}°"]
     if row.distance is None:
-        return [*start, "not seen without a laser", "–", "–"]
+        return [*first_cells, "not seen without a laser", "–", "–"]
     return [
-        *start,
+        *first_cells,
         scaled(row.limit, "W/m²"),
         end(row.distance),
         "dazzled" if row.dazzled else "seen",
@@ -502,11 +518,11 @@ def distance_table(rows: Sequence[EyeDazzleRow]) -> list[list[str]]:
     angles = list(dict.fromkeys(row.angle for row in rows))
     table = [["surroundings", *(f"{angle:.3g}° from the laser" for angle in angles)]]
     for background in dict.fromkeys(row.background for row in rows):
-        reach = [row.distance for row in rows if row.background == background]
+        distances = [row.distance for row in rows if row.background == background]
         table.append(
             [
                 f"{background:g} cd/m²",
-                *("not seen" if x is None else metres(x.value) for x in reach),
+                *("not seen" if spread is None else metres(spread.value) for spread in distances),
             ]
         )
     return table
@@ -564,13 +580,13 @@ def table(remedies: Sequence[Remedy]) -> list[list[str]]:
 def cells(remedy: Remedy) -> list[str]:
     """Return the row of one means against one limit."""
     cost = remedy.cost
-    left = "–" if cost is None else f"{100 * cost.scene:.3g} %"
+    scene_text = "–" if cost is None else f"{100 * cost.scene:.3g} %"
     return [
         remedy.limit,
         remedy.means,
         _value(remedy),
         "–" if remedy.safe is None or remedy.value is None else _number(remedy.means, remedy.safe),
-        left,
+        scene_text,
         "–" if cost is None else _snr(cost),
         _note(remedy),
     ]
@@ -582,15 +598,20 @@ def _value(remedy: Remedy) -> str:
         return MET
     if remedy.value is None:
         return "not judged" if remedy.reason.startswith("not judged") else "none helps"
-    middle, low, high = (
-        _number(remedy.means, x) for x in (remedy.value.value, remedy.value.low, remedy.value.high)
+    nominal_text, low_text, high_text = (
+        _number(remedy.means, number)
+        for number in (remedy.value.value, remedy.value.low, remedy.value.high)
     )
-    low, high = low.removeprefix(_DENSITY), high.removeprefix(_DENSITY)
-    return middle if low == high == middle.removeprefix(_DENSITY) else f"{middle} ({low} to {high})"
+    low_text, high_text = low_text.removeprefix(_DENSITY), high_text.removeprefix(_DENSITY)
+    return (
+        nominal_text
+        if low_text == high_text == nominal_text.removeprefix(_DENSITY)
+        else f"{nominal_text} ({low_text} to {high_text})"
+    )
 
 
 def _number(means: str, value: float) -> str:
-    """Return a density, a diameter or an exposure with its unit."""
+    """Return an optical density, a diameter (m) or an exposure (s) as text with its unit."""
     if means in ("grey filter", "notch filter"):
         return f"{_DENSITY}{value:.2f}"
     return scaled(value, "m" if means == "stop" else "s")
@@ -617,7 +638,7 @@ def _notch_note(remedy: Remedy) -> str:
     """Return the band that a notch filter has to block."""
     if remedy.band is None:
         return ""
-    low, high = (f"{x * 1e9:.4g}" for x in remedy.band)
+    low, high = (f"{wavelength * 1e9:.4g}" for wavelength in remedy.band)
     return f"blocks {low} to {high} nm; the colour of the laser has to be known"
 
 
@@ -659,11 +680,11 @@ def paragraphs(estimate: Estimate) -> list[list[str]]:
     """Return the verdict, the tables of limits and distances, the eye, and the sources, before
     lines are wrapped.
     """
-    parts = [
+    texts = [
         [f"{estimate.recipe.name}: {estimate.recipe.title}", CERTIFICATE, ""],
         [laser_text(estimate)],
     ]
-    steps = (
+    writers = (
         _damage,
         _limits,
         _dazzled_area,
@@ -675,9 +696,9 @@ def paragraphs(estimate: Estimate) -> list[list[str]]:
         _sources,
         _eye_sources,
     )
-    for step in steps:
-        parts += step(estimate)
-    return parts
+    for step in writers:
+        texts += step(estimate)
+    return texts
 
 
 def _damage(estimate: Estimate) -> Iterator[list[str]]:
@@ -698,9 +719,9 @@ def _dazzled_area(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the table of the dazzled area, and whether the mask enlarges it."""
     if not estimate.dazzled:
         return
-    here = metres(estimate.safety.laser.distance)
+    distance_text = metres(estimate.safety.laser.distance)
     yield _table(
-        f"dazzled area at {here}",
+        f"dazzled area at {distance_text}",
         DAZZLE_COLUMNS,
         [dazzled_cells(area) for area in estimate.dazzled],
     )
@@ -778,4 +799,5 @@ def _source(finding: Finding) -> str:
 
 
 def _table(title: str, header: tuple[str, ...], rows: list[list[str]]) -> list[str]:
+    """Return a table as lines: an empty one, the title, and header and rows in aligned columns."""
     return ["", title, *(f"  {line}" for line in columns([list(header), *rows]))]

@@ -92,11 +92,11 @@ def remedies(safety: Safety, draws: SettingDraws, ranked: Sequence[Ranked]) -> t
     the recipe.
     """
     question = _Question(safety, draws, ranked)
-    plain = question.ratios(_Trial(Option("plain lens")))
-    ways = list(_ways(question)) if plain else []
+    plain_ratios = question.ratios(_Trial(Option("plain lens")))
+    means = list(_ways(question)) if plain_ratios else []
     answers: list[Remedy] = []
-    for limit in plain:
-        for remedy in _remedies(limit, ways):  # which may find that the limit is open
+    for limit in plain_ratios:
+        for remedy in _remedies(limit, means):  # which may find that the limit is open
             answers.append(_open(remedy) if limit in question.open else remedy)
     return tuple(answers)
 
@@ -108,10 +108,10 @@ def _open(remedy: Remedy) -> Remedy:
 
 def problem_of(limit: str) -> Problem:
     """Return the problem that a limit belongs to, by its name."""
-    word = limit.partition(":")[0]
-    if word == "saturated":
+    first_word = limit.partition(":")[0]
+    if first_word == "saturated":
         return "saturation"
-    return "contrast" if word == "veiled" else "damage"
+    return "contrast" if first_word == "veiled" else "damage"
 
 
 # --- the question: how often is each limit exceeded behind another protection? --------------------
@@ -142,7 +142,7 @@ class _Question:
         safety, draws = _exposed(self.safety, self.draws, trial.exposure)
         if not drawn:
             draws = replace(
-                draws, count=0, values={name: x[:0] for name, x in draws.values.items()}
+                draws, count=0, values={name: values[:0] for name, values in draws.values.items()}
             )
         exposures = compute_exposures(
             safety, draws, (trial.option,), np.array([safety.laser.distance])
@@ -167,15 +167,15 @@ class _Question:
         """
         if problem_of(limit) != "contrast":
             return asked.get(limit)
-        full = asked.get(limit.replace("veiled", "saturated"))
+        saturation_ratio = asked.get(limit.replace("veiled", "saturated"))
         safety, _ = _exposed(self.safety, self.draws, trial.exposure)
         dazzle, well = safety.settings.dazzle, safety.settings.sensor.full_well
-        if full is None or dazzle is None or well is None:
+        if saturation_ratio is None or dazzle is None or well is None:
             return None
-        scene = trial.option.scene_share(safety.settings.lens.diameter)
-        if veil_level(dazzle, scene) <= 0 or dazzle.background * scene >= well:
-            return np.full_like(full, math.inf)
-        return asked.get(limit, full)
+        scene_share = trial.option.scene_share(safety.settings.lens.diameter)
+        if veil_level(dazzle, scene_share) <= 0 or dazzle.background * scene_share >= well:
+            return np.full_like(saturation_ratio, math.inf)
+        return asked.get(limit, saturation_ratio)
 
 
 def _exposed(safety: Safety, draws: SettingDraws, factor: float) -> tuple[Safety, SettingDraws]:
@@ -190,7 +190,8 @@ def _exposed(safety: Safety, draws: SettingDraws, factor: float) -> tuple[Safety
     if dazzle is not None:
         dazzle = dazzle.model_copy(update={"background": dazzle.background * factor})
     values = {
-        name: x * factor if name == "sensor.exposure" else x for name, x in draws.values.items()
+        name: drawn_values * factor if name == "sensor.exposure" else drawn_values
+        for name, drawn_values in draws.values.items()
     }
     changed = settings.model_copy(update={"sensor": sensor, "dazzle": dazzle})
     return replace(safety, settings=changed), replace(draws, values=values)
@@ -236,7 +237,10 @@ class _Way:
         lens, sensor, dazzle = settings.lens, settings.sensor, settings.dazzle
         scene = trial.option.scene_share(lens.diameter) * trial.exposure
         diameters = (lens.diameter, min(lens.diameter, trial.option.diameter or lens.diameter))
-        cutoffs = [diffraction_cutoff(lens.focal_length, x, sensor.pixel_pitch) for x in diameters]
+        cutoffs = [
+            diffraction_cutoff(lens.focal_length, diameter, sensor.pixel_pitch)
+            for diameter in diameters
+        ]
         white = None if sensor.full_well is None else sensor.full_well * min(1.0, scene)
         if dazzle is None:
             return PictureCost(scene, cutoffs[0], cutoffs[1], white)
@@ -245,9 +249,18 @@ class _Way:
             "feature": dazzle.feature,
             "read_noise": dazzle.read_noise,
         }
-        ratios = [feature_snr(dazzle.background * share, 0.0, **feature) for share in (1.0, scene)]
+        # without a filter or stop, and with it, while no laser shines: 0.0 is its light
+        feature_snrs = [
+            feature_snr(dazzle.background * share, 0.0, **feature) for share in (1.0, scene)
+        ]
         return PictureCost(
-            scene, cutoffs[0], cutoffs[1], white, dazzle.background * scene, ratios[0], ratios[1]
+            scene,
+            cutoffs[0],
+            cutoffs[1],
+            white,
+            dazzle.background * scene,
+            feature_snrs[0],
+            feature_snrs[1],
         )
 
 
@@ -258,7 +271,8 @@ def _ways(question: _Question) -> Iterator[_Way]:
         question.safety.settings.sensor.exposure,
     )
     band = _notch(question)
-    left = 1 - white_share(*band)
+    # share of white light that the notch lets through
+    scene_left = 1 - white_share(*band)
     yield _Way(
         question, "grey filter", _FILTERS, lambda x: _Trial(Option("grey filter", passing=x))
     )
@@ -266,7 +280,7 @@ def _ways(question: _Question) -> Iterator[_Way]:
         question,
         "notch filter",
         _FILTERS,
-        lambda x: _Trial(Option("notch filter", passing=x, scene=left)),
+        lambda x: _Trial(Option("notch filter", passing=x, scene=scene_left)),
     )
     yield replace(notch, band=band)
     stops = _stops(question.safety.settings.lens.focal_length / diameter)
@@ -285,8 +299,9 @@ def _stops(f_number: float) -> tuple[float, ...]:
     than f/32.
     """
     smallest = min(0.5, f_number / _SLOWEST)
-    steps = max(4, math.ceil(math.log(smallest) / math.log(_HALF_STOP) / 2))
-    return tuple(smallest ** (x / steps) for x in range(steps + 1))
+    # diameters in equal ratios, of two half stops at most
+    step_count = max(4, math.ceil(math.log(smallest) / math.log(_HALF_STOP) / 2))
+    return tuple(smallest ** (x / step_count) for x in range(step_count + 1))
 
 
 def _notch(question: _Question) -> tuple[float, float]:
@@ -311,24 +326,32 @@ def _remedies(limit: str, ways: Sequence[_Way]) -> Iterator[Remedy]:
     one that helps.
     """
     yield from (_remedy(limit, way) for way in ways if way.means != "exposure")
-    looks = [way for way in ways if way.means == "exposure"]
+    exposure_ways = [way for way in ways if way.means == "exposure"]
     if problem_of(limit) != "contrast":
-        looks = looks[:1]  # a longer exposure can only help contrast
-    answers = [_remedy(limit, way) for way in looks]
+        exposure_ways = exposure_ways[:1]  # a longer exposure can only help contrast
+    answers = [_remedy(limit, way) for way in exposure_ways]
+    # the first that helps, else the first
     yield from [answer for answer in answers if answer.value is not None][:1] or answers[:1]
 
 
 def _remedy(limit: str, way: _Way) -> Remedy:
     """Return what one means does against one limit."""
-    problem, here = problem_of(limit), way.value(1.0)
-    present = way.ratio(limit, 1.0)
-    if present is not None and _is_met(present):
+    problem, present_value = problem_of(limit), way.value(1.0)
+    present_ratio = way.ratio(limit, 1.0)
+    if present_ratio is not None and _is_met(present_ratio):
         return Remedy(
-            problem, limit, way.means, Spread(here, here, here), here, MET, float(present[0]), 1.0
+            problem,
+            limit,
+            way.means,
+            Spread(present_value, present_value, present_value),
+            present_value,
+            MET,  # reason
+            float(present_ratio[0]),  # put back
+            1.0,  # share of the draws below the limit
         )
-    rows = [way.ratio(limit, factor) for factor in way.factors]
-    judged = [row for row in rows if row is not None]
-    if len(judged) < len(rows):
+    ratios = [way.ratio(limit, factor) for factor in way.factors]
+    judged_ratios = [row for row in ratios if row is not None]
+    if len(judged_ratios) < len(ratios):
         return Remedy(
             problem,
             limit,
@@ -336,10 +359,14 @@ def _remedy(limit: str, way: _Way) -> Remedy:
             None,
             reason="not judged: the dazzled area behind it is not known",
         )
-    table = np.stack(judged)
-    factors = crossing(np.array(way.factors), table, problem)
+    # (factor, 1 + draw)
+    ratio_table = np.stack(judged_ratios)
+    # (1 + draw,), NaN where no factor is enough
+    factors = crossing(np.array(way.factors), ratio_table, problem)
     if np.isnan(factors[0]):
-        return Remedy(problem, limit, way.means, None, reason=_why_not(problem, way.means, table))
+        return Remedy(
+            problem, limit, way.means, None, reason=_why_not(problem, way.means, ratio_table)
+        )
     return _solved(limit, way, factors)
 
 
@@ -349,12 +376,12 @@ def _solved(limit: str, way: _Way, factors: FloatArray) -> Remedy:
     """
     nominal = _refined(limit, way, float(factors[0]))
     safe, covered = _safe(limit, way, factors[1:]) if len(factors) > 1 else (nominal, None)
-    drawn = np.array([way.value(factor) for factor in factors[1:] if factor > 0])
+    drawn_values = np.array([way.value(factor) for factor in factors[1:] if factor > 0])
     return Remedy(
         problem=problem_of(limit),
         limit=limit,
         means=way.means,
-        value=Spread.of(way.value(nominal), drawn),
+        value=Spread.of(way.value(nominal), drawn_values),
         safe=None if safe is None else way.value(safe),
         reason="" if safe is not None else UNSAFE,
         put_back=way.nominal(limit, nominal),
@@ -381,43 +408,56 @@ def crossing(factors: FloatArray, ratio: FloatArray, problem: Problem) -> FloatA
     the scene until nothing is seen. Between two factors the logarithm of the ratio is linear in
     that of the factor.
     """
-    below = ratio <= 1
+    within = ratio <= 1
     if problem != "contrast":
-        below = np.flip(np.logical_and.accumulate(np.flip(below, 0), 0), 0)
-    last = below.argmax(0)
-    first = np.maximum(last - 1, 0)
+        # within here and at every stronger factor
+        within = np.flip(np.logical_and.accumulate(np.flip(within, 0), 0), 0)
+    first_within = within.argmax(0)
+    one_before = np.maximum(first_within - 1, 0)
     column = np.arange(ratio.shape[1])
-    height = np.log(np.clip(ratio, _FLOOR, _CEILING))
-    above, under = height[first, column], height[last, column]
-    share = np.where(last == 0, 1.0, above / np.where(last == 0, 1.0, above - under))
-    place = np.log(factors[first]) + share * (np.log(factors[last]) - np.log(factors[first]))
-    return np.where(below.any(0), np.exp(place), np.nan)
+    log_ratio = np.log(np.clip(ratio, _FLOOR, _CEILING))
+    height_before, height_within = log_ratio[one_before, column], log_ratio[first_within, column]
+    # how far between both the logarithm is 0; the present factor stays
+    share = np.where(
+        first_within == 0,
+        1.0,
+        height_before / np.where(first_within == 0, 1.0, height_before - height_within),
+    )
+    log_factor = np.log(factors[one_before]) + share * (
+        np.log(factors[first_within]) - np.log(factors[one_before])
+    )
+    return np.where(within.any(0), np.exp(log_factor), np.nan)
 
 
 def _refined(limit: str, way: _Way, factor: float) -> float:
     """Return the nominal factor at which the ratio, computed again, is 1, near an interpolated
     factor.
 
-    False position in the logarithms, where the end that stays is drawn in (Illinois).
+    False position in the logarithms of factor and ratio, where the end that stays is drawn in: its
+    height is halved (Illinois).
     """
     if factor in (way.factors[0], way.factors[-1]):
         return factor
+    # the first factor that is as strong, which ends the bracket
     index = next(
-        i for i, x in enumerate(way.factors) if (x < factor) == (way.factors[-1] < 1) or x == factor
+        i
+        for i, tried in enumerate(way.factors)
+        if (tried < factor) == (way.factors[-1] < 1) or tried == factor
     )
-    ends = [math.log(way.factors[index - 1]), math.log(way.factors[index])]
-    heights = [_height(limit, way, end) for end in ends]
-    place, last = math.log(factor), 0
+    bracket = [math.log(way.factors[index - 1]), math.log(way.factors[index])]
+    heights = [_height(limit, way, end) for end in bracket]
+    log_factor, last_side = math.log(factor), 0
     for _ in range(_STEPS):
-        height = _height(limit, way, place)
+        height = _height(limit, way, log_factor)
         if abs(height) < _AGREE:
             break
+        # end 0 has a ratio above 1
         side = 0 if height > 0 else 1
-        if side == last:
+        if side == last_side:
             heights[1 - side] /= 2
-        ends[side], heights[side], last = place, height, side
-        place = (ends[0] * heights[1] - ends[1] * heights[0]) / (heights[1] - heights[0])
-    return math.exp(place)
+        bracket[side], heights[side], last_side = log_factor, height, side
+        log_factor = (bracket[0] * heights[1] - bracket[1] * heights[0]) / (heights[1] - heights[0])
+    return math.exp(log_factor)
 
 
 def _height(limit: str, way: _Way, place: float) -> float:
@@ -429,27 +469,35 @@ def _safe(limit: str, way: _Way, factors: FloatArray) -> tuple[float | None, flo
     """Return the factor that holds in 95 % of the draws, and the share of the draws below the
     limit with it.
     """
-    towards = -1 if way.factors[-1] < 1 else 1
-    ordered = np.sort(towards * np.where(np.isnan(factors), towards * math.inf, factors))
-    safe = towards * float(ordered[min(len(ordered) - 1, math.ceil(_SAFE * len(ordered)))])
+    # stronger is smaller, or for a longer exposure larger
+    direction = -1 if way.factors[-1] < 1 else 1
+    # the weakest first; draws without a factor last
+    ordered_factors = np.sort(
+        direction * np.where(np.isnan(factors), direction * math.inf, factors)
+    )
+    safe = direction * float(
+        ordered_factors[min(len(ordered_factors) - 1, math.ceil(_SAFE * len(ordered_factors)))]
+    )
     for _ in range(_REFINED):
         if not math.isfinite(safe) or safe <= 0:
             return None, None
         ratio = way.ratio(limit, safe)
-        covered = 0.0 if ratio is None else float((ratio[1:] <= 1).mean())
-        if covered >= _SAFE or ratio is None:
-            return safe, covered
-        excess = float(np.quantile(ratio[1:], _SAFE, method="higher"))
-        safe *= excess ** (-1.0 if way.unit is None else 0.5 * towards)
+        covered_share = 0.0 if ratio is None else float((ratio[1:] <= 1).mean())
+        if covered_share >= _SAFE or ratio is None:
+            return safe, covered_share
+        ratio_at_quantile = float(np.quantile(ratio[1:], _SAFE, method="higher"))
+        # the ratio goes with a transmittance; of a stop or an exposure with up to its square
+        safe *= ratio_at_quantile ** (-1.0 if way.unit is None else 0.5 * direction)
     return None, None
 
 
 def _why_not(problem: Problem, means: Means, table: FloatArray) -> str:
     """Return why a means does not help against a limit."""
-    changed = bool(np.abs(table[-1, 0] / table[0, 0] - 1) > _UNCHANGED)
-    if problem == "damage" and means == "exposure" and not changed:
+    # nominal ratio at the strongest factor over that at the present one
+    changes_ratio = bool(np.abs(table[-1, 0] / table[0, 0] - 1) > _UNCHANGED)
+    if problem == "damage" and means == "exposure" and not changes_ratio:
         return "the exposure never changes damage"
-    if means == "exposure" and not changed:
+    if means == "exposure" and not changes_ratio:
         return "scene and laser change alike with the exposure"
     if problem == "contrast" and means == "grey filter":
         return "a grey filter dims the scene as much as the laser"

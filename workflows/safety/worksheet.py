@@ -132,6 +132,7 @@ def _contents(estimate: Estimate) -> list[tuple[Callable[[Sheet, Estimate], None
 
 
 def _inputs(sheet: Sheet, estimate: Estimate) -> None:
+    """Add the inputs: light, beam, distance, air, lens, sensor and eye."""
     beam, lens, sensor = (
         estimate.exposures.beams[0],
         estimate.safety.settings.lens,
@@ -186,11 +187,13 @@ def _light(sheet: Sheet, estimate: Estimate) -> None:
     )
     emitted, air, unit = sheet.values["X"], sheet.values["T"], "J" if beam.is_pulsed else "W"
     radius = beam_radius(beam, distance)
-    filling = lens.diameter**2 / (4 * radius**2)
+    fill = lens.diameter**2 / (4 * radius**2)
     peak = emitted * sensor_density(
         beam, distance, lens.diameter, lens.focal_length, lens.transmittance, air
     )
-    judged = emitted * float(estimate.exposures.sensor[estimate.options[0].name][0, estimate.at])
+    estimated_peak = emitted * float(
+        estimate.exposures.sensor[estimate.options[0].name][0, estimate.at]
+    )
     sheet.computed(
         "w", "radius of the beam at the lens, 1/e²", radius, "m", "sqrt(w0**2 + (theta * R / 2)**2)"
     )
@@ -202,14 +205,14 @@ def _light(sheet: Sheet, estimate: Estimate) -> None:
     sheet.computed(
         "Xa", "through the aperture", through, unit, "X * T * (1 - exp(-D**2 / (2 * w**2)))"
     )
-    sheet.computed("x", "filling of the aperture", filling, "", "D**2 / (4 * w**2)")
+    sheet.computed("x", "filling of the aperture", fill, "", "D**2 / (4 * w**2)")
     sheet.computed(
-        "u", "of the peak that a narrow beam keeps", underfilled(filling), "", "2 / x * tanh(x / 2)"
+        "u", "of the peak that a narrow beam keeps", underfilled(fill), "", "2 / x * tanh(x / 2)"
     )
-    clear = "Xa * tau * u * pi * D**2 / 4 / (lambda * F)**2"
-    sheet.computed("Ec", "peak of a clear lens in focus", peak, f"{unit}/m²", clear)
-    sheet.given("q", "factor of focus and beam, computed by the estimate", judged / peak)
-    sheet.computed("Es", "peak on the sensor", judged, f"{unit}/m²", "Ec * q")
+    peak_formula = "Xa * tau * u * pi * D**2 / 4 / (lambda * F)**2"
+    sheet.computed("Ec", "peak of a clear lens in focus", peak, f"{unit}/m²", peak_formula)
+    sheet.given("q", "factor of focus and beam, computed by the estimate", estimated_peak / peak)
+    sheet.computed("Es", "peak on the sensor", estimated_peak, f"{unit}/m²", "Ec * q")
 
 
 # --- limits of the sensor -------------------------------------------------------------------------
@@ -224,8 +227,9 @@ def _limits(sheet: Sheet, estimate: Estimate) -> None:
     """Add the saturation of a pixel, and each limit with the exposure over it and the density
     that meets it.
     """
+    # inputs that not every recipe states
     if {"eta", "n", "t"} <= set(sheet.values):
-        full = float(saturating(estimate.safety, estimate.draws)[0])
+        full_irradiance = float(saturating(estimate.safety, estimate.draws)[0])
         sheet.given(
             "k",
             "photons in a joule, lambda / (h c)",
@@ -233,7 +237,7 @@ def _limits(sheet: Sheet, estimate: Estimate) -> None:
             "1/J",
         )
         formula = "n / (eta * k * t * p**2)"
-        sheet.computed("S", "irradiance that fills a pixel", full, "W/m²", formula)
+        sheet.computed("S", "irradiance that fills a pixel", full_irradiance, "W/m²", formula)
     for number, finding in enumerate(_plain(estimate), 1):
         _limit(sheet, number, finding, estimate.helps)
 
@@ -252,7 +256,14 @@ def _limit(sheet: Sheet, number: int, finding: Finding, remedies: Sequence[Remed
         sheet.computed(
             f"OD{number}", f"{name}: density that meets it", density, "", f"log10(r{number})"
         )
-    safe = next((x.safe for x in remedies if x.limit == name and x.means == "grey filter"), None)
+    safe = next(
+        (
+            remedy.safe
+            for remedy in remedies
+            if remedy.limit == name and remedy.means == "grey filter"
+        ),
+        None,
+    )
     if safe is not None:
         sheet.given(f"OS{number}", f"{name}: density that meets it in 95 % of the draws", safe)
 
@@ -283,14 +294,19 @@ def _eye(sheet: Sheet, estimate: Estimate) -> None:
     share = eye_share(eye.limit, aperture, sheet.values["X"])
     sheet.given("a", "aperture of the eye", aperture, "m")
     sheet.computed("se", "share of X that the eye may receive", share, "", "pi * a**2 / 4 * M / X")
-    reach = nominal_ocular_hazard_distance(
+    hazard_distance = nominal_ocular_hazard_distance(
         beam, eye.duration, rule=estimate.safety.settings.eye.rule
     )
     if share >= 1:
-        sheet.given("NOHD", "nominal ocular hazard distance, 0 since se is not below 1", reach, "m")
+        sheet.given(
+            "NOHD",
+            "nominal ocular hazard distance, 0 since se is not below 1",
+            hazard_distance,
+            "m",
+        )
         return
     formula = "2 * sqrt(max(0, -a**2 / 2 / ln(1 - se) - w0**2)) / theta"
-    sheet.computed("NOHD", "nominal ocular hazard distance", reach, "m", formula)
+    sheet.computed("NOHD", "nominal ocular hazard distance", hazard_distance, "m", formula)
 
 
 def _eye_limit(sheet: Sheet, estimate: Estimate, eye: EyeFinding, unit: str) -> None:
@@ -308,14 +324,14 @@ def _eye_limit(sheet: Sheet, estimate: Estimate, eye: EyeFinding, unit: str) -> 
             f"{formula} / {put(eye.duration)}",
         )
         return
-    single = eye_mpe_formula(beam.wavelength, beam.pulse_duration)
+    pulse_formula = eye_mpe_formula(beam.wavelength, beam.pulse_duration)
     sheet.computed(
         "M1",
         "limit of one pulse",
         eye_mpe(beam.wavelength, beam.pulse_duration),
         unit,
         "H(tp)",
-        single,
+        pulse_formula,
     )
     if beam.repetition_rate is None or eye.duration * beam.repetition_rate <= 1:
         sheet.computed("M", "limit of the eye (MPE)", limit, unit, "M1")
@@ -335,8 +351,8 @@ def _eye_limit(sheet: Sheet, estimate: Estimate, eye: EyeFinding, unit: str) -> 
     smallest = "min(M1, M2)"
     if math.isfinite(train.repeated):
         smallest = "min(M1, M2, M3)"
-        group = train.repeated * train.together / train.factor
-        sheet.given("Hg", "limit of one pulse, or of a group that counts as one", group, unit)
+        group_limit = train.repeated * train.together / train.factor
+        sheet.given("Hg", "limit of one pulse, or of a group that counts as one", group_limit, unit)
         sheet.given("g", "pulses that count as one", train.together)
         sheet.given("N", "pulses or groups that are counted", train.groups)
         sheet.given("C5", f"factor of repeated pulses by the rule {rule}", train.factor)
@@ -362,17 +378,28 @@ def _dazzle(sheet: Sheet, estimate: Estimate) -> None:
 
 def _dazzle_row(sheet: Sheet, number: int, row: EyeDazzleRow) -> None:
     """Add the exposure that hides the target, for one light of the surroundings and one angle."""
-    where = f"{row.background:g} cd/m², {row.angle:.3g}°"
-    sheet.given(f"lx{number}", f"{where}: illuminance that hides the target", row.illuminance, "lx")
+    condition_text = f"{row.background:g} cd/m², {row.angle:.3g}°"
+    sheet.given(
+        f"lx{number}", f"{condition_text}: illuminance that hides the target", row.illuminance, "lx"
+    )
     if row.distance is None:
         return
     formula = f"lx{number} / (683 * V)"
-    sheet.computed(f"MDE{number}", f"{where}: maximum dazzle exposure", row.limit, "W/m²", formula)
-    reach = f"2 * sqrt(max(0, 2 * P / (pi * MDE{number}) - w0**2)) / theta"
-    sheet.computed(f"NODD{number}", f"{where}: dazzle distance", row.distance.value, "m", reach)
+    sheet.computed(
+        f"MDE{number}", f"{condition_text}: maximum dazzle exposure", row.limit, "W/m²", formula
+    )
+    distance_formula = f"2 * sqrt(max(0, 2 * P / (pi * MDE{number}) - w0**2)) / theta"
+    sheet.computed(
+        f"NODD{number}",
+        f"{condition_text}: dazzle distance",
+        row.distance.value,
+        "m",
+        distance_formula,
+    )
 
 
 def _dazzle_text(estimate: Estimate) -> str:
+    """Return what is asked of the eye and the source, or why its dazzle is not judged."""
     dazzle, asked = estimate.eye_dazzle, estimate.safety.settings.eye.dazzle
     if dazzle.reason:
         return f"Not judged: {dazzle.reason}."
@@ -384,10 +411,11 @@ def _dazzle_text(estimate: Estimate) -> str:
 
 
 def _assumed(estimate: Estimate) -> str:
-    laws = "; ".join(f"{name} {text}" for name, text in estimate.draws.laws.items())
-    drawn = f"Uncertain: {laws}. The values above are the nominal ones. " if laws else ""
+    """Return what is uncertain and what is assumed, as text."""
+    laws = "; ".join(f"{name} {law_text}" for name, law_text in estimate.draws.laws.items())
+    start = f"Uncertain: {laws}. The values above are the nominal ones. " if laws else ""
     return (
-        f"{drawn}The beam is Gaussian and hits the middle of the lens. Limits of the eye hold for"
+        f"{start}The beam is Gaussian and hits the middle of the lens. Limits of the eye hold for"
         " the unaided eye and a small source, in clear air; reflections, binoculars and beams that"
         f" sweep are not in them. {CERTIFICATE}"
     )

@@ -34,8 +34,8 @@ def run_cold(recipe: Recipe, store: Store, device: str = "cpu") -> Result:
     """Run ``recipe`` on ``device`` with a temporary store that has no results, and return the
     result.
     """
-    with cold(store) as empty:
-        return run(recipe, empty, device=device)
+    with cold(store) as empty_store:
+        return run(recipe, empty_store, device=device)
 
 
 def key_parts(recipe: Recipe, code: Code, device: str = "cpu") -> list[Any]:

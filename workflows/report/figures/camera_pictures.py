@@ -47,8 +47,8 @@ def overview(
     white = high(truth)
     pictures = {"truth": truth, "plain lens": plain, "with mask": mask}
     pictures |= {} if restored is None else {"restored": restored}
-    count = len(pictures) + (restored is not None)
-    figure, axes = canvas(2.6 * count, 3.4, 1, count)
+    columns = len(pictures) + (restored is not None)
+    figure, axes = canvas(2.6 * columns, 3.4, 1, columns)
     for ax, (name, image) in zip(axes[0], pictures.items(), strict=False):
         picture(ax, encoded(centre(image, truth) / white), name)
         _ring(ax, spots or {}, truth)
@@ -59,33 +59,37 @@ def overview(
 
 
 def _error(figure: Any, ax: Any, error: Tensor) -> None:
-    shown = picture(
+    """Draw the error of the restored picture with its colour bar."""
+    error_image = picture(
         ax, error.cpu().numpy(), "|restored − truth|", cmap="viridis", vmin=0.0, vmax=high(error)
     )
-    bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03, extend="max")
-    bar.set_label("fraction of white", fontsize=9)
-    bar.ax.tick_params(labelsize=9)
+    colour_bar = figure.colorbar(error_image, ax=ax, fraction=0.046, pad=0.03, extend="max")
+    colour_bar.set_label("fraction of white", fontsize=9)
+    colour_bar.ax.tick_params(labelsize=9)
 
 
 def high(values: Tensor) -> float:
     """Return the 99.5 % quantile of the pixel values of an image as white level, but at least
     1e-9.
     """
-    sample = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
-    return max(float(torch.quantile(sample, 0.995)), 1e-9)
+    # about 200 000 pixels are enough, and `quantile` takes no more than some millions
+    sampled_pixels = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
+    return max(float(torch.quantile(sampled_pixels, 0.995)), 1e-9)
 
 
 def centre(image: Tensor, like: Tensor) -> Tensor:
     """Crop the centre of an image to the size of the image ``like``; the optical axis stays at
     pixel N // 2.
     """
-    top, left = (image.shape[d] // 2 - like.shape[d] // 2 for d in (-2, -1))
-    if top < 0 or left < 0:
+    first_row, first_column = (image.shape[axis] // 2 - like.shape[axis] // 2 for axis in (-2, -1))
+    if first_row < 0 or first_column < 0:
         raise ValueError(
             f"a picture of shape {tuple(image.shape)} is smaller than the scene,"
             f" {tuple(like.shape)}"
         )
-    return image[..., top : top + like.shape[-2], left : left + like.shape[-1]].float()
+    return image[
+        ..., first_row : first_row + like.shape[-2], first_column : first_column + like.shape[-1]
+    ].float()
 
 
 def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
@@ -96,11 +100,12 @@ def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
 
     radius = max(like.shape[-1] / 14, 3.0)
     images = [centre(spot, like) for spot in spots.values()]
+    # a set: one ring for lasers at one pixel
     for y, x in {divmod(int(image.sum(0).argmax()), image.shape[-1]) for image in images}:
         if not (0 < y < like.shape[-2] - 1 and 0 < x < like.shape[-1] - 1):
             continue
-        for width, colour in ((3.0, "black"), (1.4, ORANGE)):
-            ax.add_patch(Circle((x, y), radius, fill=False, color=colour, linewidth=width))
+        for line_width, colour in ((3.0, "black"), (1.4, ORANGE)):
+            ax.add_patch(Circle((x, y), radius, fill=False, color=colour, linewidth=line_width))
 
 
 # --- scene spectra --------------------------------------------------------------------------------
@@ -146,18 +151,22 @@ def _points(scene: Tensor) -> list[tuple[int, int]]:
     """Return (y, x) of the reddest, the greenest and the bluest pixel of the scene that is
     neither dark nor clipped.
     """
-    inner = (
+    blurred = (
         torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0]
         if min(scene.shape[-2:]) >= 5
         else scene
     )
-    lit, white = inner.amax(0), high(scene)
-    usable = (lit > 0.2 * white) & (lit < 0.9 * white)
-    share = inner / inner.sum(0).clamp_min(1e-9)
-    return [divmod(int(channel.where(usable, -1.0).argmax()), scene.shape[-1]) for channel in share]
+    brightness, white = blurred.amax(0), high(scene)
+    usable = (brightness > 0.2 * white) & (brightness < 0.9 * white)
+    share_of_channels = blurred / blurred.sum(0).clamp_min(1e-9)
+    return [
+        divmod(int(channel.where(usable, -1.0).argmax()), scene.shape[-1])
+        for channel in share_of_channels
+    ]
 
 
 def _scene(ax: Any, scene: Tensor, points: list[tuple[int, int]]) -> None:
+    """Draw the scene, with rings around the three points."""
     picture(ax, encoded(scene / high(scene)), "three points of the scene")
     for y, x in points:
         for colour, width in (("white", 2.5), ("black", 1.0)):
@@ -167,26 +176,35 @@ def _scene(ax: Any, scene: Tensor, points: list[tuple[int, int]]) -> None:
 def _spectra(
     ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: list[tuple[int, int]]
 ) -> None:
-    nm = nanometres(bands.centres)
+    """Draw the spectrum of each point, in its colour."""
+    wavelengths_nm = nanometres(bands.centres)
     for name, (y, x), style in zip(_POINTS, points, ("-", "--", "-."), strict=True):
         rgb = scene[:, y, x].tolist()
         row, column = (
-            p * r // s
-            for p, r, s in zip((y, x), radiance.shape[-2:], scene.shape[-2:], strict=True)
+            # the cube may have fewer pixels than the scene
+            pixel * radiance_side // scene_side
+            for pixel, radiance_side, scene_side in zip(
+                (y, x), radiance.shape[-2:], scene.shape[-2:], strict=True
+            )
         )
         label = f"{name}: RGB {rgb[0]:.2f} {rgb[1]:.2f} {rgb[2]:.2f}"
         colour = encoded(0.75 * scene[:, y : y + 1, x : x + 1] / max(*rgb, 1e-9))[0, 0]
-        ax.plot(nm, radiance[:, row, column].cpu().numpy(), style, color=colour, label=label)
+        ax.plot(
+            wavelengths_nm, radiance[:, row, column].cpu().numpy(), style, color=colour, label=label
+        )
     ax.set(title="spectra reconstructed from RGB", ylabel="relative spectral radiance")
 
 
 def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> None:
-    nm = nanometres(bands.centres)
-    ax.plot(nm, illuminant.cpu().numpy(), color="black", linestyle="--", label="illuminant")
+    """Draw the illuminant, and the response of each channel."""
+    wavelengths_nm = nanometres(bands.centres)
+    ax.plot(
+        wavelengths_nm, illuminant.cpu().numpy(), color="black", linestyle="--", label="illuminant"
+    )
     for channel, (colour, name) in zip(
         responses, CHANNELS if len(responses) > 1 else MONO, strict=True
     ):
-        ax.plot(nm, channel.cpu().numpy(), color=colour, label=name)
+        ax.plot(wavelengths_nm, channel.cpu().numpy(), color=colour, label=name)
     ax.set(title="illuminant and channels", ylabel="relative")
 
 
@@ -194,15 +212,16 @@ def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
     """Draw a vertical line at the wavelength of each laser; one label stands for three or more
     lasers.
     """
-    for number, (name, line) in enumerate(lines.items()):
-        nm = mean_wavelength(line) * 1e9
+    for number, (name, laser_bands) in enumerate(lines.items()):
+        wavelength_nm = mean_wavelength(laser_bands) * 1e9
         label = None
         if len(lines) < 3:
-            label = f"laser {name}, {nm:.0f} nm"
+            label = f"laser {name}, {wavelength_nm:.0f} nm"
         elif number == 0:
             label = f"{len(lines)} lasers"
+        # two lasers are told apart by their lines
         style = "-." if len(lines) == 2 and number == 1 else ":"
-        ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=style, label=label)
+        ax.axvline(wavelength_nm, color="#555555", linewidth=1.2, linestyle=style, label=label)
 
 
 # --- frame and interval ---------------------------------------------------------------------------
@@ -246,19 +265,33 @@ def restored_frame(
     figure, axes = canvas(11.0, 4.1, 1, 3)
     picture(axes[0, 0], encoded(frame), "frame")
     picture(axes[0, 1], encoded(restored), "restored")
-    wide, saturated = half_width(spread, draws), clipped.any(0)
-    half, invented = wide.mean(0).cpu().numpy(), saturated.cpu().numpy()
-    top = float(np.quantile(half[~invented], 0.995)) if not invented.all() else float(half.max())
-    shown = picture(
-        axes[0, 2], half, "90 % interval, ±", cmap="viridis", vmin=0.0, vmax=max(top, 1e-9)
+    half_widths, saturated = half_width(spread, draws), clipped.any(0)
+    mean_half_width, invented = half_widths.mean(0).cpu().numpy(), saturated.cpu().numpy()
+    upper_end = (
+        float(np.quantile(mean_half_width[~invented], 0.995))
+        if not invented.all()
+        else float(mean_half_width.max())
     )
-    bar = figure.colorbar(shown, ax=axes[0, 2], fraction=0.046, pad=0.03, extend="max")
-    bar.set_label("fraction of white", fontsize=9)
-    bar.ax.tick_params(labelsize=9)
-    strange = unexplained(restored, wide, saturated).cpu().numpy()
+    interval_image = picture(
+        axes[0, 2],
+        mean_half_width,
+        "90 % interval, ±",
+        cmap="viridis",
+        vmin=0.0,
+        vmax=max(upper_end, 1e-9),
+    )
+    colour_bar = figure.colorbar(
+        interval_image, ax=axes[0, 2], fraction=0.046, pad=0.03, extend="max"
+    )
+    colour_bar.set_label("fraction of white", fontsize=9)
+    colour_bar.ax.tick_params(labelsize=9)
+    unexplained_pixels = unexplained(restored, half_widths, saturated).cpu().numpy()
     _mark(
         axes[0, 2],
-        {"saturated: invented": (invented, ORANGE), "no scene explains": (strange, VERMILION)},
+        {
+            "saturated: invented": (invented, ORANGE),
+            "no scene explains": (unexplained_pixels, VERMILION),
+        },
     )
     return figure
 
@@ -271,12 +304,13 @@ def _mark(ax: Any, kinds: Mapping[str, tuple[Any, str]]) -> None:
     from matplotlib.patches import Patch
 
     handles = []
-    for name, (where, colour) in kinds.items():
-        if not where.any():
+    for name, (marked_pixels, colour) in kinds.items():
+        if not marked_pixels.any():
             continue
-        over = np.zeros((*where.shape, 4))
-        over[where] = to_rgba(colour)
-        ax.imshow(over)
-        handles.append(Patch(facecolor=colour, label=f"{name} ({where.mean():.2%})"))
+        # RGBA, transparent where nothing is marked
+        overlay = np.zeros((*marked_pixels.shape, 4))
+        overlay[marked_pixels] = to_rgba(colour)
+        ax.imshow(overlay)
+        handles.append(Patch(facecolor=colour, label=f"{name} ({marked_pixels.mean():.2%})"))
     if handles:
         ax.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.02), fontsize=9)

@@ -42,19 +42,20 @@ def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) ->
     results the step reads.
     """
     wires, looks, counts = grouped(sources, states)
-    places = layout(wires)
-    columns = max((x for x, _ in places.values()), default=0.0) + 1
-    rows = max((y for _, y in places.values()), default=0) + 1
-    width = min(max(_WIDTH * columns, 6.0), 15.0)
-    letters = int(72 * _INSIDE * (width - 0.2) / columns / _LETTER)
-    figure, axes = canvas(width, _HEIGHT * rows + 0.7)
+    positions = layout(wires)
+    columns = max((column for column, _ in positions.values()), default=0.0) + 1
+    rows = max((row for _, row in positions.values()), default=0) + 1
+    figure_width = min(max(_WIDTH * columns, 6.0), 15.0)
+    # letters that fit into a box, at 72 points an inch
+    letters = int(72 * _INSIDE * (figure_width - 0.2) / columns / _LETTER)
+    figure, axes = canvas(figure_width, _HEIGHT * rows + 0.7)
     ax = axes[0, 0]
-    for name, befores in wires.items():
-        for before in befores:
-            _edge(ax, places[before], places[name])
-    for name, (x, y) in places.items():
+    for name, sources_of_step in wires.items():
+        for source in sources_of_step:
+            _edge(ax, positions[source], positions[name])
+    for name, (column, row) in positions.items():
         text = broken(name, letters, f" ×{counts[name]}" if counts[name] > 1 else "")
-        _box(ax, x, y, text, looks[name])
+        _box(ax, column, row, text, looks[name])
     ax.set(xlim=(-0.6, columns - 0.4), ylim=(rows - 0.5, -0.5))
     ax.axis("off")
     _legend(figure, looks.values())
@@ -70,15 +71,18 @@ def grouped(
     The state is ``run`` if any copy of the step ran.
     """
     family = {name: name.partition("[")[0] for name in sources}
-    wires: dict[str, list[str]] = {f: [] for f in family.values()}
+    wires: dict[str, list[str]] = {family_name: [] for family_name in family.values()}
     looks: dict[str, str] = {}
-    for name, befores in sources.items():
-        mine = family[name]
-        wires[mine] += [
-            f for f in dict.fromkeys(family[b] for b in befores) if f not in (*wires[mine], mine)
+    for name, step_sources in sources.items():
+        own_family = family[name]
+        wires[own_family] += [
+            family_name
+            for family_name in dict.fromkeys(family[source_name] for source_name in step_sources)
+            if family_name not in (*wires[own_family], own_family)
         ]
         state = states[name] if states.get(name) in LOOKS else "cached"
-        looks[mine] = "run" if "run" in (state, looks.get(mine)) else state
+        # run if any copy ran
+        looks[own_family] = "run" if "run" in (state, looks.get(own_family)) else state
     return wires, looks, Counter(family.values())
 
 
@@ -86,23 +90,29 @@ def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
     """Return the position (x, row) of each step in the figure of a graph, below and near the
     sources of the step.
     """
-    depth = _depths(wires)
+    row_of_step = _depths(wires)
     rows: dict[int, list[str]] = {}
-    for name, row in depth.items():
+    for name, row in row_of_step.items():
         rows.setdefault(row, []).append(name)
-    widest = max((len(r) for r in rows.values()), default=1)
-    places: dict[str, tuple[float, int]] = {}
+    widest = max((len(row_steps) for row_steps in rows.values()), default=1)
+    positions: dict[str, tuple[float, int]] = {}
     for row in sorted(rows):
-        wish = {
-            n: _mean([places[b][0] for b in wires[n] if b in places], (widest - 1) / 2)
-            for n in rows[row]
+        # the mean of the sources, else the middle of the figure
+        wished_x = {
+            step: _mean(
+                [positions[source][0] for source in wires[step] if source in positions],
+                (widest - 1) / 2,
+            )
+            for step in rows[row]
         }
-        names = sorted(rows[row], key=lambda n: wish[n])
-        start = min(
-            max(_mean(list(wish.values()), 0.0) - (len(names) - 1) / 2, 0.0), widest - len(names)
+        names = sorted(rows[row], key=lambda n: wished_x[n])
+        # as near to the wishes as the widest row allows
+        first_x = min(
+            max(_mean(list(wished_x.values()), 0.0) - (len(names) - 1) / 2, 0.0),
+            widest - len(names),
         )
-        places |= {name: (start + i, row) for i, name in enumerate(names)}
-    return places
+        positions |= {name: (first_x + position, row) for position, name in enumerate(names)}
+    return positions
 
 
 def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
@@ -112,39 +122,53 @@ def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
     order = in_order(wires, wires)
     depth: dict[str, int] = {}
     for name in order:
-        depth[name] = max((depth[b] + 1 for b in wires[name]), default=0)
-    first: dict[str, int] = {}
+        # below all sources
+        depth[name] = max((depth[source] + 1 for source in wires[name]), default=0)
+    first_reader_row: dict[str, int] = {}
     for name in reversed(order):
-        depth[name] = first.get(name, depth[name] + 1) - 1
-        for b in wires[name]:
-            first[b] = min(first.get(b, depth[name]), depth[name])
+        # as far down as the first reader allows
+        depth[name] = first_reader_row.get(name, depth[name] + 1) - 1
+        for source in wires[name]:
+            first_reader_row[source] = min(first_reader_row.get(source, depth[name]), depth[name])
     return depth
 
 
 def _mean(values: list[float], other: float) -> float:
+    """Return the mean of values, or ``other`` without any."""
     return sum(values) / len(values) if values else other
 
 
 def _edge(ax: Any, start: tuple[float, int], end: tuple[float, int]) -> None:
+    """Draw the arrow from a step to one that reads it, bent where it passes other rows."""
     from matplotlib.patches import FancyArrowPatch
 
-    bend = 0.12 if end[0] <= start[0] else -0.12
+    curvature = 0.12 if end[0] <= start[0] else -0.12
+    # neighbouring rows: nothing to pass
     if end[1] - start[1] == 1:
-        bend = 0.0
-    path: dict[str, Any] = {
-        "connectionstyle": f"arc3,rad={bend}",
+        curvature = 0.0
+    arrow_style: dict[str, Any] = {
+        "connectionstyle": f"arc3,rad={curvature}",
         "arrowstyle": "-|>",
         "mutation_scale": 9,
     }
-    a, b = (start[0], start[1] + 0.27), (end[0], end[1] - 0.27)
+    # from the lower edge of a box to the upper edge of the next
+    start_point, end_point = (start[0], start[1] + 0.27), (end[0], end[1] - 0.27)
     ax.add_artist(
         FancyArrowPatch(
-            a, b, color="#8a8a8a", linewidth=0.9, shrinkA=0, shrinkB=0, zorder=1, **path
+            start_point,
+            end_point,
+            color="#8a8a8a",
+            linewidth=0.9,
+            shrinkA=0,
+            shrinkB=0,
+            zorder=1,
+            **arrow_style,
         )
     )
 
 
 def _box(ax: Any, x: float, y: float, text: str, look: str) -> None:
+    """Draw the box of a step with its name, in the colours of its state."""
     from matplotlib.patches import FancyBboxPatch
 
     style: dict[str, Any] = {
@@ -167,20 +191,29 @@ def broken(name: str, letters: int, copies: str = "") -> str:
     """
     if len(name + copies) <= letters:
         return name + copies
-    cuts = [i + 1 for i, sign in enumerate(name[:-1]) if sign in "_. " and i < letters]
-    cut = cuts[-1] if cuts else letters
+    # after a sign between words, else in the middle of a word
+    cuts = [
+        position + 1
+        for position, character in enumerate(name[:-1])
+        if character in "_. " and position < letters
+    ]
+    cut_position = cuts[-1] if cuts else letters
     room = max(letters - len(copies), 3)
-    first, second = name[:cut].rstrip(), name[cut:]
-    if len(second) > room:
-        second = f"{second[: room // 2]}…{second[-(room - room // 2 - 1) :]}"
-    return f"{first}\n{second}{copies}"
+    first_line, second_line = name[:cut_position].rstrip(), name[cut_position:]
+    if len(second_line) > room:
+        second_line = f"{second_line[: room // 2]}…{second_line[-(room - room // 2 - 1) :]}"
+    return f"{first_line}\n{second_line}{copies}"
 
 
 def _legend(figure: Any, looks: Iterable[str]) -> None:
+    """Write the legend of the states that occur."""
     from matplotlib.patches import Patch
 
-    kinds = [k for k in LOOKS if k in set(looks)]
-    patches = [Patch(facecolor=LOOKS[k][0], edgecolor="#444444", label=LOOKS[k][1]) for k in kinds]
+    states = [state for state in LOOKS if state in set(looks)]
+    patches = [
+        Patch(facecolor=LOOKS[state][0], edgecolor="#444444", label=LOOKS[state][1])
+        for state in states
+    ]
     figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), fontsize=10)
 
 
@@ -219,26 +252,30 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
 
     ``rows``, the steps that ran, may lack steps of ``schedule`` and may contain further steps.
     """
-    ran = {step: (lane, began, seconds) for step, lane, began, seconds in rows}
-    plan = {slot.task: (slot.device, slot.start, slot.end - slot.start) for slot in schedule.slots}
-    lanes = _lanes_in_use(schedule, plan, ran)
-    steps = _shown(plan, ran)
-    spans = (*plan.values(), *ran.values())
-    end = max((start + took for _, start, took in spans), default=0.0) or 1.0
-    scale, unit = _unit(end)
+    actual_spans = {step: (lane, began, seconds) for step, lane, began, seconds in rows}
+    planned_spans = {
+        slot.task: (slot.device, slot.start, slot.end - slot.start) for slot in schedule.slots
+    }
+    lanes = _lanes_in_use(schedule, planned_spans, actual_spans)
+    steps = _shown(planned_spans, actual_spans)
+    spans = (*planned_spans.values(), *actual_spans.values())
+    last_end = max((start + duration for _, start, duration in spans), default=0.0) or 1.0
+    scale, unit = _unit(last_end)
     heights = (_LANE_HEIGHT * max(len(lanes), 2) + 0.25, _STEP_HEIGHT * max(len(steps), 3) + 0.25)
     figure, axes = canvas(
         10.0, sum(heights) + 1.1, 2, 1, layout=None, sharex=True, height_ratios=heights
     )
     colour = dict(zip(lanes, itertools.cycle(_COLOURS), strict=False))
-    chart = _Chart(plan, ran, colour, scale)
+    chart = _Chart(planned_spans, actual_spans, colour, scale)
     _lanes(axes[0, 0], chart)
     critical = {slot.task for slot in schedule.critical_path()}
     _steps(axes[1, 0], steps, chart, critical)
-    left = len(plan.keys() | ran.keys()) - len(steps)
-    xlabel = f"time ({unit})" + (f"; the {left} shortest steps have no row" if left else "")
-    axes[1, 0].set(xlabel=xlabel, xlim=(-0.004 * end * scale, end * scale * 1.01))
-    axes[0, 0].set_title(_title(plan, ran), loc="left")
+    steps_without_row = len(planned_spans.keys() | actual_spans.keys()) - len(steps)
+    xlabel = f"time ({unit})" + (
+        f"; the {steps_without_row} shortest steps have no row" if steps_without_row else ""
+    )
+    axes[1, 0].set(xlabel=xlabel, xlim=(-0.004 * last_end * scale, last_end * scale * 1.01))
+    axes[0, 0].set_title(_title(planned_spans, actual_spans), loc="left")
     _gantt_legend(figure)
     _place(figure, [*lanes, *steps])
     return figure
@@ -256,7 +293,9 @@ def _lanes_in_use(schedule: Schedule, plan: Spans, ran: Spans) -> list[str]:
 def _shown(plan: Spans, ran: Spans) -> list[str]:
     """Return the longest steps of a run, at most 80, in the order of their start."""
     longest = sorted(
-        {**plan, **ran}, key=lambda s: -max(plan.get(s, ("", 0, 0))[2], ran.get(s, ("", 0, 0))[2])
+        # element 2 is the duration, element 1 the start
+        {**plan, **ran},
+        key=lambda s: -max(plan.get(s, ("", 0, 0))[2], ran.get(s, ("", 0, 0))[2]),
     )
     return sorted(longest[:_MOST], key=lambda s: (ran.get(s) or plan[s])[1])
 
@@ -267,13 +306,21 @@ def _lanes(ax: Any, chart: _Chart) -> None:
     """
     plan, ran, colour, scale = chart
     for y, lane in enumerate(colour):
-        planned = [(start * scale, took * scale) for on, start, took in plan.values() if on == lane]
-        done = [(start * scale, took * scale) for on, start, took in ran.values() if on == lane]
+        planned_bars = [
+            (start * scale, duration * scale)
+            for lane_of_step, start, duration in plan.values()
+            if lane_of_step == lane
+        ]
+        actual = [
+            (start * scale, duration * scale)
+            for lane_of_step, start, duration in ran.values()
+            if lane_of_step == lane
+        ]
         ax.broken_barh(
-            planned, (y - 0.4, 0.36), facecolor="white", edgecolor=colour[lane], linewidth=0.9
+            planned_bars, (y - 0.4, 0.36), facecolor="white", edgecolor=colour[lane], linewidth=0.9
         )
         ax.broken_barh(
-            done, (y + 0.04, 0.36), facecolor=colour[lane], edgecolor="white", linewidth=0.3
+            actual, (y + 0.04, 0.36), facecolor=colour[lane], edgecolor="white", linewidth=0.3
         )
     _rows(ax, list(colour))
     for tick, shade in zip(ax.get_yticklabels(), colour.values(), strict=True):
@@ -285,17 +332,17 @@ def _steps(ax: Any, steps: Sequence[str], chart: _Chart, critical: set[str]) -> 
     the right.
     """
     plan, ran, colour, scale = chart
-    right: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center"}
+    beside_the_axes: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center"}
     for y, step in enumerate(steps):
         if step in plan:
-            lane, start, took = plan[step]
-            _bar(ax, y, start * scale, took * scale, 0.74, fc="none", ec=colour[lane], zorder=3)
+            lane, start, duration = plan[step]
+            _bar(ax, y, start * scale, duration * scale, 0.74, fc="none", ec=colour[lane], zorder=3)
         if step in ran:
-            lane, start, took = ran[step]
-            _bar(ax, y, start * scale, took * scale, 0.4, fc=colour[lane], ec=colour[lane])
+            lane, start, duration = ran[step]
+            _bar(ax, y, start * scale, duration * scale, 0.4, fc=colour[lane], ec=colour[lane])
         times = (_time(spans[step][2]) if step in spans else "–" for spans in (plan, ran))
-        ax.text(1.01, y, " → ".join(times), **right)
-    ax.text(1.01, -1, "planned → took", fontweight="bold", **right)
+        ax.text(1.01, y, " → ".join(times), **beside_the_axes)
+    ax.text(1.01, -1, "planned → took", fontweight="bold", **beside_the_axes)
     _rows(ax, steps)
     for tick, step in zip(ax.get_yticklabels(), steps, strict=True):
         tick.set_color(VERMILION if step in critical else BLACK)
@@ -317,25 +364,26 @@ def _place(figure: Any, names: Sequence[str]) -> None:
     Only few texts are measured, so that this takes a tenth of the time of matplotlib's own placing.
     """
     renderer, (width, height) = figure.canvas.get_renderer(), figure.get_size_inches()
-    top, bottom = figure.axes
+    device_axis, step_axis = figure.axes
     longest = sorted(names, key=len)[-_MEASURED:]
-    names_beside = [*top.get_yticklabels(), *bottom.get_yticklabels()]
-    labels = [text for text in names_beside if text.get_text() in longest]
-    times = sorted(bottom.texts, key=lambda text: len(text.get_text()))[-_MEASURED:]
-    left, right = (
-        max((text.get_window_extent(renderer).width for text in texts), default=0.0) / figure.dpi
+    names_beside = [*device_axis.get_yticklabels(), *step_axis.get_yticklabels()]
+    labels = [label for label in names_beside if label.get_text() in longest]
+    times = sorted(step_axis.texts, key=lambda text: len(text.get_text()))[-_MEASURED:]
+    name_width, time_width = (
+        max((label.get_window_extent(renderer).width for label in texts), default=0.0) / figure.dpi
         for texts in (labels, times)
     )
-    inner = {
-        "left": min((left + _ASIDE) / width, _MOST_BESIDE),
-        "right": 1 - (right + _ASIDE) / width,
+    sides = {
+        "left": min((name_width + _ASIDE) / width, _MOST_BESIDE),
+        "right": 1 - (time_width + _ASIDE) / width,
     }
     figure.subplots_adjust(
-        **inner, top=1 - _ABOVE / height, bottom=_BELOW / height, hspace=_BETWEEN
+        **sides, top=1 - _ABOVE / height, bottom=_BELOW / height, hspace=_BETWEEN
     )
 
 
 def _rows(ax: Any, names: Sequence[str]) -> None:
+    """Label the rows of an axis, the first at the top."""
     ax.set_yticks(range(len(names)), names)
     ax.set_ylim(max(len(names), 1) - 0.4, -0.6)
     ax.tick_params(axis="y", length=0)
@@ -347,15 +395,16 @@ def _rows(ax: Any, names: Sequence[str]) -> None:
 
 
 def _title(plan: Spans, ran: Spans) -> str:
-    ends = {
-        word: _time(max(start + took for _, start, took in spans.values()))
+    """Return when the planned and the actual run end, as text."""
+    times_by_word = {
+        word: _time(max(start + duration for _, start, duration in spans.values()))
         for word, spans in (("planned", plan), ("took", ran))
         if spans
     }
     predicted = sum(step in plan for step in ran)
     if plan and predicted < len(ran):
-        ends["planned"] += f" for {predicted} of {len(ran)} steps"
-    return ", ".join(f"{word} {end}" for word, end in ends.items()) or "nothing to run"
+        times_by_word["planned"] += f" for {predicted} of {len(ran)} steps"
+    return ", ".join(f"{word} {end}" for word, end in times_by_word.items()) or "nothing to run"
 
 
 def _unit(seconds: float) -> tuple[float, str]:
@@ -368,6 +417,7 @@ def _unit(seconds: float) -> tuple[float, str]:
 
 
 def _time(seconds: float) -> str:
+    """Return a time as text, in s, ms or us."""
     scale, unit = _unit(seconds)
     return f"{seconds * scale:.3g} {unit}"
 
@@ -385,6 +435,7 @@ def _letter() -> Any:
 
 
 def _gantt_legend(figure: Any) -> None:
+    """Write the legend of the chart: hollow and solid bars, and the colour of the critical path."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -41,15 +41,16 @@ def height(*, pupil: Pupil) -> Any:
     clear aperture.
     """
     figure, axes = canvas(13.0, 3.5, 1, 4)
-    step = max(1, pupil.height.shape[-1] // 540)
-    clear = pupil.aperture[::step, ::step] > 0
-    half = float(pupil.pitch) * pupil.height.shape[-1] / 2 * 1e3
-    extent = (-half, half, -half, half)
-    metres = pupil.height[::step, ::step].double()
+    # at most 540 samples a side
+    stride = max(1, pupil.height.shape[-1] // 540)
+    is_clear = pupil.aperture[::stride, ::stride] > 0
+    half_width = float(pupil.pitch) * pupil.height.shape[-1] / 2 * 1e3
+    extent = (-half_width, half_width, -half_width, half_width)
+    heights = pupil.height[::stride, ::stride].double()
     _map(
         figure,
         axes[0, 0],
-        (metres * 1e6).where(clear, torch.nan),
+        (heights * 1e6).where(is_clear, torch.nan),
         "height",
         "µm",
         extent,
@@ -57,7 +58,7 @@ def height(*, pupil: Pupil) -> Any:
     )
     for ax, wavelength in zip(axes[0, 1:], _WAVELENGTHS, strict=True):
         band, name = nearest(pupil.wavelengths, wavelength)
-        turns = torch.remainder(mask_turns(pupil, band, step), 1.0).where(clear, torch.nan)
+        turns = torch.remainder(mask_turns(pupil, band, stride), 1.0).where(is_clear, torch.nan)
         _map(
             figure,
             ax,
@@ -82,12 +83,13 @@ def _map(
     extent: tuple[float, ...],
     **options: Any,
 ) -> None:
-    shown = ax.imshow(values.cpu().numpy(), origin="lower", extent=extent, **options)
+    """Draw one map of the pupil with its colour bar."""
+    image = ax.imshow(values.cpu().numpy(), origin="lower", extent=extent, **options)
     ax.set(title=title, xlabel="u (mm)")
     ax.grid(False)
-    bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
-    bar.set_label(unit, fontsize=9)
-    bar.ax.tick_params(labelsize=9)
+    colour_bar = figure.colorbar(image, ax=ax, fraction=0.046, pad=0.03)
+    colour_bar.set_label(unit, fontsize=9)
+    colour_bar.ax.tick_params(labelsize=9)
 
 
 @drawn
@@ -97,35 +99,45 @@ def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
     """
     figure, axes = canvas(13.0, 6.6, 2, 4)
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
-    shown: Any = None
+    last_image: Any = None
     for row, (arm, arm_psf) in enumerate({"plain lens": plain, "with mask": mask}.items()):
         for column, wavelength in enumerate(_WAVELENGTHS):
-            shown = _spot(
+            last_image = _spot(
                 axes[row, column], arm_psf, *nearest(bands.centres, wavelength), pixel_pitch, arm
             )
         _encircled(axes[row, 3], arm_psf, bands, pixel_pitch, arm)
-    bar = figure.colorbar(shown, ax=axes[:, :3].ravel().tolist(), fraction=0.025, pad=0.01)
-    bar.set_label("log₁₀ (pixel / peak of the clear lens)", fontsize=10)
-    bar.ax.tick_params(labelsize=9)
+    colour_bar = figure.colorbar(
+        last_image, ax=axes[:, :3].ravel().tolist(), fraction=0.025, pad=0.01
+    )
+    colour_bar.set_label("log₁₀ (pixel / peak of the clear lens)", fontsize=10)
+    colour_bar.ax.tick_params(labelsize=9)
     return figure
 
 
 def _spot(ax: Any, psf: Psf, band: int, name: str, pitch: float, arm: str) -> Any:
+    """Draw the logarithm of a PSF around its middle in one band, and return the image."""
     size = min(257, *psf.intensity.shape[-2:])
-    log = _window(metrics.over_clear_peak(psf, band), size).double().clamp_min(1e-30).log10()
-    shown = picture(
-        ax, log.cpu().numpy(), f"{arm}, {name}", origin="lower", cmap="viridis", vmin=-8.0, vmax=0.0
+    log_psf = _window(metrics.over_clear_peak(psf, band), size).double().clamp_min(1e-30).log10()
+    image = picture(
+        ax,
+        log_psf.cpu().numpy(),
+        f"{arm}, {name}",
+        origin="lower",
+        cmap="viridis",
+        vmin=-8.0,
+        vmax=0.0,
     )
     ax.set_xlabel(f"{size * pitch * 1e6:.0f} µm across")
-    return shown
+    return image
 
 
 def _window(image: Tensor, size: int) -> Tensor:
     """Return the middle ``size`` by ``size`` pixels of an image; the optical axis stays at pixel
     N // 2.
     """
-    top, left = (n // 2 - size // 2 for n in image.shape[-2:])
-    return image[top : top + size, left : left + size]
+    # the axis at N // 2 of the image becomes that of the window
+    first_row, first_column = (side // 2 - size // 2 for side in image.shape[-2:])
+    return image[first_row : first_row + size, first_column : first_column + size]
 
 
 def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
@@ -135,6 +147,7 @@ def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
     for wavelength, colour in zip(_WAVELENGTHS, (BLUE, "#00785A", "#B3261E"), strict=True):
         band, name = nearest(bands.centres, wavelength)
         share = metrics.encircled_curve(psf.intensity[band])
+        # the middle of each ring, 1 pixel wide
         microns = (torch.arange(len(share)) + 0.5) * pitch * 1e6
         ax.semilogx(microns.numpy(), share.numpy(), color=colour, label=name)
     title = f"{arm}: encircled energy"
@@ -149,17 +162,23 @@ def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = Non
     the BSR if given.
     """
     figure, axes = canvas(11.0 if bsr is not None else 6.4, 4.2, 1, 2 if bsr is not None else 1)
-    nm, left = nanometres(bands.centres), axes[0, 0]
-    _unsuppressed(left)
-    left.semilogy(nm, lsr.cpu().numpy(), "o-", color=VERMILION, markersize=3.5, label="with mask")
-    left.semilogy(nm, metrics.least_lsr(psf).cpu().numpy(), "--", color=BLUE, label="energy floor")
-    left.set(title="laser suppression ratio (peak / clear peak)", ylabel="LSR")
+    wavelengths_nm, lsr_axis = nanometres(bands.centres), axes[0, 0]
+    _unsuppressed(lsr_axis)
+    lsr_axis.semilogy(
+        wavelengths_nm, lsr.cpu().numpy(), "o-", color=VERMILION, markersize=3.5, label="with mask"
+    )
+    lsr_axis.semilogy(
+        wavelengths_nm, metrics.least_lsr(psf).cpu().numpy(), "--", color=BLUE, label="energy floor"
+    )
+    lsr_axis.set(title="laser suppression ratio (peak / clear peak)", ylabel="LSR")
     if bsr is not None:
-        right = axes[0, 1]
-        _unsuppressed(right)
-        right.plot(nm, bsr.cpu().numpy(), "s-", color=GREEN, markersize=3.5, label="with mask")
-        right.set_ylim(0.0, max(1.1, 1.1 * float(bsr.max())))
-        right.set(title="background kept in the field (BSR)", ylabel="BSR")
+        bsr_axis = axes[0, 1]
+        _unsuppressed(bsr_axis)
+        bsr_axis.plot(
+            wavelengths_nm, bsr.cpu().numpy(), "s-", color=GREEN, markersize=3.5, label="with mask"
+        )
+        bsr_axis.set_ylim(0.0, max(1.1, 1.1 * float(bsr.max())))
+        bsr_axis.set(title="background kept in the field (BSR)", ylabel="BSR")
     for ax in axes[0]:
         ax.set_xlabel("wavelength (nm)")
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3)
@@ -167,6 +186,7 @@ def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = Non
 
 
 def _unsuppressed(ax: Any) -> None:
+    """Draw the line of a lens that suppresses nothing."""
     ax.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")
 
 
@@ -219,7 +239,9 @@ def tables(
 
 
 def _filled(panels: Sequence[Draw]) -> Any:
+    """Return a figure of the panels, each drawn by its function, at most three side by side."""
     columns = min(3, len(panels))
+    # -(-a // b): a / b rounded up, the number of rows
     figure, axes = canvas(
         _WIDTH * columns, 4.2 * -(-len(panels) // columns), -(-len(panels) // columns), columns
     )
@@ -231,19 +253,25 @@ def _filled(panels: Sequence[Draw]) -> Any:
 
 
 def _camera(ax: Any, file: Path) -> None:
+    """Draw the curve of each channel of a camera's table, in % or relative to the largest."""
     curves, absolute = spectra.camera_curves(file)
-    table, mono = curves.table(), len(curves.columns) == 1
-    colours = _COLOURS if not mono else (BLACK,)
+    table, is_mono = curves.table(), len(curves.columns) == 1
+    colours = _COLOURS if not is_mono else (BLACK,)
     for column, values, colour in zip(curves.columns, table.values, colours, strict=True):
-        shown = 100 * values if absolute else values / table.values.max()
+        shown_values = 100 * values if absolute else values / table.values.max()
         ax.plot(
-            nanometres(table.wavelengths), shown.numpy(), ".-", color=colour, label=column.quantity
+            nanometres(table.wavelengths),
+            shown_values.numpy(),
+            ".-",
+            color=colour,
+            label=column.quantity,
         )
     ax.set(title=file.name, ylabel="quantum efficiency (%)" if absolute else "relative sensitivity")
     _spectral(ax)
 
 
 def _glass(ax: Any, glass: Any) -> None:
+    """Draw the refractive index of a glass, with the rows of its file if it has one."""
     wavelengths, index = doe.index_curve(glass)
     ax.plot(nanometres(wavelengths), index.numpy(), "-", color=BLUE, label="as used")
     if isinstance(glass, Path) and (rows := doe.index_rows(glass)):
@@ -254,6 +282,7 @@ def _glass(ax: Any, glass: Any) -> None:
 
 
 def _light(ax: Any, file: Path) -> None:
+    """Draw the spectrum of an illuminant's table, relative to the largest value."""
     table = spectra.light_curve(file).table()
     power = table.values[0] / table.values.max()
     ax.plot(nanometres(table.wavelengths), power.numpy(), ".-", color=ORANGE, label="illuminant")
@@ -268,27 +297,31 @@ def _lasers(ax: Any, files: Mapping[str, Path]) -> None:
     for number, (name, file) in enumerate(files.items()):
         laser = spectra.laser_table(file)
         table = laser.power.table()
-        look = {
+        style = {
             "color": _LASERS[number % len(_LASERS)],
             "linestyle": _STYLES[number % len(_STYLES)],
         }
-        nm, power = nanometres(table.wavelengths), (table.values[0] / table.values.max()).numpy()
+        wavelengths_nm, power = (
+            nanometres(table.wavelengths),
+            (table.values[0] / table.values.max()).numpy(),
+        )
         if laser.widths is None:
-            ax.plot(nm, power, label=f"{name}, {file.name}", **look)
+            ax.plot(wavelengths_nm, power, label=f"{name}, {file.name}", **style)
         else:
             ax.vlines(
-                nm,
+                wavelengths_nm,
                 0,
                 power,
                 label=f"{name}, {file.name}",
-                colors=look["color"],
-                linestyles=look["linestyle"],
+                colors=style["color"],
+                linestyles=style["linestyle"],
             )
     ax.set(title="lasers", ylabel="power / largest")
     _spectral(ax)
 
 
 def _spectral(ax: Any) -> None:
+    """Label the axis of wavelengths, and let all but an index begin at 0."""
     ax.set_xlabel("wavelength (nm)")
     if ax.get_ylabel() != "refractive index":
         ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if ax.dataLim.y0 < 0 else 0.0)
@@ -299,15 +332,17 @@ def _spectral(ax: Any) -> None:
 def _height(
     figure: Any, ax: Any, file: Path, depth: float | None, unit: float | None, pitch: float | None
 ) -> None:
-    heights, own = doe.height_map(file, depth=depth, unit=unit, pitch=pitch)
-    step = max(1, max(heights.shape) // 540)
-    half = [n * (own * 1e3 if own else 1.0) / 2 for n in heights.shape]
-    extent = (-half[1], half[1], -half[0], half[0])
-    microns = (heights[::step, ::step].double() * 1e6).numpy()
-    shown = ax.imshow(microns, origin="lower", extent=extent, cmap="cividis")
-    unit_name = "mm" if own else "samples"
+    """Draw a height map's file; without a pitch the axes count its samples."""
+    heights, own_pitch = doe.height_map(file, depth=depth, unit=unit, pitch=pitch)
+    stride = max(1, max(heights.shape) // 540)
+    # mm, or samples without a pitch; (y, x)
+    half_sides = [side * (own_pitch * 1e3 if own_pitch else 1.0) / 2 for side in heights.shape]
+    extent = (-half_sides[1], half_sides[1], -half_sides[0], half_sides[0])
+    microns = (heights[::stride, ::stride].double() * 1e6).numpy()
+    image = ax.imshow(microns, origin="lower", extent=extent, cmap="cividis")
+    unit_name = "mm" if own_pitch else "samples"
     ax.set(title=file.name, xlabel=f"u ({unit_name})", ylabel=f"v ({unit_name})")
     ax.grid(False)
-    bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
-    bar.set_label("height (µm)", fontsize=9)
-    bar.ax.tick_params(labelsize=9)
+    colour_bar = figure.colorbar(image, ax=ax, fraction=0.046, pad=0.03)
+    colour_bar.set_label("height (µm)", fontsize=9)
+    colour_bar.ax.tick_params(labelsize=9)

@@ -73,6 +73,7 @@ def panels(
     ``below`` is the height (inches) of what stands below or beside the panels, such as a legend.
     """
     columns = min(across, count)
+    # rounded up
     rows = -(-count // columns)
     figure, axes = canvas(width * columns, height * rows + below, rows, columns, **options)
     for unused in axes.flat[count:]:
@@ -107,17 +108,17 @@ def png_of(figure: Any) -> bytes:
 
     The axes are placed here, because `savefig` draws the whole figure twice to place them.
     """
-    out, engine = io.BytesIO(), figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
+    buffer, layout_engine = io.BytesIO(), figure.get_layout_engine()
+    if layout_engine is not None:
+        layout_engine.execute(figure)
     drawn_part = figure.get_tightbbox(figure.canvas.get_renderer()).padded(_MARGIN)
     figure.set_layout_engine(None)
     png_options = {
         "metadata": {"Software": "neusee"},
         "pil_kwargs": {"compress_level": _COMPRESSION},
     }
-    figure.savefig(out, format="png", bbox_inches=drawn_part, **png_options)
-    return out.getvalue()
+    figure.savefig(buffer, format="png", bbox_inches=drawn_part, **png_options)
+    return buffer.getvalue()
 
 
 def warm() -> None:
@@ -134,12 +135,12 @@ def picture(axes: Any, image: Any, title: str, **options: Any) -> Any:
     """Show an image without axis ticks; pass ``options``, such as the colour scale, to
     ``imshow``.
     """
-    shown = axes.imshow(image, **options)
+    shown_image = axes.imshow(image, **options)
     axes.set(title=title, xticks=[], yticks=[])
     axes.grid(False)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    return shown
+    return shown_image
 
 
 def encoded(linear: Tensor) -> Any:
@@ -219,11 +220,11 @@ def place_labels(
     """
     figure.draw_without_rendering()
     renderer = figure.canvas.get_renderer()
-    for ax, own in points.items():
-        taken = _taken(ax, own, renderer)
-        for point in own:
+    for ax, labels in points.items():
+        taken_boxes = _taken(ax, labels, renderer)
+        for point in labels:
             if point.text:
-                _place(ax, point, taken, renderer, framed)
+                _place(ax, point, taken_boxes, renderer, framed)
 
 
 def _taken(ax: Any, points: Sequence[PointLabel], renderer: Any) -> list[Any]:
@@ -231,10 +232,13 @@ def _taken(ax: Any, points: Sequence[PointLabel], renderer: Any) -> list[Any]:
     from matplotlib.transforms import Bbox
 
     centres = (ax.transData.transform((point.x, point.y)) for point in points)
-    half = _MARKER / 2
+    half_side = _MARKER / 2
     legend = [ax.get_legend()] if ax.get_legend() else []
     return [
-        *(Bbox.from_bounds(x - half, y - half, _MARKER, _MARKER) for x, y in centres),
+        *(
+            Bbox.from_bounds(pixel_x - half_side, pixel_y - half_side, _MARKER, _MARKER)
+            for pixel_x, pixel_y in centres
+        ),
         *(artist.get_window_extent(renderer) for artist in (*ax.texts, *legend)),
     ]
 
@@ -252,11 +256,11 @@ def _place(ax: Any, point: PointLabel, taken: list[Any], renderer: Any, framed: 
         "zorder": 5,
     }
     style |= {"bbox": _FRAME} if framed else {}
-    for x, y in _OFFSETS:
+    for offset_x, offset_y in _OFFSETS:
         side = "center"
-        if x:
-            side = "left" if x > 0 else "right"
-        placement = {"xytext": (x, y), "textcoords": "offset points", "ha": side}
+        if offset_x:
+            side = "left" if offset_x > 0 else "right"
+        placement = {"xytext": (offset_x, offset_y), "textcoords": "offset points", "ha": side}
         text = ax.annotate(point.text, (point.x, point.y), **placement, fontsize=9, **style)
         text.set_in_layout(False)
         box = text.get_window_extent(renderer)
@@ -269,8 +273,8 @@ def _place(ax: Any, point: PointLabel, taken: list[Any], renderer: Any, framed: 
 
 def _contains(outer: Any, box: Any) -> bool:
     """Return True if a box lies in another one."""
-    across = bool(outer.x0 <= box.x0 and box.x1 <= outer.x1)
-    return across and bool(outer.y0 <= box.y0 and box.y1 <= outer.y1)
+    within_width = bool(outer.x0 <= box.x0 and box.x1 <= outer.x1)
+    return within_width and bool(outer.y0 <= box.y0 and box.y1 <= outer.y1)
 
 
 def plain_ticks(axis: Any) -> None:
@@ -279,11 +283,23 @@ def plain_ticks(axis: Any) -> None:
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    low, high = sorted(axis.get_view_interval())
-    decades, room, size = math.log10(high / low), _length(axis), _label_size(axis, low, high)
-    few = [subs for subs, gap in _SUBS if decades <= _FEW and gap * room / decades > size]
+    least, greatest = sorted(axis.get_view_interval())
+    decades, axis_length, label_length = (
+        math.log10(greatest / least),
+        _length(axis),
+        _label_size(axis, least, greatest),
+    )
+    # the gap between two numbers of a decade, in points, has room for a number
+    ticks_that_fit = [
+        subs
+        for subs, gap in _SUBS
+        if decades <= _FEW and gap * axis_length / decades > label_length
+    ]
     axis.set_major_locator(
-        LogLocator(subs=few[0] if few else (1.0,), numticks=max(2, int(room / size)))
+        LogLocator(
+            subs=ticks_that_fit[0] if ticks_that_fit else (1.0,),
+            numticks=max(2, int(axis_length / label_length)),
+        )
     )
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axis.set_minor_formatter(NullFormatter())
@@ -303,4 +319,5 @@ def _label_size(axis: Any, low: float, high: float) -> float:
     if axis.axis_name == "y":
         return 1.5 * _POINTS
     ends = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    # a digit is about 0.65 of the size of the letters wide; one more as a gap
     return 0.65 * _POINTS * (1 + max(len(f"{10.0**end:g}") for end in ends))

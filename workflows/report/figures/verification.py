@@ -41,16 +41,17 @@ def error_time(*, rows: Sequence[tuple[str, str, float, float]]) -> Any:
     """
     figure, axes = canvas(6.4, 4.2)
     ax = axes[0, 0]
-    marks = zip(
+    lines_and_colours = zip(
         dict.fromkeys(line for line, *_ in rows),
         itertools.cycle((BLUE, GREEN, VERMILION, ORANGE)),
         strict=False,
     )
-    for line, colour in marks:
-        mine = [row for row in rows if row[0] == line]
+    for line, colour in lines_and_colours:
+        rows_of_line = [row for row in rows if row[0] == line]
         ax.loglog(
-            [r[3] * 1e3 for r in mine],
-            [max(r[2], _LEAST) for r in mine],
+            # a row: property, new value, error, seconds
+            [r[3] * 1e3 for r in rows_of_line],
+            [max(r[2], _LEAST) for r in rows_of_line],
             "o",
             color=colour,
             label=line,
@@ -63,8 +64,8 @@ def error_time(*, rows: Sequence[tuple[str, str, float, float]]) -> Any:
         figure,
         {
             ax: [
-                PointLabel(1e3 * took, max(e, _LEAST), text, BLACK)
-                for _, text, e, took in rows
+                PointLabel(1e3 * seconds, max(error, _LEAST), text, BLACK)
+                for _, text, error, seconds in rows
                 if text
             ]
         },
@@ -94,7 +95,10 @@ def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
                 color="black",
                 fontsize=10,
             )
-    ax.set_xticks(range(len(STRENGTHS)), [f"{s:.0e}" if s > 1 else f"{s:.0f}" for s in STRENGTHS])
+    ax.set_xticks(
+        range(len(STRENGTHS)),
+        [f"{strength:.0e}" if strength > 1 else f"{strength:.0f}" for strength in STRENGTHS],
+    )
     ax.set_yticks(range(len(METHODS)), METHODS)
     ax.invert_yaxis()
     ax.grid(False)
@@ -104,6 +108,7 @@ def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
 
 
 def _verdict(error: float) -> tuple[str, str]:
+    """Return the word and the colour of an error."""
     if error < 1e-5:
         return "sound", "#9AD6C1"
     return ("watch", "#F6D58A") if error < 1e-3 else ("wrong", "#F2B08A")
@@ -113,34 +118,50 @@ def laser_trial(step: Callable[..., Any], psf: Psf, size: int = 192) -> Tensor:
     """Return the float32 error of the image of a laser, for each way to add the laser and for
     each laser strength.
     """
-    band, half = psf.intensity.shape[0] // 2, min(64, *(n // 2 for n in psf.intensity.shape[-2:]))
-    top, left = (n // 2 - half for n in psf.intensity.shape[-2:])
-    core = psf.intensity[band : band + 1, top : top + 2 * half, left : left + 2 * half]
-    kernel = Psf(core / core.sum(), psf.clear_peak[band : band + 1])
+    band, half_size = (
+        psf.intensity.shape[0] // 2,
+        min(64, *(side // 2 for side in psf.intensity.shape[-2:])),
+    )
+    first_row, first_column = (side // 2 - half_size for side in psf.intensity.shape[-2:])
+    psf_core = psf.intensity[
+        band : band + 1,
+        first_row : first_row + 2 * half_size,
+        first_column : first_column + 2 * half_size,
+    ]
+    kernel = Psf(psf_core / psf_core.sum(), psf.clear_peak[band : band + 1])
     scene = torch.rand(1, size, size, generator=torch.Generator().manual_seed(3))
+    # off the middle, where a mistake of symmetry would not show
     position = size // 2 - 11
     return torch.tensor(
-        [_errors(step, scene, kernel, strength, position, half) for strength in STRENGTHS]
+        [_errors(step, scene, kernel, strength, position, half_size) for strength in STRENGTHS]
     ).T
 
 
 def _errors(
     step: Callable[..., Any], scene: Tensor, psf: Psf, strength: float, position: int, half: int
 ) -> list[float]:
+    """Return the largest float32 error far from the laser, for both `METHODS`, over the range of
+    the scene.
+    """
     point = torch.zeros_like(scene)
     point[..., position, position] = strength
-    spot = torch.zeros_like(scene)
-    spot[..., position - half : position + half, position - half : position + half] = (
+    laser_image = torch.zeros_like(scene)
+    laser_image[..., position - half : position + half, position - half : position + half] = (
         strength * psf.intensity
     )
-    double = psf._replace(intensity=psf.intensity.double())
-    truth = step(scene.double(), double) + spot.double()
-    results = (step(scene, psf) + spot, step(scene + point, psf))
-    down, across = (torch.arange(n) - position for n in scene.shape[-2:])
-    far = torch.hypot(down[:, None].double(), across[None, :].double()) > 16
+    double_psf = psf._replace(intensity=psf.intensity.double())
+    truth = step(scene.double(), double_psf) + laser_image.double()
+    # the laser added to the image, or to the scene before the convolution
+    results = (step(scene, psf) + laser_image, step(scene + point, psf))
+    rows_from_laser, columns_from_laser = (
+        torch.arange(side) - position for side in scene.shape[-2:]
+    )
+    is_far = (
+        torch.hypot(rows_from_laser[:, None].double(), columns_from_laser[None, :].double()) > 16
+    )
     return [
-        float(((x.double() - truth).abs()[..., far]).max() / (scene.max() - scene.min()))
-        for x in results
+        float(((image.double() - truth).abs()[..., is_far]).max() / (scene.max() - scene.min()))
+        for image in results
     ]
 
 
@@ -167,41 +188,61 @@ def transfer(*, measured: Tensor) -> Any:
     signal, variance, predicted = measured.detach().double().cpu().unbind(1)
     figure, axes = canvas(6.6, 4.4)
     ax = axes[0, 0]
-    lit = signal > 0
-    clipped = lit & (variance < _CLIPPED * predicted)
-    unclipped = lit & ~clipped & (variance > 0)
-    light, floor = signal[unclipped], float(predicted[0].sqrt())
+    is_lit = signal > 0
+    is_clipped = is_lit & (variance < _CLIPPED * predicted)
+    is_unclipped = is_lit & ~is_clipped & (variance > 0)
+    signal_shown, dark_noise = signal[is_unclipped], float(predicted[0].sqrt())
     ax.loglog(
-        light.numpy(),
-        variance[unclipped].sqrt().numpy(),
+        signal_shown.numpy(),
+        variance[is_unclipped].sqrt().numpy(),
         "o",
         color=BLACK,
         markersize=4,
         label="flat fields",
     )
     ax.loglog(
-        light.numpy(),
-        predicted[unclipped].sqrt().numpy(),
+        signal_shown.numpy(),
+        predicted[is_unclipped].sqrt().numpy(),
         "-",
         color="#777777",
         linewidth=1.2,
         label="predicted",
     )
-    shot = (predicted[unclipped] - predicted[0]).clamp_min(0.0).sqrt()
-    ax.loglog(light.numpy(), shot.numpy(), "--", color=BLUE, label="shot noise, slope ½")
-    if floor > 0:  # a sensor without noise has no floor, which a logarithmic axis could not show
-        ax.axhline(floor, color=GREEN, linestyle="-.", label=f"dark noise, {floor:.3g} DN, slope 0")
-    full = float(signal.max())
+    # variances add: that of the dark is subtracted
+    shot_noise = (predicted[is_unclipped] - predicted[0]).clamp_min(0.0).sqrt()
+    ax.loglog(
+        signal_shown.numpy(), shot_noise.numpy(), "--", color=BLUE, label="shot noise, slope ½"
+    )
+    # a sensor without noise has no floor, which a logarithmic axis could not show
+    if dark_noise > 0:
+        ax.axhline(
+            dark_noise,
+            color=GREEN,
+            linestyle="-.",
+            label=f"dark noise, {dark_noise:.3g} DN, slope 0",
+        )
+    largest_signal = float(signal.max())
     ax.axvline(
-        full, color=VERMILION, linestyle=":", label=f"largest signal, {full:,.0f} DN above dark"
+        largest_signal,
+        color=VERMILION,
+        linestyle=":",
+        label=f"largest signal, {largest_signal:,.0f} DN above dark",
     )
     lowest = (
-        min([x for x in (floor, *variance[unclipped].sqrt().tolist()) if x > 0], default=1.0) / 3
+        min(
+            [
+                deviation
+                for deviation in (dark_noise, *variance[is_unclipped].sqrt().tolist())
+                if deviation > 0
+            ],
+            default=1.0,
+        )
+        / 3
     )
-    if bool(clipped.any()):
-        heights = variance[clipped].sqrt().clamp_min(1.3 * lowest)
+    if bool(is_clipped.any()):
+        heights = variance[is_clipped].sqrt().clamp_min(1.3 * lowest)
         ax.loglog(
-            signal[clipped].numpy(),
+            signal[is_clipped].numpy(),
             heights.numpy(),
             "v",
             label="clipped: noise at most as drawn",

@@ -91,9 +91,11 @@ def work_precision(
     _draw_diagram(diagram, errors=[tolerance])
     _ring_own_setting(ax, lines)
     if pareto_front:
-        x, y = zip(*pareto_front, strict=True)
+        seconds, front_errors = zip(*pareto_front, strict=True)
         style = {"color": BLACK, "linewidth": 5.0, "alpha": 0.16, "zorder": 0}
-        ax.step(x, np.maximum(y, EXACT), where="post", label="Pareto front", **style)
+        ax.step(
+            seconds, np.maximum(front_errors, EXACT), where="post", label="Pareto front", **style
+        )
     ax.axhline(
         tolerance, color=VERMILION, linestyle="--", linewidth=1.2, label="tolerance of the recipe"
     )
@@ -111,32 +113,37 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
     reference node.
     """
     columns = min(3, len(diagrams))
+    # rounded up
     rows = -(-len(diagrams) // columns)
     styles = _styles(line.name for line in itertools.chain(*(lines for _, lines, _ in diagrams)))
-    width = 3.9 * columns + 0.4
-    across = min(int(width / _ENTRY), 1 + len(styles))
-    below = max(0.7, 0.25 * math.ceil((1 + len(styles)) / across))
-    figure, axes = canvas(width, 3.5 * rows + below, rows, columns)
-    shown: list[Diagram] = []
+    figure_width = 3.9 * columns + 0.4
+    legend_columns = min(int(figure_width / _ENTRY), 1 + len(styles))
+    # inches: a row of the legend is 0.25 high
+    legend_height = max(0.7, 0.25 * math.ceil((1 + len(styles)) / legend_columns))
+    figure, axes = canvas(figure_width, 3.5 * rows + legend_height, rows, columns)
+    scaled_diagrams: list[Diagram] = []
     for ax, (name, lines, reference) in zip(axes.flat, diagrams, strict=False):
         scaled = [
-            replace(line, dots=[replace(d, seconds=1e3 * d.seconds) for d in line.dots])
+            replace(line, dots=[replace(dot, seconds=1e3 * dot.seconds) for dot in line.dots])
             for line in lines
         ]
-        shown.append((ax, scaled, styles, _STEP_EXACT))
-        _draw_diagram(shown[-1], seconds=[1e3 * reference])
+        scaled_diagrams.append((ax, scaled, styles, _STEP_EXACT))
+        _draw_diagram(scaled_diagrams[-1], seconds=[1e3 * reference])
         ax.axvline(1e3 * reference, color=_GREY, linestyle=":", label="reference of the step")
         ax.set_title(name)
         ax.set_xlabel("run time (ms)")
         ax.set_ylabel("error")
+    # panels without a step
     for ax in list(axes.flat)[len(diagrams) :]:
         ax.set_axis_off()
     handles: dict[str, Any] = {}
     for ax in axes.flat:
-        marks, labels = ax.get_legend_handles_labels()
-        handles |= dict(zip(labels, marks, strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=across)
-    _place_labels(figure, shown)
+        handles_of_axes, labels = ax.get_legend_handles_labels()
+        handles |= dict(zip(labels, handles_of_axes, strict=True))
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=legend_columns
+    )
+    _place_labels(figure, scaled_diagrams)
     return figure
 
 
@@ -150,11 +157,15 @@ def promises(
     figure, axes = canvas(8.4, 5.0)
     ax = axes[0, 0]
     ax.loglog(asked, asked, color=BLACK, linewidth=1.2, label="error equal to the tolerance")
-    bounds = [(t, max(b, EXACT)) for t, b in zip(asked, stated, strict=True) if b is not None]
+    bounds = [
+        (tolerance, max(bound, EXACT))
+        for tolerance, bound in zip(asked, stated, strict=True)
+        if bound is not None
+    ]
     if bounds:
         ax.loglog(*zip(*bounds, strict=True), color=_GREY, linestyle="--", label="stated error")
-    for name, (colour, mark) in _styles(measured).items():
-        style = {"color": colour, "marker": mark, "markersize": 6, "linewidth": 1.0}
+    for name, (colour, marker) in _styles(measured).items():
+        style = {"color": colour, "marker": marker, "markersize": 6, "linewidth": 1.0}
         ax.loglog(asked, np.maximum(measured[name], EXACT), label=name, **style)
     ax.set_title("Measured error of each output against the requested tolerance")
     ax.set_xlabel("tolerance")
@@ -185,15 +196,18 @@ def _draw_diagram(
     ax.set_xscale("log")
     ax.set_yscale("log")
     dots = _dots(lines)
-    y = [max(d.error, exact) for d in dots] + [max(d.most or d.error, exact) for d in dots]
+    drawn_errors = [max(dot.error, exact) for dot in dots] + [
+        max(dot.most or dot.error, exact) for dot in dots
+    ]
     # set limits first: with automatic limits, matplotlib warns of errors that differ in the last
     # digit only
-    ax.set_xlim(*_axis_limits([*(d.seconds for d in dots), *seconds], 10.0, 1.5))
-    ax.set_ylim(*_axis_limits([*y, *errors], 100.0, 4.0))
+    # a ratio of 10 at least, and a margin of 1.5 around the dots
+    ax.set_xlim(*_axis_limits([*(dot.seconds for dot in dots), *seconds], 10.0, 1.5))
+    ax.set_ylim(*_axis_limits([*drawn_errors, *errors], 100.0, 4.0))
     for line in lines:
         _draw(ax, line, *styles[line.name], exact)
     plain_ticks(ax.xaxis)
-    _draw_exact_level(ax, [d.error for d in dots], exact)
+    _draw_exact_level(ax, [dot.error for dot in dots], exact)
 
 
 def _dots(lines: Sequence[Line]) -> list[Dot]:
@@ -205,18 +219,19 @@ def _axis_limits(values: Sequence[float], ratio: float, margin: float) -> tuple[
     """Return the limits of a logarithmic axis: a margin around all values, and a ratio of at
     least ``ratio``.
     """
-    low, high = min(values) / margin, max(values) * margin
-    wider = math.sqrt(max(1.0, ratio / (high / low)))
-    return low / wider, high * wider
+    least, greatest = min(values) / margin, max(values) * margin
+    # on a logarithmic axis both ends move by the same factor
+    widening = math.sqrt(max(1.0, ratio / (greatest / least)))
+    return least / widening, greatest * widening
 
 
 def _draw(ax: Any, line: Line, colour: str, mark: str, exact: float) -> None:
     """Draw one line with a marker at each point, and error bars from the smallest to the largest
     error of the point.
     """
-    y = np.maximum([d.error for d in line.dots], exact)
-    lower = np.maximum([d.error if d.least is None else d.least for d in line.dots], exact)
-    upper = np.maximum([d.error if d.most is None else d.most for d in line.dots], exact)
+    errors = np.maximum([dot.error for dot in line.dots], exact)
+    lower = np.maximum([dot.error if dot.least is None else dot.least for dot in line.dots], exact)
+    upper = np.maximum([dot.error if dot.most is None else dot.most for dot in line.dots], exact)
     style = {"color": colour, "marker": mark, "markersize": 7, "capsize": 3, "label": line.name}
     style |= (
         {"linewidth": 2.0, "alpha": 1.0, "zorder": 3}
@@ -224,14 +239,15 @@ def _draw(ax: Any, line: Line, colour: str, mark: str, exact: float) -> None:
         else {"linewidth": 0.9, "alpha": 0.75}
     )
     ax.errorbar(
-        [d.seconds for d in line.dots],
-        y,
-        yerr=np.maximum([y - lower, upper - y], 0.0),
+        [dot.seconds for dot in line.dots],
+        errors,
+        yerr=np.maximum([errors - lower, upper - errors], 0.0),
         **{"zorder": 2} | style,
     )
 
 
 def _ring_own_setting(ax: Any, lines: Sequence[Line]) -> None:
+    """Draw a ring around the first dot with the recipe's own settings."""
     ring = {
         "marker": "o",
         "markersize": 17,
@@ -239,13 +255,15 @@ def _ring_own_setting(ax: Any, lines: Sequence[Line]) -> None:
         "markeredgecolor": BLACK,
         "linestyle": "",
     }
+    # all lines meet there: one ring is enough
     for dot in [d for d in _dots(lines) if d.own][:1]:
-        place = [dot.seconds], [max(dot.error, EXACT)]
-        ax.plot(*place, **ring, markeredgewidth=1.6, label="the recipe's own settings", zorder=4)
+        position = [dot.seconds], [max(dot.error, EXACT)]
+        ax.plot(*position, **ring, markeredgewidth=1.6, label="the recipe's own settings", zorder=4)
 
 
 def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
-    if any(e < exact for e in errors):
+    """Draw a line with a note where some errors are smaller, so that their dots lie on it."""
+    if any(error < exact for error in errors):
         ax.axhline(exact, color=_GREY, linewidth=0.8, linestyle=":")
         transform = ax.get_yaxis_transform()
         ax.text(
@@ -263,15 +281,16 @@ def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
     """Write the label of each point of the diagrams where the label covers no marker, no note
     and no other label.
     """
-    points: dict[Any, list[PointLabel]] = {}
+    labels: dict[Any, list[PointLabel]] = {}
     for ax, lines, styles, exact in diagrams:
-        points[ax] = []
+        labels[ax] = []
         for line in lines:
             colour = styles[line.name][0]
-            points[ax] += [
-                PointLabel(d.seconds, max(d.error, exact), d.label, colour) for d in line.dots
+            labels[ax] += [
+                PointLabel(dot.seconds, max(dot.error, exact), dot.label, colour)
+                for dot in line.dots
             ]
-    place_labels(figure, points)
+    place_labels(figure, labels)
 
 
 # --- accuracy report ------------------------------------------------------------------------------
@@ -359,10 +378,12 @@ def choices(points: Points) -> list[ToleranceChoice]:
     """Return the engine's choice for each tolerance, and the quickest measured setting within
     the tolerance.
     """
-    sound = [p for p in points if p.sound]
-    asked = ((p.trial.value, p) for p in sound)
+    measured = [point for point in points if point.sound]
+    with_tolerances = ((point.trial.value, point) for point in measured)
     return [
-        ToleranceChoice(value, p, cheapest(sound, value)) for value, p in asked if value is not None
+        ToleranceChoice(value, point, cheapest(measured, value))
+        for value, point in with_tolerances
+        if value is not None
     ]
 
 
@@ -370,44 +391,48 @@ def count_missed(points: Points) -> int:
     """Return the number of tolerances that the measured error exceeds by more than the rounding
     error.
     """
-    return sum(not c.held and not _beyond_rounding(c, points) for c in choices(points))
+    return sum(
+        not choice.held and not _beyond_rounding(choice, points) for choice in choices(points)
+    )
 
 
 def lead(recipe: Recipe, points: Points) -> str:
     """Return the summary of the accuracy study in a few sentences."""
     sentences = [*_times(recipe, points), *_kept_tolerances(points)]
-    load = max((p.found.load for p in points), default=0.0)
+    load = max((point.found.load for point in points), default=0.0)
     if load > _BUSY:
-        busy = f"The machine was busy with other work ({load:.1f} processes for each core)"
-        sentences.append(f"{busy}: run times are too long and vary.")
+        busy_text = f"The machine was busy with other work ({load:.1f} processes for each core)"
+        sentences.append(f"{busy_text}: run times are too long and vary.")
     return " ".join(sentences)
 
 
 def _times(recipe: Recipe, points: Points) -> Iterator[str]:
     """Yield how long the recipe and the full computation take."""
-    own, full = _own(points), _whole(points)
-    if own is None:
+    own_point, full_point = _own(points), _whole(points)
+    if own_point is None:
         return
     yield (
         f"With its own tolerance of {power_of_ten(recipe.tolerance)}, the recipe takes"
-        f" {own.seconds:.3g} s; its largest error is {own.most:.2g}, at the output"
-        f" {_worst_output(own)}."
+        f" {own_point.seconds:.3g} s; its largest error is {own_point.most:.2g}, at the output"
+        f" {_worst_output(own_point)}."
     )
-    if full is not None:
-        ratio = full.seconds / own.seconds
-        yield f"The full computation takes {full.seconds:.3g} s, {ratio:.1f} times as long."
+    if full_point is not None:
+        ratio = full_point.seconds / own_point.seconds
+        yield f"The full computation takes {full_point.seconds:.3g} s, {ratio:.1f} times as long."
 
 
 def _kept_tolerances(points: Points) -> Iterator[str]:
     """Yield how many tolerances were held, and how good the choices are."""
-    full, judged = _whole(points), choices(points)
-    yield f"{sum(c.held for c in judged)} of {len(judged)} tolerances were held."
-    if full is not None and (beyond := sum(_beyond_rounding(c, points) for c in judged)):
+    full_computation, decisions = _whole(points), choices(points)
+    yield f"{sum(choice.held for choice in decisions)} of {len(decisions)} tolerances were held."
+    if full_computation is not None and (
+        untestable := sum(_beyond_rounding(choice, points) for choice in decisions)
+    ):
         yield (
-            f"{beyond} cannot be tested: rounding gives the full computation itself an error of"
-            f" {full.most:.1g}."
+            f"{untestable} cannot be tested: rounding gives the full computation itself an error of"
+            f" {full_computation.most:.1g}."
         )
-    if (ratio_of_times := median_ratio(judged)) is not None:
+    if (ratio_of_times := median_ratio(decisions)) is not None:
         yield (
             f"At the median, the engine's choice takes {ratio_of_times:.2f} times as long as the"
             " cheapest setting."
@@ -415,36 +440,38 @@ def _kept_tolerances(points: Points) -> Iterator[str]:
 
 
 def _own(points: Points) -> WorkPrecisionPoint | None:
-    return next((p for p in points if p.trial.own and p.sound), None)
+    """Return the point of the recipe's own settings, or None if it was not measured."""
+    return next((point for point in points if point.trial.own and point.sound), None)
 
 
 def _whole(points: Points) -> WorkPrecisionPoint | None:
-    return next((p for p in points if p.trial.line == KEEP_ALL and p.sound), None)
+    """Return the point of the full computation, or None if it was not measured."""
+    return next((point for point in points if point.trial.line == KEEP_ALL and point.sound), None)
 
 
 def _beyond_rounding(choice: ToleranceChoice, points: Points) -> bool:
     """Return True if the measured error exceeds the tolerance, but by at most the rounding
     error.
     """
-    full = _whole(points)
-    rounding = _NO_WORSE * full.most if full else 0.0
+    full_computation = _whole(points)
+    rounding = _NO_WORSE * full_computation.most if full_computation else 0.0
     return not choice.held and choice.chosen.most <= choice.tolerance + rounding
 
 
 def pictures(result: AccuracyResult) -> dict[str, bytes]:
     """Return the diagrams of the accuracy study's page by name, as PNG bytes."""
     images = {}
-    sound = [p for p in result.points if p.sound]
+    sound = [point for point in result.points if point.sound]
     if sound:
-        front = [(p.seconds, p.error) for p in pareto_front(sound)]
+        front = [(point.seconds, point.error) for point in pareto_front(sound)]
         title = f"{result.recipe.name}: error against run time"
         images["work_precision"] = work_precision(
             _lines(result.recipe, sound), front, result.recipe.tolerance, title
         )
-    if asked := choices(sound):
-        images["promises"] = _promises(asked)
-    if measured_steps := [s for s in result.steps if s.variants]:
-        images["steps"] = steps([_diagram(s) for s in measured_steps])
+    if engine_choices := choices(sound):
+        images["promises"] = _promises(engine_choices)
+    if measured_steps := [step for step in result.steps if step.variants]:
+        images["steps"] = steps([_diagram(step) for step in measured_steps])
     return images
 
 
@@ -469,29 +496,35 @@ def sections(result: AccuracyResult, drawn: Mapping[str, bytes]) -> list[Section
     ):
         seeds += " " + _POISSON
     # the recipe's own setting of a parameter is the recipe itself
-    once = [p for p in result.points if p.trial.recipe is not result.recipe]
+    without_repetition = [
+        point for point in result.points if point.trial.recipe is not result.recipe
+    ]
     return [
-        _all_points(once, f"{_REFERENCE}\n\n{_TIME}\n\n{seeds}", drawn.get("work_precision")),
+        _all_points(
+            without_repetition, f"{_REFERENCE}\n\n{_TIME}\n\n{seeds}", drawn.get("work_precision")
+        ),
         _chosen(result.points),
-        *_outputs(once, drawn.get("promises")),
+        *_outputs(without_repetition, drawn.get("promises")),
         _steps(result.steps, drawn.get("steps")),
         _not_varied(result),
     ]
 
 
 def _all_points(points: Points, text: str, picture: bytes | None) -> Section:
+    """Return the section with run time and errors of every point; a star marks the Pareto front."""
     columns = ["parameter", "setting", "run time, s", "of it computing, s"]
     columns += ["error", "least", "most", "stated", "worst output"]
-    sound = [p for p in points if p.sound]
-    best = {id(p) for p in pareto_front(sound)}
+    measured = [p for p in points if p.sound]
+    # identities, because points cannot be hashed
+    front = {id(p) for p in pareto_front(measured)}
     rows = []
-    for p in sound:
-        setting = f"{p.trial.label}{' (the recipe)' * p.trial.own}{' *' * (id(p) in best)}"
-        largest = Marked(p.most)
+    for p in measured:
+        setting = f"{p.trial.label}{' (the recipe)' * p.trial.own}{' *' * (id(p) in front)}"
+        largest_cell = Marked(p.most)
         if p.trial.value is not None:
-            largest = Marked(p.most, _mark(ToleranceChoice(p.trial.value, p, None), points))
+            largest_cell = Marked(p.most, _mark(ToleranceChoice(p.trial.value, p, None), points))
         times = (p.seconds, p.found.computing)
-        errors = (p.error, min(p.by_seed), largest, p.found.bound, _worst_output(p))
+        errors = (p.error, min(p.by_seed), largest_cell, p.found.bound, _worst_output(p))
         rows.append((p.trial.line, setting, *times, *errors))
     text += """\n\nA star marks the Pareto front: no other point is both quicker and more accurate.
         The marks show whether a tolerance was held with every seed; an exclamation mark, that only
@@ -500,6 +533,9 @@ def _all_points(points: Points, text: str, picture: bytes | None) -> Section:
 
 
 def _chosen(points: Points) -> Section:
+    """Return the section that compares the engine's choice for each tolerance with the quickest
+    point.
+    """
     columns = (
         "tolerance",
         "chosen: error",
@@ -510,15 +546,19 @@ def _chosen(points: Points) -> Section:
         "chosen over cheapest",
     )
     rows: list[tuple[Any, ...]] = []
-    for c in choices(points):
-        chosen = (Marked(c.chosen.most, _mark(c, points)), c.chosen.seconds)
-        best: tuple[Any, ...] = (None, None, None)
-        if c.cheapest:
-            best = (c.cheapest.trial.name, c.cheapest.most, c.cheapest.seconds)
+    for choice in choices(points):
+        chosen_cells = (Marked(choice.chosen.most, _mark(choice, points)), choice.chosen.seconds)
+        quickest_cells: tuple[Any, ...] = (None, None, None)
+        if choice.cheapest:
+            quickest_cells = (
+                choice.cheapest.trial.name,
+                choice.cheapest.most,
+                choice.cheapest.seconds,
+            )
         ratio = None
-        if c.ratio is not None:
-            ratio = Marked(c.ratio, "pass" if c.ratio <= _FACTOR else "warn")
-        rows.append((power_of_ten(c.tolerance), *chosen, *best, ratio))
+        if choice.ratio is not None:
+            ratio = Marked(choice.ratio, "pass" if choice.ratio <= _FACTOR else "warn")
+        rows.append((power_of_ten(choice.tolerance), *chosen_cells, *quickest_cells, ratio))
     text = f"""For each tolerance, the engine's choice and the quickest of all points above whose
         error is within the tolerance. A choice passes if it takes at most {_FACTOR:g} times as long
         as the quickest point."""
@@ -527,7 +567,7 @@ def _chosen(points: Points) -> Section:
 
 def _outputs(points: Points, picture: bytes | None) -> list[Section]:
     """Return the errors of all outputs in tables of a few columns each, which fit the page."""
-    names = list(dict.fromkeys(itertools.chain(*(p.found.errors for p in points))))
+    names = list(dict.fromkeys(itertools.chain(*(point.found.errors for point in points))))
     groups = [names[i : i + _ABREAST] for i in range(0, len(names), _ABREAST)] or [[]]
     text = (
         "The largest error of each output over the seeds; a dash where the setting changes the"
@@ -540,23 +580,31 @@ def _outputs(points: Points, picture: bytes | None) -> list[Section]:
         parts.append(
             Section(heading, "" if number else text, columns, _errors(points, group), picture)
         )
+        # in the first table alone
         picture = None
     return parts
 
 
 def _errors(points: Points, names: Sequence[str]) -> list[tuple[Any, ...]]:
+    """Return a row for each point: parameter, setting, and the largest error of each
+    named output.
+    """
     return [
         (
-            p.trial.line,
-            p.trial.label,
-            *(max(p.found.errors[n]) if n in p.found.errors else None for n in names),
+            point.trial.line,
+            point.trial.label,
+            *(
+                max(point.found.errors[output]) if output in point.found.errors else None
+                for output in names
+            ),
         )
-        for p in points
-        if p.sound
+        for point in points
+        if point.sound
     ]
 
 
 def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:
+    """Return the section with the variants of each slow step."""
     columns = (
         "step",
         "node",
@@ -568,15 +616,22 @@ def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:
         "tried on",
     )
     rows: list[tuple[Any, ...]] = []
-    for s in tried:
-        head = (s.step, s.node, f"{100 * s.share:.1f} %")
-        on = s.found.cut_inputs or "its own inputs"
+    for step in tried:
+        first_cells = (step.step, step.node, f"{100 * step.share:.1f} %")
+        tried_on = step.found.cut_inputs or "its own inputs"
         rows += [
-            (*head, f"{f.line} {f.label}".strip(), f.error, f.seconds, s.found.reference, on)
-            for f in s.variants
+            (
+                *first_cells,
+                f"{variant.line} {variant.label}".strip(),
+                variant.error,
+                variant.seconds,
+                step.found.reference,
+                tried_on,
+            )
+            for variant in step.variants
         ]
-        if s.found.refused:
-            rows.append((*head, f"not tried: {s.found.refused}", None, None, None, None))
+        if step.found.refused:
+            rows.append((*first_cells, f"not tried: {step.found.refused}", None, None, None, None))
     text = """Steps that take more than a hundredth of the run time of the full computation; for a
         step of several items, the slowest item. Each variant is compared with the node's reference,
         a direct computation in float64, on the step's own inputs. If that takes too long, all
@@ -586,9 +641,15 @@ def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:
 
 
 def _not_varied(result: AccuracyResult) -> Section:
-    rows = [(knob, "", why) for knob, _, why in (text.partition(": ") for text in result.without)]
+    """Return the section with what could not be varied, and why."""
+    # texts such as "bands: this recipe has no such value"
+    rows = [
+        (knob, "", reason) for knob, _, reason in (text.partition(": ") for text in result.without)
+    ]
     rows += [
-        (p.trial.line, p.trial.label, p.found.refused) for p in result.points if p.found.refused
+        (point.trial.line, point.trial.label, point.found.refused)
+        for point in result.points
+        if point.found.refused
     ]
     missing = "Parameters that this recipe does not have, and settings that are not possible."
     text = missing if rows else "Every parameter could be varied."
@@ -599,34 +660,48 @@ def table(result: AccuracyResult) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of ``table.csv``: one for each measured error, and one for each setting
     that was not possible.
     """
-    for p in result.points:
-        head = ("recipe", p.trial.line, p.trial.label)
-        if p.found.refused:
-            yield (*head, *[""] * 6, p.found.refused)
-        for name, errors in p.found.errors.items():
+    for point in result.points:
+        first_cells = ("recipe", point.trial.line, point.trial.label)
+        if point.found.refused:
+            # empty from "output" to "stated", then the reason
+            yield (*first_cells, *[""] * 6, point.found.refused)
+        for name, errors in point.found.errors.items():
             for seed, error in enumerate(errors):
-                yield (*head, name, seed, error, p.seconds, p.found.computing, p.found.bound, "")
-    for s in result.steps:
-        for f in s.variants:
+                yield (
+                    *first_cells,
+                    name,
+                    seed,
+                    error,
+                    point.seconds,
+                    point.found.computing,
+                    point.found.bound,
+                    "",
+                )
+    for step in result.steps:
+        for variant in step.variants:
             yield (
-                f"step {s.step}",
-                f.line,
-                f.label,
-                s.found.cut_inputs,
+                f"step {step.step}",
+                variant.line,
+                variant.label,
+                step.found.cut_inputs,
                 "",
-                f.error,
-                f.seconds,
+                variant.error,
+                variant.seconds,
                 "",
                 "",
                 "",
             )
-        if s.found.refused:
-            yield (f"step {s.step}", s.node, *[""] * 7, s.found.refused)
+        if step.found.refused:
+            yield (f"step {step.step}", step.node, *[""] * 7, step.found.refused)
 
 
 def _lines(recipe: Recipe, points: Points) -> list[Line]:
-    varied = dict.fromkeys(p.trial.line for p in points if p.trial.recipe is not recipe)
-    of_line = {name: [_dot(p, recipe) for p in points if p.trial.line == name] for name in varied}
+    """Return a line of dots for each varied parameter; that of the tolerance is thicker."""
+    varied = dict.fromkeys(point.trial.line for point in points if point.trial.recipe is not recipe)
+    of_line = {
+        name: [_dot(point, recipe) for point in points if point.trial.line == name]
+        for name in varied
+    }
     return [Line(name, dots, strong=name == TOLERANCE) for name, dots in of_line.items()]
 
 
@@ -642,13 +717,21 @@ def _diagram(s: StepTried) -> tuple[str, list[Line], float]:
     """Return the data of a step's diagram: title, a line for each changed property, and the
     reference's time in s.
     """
-    names = dict.fromkeys(f.line for f in s.variants)
+    names = dict.fromkeys(variant.line for variant in s.variants)
     lines = [
-        Line(n, [Dot(f.seconds, f.error, f.label) for f in s.variants if f.line == n], n == USED)
-        for n in names
+        Line(
+            line_name,
+            [
+                Dot(variant.seconds, variant.error, variant.label)
+                for variant in s.variants
+                if variant.line == line_name
+            ],
+            line_name == USED,
+        )
+        for line_name in names
     ]
-    on = f"\non {s.found.cut_inputs}" if s.found.cut_inputs else ""
-    return f"{s.step}\n{s.node}{on}", lines, s.found.reference
+    tried_on = f"\non {s.found.cut_inputs}" if s.found.cut_inputs else ""
+    return f"{s.step}\n{s.node}{tried_on}", lines, s.found.reference
 
 
 def _worst_output(p: WorkPrecisionPoint) -> str:

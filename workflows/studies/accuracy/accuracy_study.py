@@ -77,13 +77,16 @@ def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
     """Yield the settings to measure: each tolerance, the full computation, and each value of
     each varied parameter.
     """
-    asked = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
-    for tolerance in asked:
-        other = replace(recipe, tolerance=tolerance, exact=False)
-        own = tolerance == recipe.tolerance and not recipe.exact
-        yield Trial(TOLERANCE, power_of_ten(tolerance), other, value=tolerance, own=own)
+    tolerances = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
+    for tolerance in tolerances:
+        with_tolerance = replace(recipe, tolerance=tolerance, exact=False)
+        is_own_setting = tolerance == recipe.tolerance and not recipe.exact
+        yield Trial(
+            TOLERANCE, power_of_ten(tolerance), with_tolerance, value=tolerance, own=is_own_setting
+        )
     yield Trial(KEEP_ALL, "", replace(recipe, exact=True), own=recipe.exact)
     for knob in turned.found:
+        # shorter for the page: step.parameter
         paths = (
             path.strip().removeprefix("steps.").replace(".with.", ".")
             for path in knob.name.split(",")
@@ -103,26 +106,34 @@ def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
 def _measure(
     recipe: Recipe, cache: PointCache, progress: Progress, quick: bool, until: float
 ) -> AccuracyResult:
-    turned = knobs(recipe, quick)
-    todo = list(trials(recipe, turned, quick))
+    """Measure all points, then again for their times, then the slow steps.
+
+    ``until`` is the monotonic time after which no further setting of a parameter is measured.
+    """
+    varied = knobs(recipe, quick)
+    queue = list(trials(recipe, varied, quick))
     progress(
-        f"{len(todo)} points, {cache.seeds} seed{'s' * (cache.seeds > 1)}; the reference first"
+        f"{len(queue)} points, {cache.seeds} seed{'s' * (cache.seeds > 1)}; the reference first"
     )
     cache.truth(0)
     points = []
-    for number, trial in enumerate(todo, 1):
-        left = time.monotonic() > until and _may_wait(trial, cache)
-        points.append(cache.point(replace(trial, recipe=None, refused=_LEFT) if left else trial))
-        progress(f"{number}/{len(todo)}  {accuracy_page.summary_line(points[-1])}")
+    for number, trial in enumerate(queue, 1):
+        out_of_time = time.monotonic() > until and _may_wait(trial, cache)
+        points.append(
+            cache.point(replace(trial, recipe=None, refused=_LEFT) if out_of_time else trial)
+        )
+        progress(f"{number}/{len(queue)}  {accuracy_page.summary_line(points[-1])}")
     # in turn, so that other work of the machine disturbs all points alike
     for number in range(2, TIMES + 1):
         points = [cache.time_again(point, number) for point in points]
         progress(f"timed again: {number} of {TIMES}")
     steps = []
-    for stage, name, share in _slow_steps(recipe, points):
-        steps.append(try_step(stage, name, share, cache.store, _LITTLE if quick else _PATIENCE))
+    for recipe_of_step, name, share in _slow_steps(recipe, points):
+        steps.append(
+            try_step(recipe_of_step, name, share, cache.store, _LITTLE if quick else _PATIENCE)
+        )
         progress(f"step {name}: {steps[-1].found.refused or f'{len(steps[-1].variants)} variants'}")
-    return AccuracyResult(recipe, tuple(points), tuple(steps), turned.without, cache.seeds)
+    return AccuracyResult(recipe, tuple(points), tuple(steps), varied.without, cache.seeds)
 
 
 def _may_wait(trial: Trial, cache: PointCache) -> bool:
@@ -140,17 +151,19 @@ def _slow_steps(
     """Yield (recipe, step name, share of run time) of each slow step, and of slow steps that
     replace other steps.
     """
-    seconds = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
+    seconds = next((point.found.steps for point in points if point.trial.line == KEEP_ALL), {})
     for name, share in steps_that_matter(recipe, seconds):
         yield recipe, name, share
-    own = next((p.found.steps for p in points if p.trial.own), {})
+    own_seconds = next((point.found.steps for point in points if point.trial.own), {})
     cheaper = with_substitutions(recipe, recipe.outputs)
-    for name, share in steps_that_matter(cheaper, own):
+    for name, share in steps_that_matter(cheaper, own_seconds):
+        # steps of the recipe have been yielded above
         if name not in recipe.steps:
             yield cheaper, name, share
 
 
 def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[str, Any]:
+    """Return what provenance.json says of the study."""
     return {
         "tolerance": result.recipe.tolerance,
         "seed": result.recipe.seed,
@@ -164,6 +177,7 @@ def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[st
 
 
 def _report(result: AccuracyResult) -> StudyReport:
+    """Return the page of the study, with its diagrams and its table."""
     pictures = accuracy_page.pictures(result)
     return StudyReport(
         f"Accuracy of {result.recipe.name}",

@@ -75,16 +75,20 @@ def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
     """
     varied: list[Knob] = []
     without: list[str] = []
-    for kind, turned in (
+    for kind, knobs_or_reasons in (
         ("bands", _bands(recipe, quick)),
         ("pupil samples at the same width", _samples(recipe, quick)),
         ("window of the PSF", _windows(recipe, quick)),
         ("precision", _precisions(recipe)),
     ):
-        mine = [knob if isinstance(knob, str) else replace(knob, what=kind) for knob in turned]
-        varied += [knob for knob in mine if isinstance(knob, Knob) and len(knob.changes) > 1]
-        without += [f"{kind}: {knob}" for knob in mine if isinstance(knob, str)]
-        if not mine:
+        # a text is the reason why a parameter cannot be varied
+        of_kind = [
+            knob if isinstance(knob, str) else replace(knob, what=kind) for knob in knobs_or_reasons
+        ]
+        # a parameter with one value has nothing to compare
+        varied += [knob for knob in of_kind if isinstance(knob, Knob) and len(knob.changes) > 1]
+        without += [f"{kind}: {knob}" for knob in of_kind if isinstance(knob, str)]
+        if not of_kind:
             without.append(f"{kind}: this recipe has no such value")
     return Knobs(tuple(varied), tuple(without))
 
@@ -101,13 +105,25 @@ def finest(recipe: Recipe) -> Recipe:
 
 
 def _bands(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
+    """Yield a parameter for each number of bands that the recipe sets, with the numbers to try."""
     for place in _places(recipe, "count", gives=Bands):
-        own = int(place.value)
-        counts = {1 + round((own - 1) * f) for f in (1.0, *(_FEWER if quick else _FACTORS))}
-        yield _knob(place.path, [(n, str(n), (f"{place.path}={n}",)) for n in sorted(counts)], own)
+        own_count = int(place.value)
+        # `count` bands have `count - 1` intervals between them, which the factors scale
+        counts = {
+            1 + round((own_count - 1) * factor)
+            for factor in (1.0, *(_FEWER if quick else _FACTORS))
+        }
+        yield _knob(
+            place.path,
+            [(count, str(count), (f"{place.path}={count}",)) for count in sorted(counts)],
+            own_count,
+        )
 
 
 def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
+    """Yield the parameter of the pupil samples, whose pitch changes so that the width stays; or the
+    reason, as text, why it cannot be varied.
+    """
     samples, pitches = (_places(recipe, name, beside=other) for name, other in _BOTH)
     if len(samples) != 1 or len(pitches) != 1:
         if samples:
@@ -116,40 +132,61 @@ def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
                 " and pitch"
             )
         return
-    own, pitch = int(samples[0].value), pitches[0].value
+    own_samples, pitch = int(samples[0].value), pitches[0].value
     if pitch is None:  # the grid is as wide as the aperture
-        sizes = _sizes(own, quick)
-        yield _knob(samples[0].path, [(n, str(n), (f"{samples[0].path}={n}",)) for n in sizes], own)
+        sizes = _sizes(own_samples, quick)
+        yield _knob(
+            samples[0].path,
+            [(count, str(count), (f"{samples[0].path}={count}",)) for count in sizes],
+            own_samples,
+        )
         return
-    if others := _others(recipe, "pitch", pitches[0]):
-        yield f"{', '.join(others)} would keep the old pitch, which is written elsewhere"
+    if equal_elsewhere := _others(recipe, "pitch", pitches[0]):
+        yield f"{', '.join(equal_elsewhere)} would keep the old pitch, which is written elsewhere"
         return
-    path, other = samples[0].path, pitches[0].path
+    samples_path, other = samples[0].path, pitches[0].path
     settings = [
-        (n, str(n), (f"{path}={n}", f"{other}={own * pitch / n!r} m")) for n in _sizes(own, quick)
+        # the width of the pupil stays: samples x pitch
+        (
+            count,
+            str(count),
+            (f"{samples_path}={count}", f"{other}={own_samples * pitch / count!r} m"),
+        )
+        for count in _sizes(own_samples, quick)
     ]
-    yield _knob(path, settings, own)
+    yield _knob(samples_path, settings, own_samples)
 
 
 def _sizes(own: int, quick: bool) -> list[int]:
     """Return the numbers of pupil samples that a study tries, the recipe's own among them."""
-    return sorted({max(2, round(own * f)) for f in (1.0, *(_FEWER_SCALES if quick else _SCALES))})
+    # a pupil has two samples at least
+    return sorted(
+        {max(2, round(own * factor)) for factor in (1.0, *(_FEWER_SCALES if quick else _SCALES))}
+    )
 
 
 _BOTH = (("samples", "pitch"), ("pitch", "samples"))
 
 
 def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
+    """Yield a parameter for each window of a PSF, with the shapes to try; or, as text, the reason
+    why it cannot be varied.
+    """
     for place in _places(recipe, "shape", gives=Psf):
-        if others := _others(recipe, "shape", place):
-            yield f"{place.path} is also a parameter of the step {others[0]}"
+        if other_steps := _others(recipe, "shape", place):
+            yield f"{place.path} is also a parameter of the step {other_steps[0]}"
             continue
-        own, scales = tuple(place.value), (1.0, *(_FEWER_SCALES if quick else _SCALES))
-        sizes = sorted({tuple(max(1, round(n * f)) for n in own) for f in scales})
+        own_shape, scales = tuple(place.value), (1.0, *(_FEWER_SCALES if quick else _SCALES))
+        sizes = sorted(
+            {tuple(max(1, round(side * factor)) for side in own_shape) for factor in scales}
+        )
         yield _knob(
             place.path,
-            [(s, "×".join(map(str, s)), (f"{place.path}={list(s)}",)) for s in sizes],
-            own,
+            [
+                (shape, "×".join(map(str, shape)), (f"{place.path}={list(shape)}",))
+                for shape in sizes
+            ],
+            own_shape,
         )
 
 
@@ -159,9 +196,14 @@ def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
     """
     if places := _places(recipe, "precision"):
         words = allowed_words(places[0].steps[0], "precision")
-        path = ", ".join(p.path for p in places)
+        path = ", ".join(precision_place.path for precision_place in places)
         yield _knob(
-            path, [(w, w, tuple(f"{p.path}={w}" for p in places)) for w in words], places[0].value
+            path,
+            [
+                (word, word, tuple(f"{precision_place.path}={word}" for precision_place in places))
+                for word in words
+            ],
+            places[0].value,
         )
 
 
@@ -193,8 +235,9 @@ def allowed_words(step: Step, parameter: str) -> tuple[str, ...]:
 def _places(
     recipe: Recipe, parameter: str, gives: type | None = None, beside: str = ""
 ) -> list[_Place]:
-    """Return the recipe paths that set ``parameter``, for steps that return ``gives`` and also
-    have ``beside``.
+    """Return the recipe paths that set ``parameter``, each with the steps that read it.
+
+    Only steps count that return the type ``gives`` and also have the parameter ``beside``.
     """
     places: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
@@ -205,16 +248,17 @@ def _places(
             continue
         path = _written(recipe, step, parameter)
         if path is not None:
-            before = places[path].steps if path in places else ()
-            places[path] = _Place(path, step.params[parameter], (*before, step))
+            other_readers = places[path].steps if path in places else ()
+            places[path] = _Place(path, step.params[parameter], (*other_readers, step))
     return list(places.values())
 
 
 def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
-    """Return the recipe path that sets a step's parameter, or None if repetitions of the step
-    have different values.
+    """Return the recipe path at which a step's parameter is written, following references such as
+    ``${optics.bands}``; None if repetitions of the step have different values.
     """
     path = f"steps.{step.name.partition('[')[0]}.with.{parameter}"
+    # from reference to reference, to the path with a value
     while True:
         setting = recipe.config.settings.get(path)
         match = (
@@ -235,17 +279,20 @@ def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
     """
     if parameter == "pitch":
         return _equal_elsewhere(recipe, parameter, place)
-    mine = {step.name for step in place.steps}
+    reading_steps = {step.name for step in place.steps}
     names: list[str] = []
     for step in recipe.steps.values():
-        if step.name not in mine:
-            read = [p for p in step.params if _written(recipe, step, p) == place.path]
-            names += [step.name for p in read if p in step.param_marks]
+        if step.name not in reading_steps:
+            params_read = [
+                param for param in step.params if _written(recipe, step, param) == place.path
+            ]
+            # only parameters that are written in the recipe count, not defaults
+            names += [step.name for param in params_read if param in step.param_marks]
     return names
 
 
 def _equal_elsewhere(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
     """Return the names of steps whose parameter has the value of ``place`` from another path."""
-    having = [step for step in recipe.steps.values() if parameter in step.params]
-    equal = [step for step in having if step.params[parameter] == place.value]
-    return [step.name for step in equal if _written(recipe, step, parameter) != place.path]
+    with_parameter = [step for step in recipe.steps.values() if parameter in step.params]
+    equal_steps = [step for step in with_parameter if step.params[parameter] == place.value]
+    return [step.name for step in equal_steps if _written(recipe, step, parameter) != place.path]

@@ -90,16 +90,20 @@ def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tupl
     """Return (slowest repetition, share of the run time) of each step that takes more than
     `SHARE` of the run time.
     """
-    items: dict[str, list[str]] = defaultdict(list)
+    items_of_step: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
-            items[_ITEM.sub("", name)].append(name)
+            # names without their item in brackets
+            items_of_step[_ITEM.sub("", name)].append(name)
     total = sum(seconds.values()) or 1.0
     shares = [
-        (max(names, key=seconds.__getitem__), sum(seconds[n] for n in names) / total)
-        for names in items.values()
+        (max(names, key=seconds.__getitem__), sum(seconds[item] for item in names) / total)
+        for names in items_of_step.values()
     ]
-    return sorted((f for f in shares if f[1] > SHARE), key=lambda f: -f[1])
+    return sorted(
+        (slowest_and_share for slowest_and_share in shares if slowest_and_share[1] > SHARE),
+        key=lambda f: -f[1],
+    )
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
@@ -123,10 +127,13 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
 
 
 def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
+    """Return the store key of the measurement of a step: its inputs, its code, patience and
+    machine.
+    """
     keys: dict[str, str] = {}
     code = Code(store.code_memo)
-    for before in needed(recipe, (name,)):
-        keys[before], _ = key_of(recipe.steps[before], keys, recipe.seed, code)
+    for source_name in needed(recipe, (name,)):
+        keys[source_name], _ = key_of(recipe.steps[source_name], keys, recipe.seed, code)
     return digest(
         "accuracy of a step",
         keys[name],
@@ -137,11 +144,12 @@ def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
 
 
 def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
+    """Return errors and run times of the variants of a step, or why they cannot be measured."""
     try:
-        values = run(replace(recipe, exact=True), store, step.sources).values
+        input_values = run(replace(recipe, exact=True), store, step.sources).values
     except RunError as error:
         return StepMeasurement(refused=f"the inputs could not be computed: {error.cause}")
-    inputs = [_gathered(step.wires.get(name), values) for name in step.node.inputs]
+    inputs = [_gathered(step.wires.get(name), input_values) for name in step.node.inputs]
     with torch.no_grad():
         afforded = _largest(step, inputs, recipe.seed, patience)
         if afforded is None:
@@ -153,14 +161,18 @@ def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepM
         variants = [
             asdict(variant) for variant in _variants(step, small_inputs, truth, recipe.seed)
         ]
+    # without any cut: nothing is said of parts of the inputs
     complete = all(
-        a.shape == b.shape
-        for a, b in zip(tensors_in(inputs), tensors_in(small_inputs), strict=True)
+        whole_tensor.shape == cut_tensor.shape
+        for whole_tensor, cut_tensor in zip(
+            tensors_in(inputs), tensors_in(small_inputs), strict=True
+        )
     )
     return StepMeasurement(variants, seconds, "" if complete else _cut_text(step.node, size))
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
+    """Return the input of a wire: one result, a list of results, or None without a wire."""
     return wire and (values[wire] if isinstance(wire, str) else [values[name] for name in wire])
 
 
@@ -170,19 +182,20 @@ def _largest(
     """Return the largest input size for which the reference takes about ``patience`` s, the
     result and the time.
     """
-    best: tuple[Cut, Any, float] | None = None
+    largest_measured: tuple[Cut, Any, float] | None = None
     for size in _CUTS:
-        if best is not None and best[2] * _GROWTH > patience:
+        # the next cut would take too long: best is (size, result, seconds)
+        if largest_measured is not None and largest_measured[2] * _GROWTH > patience:
             break
         small_inputs = cut_inputs(step.node, inputs, size)
         try:
-            best = (
+            largest_measured = (
                 size,
                 *_time_once(partial(_call, step, step.node.hooks.reference, small_inputs, seed)),
             )
         except Exception:  # a small part of a picture may be no valid input; a larger part may be
             continue
-    return best
+    return largest_measured
 
 
 def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Variant]:
@@ -192,9 +205,10 @@ def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[
     for (line, label), compute in _calls(step, inputs, seed).items():
         # another shape, or a dtype that the variant does not take
         with suppress(ValueError, RuntimeError):
-            value, seconds = _median_time(compute)
+            # errors are those of tensors that can be compared
+            result, seconds = _median_time(compute)
             yield Variant(
-                line, label, error_of(_compared_value(value), _compared_value(truth)), seconds
+                line, label, error_of(_compared_value(result), _compared_value(truth)), seconds
             )
 
 
@@ -204,17 +218,18 @@ def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Ca
     calls: dict[tuple[str, str], Callable[[], Any]] = {
         (USED, ""): partial(_call, step, node, inputs, seed)
     }
-    for word in _other_precisions(step):
-        calls[_PRECISION, word] = partial(_call, step, node, inputs, seed, precision=word)
+    for precision in _other_precisions(step):
+        calls[_PRECISION, precision] = partial(_call, step, node, inputs, seed, precision=precision)
     if "precision" not in step.params and any(map(_is_single, tensors_in(inputs))):
-        double = each_tensor(lambda x: x.double() if _is_single(x) else x, inputs)
-        calls[_PRECISION, "double"] = partial(_call, step, node, double, seed)
+        double_inputs = each_tensor(lambda x: x.double() if _is_single(x) else x, inputs)
+        calls[_PRECISION, "double"] = partial(_call, step, node, double_inputs, seed)
     for factor in _ALLOWANCES if "within" in step.params else ():
         within = step.params["within"] * factor
+        # 1e-03 as 1e-3
         label = f"{within:.0e}".replace("e-0", "e-")
         calls["allowed error", label] = partial(_call, step, node, inputs, seed, within=within)
-    for share, smaller in _smaller_windows(inputs):
-        calls["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller, seed)
+    for share, smaller_inputs in _smaller_windows(inputs):
+        calls["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller_inputs, seed)
     if node.hooks.skip_bound is not None:
         calls["left out", ""] = lambda: inputs[0]
     return calls
@@ -222,8 +237,12 @@ def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Ca
 
 def _other_precisions(step: Step) -> list[str]:
     """Return the words for a precision that a step does not have; none without this parameter."""
-    own = step.params.get("precision")
-    return [] if own is None else [w for w in allowed_words(step, "precision") if w != own]
+    own_precision = step.params.get("precision")
+    return (
+        []
+        if own_precision is None
+        else [word for word in allowed_words(step, "precision") if word != own_precision]
+    )
 
 
 def _is_single(x: Tensor) -> bool:
@@ -232,17 +251,20 @@ def _is_single(x: Tensor) -> bool:
 
 def _smaller_windows(inputs: list[Any]) -> Iterator[tuple[float, list[Any]]]:
     """Yield the inputs with smaller windows of their PSFs, and the share; none without a PSF."""
-    if any(isinstance(x, Psf) for x in inputs):
+    if any(isinstance(value, Psf) for value in inputs):
         for share in _WINDOWS:
-            yield share, [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
+            yield (
+                share,
+                [_inner(value, share) if isinstance(value, Psf) else value for value in inputs],
+            )
 
 
 def _inner(psf: Psf, share: float) -> Psf:
     """Return a PSF cropped to ``share`` of each side; the centre stays at index N // 2."""
-    x = psf.intensity
+    intensity = psf.intensity
     for axis in (-2, -1):
-        x = _centred(x, axis, max(1, round(share * x.shape[axis])))
-    return psf._replace(intensity=x)
+        intensity = _centred(intensity, axis, max(1, round(share * intensity.shape[axis])))
+    return psf._replace(intensity=intensity)
 
 
 def _centred(x: Tensor, axis: int, count: int) -> Tensor:
@@ -259,6 +281,9 @@ def _compared_value(value: Any) -> Any:
 
 
 def _call(step: Step, function: Any, inputs: list[Any], seed: int, **other: Any) -> Any:
+    """Return ``function`` of the inputs with the parameters of a step, of which ``other`` replaces
+    some; a random step gets the random numbers that it has in a run.
+    """
     rng = (
         {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))}
         if step.node.random
@@ -278,6 +303,7 @@ def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
     first call.
     """
     value, seconds = _time_once(compute)
+    # a short first call may import or compile: it does not count
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
         times.append(_time_once(compute)[1])
@@ -289,22 +315,29 @@ def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
     names the band axis.
     """
     side, bands = size
-    parts = []
+    smaller_inputs = []
     for name, value in zip(node.inputs, inputs, strict=True):
         axis = (node.bands or {}).get(name)
-        fewer = value if axis is None or not bands else _fewer_bands(value, axis, bands)
-        parts.append(each_tensor(lambda x: _middle(x, side), fewer) if side else fewer)
-    return parts
+        fewer_bands = value if axis is None or not bands else _fewer_bands(value, axis, bands)
+        smaller_inputs.append(
+            each_tensor(lambda x: _middle(x, side), fewer_bands) if side else fewer_bands
+        )
+    return smaller_inputs
 
 
 def _cut_text(node: Node, size: Cut) -> str:
+    """Return which part of the inputs is used, such as ``the middle 64 x 64 and 3 bands``."""
     side, bands = size
-    fewer = bands and (node.bands or {}).keys() - {"return"}
-    parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(fewer)
+    takes_bands = bands and (node.bands or {}).keys() - {"return"}
+    # a factor of False leaves a part out
+    parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(takes_bands)
     return " and ".join(parts)
 
 
 def _middle(x: Tensor, side: int) -> Tensor:
+    """Return the middle of a picture, of ``side`` pixels; other tensors and smaller
+    ones unchanged.
+    """
     for axis in (-2, -1) if x.ndim >= 2 and min(x.shape[-2:]) > side else ():
         x = _centred(x, axis, side)
     return x
@@ -316,13 +349,14 @@ def _fewer_bands(value: Any, axis: int, bands: int) -> Any:
         count = value.shape[axis]
         if count <= bands:
             return value
+        # middles of equal parts of the bands
         indices = value.new_tensor(
-            [round((i + 0.5) * count / bands - 0.5) for i in range(bands)]
+            [round((number + 0.5) * count / bands - 0.5) for number in range(bands)]
         ).long()
         return value.index_select(axis, indices)
     fields = {name: getattr(value, name) for name in band_names(value)}
     return (
-        value._replace(**{n: _fewer_bands(x, axis, bands) for n, x in fields.items()})
+        value._replace(**{n: _fewer_bands(tensor, axis, bands) for n, tensor in fields.items()})
         if fields
         else value
     )

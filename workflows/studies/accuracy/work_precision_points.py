@@ -106,11 +106,14 @@ class PointCache:
     """
 
     def __init__(self, reference: Recipe, store: Store, seeds: int, device: str = "cpu") -> None:
+        """Prepare measurements against ``reference``, with ``seeds`` seeds of the noise (one
+        without noise).
+        """
         self.reference, self.store, self.device = reference, store, device
-        random = any(
+        has_noise = any(
             reference.steps[name].node.random for name in needed(reference, reference.outputs)
         )
-        self.seeds = seeds if random else 1
+        self.seeds = seeds if has_noise else 1
         self._truth: dict[int, dict[str, Any]] = {}
         self._code = Code(store.code_memo)
         self._warm = False
@@ -148,8 +151,12 @@ class PointCache:
         """Return the store key of a measurement: a digest of recipe, reference, engine, seeds,
         device and machine.
         """
-        both = [key_parts(r, self._code, self.device) for r in (recipe, self.reference)]
-        return digest("accuracy", both, self.seeds, self.device, engine(), machine())
+        recipe_and_reference = [
+            key_parts(compared, self._code, self.device) for compared in (recipe, self.reference)
+        ]
+        return digest(
+            "accuracy", recipe_and_reference, self.seeds, self.device, engine(), machine()
+        )
 
     def truth(self, seed: int) -> dict[str, Any]:
         """Return the outputs of the reference with the noise of ``seed``, from the store or
@@ -159,18 +166,24 @@ class PointCache:
             recipe = replace(self.reference, seed=self.reference.seed + seed)
             result = run(recipe, self.store, device=self.device)
             self._truth[seed] = result.values
+            # a process that has computed most of the steps has imported their libraries
             self._warm |= (
                 sum(done.state == "run" for done in result.done.values()) > len(result.done) / 2
             )
         return self._truth[seed]
 
     def _measure(self, recipe: Recipe) -> PointMeasurement:
-        load = os.getloadavg()[0] / (os.cpu_count() or 1) if hasattr(os, "getloadavg") else 0.0
-        ran: dict[str, float] = {}
+        """Run a recipe cold and compare its outputs with the reference; return errors and times."""
+        load_per_core = (
+            os.getloadavg()[0] / (os.cpu_count() or 1) if hasattr(os, "getloadavg") else 0.0
+        )
+        seconds_by_step: dict[str, float] = {}
 
         def watch(event: Event) -> None:
             if event.done is not None and event.done.state == "run":  # again if the engine retries
-                ran[event.step] = ran.get(event.step, 0.0) + event.done.seconds
+                seconds_by_step[event.step] = (
+                    seconds_by_step.get(event.step, 0.0) + event.done.seconds
+                )
 
         try:
             self._warm_up(recipe)
@@ -182,10 +195,10 @@ class PointCache:
         return PointMeasurement(
             errors,
             [result.seconds],
-            sum(ran.values()),
-            load,
+            sum(seconds_by_step.values()),
+            load_per_core,
             result.proof.worst_stated(result.values),
-            ran,
+            seconds_by_step,
         )
 
     def _warm_up(self, recipe: Recipe) -> None:
@@ -194,6 +207,7 @@ class PointCache:
         """
         self.truth(0)
         for step in with_substitutions(recipe, recipe.outputs).steps.values():
+            # digests of the code are kept in the store, and then not timed
             self._code.digest(step.node.fn.__module__)
         self._code.save()
         if not self._warm:
@@ -206,10 +220,11 @@ class PointCache:
         """Return the errors of each output for all seeds, without outputs whose shape differs
         from the reference.
         """
+        # the same noise in recipe and reference
         by_output = compare_outputs(values, self.truth(0))
         for seed in range(1, self.seeds):
-            again = run(replace(recipe, seed=recipe.seed + seed), store, device=self.device)
-            for name, errors in compare_outputs(again.values, self.truth(seed)).items():
+            other_seed = run(replace(recipe, seed=recipe.seed + seed), store, device=self.device)
+            for name, errors in compare_outputs(other_seed.values, self.truth(seed)).items():
                 by_output[name] += errors
         return by_output
 
@@ -220,6 +235,7 @@ def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict
     """
     errors: dict[str, list[float]] = {}
     for name, value in values.items():
+        # an output of another shape cannot be compared
         with suppress(ValueError):
             errors[name] = [error_of(value, truth[name])]
     return errors
@@ -261,11 +277,12 @@ def pareto_front(points: Points) -> list[WorkPrecisionPoint]:
     """Return the Pareto front: settings that no other setting beats in both run time and error,
     the quickest first.
     """
-    line: list[WorkPrecisionPoint] = []
+    front: list[WorkPrecisionPoint] = []
     for point in sorted(points, key=lambda p: (p.seconds, p.most)):
-        if not line or point.most < line[-1].most:
-            line.append(point)
-    return line
+        # quickest first, so that a point has to be more accurate than all before it
+        if not front or point.most < front[-1].most:
+            front.append(point)
+    return front
 
 
 def cheapest(points: Points, tolerance: float) -> WorkPrecisionPoint | None:
@@ -279,5 +296,5 @@ def median_ratio(choices: Iterable[ToleranceChoice]) -> float | None:
     """Return the median over all tolerances of the engine's run time divided by the quickest run
     time.
     """
-    ratios = [c.ratio for c in choices if c.ratio is not None]
+    ratios = [choice.ratio for choice in choices if choice.ratio is not None]
     return median(ratios) if ratios else None

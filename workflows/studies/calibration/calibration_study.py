@@ -64,21 +64,23 @@ class CalibrationStudyResult:
 
     @property
     def refused(self) -> Sequence[str]:
-        return [s.refused for s in self.simulations if s.refused]
+        return [simulation.refused for simulation in self.simulations if simulation.refused]
 
     @property
     def short(self) -> int:
         """Return the number of simulations whose Markov chain is too short for its
         autocorrelation time.
         """
-        return sum(not s.refused and not s.independent for s in self.simulations)
+        return sum(
+            not simulation.refused and not simulation.independent for simulation in self.simulations
+        )
 
     @property
     def stranded(self) -> int:
         """Return the number of simulations in which a walker stays where the posterior is almost
         0.
         """
-        return sum(s.stranded > 0 for s in self.simulations)
+        return sum(simulation.stranded > 0 for simulation in self.simulations)
 
     @property
     def failed(self) -> int:
@@ -86,7 +88,7 @@ class CalibrationStudyResult:
         of simulations.
         """
         return (
-            sum(v.failed for v in self.rank_tests)
+            sum(test.failed for test in self.rank_tests)
             + bool(self.refused)
             + bool(self.short)
             + bool(self.stranded)
@@ -111,10 +113,14 @@ def study(
         simulator = SensorSimulator(
             recipe, store, pixels, sampler or partial(walk_draws, move_name=move), move
         )
-        simulated = list(_simulate_all(simulator, simulations, progress))
-        sensitive, reason = _sensitivity(recipe, move)
+        simulations_done = list(_simulate_all(simulator, simulations, progress))
+        sensitivity_to_prior, reason = _sensitivity(recipe, move)
     result = CalibrationStudyResult(
-        simulated, rank_tests(simulated), simulator.prior_widths(), sensitive, reason
+        simulations_done,
+        rank_tests(simulations_done),
+        simulator.prior_widths(),
+        sensitivity_to_prior,
+        reason,
     )
     content = _document(result)
     return StudyOutcome(digest(content["verdicts"]), content, _report(recipe, result, pixels))
@@ -123,6 +129,7 @@ def study(
 def _simulate_all(
     simulator: SensorSimulator, count: int, progress: Progress
 ) -> Iterator[SensorSimulation]:
+    """Yield each simulation, with a line of progress for some of them."""
     for number in range(count):
         simulation = simulator.simulation(number)
         if simulation.refused:
@@ -142,13 +149,17 @@ def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
     identified = identify(problem, mode)
     if identified.refused:
         return None, identified.refused
-    drawn = walk_draws(problem, mode, recipe.seed, move, _WEIGHED)
-    if not drawn.independent:
-        return None, f"the chain is too short for its autocorrelation time of {drawn.tau:.0f} steps"
-    return sensitivity(problem, drawn.samples, identified.kinds), ""
+    sampled = walk_draws(problem, mode, recipe.seed, move, _WEIGHED)
+    if not sampled.independent:
+        return (
+            None,
+            f"the chain is too short for its autocorrelation time of {sampled.tau:.0f} steps",
+        )
+    return sensitivity(problem, sampled.samples, identified.kinds), ""
 
 
 def _document(result: CalibrationStudyResult) -> dict[str, Any]:
+    """Return the numbers of the study as JSON values."""
     return {
         "failed": result.failed,
         "simulations": len(result.simulations),
@@ -163,6 +174,7 @@ def _document(result: CalibrationStudyResult) -> dict[str, Any]:
 
 
 def _report(recipe: Recipe, result: CalibrationStudyResult, pixels: int) -> StudyReport:
+    """Return the page of the study with its tables."""
     picture = ranks(result.rank_tests)
     sections = [
         _ranks(result, picture, pixels),
@@ -188,24 +200,36 @@ def _line(v: RankTest) -> Sequence[Any]:
 
 
 def _each(result: CalibrationStudyResult) -> Iterator[Sequence[Any]]:
-    for s in result.simulations:
-        for name in s.rank:
-            yield name, s.truth[name], s.rank[name], s.inside[name], s.z[name], s.kinds[name]
+    """Yield the rows of simulations.csv: one for each parameter of each simulation."""
+    for simulation in result.simulations:
+        for name in simulation.rank:
+            yield (
+                name,
+                simulation.truth[name],
+                simulation.rank[name],
+                simulation.inside[name],
+                simulation.z[name],
+                simulation.kinds[name],
+            )
 
 
 def _lead(result: CalibrationStudyResult) -> str:
-    held = "All criteria hold" if not result.failed else f"{result.failed} criteria do not hold"
-    seconds = sum(s.seconds for s in result.simulations) / len(result.simulations)
-    taus = max((s.tau for s in result.simulations), default=0.0)
-    short = f"{result.short} a chain that is too short, {result.stranded} a stranded walker"
+    """Return the summary of the study in a few sentences."""
+    held_text = (
+        "All criteria hold" if not result.failed else f"{result.failed} criteria do not hold"
+    )
+    seconds = sum(simulation.seconds for simulation in result.simulations) / len(result.simulations)
+    longest_time = max((simulation.tau for simulation in result.simulations), default=0.0)
+    chains = f"{result.short} a chain that is too short, {result.stranded} a stranded walker"
     return (
-        f"{held}. Of {len(result.simulations)} simulations of {seconds:.2g} s each,"
-        f" {len(result.refused)} have no posterior, {short}. The longest autocorrelation time is"
-        f" {taus:.0f} steps."
+        f"{held_text}. Of {len(result.simulations)} simulations of {seconds:.2g} s each,"
+        f" {len(result.refused)} have no posterior, {chains}. The longest autocorrelation time is"
+        f" {longest_time:.0f} steps."
     )
 
 
 def _ranks(result: CalibrationStudyResult, picture: bytes, pixels: int) -> Section:
+    """Return the section on the ranks of the true parameters, with the widths of the prior."""
     text = f"""Parameters are drawn from the prior, the recipe's own steps simulate frames of
         {pixels} x {pixels} pixels with these parameters, and {DRAWS} nearly independent draws are
         made from the posterior of the frames. If the posterior is correct, the number of draws
@@ -223,6 +247,7 @@ def _ranks(result: CalibrationStudyResult, picture: bytes, pixels: int) -> Secti
 
 
 def _intervals(result: CalibrationStudyResult) -> Section:
+    """Return the section on p values, coverage and scatter of each parameter."""
     text = """p: the probability that uniform ranks in ten bins are at least as uneven as the ranks
         found; p must exceed 0.01 divided by the number of parameters. Coverage: how often the
         central 90 % of the draws contain the truth; a correct posterior is within the bar in 999 of
@@ -231,27 +256,42 @@ def _intervals(result: CalibrationStudyResult) -> Section:
         about. Told: in how many simulations the frames estimate the parameter, or only limit it."""
     columns = ("parameter", "p", "at least", "coverage", "bar", "z mean", "z sd", "told")
     rows = []
-    for v in result.rank_tests:
-        p = Marked(v.p, "pass" if v.uniform else "fail")
-        coverage = Marked(v.coverage, "pass" if v.covered else "fail")
-        bar = f"{v.bar[0]:.3f} to {v.bar[1]:.3f}"
-        judged = (p, v.least_p, coverage, bar)
-        rows.append((words_of(v.name), *judged, v.z_mean, v.z_sd, _count_kinds(result, v.name)))
+    for test in result.rank_tests:
+        p_cell = Marked(test.p, "pass" if test.uniform else "fail")
+        coverage_cell = Marked(test.coverage, "pass" if test.covered else "fail")
+        limits_text = f"{test.bar[0]:.3f} to {test.bar[1]:.3f}"
+        test_cells = (p_cell, test.least_p, coverage_cell, limits_text)
+        rows.append(
+            (
+                words_of(test.name),
+                *test_cells,
+                test.z_mean,
+                test.z_sd,
+                _count_kinds(result, test.name),
+            )
+        )
     return Section("Coverage", text, columns, rows)
 
 
 def _count_kinds(result: CalibrationStudyResult, name: str) -> str:
-    count = Counter(s.kinds[name] for s in result.simulations if not s.refused)
-    return ", ".join(f"{n} {KINDS[kind] or 'estimated'}" for kind, n in count.most_common())
+    """Return in how many simulations a parameter is estimated, or only limited, as text."""
+    simulations_by_kind = Counter(
+        simulation.kinds[name] for simulation in result.simulations if not simulation.refused
+    )
+    return ", ".join(
+        f"{number} {KINDS[kind] or 'estimated'}"
+        for kind, number in simulations_by_kind.most_common()
+    )
 
 
 def _weighed(result: CalibrationStudyResult) -> Section:
+    """Return the section on the sensitivity to the prior, or on why it is not known."""
     heading = "Sensitivity to the prior"
     if result.sensitivity is None:
         return Section(
             heading, f"The sensitivity to the prior is not known: {result.no_sensitivity}."
         )
-    names, left = list(result.sensitivity.left), result.sensitivity.left
+    names, effective_fractions = list(result.sensitivity.left), result.sensitivity.left
     text = f"""Draws from the posterior of the recipe's own frames and prior, reweighted as if one
         prior were twice as wide. Value: the mean, or the 95 % limit of a parameter that the frames
         only limit. Under each prior: the change of the value, in posterior standard deviations.
@@ -266,15 +306,32 @@ def _weighed(result: CalibrationStudyResult) -> Section:
         *(f"{words_of(name)} x 2" for name in names),
     )
     rows: list[list[Any]] = []
-    for f in result.sensitivity.findings:
-        moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
-        rows.append([words_of(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved])
-    shares = [Marked(share, "warn" if share < ENOUGH else None) for share in left.values()]
+    for finding in result.sensitivity.findings:
+        # changes in standard deviations
+        changes = [
+            None if doubled_value is None else (doubled_value - finding.value) / finding.sd
+            for doubled_value in finding.doubled.values()
+        ]
+        rows.append(
+            [
+                words_of(finding.name),
+                KINDS[finding.kind] or "estimate",
+                finding.value,
+                finding.sd,
+                *changes,
+            ]
+        )
+    shares = [
+        Marked(share, "warn" if share < ENOUGH else None) for share in effective_fractions.values()
+    ]
     rows.append(["draws left", "", None, None, *shares])
     return Section(heading, text, columns, rows)
 
 
 def _refusals(result: CalibrationStudyResult) -> list[Section]:
+    """Return the section with the simulations that have no posterior, and why; none if all have
+    one.
+    """
     if not result.refused:
         return []
     rows = Counter(result.refused).most_common()

@@ -76,17 +76,24 @@ def walk_draws(
     while True:
         walk_until([run], steps, problem.log_posterior)
         chain = run.backend.get_chain(discard=steps // 2)
-        tau = emcee_sampler.autocorrelation_time(chain)
-        apart = max(1, round(min(tau, len(chain))))
-        draws = chain[::apart].reshape(-1, chain.shape[-1])
-        enough = len(chain) >= _APART * tau and len(draws) >= 2 * count and _steady(chain)
-        if enough or steps >= _LONGEST:
+        autocorrelation_time = emcee_sampler.autocorrelation_time(chain)
+        thinning = max(1, round(min(autocorrelation_time, len(chain))))
+        draws = chain[::thinning].reshape(-1, chain.shape[-1])
+        is_long_enough = (
+            len(chain) >= _APART * autocorrelation_time
+            and len(draws) >= 2 * count
+            and _steady(chain)
+        )
+        if is_long_enough or steps >= _LONGEST:
             break
         steps = int(_GROWTH * steps)
     rng = np.random.default_rng([seed, 2])
-    taken = draws[rng.choice(len(draws), min(count, len(draws)), replace=False)]
+    chosen_draws = draws[rng.choice(len(draws), min(count, len(draws)), replace=False)]
     return PosteriorDraws(
-        taken, tau, enough, emcee_sampler.stranded(run.backend.get_log_prob(discard=steps // 2))
+        chosen_draws,
+        autocorrelation_time,
+        is_long_enough,
+        emcee_sampler.stranded(run.backend.get_log_prob(discard=steps // 2)),
     )
 
 
@@ -94,8 +101,15 @@ def _steady(chain: FloatArray) -> bool:
     """Return True if both halves of a Markov chain (step, walker, free parameter) have similar
     standard deviations.
     """
-    early, late = (half.reshape(-1, half.shape[-1]).std(0) for half in np.array_split(chain, 2))
-    return bool(((late < _ALIKE * early) & (early < _ALIKE * late)).all())
+    early_deviation, late_deviation = (
+        half.reshape(-1, half.shape[-1]).std(0) for half in np.array_split(chain, 2)
+    )
+    return bool(
+        (
+            (late_deviation < _ALIKE * early_deviation)
+            & (early_deviation < _ALIKE * late_deviation)
+        ).all()
+    )
 
 
 # --- simulated sensors ----------------------------------------------------------------------------
@@ -174,18 +188,18 @@ class SensorSimulator:
         does not have it.
         """
         key = digest("calibration study", self._key_parts(), number)
-        seed, about = (
+        seed, description = (
             stream_seed(self.recipe.seed, f"calibration study {number}"),
             {"step": "study calibration"},
         )
         return compute_once(
-            self.store, key, SensorSimulation, lambda: self._simulate(seed), about, small=True
+            self.store, key, SensorSimulation, lambda: self._simulate(seed), description, small=True
         )
 
     def truth(self, seed: int) -> dict[str, float]:
         """Draw the parameters of a sensor from the prior."""
-        drawn = self.nominal.coordinates.draw(1, torch.Generator().manual_seed(seed))
-        return {name: float(x) for name, x in drawn.items()}
+        drawn_sensor = self.nominal.coordinates.draw(1, torch.Generator().manual_seed(seed))
+        return {name: float(value) for name, value in drawn_sensor.items()}
 
     def problem(self, truth: Mapping[str, float], seed: int) -> SensorPosterior:
         """Simulate frames of a sensor with the parameters ``truth``, and return the posterior of
@@ -207,6 +221,7 @@ class SensorSimulator:
         return {name: width for name, width in widths if np.isfinite(width)}
 
     def _simulate(self, seed: int) -> SensorSimulation:
+        """Draw a sensor, calibrate its simulated frames, and rank the truth among the draws."""
         began = time.perf_counter()
         truth = self.truth(seed)
         problem = self.problem(truth, seed)
@@ -215,10 +230,10 @@ class SensorSimulator:
             identified = identify(problem, mode)
             if identified.refused:
                 raise ValueError(identified.refused)
-            drawn = self.sampler(problem, mode, seed)
+            posterior_draws = self.sampler(problem, mode, seed)
         except ValueError as error:
             return SensorSimulation(truth, refused=str(error), seconds=time.perf_counter() - began)
-        ranked = rank_truth(problem, truth, drawn)
+        ranked = rank_truth(problem, truth, posterior_draws)
         return replace(ranked, kinds=identified.kinds, seconds=time.perf_counter() - began)
 
     def _levels(self, truth: Mapping[str, float], seed: int) -> Sufficient:
@@ -227,7 +242,8 @@ class SensorSimulator:
         """
         values: dict[str, float] = {}
         for step in self.exposed:
-            values |= {f"{step}.{name}": x for name, x in truth.items()}
+            # every step that exposes frames has the same sensor
+            values |= {f"{step}.{name}": value for name, value in truth.items()}
         recipe = replace(self.recipe, seed=seed)
         with TemporaryDirectory(prefix="neusee-") as folder, torch.no_grad():
             frames = as_function(recipe, *values, outputs=[self._source], store=Store(folder))
@@ -239,17 +255,19 @@ class SensorSimulator:
         then with deviances.
         """
         step = self.recipe.steps[self.nominal.step]
+        # the statistics of the levels, and each free parameter
         free = [self._source, *(f"{step.name}.{name}" for name in self.nominal.names)]
 
         def function(detailed: bool) -> Callable[[Any], Any]:
-            changed = replace(step, params={**step.params, "told": detailed})
-            recipe = replace(self.recipe, steps={**self.recipe.steps, step.name: changed})
+            changed_step = replace(step, params={**step.params, "told": detailed})
+            recipe = replace(self.recipe, steps={**self.recipe.steps, step.name: changed_step})
             return as_function(recipe, *free, outputs=[step.name], store=store)
 
         return function(False), function(True)
 
     def _key_parts(self) -> list[Any]:
-        prior = [x.tolist() for x in self.nominal.coordinates.prior]
+        """Return what decides a simulation, for its store key."""
+        prior = [column.tolist() for column in self.nominal.coordinates.prior]
         code = [engine("studies.calibration.posterior_tests"), versions(), version("emcee")]
         return [self.nominal.key, self.recipe.seed, prior, self.label, *code]
 
@@ -264,15 +282,22 @@ def with_narrow_prior(recipe: Recipe, changed: Mapping[str, Mapping[str, Any]]) 
         for name, law in prior.params.items()
         if name in WIDEST or name == "offset"
     }
-    both = {**changed, prior.name: capped}
+    params_by_step = {**changed, prior.name: capped}
     steps = {
-        n: replace(recipe.steps[n], params={**recipe.steps[n].params, **new})
-        for n, new in both.items()
+        step_name: replace(
+            recipe.steps[step_name], params={**recipe.steps[step_name].params, **new_params}
+        )
+        for step_name, new_params in params_by_step.items()
     }
     return replace(recipe, steps={**recipe.steps, **steps})
 
 
 def _capped(name: str, law: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return the prior (median, width) of a parameter, no wider than `WIDEST`; None without a
+    prior.
+
+    The width of the offset is a standard deviation, that of all others a factor.
+    """
     if law is None:
         return None
     widest = WIDEST[name] if name == "offset" else float(np.exp(WIDEST[name]))
@@ -285,15 +310,15 @@ def rank_truth(
     """Return the rank of each true parameter among the draws, and the difference of posterior
     mean and truth.
     """
-    values = {name: x.numpy() for name, x in problem.parameters(drawn.samples).items()}
+    values = {name: draws.numpy() for name, draws in problem.parameters(drawn.samples).items()}
     simulation = SensorSimulation(
         dict(truth), tau=drawn.tau, independent=drawn.independent, stranded=drawn.stranded
     )
-    for name, x in values.items():
-        simulation.rank[name] = rank = int((x < truth[name]).sum())
+    for name, draws in values.items():
+        simulation.rank[name] = rank = int((draws < truth[name]).sum())
         # exactly 90 % of uniform ranks
-        simulation.inside[name] = _TAIL * (len(x) + 1) <= rank < (1 - _TAIL) * (len(x) + 1)
-        simulation.z[name] = float((x.mean() - truth[name]) / x.std(ddof=1))
+        simulation.inside[name] = _TAIL * (len(draws) + 1) <= rank < (1 - _TAIL) * (len(draws) + 1)
+        simulation.z[name] = float((draws.mean() - truth[name]) / draws.std(ddof=1))
     return simulation
 
 
@@ -342,7 +367,7 @@ def rank_tests(simulations: Sequence[SensorSimulation]) -> list[RankTest]:
     """Return the rank test and coverage test of each parameter, from all simulations that have a
     posterior.
     """
-    sound = [s for s in simulations if not s.refused]
+    sound = [simulated for simulated in simulations if not simulated.refused]
     if not sound:
         raise ValueError(
             "no simulation has a posterior; reason of the first simulation:"
@@ -352,19 +377,25 @@ def rank_tests(simulations: Sequence[SensorSimulation]) -> list[RankTest]:
 
 
 def _rank_test(name: str, sound: Sequence[SensorSimulation], parameters: int) -> RankTest:
+    """Return the tests of one parameter over the simulations ``sound``, which have a posterior.
+
+    ``parameters`` is their number, among which the probability of a false alarm is divided.
+    """
     from scipy.stats import chisquare
 
-    counts, _ = np.histogram([s.rank[name] for s in sound], BINS, (-0.5, DRAWS + 0.5))
-    z = np.array([s.z[name] for s in sound])
+    counts, _ = np.histogram(
+        [simulated.rank[name] for simulated in sound], BINS, (-0.5, DRAWS + 0.5)
+    )
+    z_scores = np.array([simulated.z[name] for simulated in sound])
     return RankTest(
         name,
         tuple(counts.tolist()),
         float(chisquare(counts).pvalue),
         _CHANCE / parameters,
-        float(np.mean([s.inside[name] for s in sound])),
+        float(np.mean([simulated.inside[name] for simulated in sound])),
         coverage_limits(len(sound)),
-        float(z.mean()),
-        float(z.std(ddof=1)) if len(z) > 1 else math.nan,
+        float(z_scores.mean()),
+        float(z_scores.std(ddof=1)) if len(z_scores) > 1 else math.nan,
     )
 
 
@@ -374,8 +405,8 @@ def coverage_limits(count: int) -> tuple[float, float]:
     """
     if count in _ROUNDED:
         return _ROUNDED[count]
-    low, high = chance_band(count, SHARE, _CERTAIN)
-    return low / count, high / count
+    least_count, most_count = chance_band(count, SHARE, _CERTAIN)
+    return least_count / count, most_count / count
 
 
 def chance_band(count: int, share: float, certain: float) -> tuple[float, float]:
@@ -384,8 +415,8 @@ def chance_band(count: int, share: float, certain: float) -> tuple[float, float]
     """
     from scipy.stats import binom
 
-    low, high = binom.interval(certain, count, share)
-    return float(low), float(high)
+    least_count, most_count = binom.interval(certain, count, share)
+    return float(least_count), float(most_count)
 
 
 @drawn
@@ -402,20 +433,22 @@ def ranks(rank_tests: Sequence[RankTest]) -> Any:
 
 
 def _histogram(ax: Any, test: RankTest) -> None:
+    """Draw the histogram of the ranks of one parameter, with the band of chance."""
     total, width = sum(test.counts), (DRAWS + 1) / BINS
-    low, high = chance_band(total, 1.0 / BINS, _DRAWN)
-    ax.axhspan(low, high, color="#cccccc", alpha=0.6, linewidth=0)
+    band_low, band_high = chance_band(total, 1.0 / BINS, _DRAWN)
+    ax.axhspan(band_low, band_high, color="#cccccc", alpha=0.6, linewidth=0)
     ax.axhline(total / BINS, color=_GREY, linewidth=0.8)
     colour = BLUE if test.uniform else VERMILION
+    # middles of the bins
     ax.bar(
-        [(i + 0.5) * width for i in range(BINS)],
+        [(number + 0.5) * width for number in range(BINS)],
         test.counts,
         0.92 * width,
         color=colour,
         alpha=0.85,
     )
     ax.set_title(f"{test.name.replace('_', ' ')}: p = {test.p:.2g}")
-    ax.set_ylim(0, 1.15 * max(high, *test.counts))
+    ax.set_ylim(0, 1.15 * max(band_high, *test.counts))
     ax.grid(False, axis="x")
     ax.set_axisbelow(True)
 
@@ -458,35 +491,54 @@ def sensitivity(
     """Return the sensitivity of each parameter to each prior, from draws ``samples`` (draw, free
     parameter).
     """
-    values = {name: x.numpy() for name, x in problem.parameters(samples).items()}
-    z = problem.whitened(samples)
-    weights = {name: _weights(z[:, i]) for i, name in enumerate(problem.names)}
-    left = {name: float(1.0 / (w @ w) / len(w)) for name, w in weights.items()}
-    even = np.full(len(samples), 1.0 / len(samples))
+    values = {
+        name: parameter_draws.numpy()
+        for name, parameter_draws in problem.parameters(samples).items()
+    }
+    whitened_draws = problem.whitened(samples)
+    weights = {
+        name: _weights(whitened_draws[:, number]) for number, name in enumerate(problem.names)
+    }
+    # effective number of draws 1 / sum(w^2), over their number
+    effective_fractions = {
+        name: float(1.0 / (weights_of_prior @ weights_of_prior) / len(weights_of_prior))
+        for name, weights_of_prior in weights.items()
+    }
+    equal_weights = np.full(len(samples), 1.0 / len(samples))
 
     def of(name: str) -> ParameterSensitivity:
-        x, kind = values[name], kinds[name]
-        again = {
-            by: _value(x, w, kind) if left[by] >= ENOUGH else None for by, w in weights.items()
+        parameter_draws, kind = values[name], kinds[name]
+        reweighted = {
+            widened: _value(parameter_draws, weights_of_prior, kind)
+            if effective_fractions[widened] >= ENOUGH
+            else None
+            for widened, weights_of_prior in weights.items()
         }
-        return ParameterSensitivity(name, kind, _value(x, even, kind), float(x.std(ddof=1)), again)
+        return ParameterSensitivity(
+            name,
+            kind,
+            _value(parameter_draws, equal_weights, kind),
+            float(parameter_draws.std(ddof=1)),
+            reweighted,
+        )
 
-    return Sensitivity([of(name) for name in problem.names], left)
+    return Sensitivity([of(name) for name in problem.names], effective_fractions)
 
 
 def _weights(z: FloatArray) -> FloatArray:
     """Return normalised importance weights of draws ``z`` for a normal prior of standard
     deviation 2 instead of 1.
     """
-    log = 0.5 * (1.0 - 0.25) * z**2
-    ratios = np.exp(log - log.max())
+    # log of N(z; 0, 2) / N(z; 0, 1), but for a constant
+    log_ratios = 0.5 * (1.0 - 0.25) * z**2
+    ratios = np.exp(log_ratios - log_ratios.max())
     weights: FloatArray = ratios / ratios.sum()
     return weights
 
 
 def _value(x: FloatArray, weights: FloatArray, kind: str) -> float:
-    """Return the weighted mean of the draws ``x``, or their 95 % limit if the frames only limit
-    the parameter.
+    """Return the weighted mean of the draws ``x``, or their 95 % limit if the frames only limit the
+    parameter (``kind`` is ``upper`` or ``lower``).
     """
     if kind not in ("upper", "lower"):
         return float(weights @ x)

@@ -75,8 +75,9 @@ def measure_scenes(
                 warm.append(run_cold(recipe, store))
             return _cost(scene, recipe, store)
 
-        decided = engine("studies.leave_out.leave_out_study", "engine.runner"), machine()
-        key = digest("content", key_parts(changed_recipe, code), *decided)
+        code_and_machine = engine("studies.leave_out.leave_out_study", "engine.runner"), machine()
+        key = digest("content", key_parts(changed_recipe, code), *code_and_machine)
+        # scenes of the same steps share a stored result, with another name
         cost = replace(
             compute_once(store, key, SceneCost, compute, {"step": "study leave-out"}), scene=scene
         )
@@ -88,28 +89,34 @@ def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
     """Return the recipe with each simpler scene by name, or the reason why the recipe cannot
     have the scene.
     """
-    recipes: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
-    recipes["as the recipe chooses"] = recipe
+    recipe_of_scene: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
+    recipe_of_scene["as the recipe chooses"] = recipe
     for scene, overrides in _overrides(recipe).items():
         try:
-            recipes[scene] = _changed(recipe, overrides)
+            recipe_of_scene[scene] = _changed(recipe, overrides)
         except RecipeError as error:
-            recipes[scene] = "; ".join(problem.message for problem in error.diagnostics)
-    return recipes
+            recipe_of_scene[scene] = "; ".join(problem.message for problem in error.diagnostics)
+    return recipe_of_scene
 
 
 def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Apply overrides to ``recipe``, and remove the recipe values that no step reads any more."""
+    """Apply overrides to ``recipe``, and remove (``~path``) the recipe values that no step reads
+    any more.
+    """
     try:
         return changed(recipe, overrides)
     except RecipeError as error:
-        unread = [f"~{problem.path}" for problem in error.diagnostics if problem.code == UNREAD]
-        if len(unread) < len(error.diagnostics):
+        removals = [f"~{problem.path}" for problem in error.diagnostics if problem.code == UNREAD]
+        # another mistake, which no removal mends
+        if len(removals) < len(error.diagnostics):
             raise
-        return changed(recipe, [*overrides, *unread])
+        return changed(recipe, [*overrides, *removals])
 
 
 def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
+    """Return the overrides that make each simpler scene; without those that the
+    recipe cannot have.
+    """
     no_laser, clean_window = _no_laser(recipe), _clean_window(recipe)
     lift = [_LIFT] if "cube" in recipe.steps else []
     one_wavelength = [*_bands(recipe, "549 nm", "551 nm", 1), *lift]
@@ -145,15 +152,20 @@ def _window_steps(recipe: Recipe) -> set[str]:
     """
     window = {name for name, step in recipe.steps.items() if step.node.path in _WINDOW}
     for name, step in recipe.steps.items():
-        needs = {
-            w for i, w in step.wires.items() if isinstance(w, str) and i not in step.node.optional
+        required_sources = {
+            source
+            for input_name, source in step.wires.items()
+            if isinstance(source, str) and input_name not in step.node.optional
         }
-        if name in window or not needs.isdisjoint(window):
+        if name in window or not required_sources.isdisjoint(window):
             window.add(name)
     return window
 
 
 def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
+    """Return overrides for ``count`` bands between two wavelengths, or none without
+    such settings.
+    """
     names = ("optics.shortest", "optics.longest", "optics.bands")
     if any(name not in recipe.config.settings for name in names):
         return []
@@ -161,20 +173,23 @@ def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
 
 
 def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
+    """Return the run time of a scene, or why it could not be run."""
     try:
         result = _median_run(recipe, store)
     except RunError as error:
         return SceneCost(scene, float("nan"), 0.0, 0, (), f"{error.step}: {error.cause}")
-    ran = [done.seconds for done in result.done.values() if done.state == "run"]
+    seconds_of_steps = [done.seconds for done in result.done.values() if done.state == "run"]
     left_out = [done.step for done in result.done.values() if done.state == "left out"]
     replaced = [economy.step for economy in result.recipe.substitutions]
-    return SceneCost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
+    return SceneCost(
+        scene, result.seconds, sum(seconds_of_steps), len(seconds_of_steps), (*left_out, *replaced)
+    )
 
 
 def _median_run(recipe: Recipe, store: Store) -> Result:
     """Return the run of median time; a quick one is repeated."""
     results = [run_cold(recipe, store)]
-    while max(r.seconds for r in results) < _QUICK and len(results) < _TIMES:
+    while max(measured.seconds for measured in results) < _QUICK and len(results) < _TIMES:
         results.append(run_cold(recipe, store))
     return sorted(results, key=lambda r: r.seconds)[len(results) // 2]
 
@@ -234,8 +249,8 @@ def study(
     output_errors, rows = comparison.output_errors(), []
     failure = {True: "", False: ": does not hold"}
     for output in output_errors:
-        stated = output.kind if output.bound is None else f"{output.bound:.2g} ({output.kind})"
-        error = f"error {output.rms:.2g}, stated {stated}, tolerance {recipe.tolerance:.2g}"
+        stated_text = output.kind if output.bound is None else f"{output.bound:.2g} ({output.kind})"
+        error = f"error {output.rms:.2g}, stated {stated_text}, tolerance {recipe.tolerance:.2g}"
         progress(f"{output.output}: {error}{failure[output.holds]}")
     for row in comparison.rows():
         rows.append(row)
@@ -250,6 +265,7 @@ def study(
 
 
 def _document(result: LeaveOutResult) -> dict[str, Any]:
+    """Return the rows of outputs, omissions and scenes as JSON values."""
     parts: dict[str, Sequence[Any]] = {
         "outputs": result.output_errors,
         "rows": result.rows,
@@ -259,16 +275,24 @@ def _document(result: LeaveOutResult) -> dict[str, Any]:
 
 
 def _report(recipe: Recipe, result: LeaveOutResult) -> StudyReport:
-    lines = [
+    """Return the page of the study with its tables."""
+    table_rows = [
         *map(_output_line, result.output_errors),
-        *(("omission", *_cells(r), r.holds) for r in result.rows),
+        *(("omission", *_cells(row), row.holds) for row in result.rows),
     ]
-    tables: dict[str, CsvTable] = {"table.csv": (_COLUMNS, lines)}
+    tables: dict[str, CsvTable] = {"table.csv": (_COLUMNS, table_rows)}
     sections, picture = [_outputs(recipe, result), _omissions(result)], None
     if result.costs:
         scenes = [
-            (c.scene, c.seconds, c.computing, c.steps, "; ".join(c.left_out), c.refused)
-            for c in result.costs
+            (
+                cost.scene,
+                cost.seconds,
+                cost.computing,
+                cost.steps,
+                "; ".join(cost.left_out),
+                cost.refused,
+            )
+            for cost in result.costs
         ]
         tables["costs.csv"] = (
             ("scene", "seconds", "computing", "steps", "left out", "refused"),
@@ -276,9 +300,9 @@ def _report(recipe: Recipe, result: LeaveOutResult) -> StudyReport:
         )
         sections.append(_scenes(result))
         picture = sections[-1].picture
-    title, shown = f"{recipe.name}: omissions", (*SHOWN, "tolerance")
+    title, shown_facts = f"{recipe.name}: omissions", (*SHOWN, "tolerance")
     return StudyReport(
-        title, _lead(recipe, result), sections, {"content": picture}, tables, shown=shown
+        title, _lead(recipe, result), sections, {"content": picture}, tables, shown=shown_facts
     )
 
 
@@ -287,13 +311,14 @@ def _output_line(p: OutputError) -> Sequence[Any]:
 
 
 def _cells(r: OmissionRow) -> tuple[Any, ...]:
-    worst = max(r.outputs.values(), default=0.0)
-    return r.name, r.kind, r.taken, r.bound, r.rms, r.largest, worst, r.back, r.seconds
+    worst_output = max(r.outputs.values(), default=0.0)
+    return r.name, r.kind, r.taken, r.bound, r.rms, r.largest, worst_output, r.back, r.seconds
 
 
 def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
-    taken = [row for row in result.rows if row.taken]
-    worst = max((p.rms for p in result.output_errors), default=0.0)
+    """Return the summary of the study in a few sentences."""
+    chosen = [row for row in result.rows if row.taken]
+    worst_error = max((output.rms for output in result.output_errors), default=0.0)
     held = (
         "All stated errors hold"
         if not result.failed
@@ -301,16 +326,25 @@ def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
     )
     return (
         f"{held}. Of {len(result.rows)} possible omissions with a known bound, the recipe chooses"
-        f" {len(taken)} at its tolerance of {recipe.tolerance:.2g}. The largest error of an output"
-        f" is then {worst:.2g}, relative to the full computation."
+        f" {len(chosen)} at its tolerance of {recipe.tolerance:.2g}. The largest error of an output"
+        f" is then {worst_error:.2g}, relative to the full computation."
     )
 
 
 def _outputs(recipe: Recipe, result: LeaveOutResult) -> Section:
+    """Return the section that compares the error of each output with the stated error."""
     tolerance = recipe.tolerance
     rows = [
-        (p.output, p.bound, p.kind, p.rms, p.largest, tolerance, _HELD[p.holds])
-        for p in result.output_errors
+        (
+            output.output,
+            output.bound,
+            output.kind,
+            output.rms,
+            output.largest,
+            tolerance,
+            _HELD[output.holds],
+        )
+        for output in result.output_errors
     ]
     text = """Each output of the recipe with the chosen omissions, compared with the full
         computation (`--exact`). The error is the root mean square of the difference over the
@@ -329,6 +363,7 @@ def _outputs(recipe: Recipe, result: LeaveOutResult) -> Section:
 
 
 def _omissions(result: LeaveOutResult) -> Section:
+    """Return the section with the bound and the errors of each omission alone."""
     text = """Each omission alone, with all other steps computed in full. A step that is left out
         returns its input. Light that is not added is replaced by zero. For a summed image, only the
         sums over bands that later steps need are convolved. The stated bound and the error are
@@ -359,30 +394,51 @@ def _omissions(result: LeaveOutResult) -> Section:
 
 
 def _scenes(result: LeaveOutResult) -> Section:
+    """Return the section with the run time of each simpler scene."""
     text = """The run time from an empty store, in one process: the median of up to three runs. The
         first row is the full computation; in the other rows the engine may leave out steps that the
         scene does not need."""
-    full = result.costs[0].seconds
+    full_seconds = result.costs[0].seconds
     rows = []
-    for c in result.costs:
-        seconds = (None, None) if c.refused else (c.seconds, c.seconds / full)
-        rows.append((c.scene, *seconds, c.steps, c.refused or ", ".join(c.left_out) or "nothing"))
+    for cost in result.costs:
+        seconds = (None, None) if cost.refused else (cost.seconds, cost.seconds / full_seconds)
+        rows.append(
+            (
+                cost.scene,
+                *seconds,
+                cost.steps,
+                cost.refused or ", ".join(cost.left_out) or "nothing",
+            )
+        )
     columns = ("scene", "seconds", "share of full", "steps", "left out or made cheaper")
-    timed = [c for c in result.costs if math.isfinite(c.seconds)]
+    measured_costs = [cost for cost in result.costs if math.isfinite(cost.seconds)]
     return Section(
-        "Run time of simpler scenes", text, columns, rows, _bars(timed) if timed else None
+        "Run time of simpler scenes",
+        text,
+        columns,
+        rows,
+        _bars(measured_costs) if measured_costs else None,
     )
 
 
 @drawn
 def _bars(costs: Sequence[SceneCost]) -> Any:
+    """Draw the run time of each scene: in the steps, and beside them."""
     figure, axes = canvas(8.0, 0.42 * len(costs) + 1.3)
     ax = axes[0, 0]
     names = [cost.scene for cost in costs]
-    inside = [min(cost.computing, cost.seconds) for cost in costs]
-    ax.barh(names, inside, color=BLUE, label="in the steps")
-    beside = [cost.seconds - in_steps for cost, in_steps in zip(costs, inside, strict=True)]
-    ax.barh(names, beside, left=inside, color=_WAITING, label="in the engine and the store")
+    seconds_in_steps = [min(cost.computing, cost.seconds) for cost in costs]
+    ax.barh(names, seconds_in_steps, color=BLUE, label="in the steps")
+    seconds_outside = [
+        cost.seconds - in_steps for cost, in_steps in zip(costs, seconds_in_steps, strict=True)
+    ]
+    ax.barh(
+        names,
+        seconds_outside,
+        left=seconds_in_steps,
+        color=_WAITING,
+        label="in the engine and the store",
+    )
     for row, cost in enumerate(costs):
         ax.annotate(f" {cost.seconds:.3g} s", (cost.seconds, row), va="center", fontsize=9)
     ax.invert_yaxis()

@@ -62,6 +62,7 @@ class Omission:
         for name in readers & recipe.steps.keys():
             steps[name] = replace(recipe.steps[name], wires=self._wires(recipe.steps[name]))
         outputs = tuple(self.value_of(name) for name in recipe.outputs)
+        # replacing steps come before the steps that read them
         order = in_order({name: step.sources for name, step in steps.items()}, steps)
         return replace(recipe, steps={name: steps[name] for name in order}, outputs=outputs)
 
@@ -72,12 +73,16 @@ class Omission:
         return self.exchange.get(step, step) if self.kind == "handed on" else step
 
     def _wires(self, reader: Step) -> Mapping[str, Wire]:
+        """Return the wires of a step that reads an omitted result, without it or with its
+        replacement.
+        """
         if self.kind == "not added":
             return without(reader, dict.fromkeys(self.exchange))
         return {i: _exchanged(wire, self.exchange) for i, wire in reader.wires.items()}
 
 
 def _exchanged(wire: Wire, exchange: Mapping[str, str]) -> Wire:
+    """Return a wire with the names of replaced steps exchanged."""
     if isinstance(wire, tuple):
         return tuple(exchange.get(name, name) for name in wire)
     return wire and exchange.get(wire, wire)
@@ -91,46 +96,52 @@ def omissions(full: Recipe, result: Result, facts_of: FactsOf) -> Iterator[Omiss
     yield from _stand_ins(full, order, result)
     for name in order:
         done = result.done.get(name)
-        why = done.why if done is not None and done.state == "left out" else ""
-        taken = done is None or bool(why)
+        reason = done.why if done is not None and done.state == "left out" else ""
+        # a step that the run did not reach was left out with the step that reads it
+        is_chosen = done is None or bool(reason)
         for omission in (
             _handed_on(full.steps[name], facts_of),
             _not_added(full, order, name, facts_of),
         ):
             if omission is not None and math.isfinite(omission.bound):
-                yield replace(omission, taken=taken, why=why or omission.why)
+                yield replace(omission, taken=is_chosen, why=reason or omission.why)
 
 
 def _handed_on(step: Step, facts_of: FactsOf) -> Omission | None:
+    """Return the omission of a step whose first input takes the place of its result; None if its
+    node states no bound.
+    """
     if step.node.hooks.skip_bound is None:
         return None
     decision = judge(step, step.params, facts_of, math.inf)
-    why = f"changes at most {decision.bound:.2g}"
+    reason = f"changes at most {decision.bound:.2g}"
     return Omission(
         step.name,
         "handed on",
         {step.name: decision.instead},
         decision.bound,
-        why,
-        False,
+        reason,
+        False,  # `omissions` finds out whether the run has it
         (step.name,),
     )
 
 
 def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -> Omission | None:
+    """Return the omission of light or dirt that other steps only add; None if it has no bound."""
     step = recipe.steps[name]
     readers = _adding(recipe, order, name) if step.node.hooks.zero_bound is not None else ()
     if not readers:
         return None
     largest = _largest(step, facts_of)
-    why = f"no element above {largest:.2g}"
+    reason = f"no element above {largest:.2g}"
+    # not chosen (False) until `omissions` knows
     return Omission(
         name,
         "not added",
         {name: ""},
         _share(largest, recipe, readers, facts_of),
-        why,
-        False,
+        reason,
+        False,  # `omissions` finds out whether the run has it
         readers,
     )
 
@@ -141,24 +152,24 @@ def _stand_ins(full: Recipe, order: list[str], result: Result) -> Iterator[Omiss
     All images are replaced together, because two images that a step compares must be computed in
     the same way.
     """
-    sparse = with_substitutions(replace(full, exact=False, estimates=False), full.outputs)
-    standing = [economy for economy in sparse.substitutions if economy.instead]
-    if not standing:
+    with_sums = with_substitutions(replace(full, exact=False, estimates=False), full.outputs)
+    replacements = [economy for economy in with_sums.substitutions if economy.instead]
+    if not replacements:
         return
-    exchange = {economy.step: economy.instead for economy in standing}
-    beside = tuple(step for name, step in sparse.steps.items() if name not in full.steps)
+    exchange = {economy.step: economy.instead for economy in replacements}
+    sums = tuple(step for name, step in with_sums.steps.items() if name not in full.steps)
     instead = set(exchange.values())
-    readers = tuple(n for n in order if not instead.isdisjoint(sparse.steps[n].sources))
-    taken = {economy.step for economy in result.recipe.substitutions} >= exchange.keys()
+    readers = tuple(n for n in order if not instead.isdisjoint(with_sums.steps[n].sources))
+    is_chosen = {economy.step for economy in result.recipe.substitutions} >= exchange.keys()
     yield Omission(
         name=", ".join(exchange),
         kind="stands in",
         exchange=exchange,
         bound=math.nan,
-        why=standing[0].why,
-        taken=taken,
+        why=replacements[0].why,
+        taken=is_chosen,
         at=readers,
-        beside=beside,
+        beside=sums,
     )
 
 
@@ -166,7 +177,11 @@ def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
     """Return the steps that read the result of step ``name`` if all of these steps only add the
     result, else none.
     """
-    readers = [recipe.steps[n] for n in order if name in recipe.steps[n].sources]
+    readers = [
+        recipe.steps[reader_name]
+        for reader_name in order
+        if name in recipe.steps[reader_name].sources
+    ]
     return (
         tuple(reader.name for reader in readers)
         if all(_only_adds(reader, name) for reader in readers)
@@ -175,12 +190,13 @@ def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
 
 
 def _only_adds(reader: Step, name: str) -> bool:
-    read = {
-        i
-        for i, wire in reader.wires.items()
+    """Return True if a step reads the result of another one only at inputs that it adds."""
+    inputs_read = {
+        input_name
+        for input_name, wire in reader.wires.items()
         if name == wire or (isinstance(wire, tuple) and name in wire)
     }
-    return read <= {light for light, *_ in reader.node.additive_inputs}
+    return inputs_read <= {added_input for added_input, *_ in reader.node.additive_inputs}
 
 
 def _largest(step: Step, facts_of: FactsOf) -> float:
@@ -188,14 +204,15 @@ def _largest(step: Step, facts_of: FactsOf) -> float:
     step's inputs.
     """
     assert step.node.hooks.zero_bound is not None
-    facts = [_facts(step.wires.get(name), facts_of) for name in step.node.inputs]
+    input_statistics = [_facts(step.wires.get(name), facts_of) for name in step.node.inputs]
     try:
-        return float(step.node.hooks.zero_bound(*facts, **step.params))
+        return float(step.node.hooks.zero_bound(*input_statistics, **step.params))
     except Exception as error:
         raise RunError(step, [], error) from error
 
 
 def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | None] | None:
+    """Return the statistics of the result, or of each result, that a wire carries."""
     return [facts_of(name) for name in wire] if isinstance(wire, tuple) else wire and facts_of(wire)  # type: ignore[return-value]
 
 
@@ -207,8 +224,8 @@ def _share(largest: float, recipe: Recipe, readers: tuple[str, ...], facts_of: F
         return 0.0
     if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in readers):
         return math.inf
-    top = min(_top(facts_of(name)) for name in readers)
-    return largest / top if top > 0 else math.inf
+    smallest_of_largest = min(_top(facts_of(name)) for name in readers)
+    return largest / smallest_of_largest if smallest_of_largest > 0 else math.inf
 
 
 def _top(facts: TensorStats | None) -> float:
@@ -289,15 +306,15 @@ class OmissionComparison:
         errors = []
         for name in self.recipe.outputs:
             value, reference = self.chosen.values[name], self.truth.values[name]
-            rms, proved = error_of(value, reference), self.chosen.proof
-            bound, kind = proved.stated_of(name), proved.kind_of(name)
+            rms_error, proof = error_of(value, reference), self.chosen.proof
+            bound, kind = proof.stated_of(name), proof.kind_of(name)
             # beyond the tolerance only by what noise and rounding add, which the stated error
             # counts
-            holds = rms <= (
+            holds = rms_error <= (
                 self.recipe.tolerance if bound is None or self.chosen.recipe.exact else bound
             )
             errors.append(
-                OutputError(name, bound, kind, rms, largest_error(value, reference), holds)
+                OutputError(name, bound, kind, rms_error, largest_error(value, reference), holds)
             )
         return errors
 
@@ -306,30 +323,42 @@ class OmissionComparison:
         that are not stored.
         """
         for omission in self.found:
-            alone = omission.applied_to(self.full)
-            key, compute = self._key(omission, alone), partial(self._row, omission, alone)
+            with_omission = omission.applied_to(self.full)
+            key, compute = (
+                self._key(omission, with_omission),
+                partial(self._row, omission, with_omission),
+            )
             yield compute_once(self.store, key, OmissionRow, compute, _ABOUT)
 
     def _row(self, omission: Omission, alone: Recipe) -> OmissionRow:
+        """Compare the recipe with one omission alone with the full computation, and return the
+        result.
+        """
         result = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))
         bounds = _bounds(omission, result)
-        pairs = {
+        values_and_truths = {
             name: (result.values[omission.value_of(name)], self.truth.value(name))
             for name in omission.at
         }
-        largest = max(largest_error(*pair) for pair in pairs.values())
+        largest = max(
+            largest_error(*value_and_truth) for value_and_truth in values_and_truths.values()
+        )
         return OmissionRow(
             omission.name,
             omission.kind,
             omission.why,
             omission.taken,
             max(bounds.values(), default=math.inf),
-            max(error_of(*pair) for pair in pairs.values()),
+            # rms at the step, or at the steps that read it
+            max(error_of(*value_and_truth) for value_and_truth in values_and_truths.values()),
             largest,
+            # the errors of the outputs, and their change when the omission is undone
             *self._reached(omission, alone, changed=largest > 0),
+            # s of the omitted steps, less those of the replacing ones
             self._seconds(self.full, alone) - self._seconds(alone, self.full),
             all(
-                self._holds(omission, bound, pairs[name], result) for name, bound in bounds.items()
+                self._holds(omission, bound, values_and_truths[name], result)
+                for name, bound in bounds.items()
             ),
         )
 
@@ -354,24 +383,30 @@ class OmissionComparison:
             steps = [self.full.steps[name] for name in omission.exchange]
             cheaper = [result.recipe.steps[name] for name in omission.exchange.values()]
             readers = [self.full.steps[name] for name in omission.at]
-            rtol = [max(step.node.rtol for step in group) for group in (steps, cheaper, readers)]
-            return error_of(*pair) <= bound + sum(rtol)
+            documented_errors = [
+                max(step.node.rtol for step in group) for group in (steps, cheaper, readers)
+            ]
+            return error_of(*pair) <= bound + sum(documented_errors)
         if omission.kind == "handed on" and self.full.steps[omission.name].node.random:
             return least_error(*pair) <= bound
+        # 1e-5 is rounding of the bound itself
         return largest_error(*pair) <= bound * (1 + 1e-5) + (_ROUNDING if bound else 0.0)
 
     def _back(self, omission: Omission) -> float:
         """Return the largest change of an output when one of the engine's omissions of steps is
         undone.
         """
-        recipe = self.full
+        without_this = self.full
         # from the last, because the input that is handed on may be left out too
-        for other in reversed(self.found):
-            if other.taken and other is not omission:
-                recipe = other.applied_to(recipe)
+        for chosen_omission in reversed(self.found):
+            if chosen_omission.taken and chosen_omission is not omission:
+                without_this = chosen_omission.applied_to(without_this)
         return max(
             _errors(
-                self.recipe.outputs, recipe.outputs, run(recipe, self.store), self.chosen
+                self.recipe.outputs,
+                without_this.outputs,
+                run(without_this, self.store),
+                self.chosen,
             ).values()
         )
 
@@ -379,14 +414,23 @@ class OmissionComparison:
         """Return the run time of the steps that ``recipe`` needs and recipe ``other`` does
         not need.
         """
+        # keys of results in the store, which knows their run times
         keys = resolve(recipe, order := needed(recipe, recipe.outputs), self.store).keys
-        only = [keys[name] for name in order if name not in set(needed(other, other.outputs))]
-        return sum(float((self.store.about(key) or {}).get("seconds", 0.0)) for key in only)
+        not_in_other = [
+            keys[name] for name in order if name not in set(needed(other, other.outputs))
+        ]
+        return sum(float((self.store.about(key) or {}).get("seconds", 0.0)) for key in not_in_other)
 
     def _key(self, omission: Omission, alone: Recipe) -> Key:
+        """Return the store key of a comparison: output keys of both recipes and of
+        the chosen one.
+        """
         outputs = [
-            [resolve(r, needed(r, r.outputs), self.store).keys[n] for n in r.outputs]
-            for r in (self.full, alone)
+            [
+                resolve(compared, needed(compared, compared.outputs), self.store).keys[output]
+                for output in compared.outputs
+            ]
+            for compared in (self.full, alone)
         ]
         chosen_keys = [[name, self.chosen.keys[name]] for name in self.recipe.outputs]
         details = [omission.name, omission.kind, repr(omission.bound), omission.why, omission.taken]
@@ -402,7 +446,10 @@ def _errors(
     in ``result``.
     """
     pairs = zip(names, others, strict=True)
-    return {name: error_of(result.values[other], truth.values[name]) for name, other in pairs}
+    return {
+        name: error_of(result.values[name_in_result], truth.values[name])
+        for name, name_in_result in pairs
+    }
 
 
 def _bounds(omission: Omission, result: Result) -> dict[str, float]:
@@ -423,12 +470,12 @@ def least_error(value: Tensor, reference: Tensor) -> float:
     error of the mean is as large as the mean. The largest element is random too, so four standard
     deviations are added to it.
     """
-    change = value.double() - reference.double()
-    squares, count = change.square(), change.numel()
-    mean = float(squares.mean())
-    error = float(squares.std()) / math.sqrt(count) if count > 1 else mean
-    top = float(reference.double().abs().max()) + _SURE * (
-        float(change.std()) if count > 1 else 0.0
+    difference = value.double() - reference.double()
+    squared_errors, count = difference.square(), difference.numel()
+    mean_square = float(squared_errors.mean())
+    standard_error = float(squared_errors.std()) / math.sqrt(count) if count > 1 else mean_square
+    largest = float(reference.double().abs().max()) + _SURE * (
+        float(difference.std()) if count > 1 else 0.0
     )
-    lowest = math.sqrt(max(mean - _SURE * error, 0.0))
-    return lowest / top if top > 0 else lowest
+    lower_limit = math.sqrt(max(mean_square - _SURE * standard_error, 0.0))
+    return lower_limit / largest if largest > 0 else lower_limit

@@ -68,14 +68,21 @@ def winning_region(result: ProtectionResult) -> Any:
     """
     figure, axes = canvas(11.6, 4.1, 1, len(DRAWN), sharey=True)
     levels = sorted({result.own, *LEVELS})
-    light, level = (np.geomspace(min(ends), max(ends), _FINE) for ends in (LIGHTS, levels))
+    light_axis, level = (
+        np.geomspace(min(axis_values), max(axis_values), _FINE) for axis_values in (LIGHTS, levels)
+    )
     for ax, measure in zip(axes[0], DRAWN, strict=True):
         gain = _between(
-            levels, [[result.gain[level][n][measure] for n in LIGHTS] for level in levels]
+            levels,
+            [
+                [result.gain[level][scene_light][measure] for scene_light in LIGHTS]
+                for level in levels
+            ],
         )
-        shown = ax.pcolormesh(
-            light,
+        colour_mesh = ax.pcolormesh(
+            light_axis,
             level,
+            # beyond the colours
             gain.clip(-_MOST, _MOST),
             cmap="RdBu",
             vmin=-_MOST,
@@ -83,18 +90,26 @@ def winning_region(result: ProtectionResult) -> Any:
             shading="gouraud",
             rasterized=True,
         )
+        # the line on which no rival wins
         if gain.max() > 0 > gain.min():
-            ax.contour(light, level, gain, levels=[0.0], colors=BLACK, linewidths=1.4)
+            ax.contour(light_axis, level, gain, levels=[0.0], colors=BLACK, linewidths=1.4)
         if gain.max() > 0:
             ax.contourf(
-                light, level, gain, levels=[0.0, gain.max() + 1], colors="none", hatches=["//"]
+                light_axis,
+                level,
+                gain,
+                levels=[0.0, gain.max() + 1],
+                colors="none",
+                hatches=["//"],
             )
         ax.axhline(result.own, color=BLACK, linewidth=1.0, linestyle="--")
         ax.set(xscale="log", yscale="log", xlabel=_LIGHT, title=MEASURES[measure])
         ax.title.set_fontsize(10)
         ax.grid(False)
     axes[0, 0].set_ylabel("protection: share of the harm\nof the open lens")
-    figure.colorbar(shown, ax=list(axes[0]), label="gain of the mask (dB)", pad=0.01, extend="both")
+    figure.colorbar(
+        colour_mesh, ax=list(axes[0]), label="gain of the mask (dB)", pad=0.01, extend="both"
+    )
     return figure
 
 
@@ -102,9 +117,13 @@ def _between(levels: Sequence[float], gain: Sequence[Sequence[float]]) -> Any:
     """Return a gain (level, light) on a finer grid, by linear interpolation in the logarithms of
     level and light.
     """
-    x, y = (np.linspace(np.log(min(ends)), np.log(max(ends)), _FINE) for ends in (LIGHTS, levels))
-    rows = np.array([np.interp(x, np.log(LIGHTS), row) for row in gain])
-    return np.array([np.interp(y, np.log(levels), column) for column in rows.T]).T
+    log_light, log_level = (
+        np.linspace(np.log(min(axis_values)), np.log(max(axis_values)), _FINE)
+        for axis_values in (LIGHTS, levels)
+    )
+    # first along the light, then along the level
+    at_lights = np.array([np.interp(log_light, np.log(LIGHTS), row) for row in gain])
+    return np.array([np.interp(log_level, np.log(levels), column) for column in at_lights.T]).T
 
 
 @drawn
@@ -113,20 +132,30 @@ def gain_with_bounds(result: ProtectionResult) -> Any:
     of its gain in NEQ.
     """
     figure, axes = canvas(11.0, 4.2, 1, 2)
-    left, right = axes[0]
+    gain_axis, bound_axis = axes[0]
     for measure, colour in zip(DRAWN, (BLUE, ORANGE, VERMILION), strict=True):
-        low, up = np.quantile([result.drawn[n][measure] for n in LIGHTS], [0.05, 0.95], axis=1)
-        left.fill_between(LIGHTS, low, up, color=colour, alpha=0.3, linewidth=0)
-        own = [result.gain[result.own][n][measure] for n in LIGHTS]
-        left.plot(LIGHTS, own, color=colour, label=MEASURES[measure])
-    left.axhline(0.0, color=BLACK, linewidth=0.9)
-    left.set(xscale="log", xlabel=_LIGHT, ylabel="gain of the mask (dB)")
-    left.set_title("over the best stop-and-filter, all wavelengths")
-    left.legend()
-    value, bound = (10 * np.log10([result.bound[n][i] for n in LIGHTS]) for i in (0, 1))
-    right.plot(LIGHTS, value, color=VERMILION, label="this mask")
-    right.plot(LIGHTS, bound, color=BLACK, linestyle="--", label="bound of every mask of this peak")
-    right.fill_between(
+        low_gain, high_gain = np.quantile(
+            [result.drawn[scene_light][measure] for scene_light in LIGHTS], [0.05, 0.95], axis=1
+        )
+        gain_axis.fill_between(LIGHTS, low_gain, high_gain, color=colour, alpha=0.3, linewidth=0)
+        gain_at_own_protection = [
+            result.gain[result.own][scene_light][measure] for scene_light in LIGHTS
+        ]
+        gain_axis.plot(LIGHTS, gain_at_own_protection, color=colour, label=MEASURES[measure])
+    gain_axis.axhline(0.0, color=BLACK, linewidth=0.9)
+    gain_axis.set(xscale="log", xlabel=_LIGHT, ylabel="gain of the mask (dB)")
+    gain_axis.set_title("over the best stop-and-filter, all wavelengths")
+    gain_axis.legend()
+    # pairs of gain and bound, in dB
+    gain_of_mask, bound = (
+        10 * np.log10([result.bound[scene_light][column] for scene_light in LIGHTS])
+        for column in (0, 1)
+    )
+    bound_axis.plot(LIGHTS, gain_of_mask, color=VERMILION, label="this mask")
+    bound_axis.plot(
+        LIGHTS, bound, color=BLACK, linestyle="--", label="bound of every mask of this peak"
+    )
+    bound_axis.fill_between(
         LIGHTS,
         bound,
         max(bound) + 3,
@@ -135,12 +164,12 @@ def gain_with_bounds(result: ProtectionResult) -> Any:
         linewidth=0,
         label="no mask can be here",
     )
-    right.axhline(0.0, color=BLACK, linewidth=0.9)
-    right.set(
+    bound_axis.axhline(0.0, color=BLACK, linewidth=0.9)
+    bound_axis.set(
         xscale="log", xlabel=_LIGHT, ylabel="gain in mean NEQ (dB)", ylim=(None, max(bound) + 3)
     )
-    right.set_title("one wavelength, whole lens band, no glare")
-    right.legend(loc="upper right")
+    bound_axis.set_title("one wavelength, whole lens band, no glare")
+    bound_axis.legend(loc="upper right")
     return figure
 
 
@@ -150,12 +179,13 @@ def neq_by_frequency(result: ProtectionResult) -> Any:
     figure, axes = canvas(7.4, 4.8)
     ax = axes[0, 0]
     for name, label in _labels(result).items():
-        colour, line = _LOOKS[name]
-        ax.plot(result.radius, result.curves[name], color=colour, linestyle=line, label=label)
-    top = max(map(max, result.curves.values()))
+        colour, line_style = _LOOKS[name]
+        ax.plot(result.radius, result.curves[name], color=colour, linestyle=line_style, label=label)
+    largest_neq = max(map(max, result.curves.values()))
     ax.set(
         yscale="log",
-        ylim=(top * 1e-8, top * 3),
+        # eight decades below the largest value
+        ylim=(largest_neq * 1e-8, largest_neq * 3),
         xlabel="spatial frequency (cycles a pixel)",
         ylabel="NEQ (e-)",
     )
@@ -171,27 +201,29 @@ def under_attack(result: ProtectionResult) -> Any:
     """
     figure, axes = canvas(11.0, 4.4, 1, 2)
     for name, label in _labels(result).items():
-        colour, line = _LOOKS[name]
-        _band(axes[0, 0], result.attack[name]["information"], colour, line, label)
+        colour, line_style = _LOOKS[name]
+        _band(axes[0, 0], result.attack[name]["information"], colour, line_style, label)
         _band(
             axes[0, 1],
-            [[100 * x for x in row] for row in result.attack[name]["seen"]],
+            [[100 * share for share in row] for row in result.attack[name]["seen"]],
             colour,
-            line,
+            line_style,
             label,
         )
-    for ax, shown in zip(
+    for ax, axis_label in zip(
         axes[0], ("information (bits a pixel)", "pixels that are not full (%)"), strict=True
     ):
         ax.set(
             xscale="log",
             xlabel="strength of the laser (wells in the brightest pixel, open lens)",
-            ylabel=shown,
+            ylabel=axis_label,
         )
         ax.xaxis.label.set_fontsize(9)
     axes[0, 0].set_yscale("log")
-    top = max(max(map(max, measures["information"])) for measures in result.attack.values())
-    axes[0, 0].set_ylim(top * 1e-5, top * 2)
+    most_information = max(
+        max(map(max, measures["information"])) for measures in result.attack.values()
+    )
+    axes[0, 0].set_ylim(most_information * 1e-5, most_information * 2)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -201,17 +233,22 @@ def _labels(result: ProtectionResult) -> dict[str, str]:
     rivals are one curve.
     """
     labels = {name: name for name in _LOOKS if name in result.rivals}
-    both, stop = (result.rivals[name].said for name in ("stop and filter", "smaller stop"))
-    if both == stop:
+    stop_and_filter, stop_alone = (
+        result.rivals[name].said for name in ("stop and filter", "smaller stop")
+    )
+    if stop_and_filter == stop_alone:
         del labels["smaller stop"]
         labels["stop and filter"] = "smaller stop, the best stop and filter"
     return labels
 
 
 def _band(ax: Any, rows: Sequence[Sequence[float]], colour: str, line: str, name: str) -> None:
-    low, middle, up = np.quantile(np.maximum(rows, 1e-12), [0.05, 0.5, 0.95], axis=0)
-    ax.fill_between(STRENGTHS, low, up, color=colour, alpha=0.15, linewidth=0)
-    ax.plot(STRENGTHS, middle, color=colour, linestyle=line, label=name)
+    """Draw median and middle 90 % of the draws (draw, strength) over the strength of the laser."""
+    low_values, median, high_values = np.quantile(
+        np.maximum(rows, 1e-12), [0.05, 0.5, 0.95], axis=0
+    )
+    ax.fill_between(STRENGTHS, low_values, high_values, color=colour, alpha=0.15, linewidth=0)
+    ax.plot(STRENGTHS, median, color=colour, linestyle=line, label=name)
 
 
 # --- protection page ------------------------------------------------------------------------------
@@ -236,9 +273,10 @@ def crossing(gains: Sequence[float]) -> float:
     """
     if gains[0] <= 0:
         return 0.0
-    for (n, low), (m, high) in pairwise(zip(LIGHTS, gains, strict=True)):
-        if high <= 0:
-            return float(n * (m / n) ** (low / (low - high)))
+    for (dimmer, gain_before), (brighter, gain_after) in pairwise(zip(LIGHTS, gains, strict=True)):
+        if gain_after <= 0:
+            # linear in the logarithm of the light
+            return float(dimmer * (brighter / dimmer) ** (gain_before / (gain_before - gain_after)))
     return math.inf
 
 
@@ -253,12 +291,17 @@ def quotable(result: ProtectionResult, camera: str, light: str) -> str:
         " quiet frame:"
     ]
     parts += [f"{_said(result, measure)};" for measure in DRAWN]
+    # a full stop in place of the last semicolon
     parts[-1] = parts[-1][:-1] + "."
-    names = [name for name in ("mask", "stop and filter", "grey filter") if name in result.lost]
-    halves = ", ".join(f"{_interval(result.lost[name], '.1e')} behind the {name}" for name in names)
+    shown_rivals = [
+        name for name in ("mask", "stop and filter", "grey filter") if name in result.lost
+    ]
+    halving = ", ".join(
+        f"{_interval(result.lost[name], '.1e')} behind the {name}" for name in shown_rivals
+    )
     parts.append(
         f"Under attack, at {ATTACKED_AT:g} e- a pixel, half of the information of the quiet frame"
-        f" is gone at a strength of {halves}. {_why(result)} Intervals hold 90 % of the draws of"
+        f" is gone at a strength of {halving}. {_why(result)} Intervals hold 90 % of the draws of"
         " wavelength, direction, defocus, dirt and scattered light."
     )
     return " ".join(parts)
@@ -266,24 +309,31 @@ def quotable(result: ProtectionResult, camera: str, light: str) -> str:
 
 def _said(result: ProtectionResult, measure: str) -> str:
     """Return where the mask wins by one measure: medians over the draws, with intervals."""
-    draws = np.array([result.drawn[n][measure] for n in LIGHTS])
-    own = np.median(draws, axis=1)
-    light = crossing(own.tolist())
+    draws = np.array([result.drawn[scene_light][measure] for scene_light in LIGHTS])
+    gain = np.median(draws, axis=1)
+    # the scene light at which the median gain falls to 0
+    light = crossing(gain.tolist())
     if light == 0.0:
-        return f"by the {MEASURES[measure]} it loses at every light, by {-own.max():.1f} dB or more"
-    peak = int(own.argmax())
-    by = f"by {own[peak]:.1f} dB ({_ends(draws[peak], '.1f')}) at {LIGHTS[peak]:g} e- a pixel"
+        return (
+            f"by the {MEASURES[measure]} it loses at every light, by {-gain.max():.1f} dB or more"
+        )
+    # index of the light with the largest gain
+    best = int(gain.argmax())
+    by = f"by {gain[best]:.1f} dB ({_ends(draws[best], '.1f')}) at {LIGHTS[best]:g} e- a pixel"
     if math.isinf(light):
         return f"by the {MEASURES[measure]} it wins at every light, {by}"
-    where = [crossing(row) for row in draws.T.tolist()]
+    # the same light in each draw
+    lights = [crossing(row) for row in draws.T.tolist()]
     return (
-        f"by the {MEASURES[measure]} it wins below {light:.0f} e- a pixel ({_ends(where, '.0f')}),"
+        f"by the {MEASURES[measure]} it wins below {light:.0f} e- a pixel ({_ends(lights, '.0f')}),"
         f" {by}"
     )
 
 
 def _why(result: ProtectionResult) -> str:
+    """Return why a mask gains in little light only, with its bound in much and in little light."""
     brightest = LIGHTS[-1]
+    # a pair of gain and bound: here in dB
     bound = 10 * math.log10(result.bound[brightest][1])
     dark = 10 * math.log10(result.bound[LIGHTS[0]][1])
     return (
@@ -295,12 +345,14 @@ def _why(result: ProtectionResult) -> str:
 
 
 def _interval(values: Sequence[float], form: str) -> str:
+    """Return the median of values with the middle 90 %, in the number format ``form``."""
     return f"{format(float(np.median(values)), form)} ({_ends(values, form)})"
 
 
 def _ends(values: Any, form: str) -> str:
-    low, up = np.quantile(values, [0.05, 0.95], method="nearest")
-    return f"{format(float(low), form)} to {format(float(up), form)}"
+    """Return the middle 90 % of values as text, in the number format ``form``."""
+    low_end, high_end = np.quantile(values, [0.05, 0.95], method="nearest")
+    return f"{format(float(low_end), form)} to {format(float(high_end), form)}"
 
 
 def sections(
@@ -324,6 +376,7 @@ def sections(
 
 
 def _region(result: ProtectionResult, picture: bytes) -> Section:
+    """Return the section on where the mask wins."""
     text = f"""Gain in dB of the mask, with the best stop and filter of its own, over the best
         stop-and-filter without a mask, at equal protection. Hatched: the mask wins. The dashed line
         is the protection of the mask alone, {result.own:.3g}. Above this line the mask protects
@@ -332,6 +385,9 @@ def _region(result: ProtectionResult, picture: bytes) -> Section:
 
 
 def _quiet(result: ProtectionResult, picture: bytes) -> Section:
+    """Return the section on the picture of a quiet frame: the gain by each measure
+    and scene light.
+    """
     text = """Insured: the laser may come, and the frame is quiet. The gain of the mask at its own
         protection. Error: error variance of the Wiener-filtered picture of a natural scene.
         Detection: d' of an ideal observer who knows place and shape. Shaded: the middle 90 % of the
@@ -340,49 +396,66 @@ def _quiet(result: ProtectionResult, picture: bytes) -> Section:
         the whole lens band and without glare, and not for a part of the band."""
     columns = ("scene light (e-)", *(f"{name} (dB)" for name in MEASURES), "rival by error")
     rows = [
-        (n, *(round(result.gain[result.own][n][m], 2) for m in MEASURES), result.stops[n].said)
-        for n in LIGHTS
+        (
+            scene_light,
+            *(round(result.gain[result.own][scene_light][measure], 2) for measure in MEASURES),
+            result.stops[scene_light].said,
+        )
+        for scene_light in LIGHTS
     ]
     return Section("Question 1: the everyday picture", text, columns, rows, picture)
 
 
 def _attack(result: ProtectionResult, picture: bytes) -> Section:
+    """Return the section on the information that is left under attack."""
     text = f"""The laser is there, and the scene has {ATTACKED_AT:g} e- a pixel. A strength of 1
         fills one pixel behind the open lens. A pixel that scene and glare fill holds no
         information; in every other pixel glare adds shot noise, fixed-pattern noise and what is
         wrong when glare is subtracted. Lines are medians of the draws, bands the middle 90 %."""
     columns = ("protection", "strength that halves the information", "5 %", "95 %")
     rows = [
-        (name, float(np.median(x)), *map(float, np.quantile(x, [0.05, 0.95])))
-        for name, x in result.lost.items()
+        (name, float(np.median(strengths)), *map(float, np.quantile(strengths, [0.05, 0.95])))
+        for name, strengths in result.lost.items()
     ]
     return Section("Question 2: under attack", text, columns, rows, picture)
 
 
 def _fields(result: ProtectionResult) -> Section:
+    """Return the section with the pixels that are not full, for fields of several sizes."""
     text = """Share of the pixels in % that are not full, for a laser in the middle of fields of
         several sizes. A wider field is left out where the samples of the recipe's pupil do not
         carry it: `optics=neusee` carries 2048."""
     indices = (4, 8, 11)
-    strengths = [10 ** (0.75 * i) for i in indices]
-    columns = ("protection", "field (pixels)", *(f"strength {s:.0e}" for s in strengths))
+    # elements of `STRENGTHS`
+    strengths = [10 ** (0.75 * index) for index in indices]
+    columns = (
+        "protection",
+        "field (pixels)",
+        *(f"strength {strength:.0e}" for strength in strengths),
+    )
     rows = []
     for name, sides in result.fields.items():
         for side, shares in sides.items():
-            rows.append((name, side, *(round(100 * shares[i], 2) for i in indices)))
+            rows.append((name, side, *(round(100 * shares[index], 2) for index in indices)))
     return Section("Fields", text, columns, rows)
 
 
 def _rivals(result: ProtectionResult) -> Section:
+    """Return the section with the rivals, and the error of their filtered pictures."""
     text = """Each rival of the mask, with the error of the filtered picture (dB below the contrast
         of the scene, more is better). The notch protects at one wavelength only. Tint: the largest
         share of light that a channel receives over the smallest."""
-    columns = ("rival", "made of", *(f"error at {n:g} e- (dB)" for n in LIGHTS[::2]), "tint")
+    columns = (
+        "rival",
+        "made of",
+        *(f"error at {scene_light:g} e- (dB)" for scene_light in LIGHTS[::2]),
+        "tint",
+    )
     rows = [
         (
             name,
             rival.said,
-            *(round(result.quiet[name][n]["error"], 2) for n in LIGHTS[::2]),
+            *(round(result.quiet[name][scene_light]["error"], 2) for scene_light in LIGHTS[::2]),
             result.tint[name],
         )
         for name, rival in result.rivals.items()
@@ -423,7 +496,8 @@ def study(
     glare that is subtracted wrongly.
     """
     camera = ProtectionCamera.of(recipe, store, bands)
-    side = min(int(n) for n in camera.lens["shape"])
+    side = min(int(pixels) for pixels in camera.lens["shape"])
+    # the four letters of the text are nearly four times as wide as high
     if 4 * size > side:
         raise ValueError(
             f"a text {size:g} pixels high is wider than the PSF window of {side}; give a smaller"
@@ -434,14 +508,15 @@ def study(
     bench = FrontBench(camera, store, settings)
     conditions = draw_conditions(draws, recipe.seed, _LAWS)
     result = measure_protection(bench, conditions, camera.pixel(prnu, residual), progress)
-    said = quotable(result, recipe.name, light)
-    content = {"light": light, "paragraph": said, **_document(result, conditions)}
+    paragraph = quotable(result, recipe.name, light)
+    content = {"light": light, "paragraph": paragraph, **_document(result, conditions)}
     options = {"light": light, "size": size, "prnu": prnu, "residual": residual}
-    report = _report(recipe, result, said, _notes(camera, options))
+    report = _report(recipe, result, paragraph, _notes(camera, options))
     return StudyOutcome(digest(content["gain"], content["lost"], options), content, report)
 
 
 def _document(result: ProtectionResult, conditions: Sequence[Condition]) -> dict[str, Any]:
+    """Return the numbers of the study as JSON values."""
     return {
         "protection": result.own,
         "draws": [condition.plain for condition in conditions],
@@ -451,7 +526,8 @@ def _document(result: ProtectionResult, conditions: Sequence[Condition]) -> dict
         "drawn": _texts(result.drawn),
         "quiet": {name: _texts(rows) for name, rows in result.quiet.items()},
         "bound": {
-            f"{n:g}": {"gain": pair[0], "bound": pair[1]} for n, pair in result.bound.items()
+            f"{scene_light:g}": {"gain": gain_and_bound[0], "bound": gain_and_bound[1]}
+            for scene_light, gain_and_bound in result.bound.items()
         },
         "largest glare": _texts(result.forbidden),
         "lost": {name: list(rows) for name, rows in result.lost.items()},
@@ -461,12 +537,14 @@ def _document(result: ProtectionResult, conditions: Sequence[Condition]) -> dict
 
 
 def _texts(rows: Any) -> dict[str, Any]:
+    """Return rows by number as rows by text, for JSON."""
     return {f"{key:g}": value for key, value in rows.items()}
 
 
 def _report(
     recipe: Recipe, result: ProtectionResult, said: str, notes: Sequence[str]
 ) -> StudyReport:
+    """Return the page of the study, with its table and the paragraph to quote."""
     pictures = draw_pictures(result)
     return StudyReport(
         f"{recipe.name}: equal protection",
@@ -480,25 +558,30 @@ def _report(
 
 
 def _rows(result: ProtectionResult) -> Iterator[Sequence[Any]]:
+    """Yield the rows of table.csv: the gain at each protection, scene light and measure."""
     import numpy as np
 
     for level, lights in result.gain.items():
-        for n in LIGHTS:
+        for scene_light in LIGHTS:
             for measure in MEASURES:
-                ends: Sequence[Any] = ("", "")
+                interval: Sequence[Any] = ("", "")
+                # draws are known at the mask's own protection alone
                 if level == result.own and measure in DRAWN:
-                    ends = np.quantile(result.drawn[n][measure], [0.05, 0.95]).tolist()
-                yield level, n, measure, lights[n][measure], *ends
+                    interval = np.quantile(
+                        result.drawn[scene_light][measure], [0.05, 0.95]
+                    ).tolist()
+                yield level, scene_light, measure, lights[scene_light][measure], *interval
 
 
 def _notes(camera: ProtectionCamera, options: dict[str, Any]) -> list[str]:
+    """Return what the study assumes, one text for each subject."""
     noise = camera.noise
     harm = (
         "peak of the PSF"
         if options["light"] == "pulse"
         else f"heat of the hottest pixel after {_CONTINUOUS:g} s"
     )
-    laws = ", ".join(f"{name.replace('_', ' ')} {law}" for name, law in asdict(_LAWS).items())
+    laws_text = ", ".join(f"{name.replace('_', ' ')} {law}" for name, law in asdict(_LAWS).items())
     wavelengths = len(camera.laser_bands.centres)
     return [
         (
@@ -512,7 +595,7 @@ def _notes(camera: ProtectionCamera, options: dict[str, Any]) -> list[str]:
             f" {_VARIANCE:g}. Targets: {options['size']:g} pixels high, contrast {CONTRAST:g}."
             " Every rival is restored by the Wiener filter for its own PSF and its noise."
         ),
-        f"Unknown in the draws: {laws}. Directions are shares of the field.",
+        f"Unknown in the draws: {laws_text}. Directions are shares of the field.",
         (
             "Left out: ghosts, blooming, edges of the picture, contrast that scattered light of the"
             " scene takes, a response of the eye, and masks that would be designed for this camera."

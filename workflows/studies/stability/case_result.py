@@ -49,7 +49,7 @@ def is_picture(x: Tensor) -> bool:
 
 
 def pictures_in(values: Sequence[Any]) -> list[Tensor]:
-    return [x for x in tensors_in(list(values)) if is_picture(x)]
+    return [tensor for tensor in tensors_in(list(values)) if is_picture(tensor)]
 
 
 def run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -> Any:
@@ -72,10 +72,10 @@ def as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 
 
 def in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    wide = each_tensor(lambda x: x.double() if x.is_floating_point() else x, list(inputs))
-    precise = {"precision": "double"} if "precision" in step.params else {}
+    double_inputs = each_tensor(lambda x: x.double() if x.is_floating_point() else x, list(inputs))
+    precision = {"precision": "double"} if "precision" in step.params else {}
     with _CountedInSingle():
-        return run(step, step.node.fn, wide, seed, **precise)
+        return run(step, step.node.fn, double_inputs, seed, **precision)
 
 
 def rounded(inputs: Sequence[Any], draw: int, unit: float) -> list[Any]:
@@ -85,11 +85,12 @@ def rounded(inputs: Sequence[Any], draw: int, unit: float) -> list[Any]:
     rng = torch.Generator().manual_seed(draw)
 
     def move(x: Tensor) -> Tensor:
-        off = 2 * torch.rand(x.shape, generator=rng, dtype=torch.float64) - 1
-        return x.double() * (1 + 4 * unit * off)
+        # from -1 to 1
+        offset = 2 * torch.rand(x.shape, generator=rng, dtype=torch.float64) - 1
+        return x.double() * (1 + 4 * unit * offset)
 
-    moved: list[Any] = each_tensor(lambda x: move(x) if is_picture(x) else x, list(inputs))
-    return moved
+    moved_inputs: list[Any] = each_tensor(lambda x: move(x) if is_picture(x) else x, list(inputs))
+    return moved_inputs
 
 
 # --- gradient error -------------------------------------------------------------------------------
@@ -102,7 +103,9 @@ LEAST = math.sqrt(torch.finfo(torch.float32).tiny)
 
 
 def finite(value: Any) -> bool:
-    return all(bool(x.isfinite().all()) for x in tensors_in(value) if x.is_floating_point())
+    return all(
+        bool(tensor.isfinite().all()) for tensor in tensors_in(value) if tensor.is_floating_point()
+    )
 
 
 def slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
@@ -110,11 +113,11 @@ def slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
     has no gradient.
     """
     with torch.enable_grad():
-        usual = _slopes(inputs, lambda values: run(step, step.node.fn, values, seed))
-        if usual is None:
+        gradients = _slopes(inputs, lambda values: run(step, step.node.fn, values, seed))
+        if gradients is None:
             return None
-        truth = true_slopes(step, inputs, seed)
-    return _apart(usual, truth, inputs)
+        true_gradients = true_slopes(step, inputs, seed)
+    return _apart(gradients, true_gradients, inputs)
 
 
 def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int, unit: float) -> float:
@@ -122,35 +125,51 @@ def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int, unit: flo
     up to four ``unit``.
     """
     with torch.enable_grad():
-        truth = true_slopes(step, inputs, seed)
-        drawn = [true_slopes(step, inputs, seed, moved=(draw, unit)) for draw in range(draws)]
+        true_gradients = true_slopes(step, inputs, seed)
+        moved_gradients = [
+            true_slopes(step, inputs, seed, moved=(draw, unit)) for draw in range(draws)
+        ]
     return max(
-        (_apart(slopes, truth, inputs) for slopes in drawn if slopes and finite(slopes)),
+        (
+            _apart(gradients, true_gradients, inputs)
+            for gradients in moved_gradients
+            if gradients and finite(gradients)
+        ),
         default=0.0,
     )
 
 
 def _apart(usual: list[Tensor], truth: list[Tensor] | None, inputs: list[Any]) -> float:
-    """Return the largest error of gradients by each picture, or infinity if the reference
-    gradient is not finite.
+    """Return the largest error of the gradients, one for each picture of the inputs.
+
+    It is infinite if the reference gradient is not finite, and 0 if it exceeds the numbers that the
+    type of the picture has.
     """
     if truth is None or not finite(truth):
         return math.inf
     pictures = pictures_in(inputs)
-    tops = [
-        torch.finfo(torch.float32 if x.dtype == torch.float64 else x.dtype).max for x in pictures
+    largest_numbers = [
+        torch.finfo(torch.float32 if picture.dtype == torch.float64 else picture.dtype).max
+        for picture in pictures
     ]
-    if any(bool((g.abs() >= top).any()) for g, top in zip(truth, tops, strict=True)):
+    if any(
+        bool((true_gradient.abs() >= largest_number).any())
+        for true_gradient, largest_number in zip(truth, largest_numbers, strict=True)
+    ):
         return 0.0  # the gradient exceeds the range of the picture's type
-    return max(over(a, b, _slight(x)) for a, b, x in zip(usual, truth, pictures, strict=True))
+    return max(
+        over(gradient, true_slope, _slight(picture))
+        for gradient, true_slope, picture in zip(usual, truth, pictures, strict=True)
+    )
 
 
 def _slight(picture: Tensor) -> float:
     """Return the least divisor of a gradient error: the gradient of a normalised mean, or the
     least normal number.
     """
-    top = float(picture.detach().double().abs().max())
-    return max(1.0 / (picture.numel() * max(top, LEAST)), torch.finfo(picture.dtype).tiny)
+    largest = float(picture.detach().double().abs().max())
+    # the mean over the largest element has the gradient 1 / (count x largest)
+    return max(1.0 / (picture.numel() * max(largest, LEAST)), torch.finfo(picture.dtype).tiny)
 
 
 def true_slopes(
@@ -163,16 +182,19 @@ def true_slopes(
     """Return the gradients of the reference in float64: of the tensor ``number`` of the result, at
     inputs that `rounded` moved.
     """
-    wide = (
+    double_inputs = (
         rounded(inputs, *moved)
         if moved
         else each_tensor(lambda x: x.double() if is_picture(x) else x, inputs)
     )
+    # gradients are those of the pictures, which are not pictures in float64
     leaves = [
-        id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if is_picture(x)
+        id(double_tensor)
+        for double_tensor, tensor in zip(tensors_in(double_inputs), tensors_in(inputs), strict=True)
+        if is_picture(tensor)
     ]
     reference = step.node.hooks.reference
-    ways = (
+    computations = (
         [partial(run, step, reference), partial(in_double, step)]
         if reference
         else [partial(in_double, step)]
@@ -182,8 +204,9 @@ def true_slopes(
         value = way(values, seed)
         return value if number is None else tensors_in(value)[number]
 
-    for way in ways:
-        slopes = _slopes(wide, partial(of, way), leaves)
+    # the reference of a node may have no gradient: then the node in float64
+    for computation in computations:
+        slopes = _slopes(double_inputs, partial(of, computation), leaves)
         if slopes:
             return slopes
     return None
@@ -193,32 +216,39 @@ def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Te
     """Return the gradients of ``fn(inputs)`` with respect to the pictures, or to the tensors
     with these ``ids``.
     """
-    leaves: list[Tensor] = []
+    pictures: list[Tensor] = []
 
     def leaf(x: Tensor) -> Tensor:
         if is_picture(x) if ids is None else id(x) in ids:
-            leaves.append(x.detach().clone().requires_grad_())
-            return leaves[-1]
+            pictures.append(x.detach().clone().requires_grad_())
+            return pictures[-1]
         return x
 
-    total = _weighed(fn(each_tensor(leaf, inputs)))
-    if total is None or not leaves:
+    weighted_sum = _weighed(fn(each_tensor(leaf, inputs)))
+    if weighted_sum is None or not pictures:
         return None
-    grads = torch.autograd.grad(total, leaves, allow_unused=True)
-    return [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, grads, strict=True)]
+    gradients = torch.autograd.grad(weighted_sum, pictures, allow_unused=True)
+    # a picture that the result does not depend on has the gradient 0
+    return [
+        torch.zeros_like(picture) if gradient is None else gradient
+        for picture, gradient in zip(pictures, gradients, strict=True)
+    ]
 
 
 def _weighed(value: Any) -> Tensor | None:
     """Return the sum of all differentiable results, each scaled to about 1 and multiplied by
     fixed random weights.
     """
-    parts = [
-        (x.double() * _weight(x) / _near(x)).sum() for x in tensors_in(value) if x.requires_grad
+    weighted_sums = [
+        (tensor.double() * _weight(tensor) / _near(tensor)).sum()
+        for tensor in tensors_in(value)
+        if tensor.requires_grad
     ]
-    return torch.stack(parts).sum() if parts else None
+    return torch.stack(weighted_sums).sum() if weighted_sums else None
 
 
 def _weight(x: Tensor) -> Tensor:
+    """Return random weights from 0 to 1, the same for each tensor of a shape."""
     return torch.rand(x.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float32)
 
 
@@ -229,9 +259,10 @@ def _near(x: Tensor) -> float:
     A loss near 0 is a difference of pictures, whose gradient does not shrink with the loss. In a
     loss of 1e4, terms of 1e4 cancel where the gradient is 0, and leave their rounding.
     """
-    top = float(x.detach().double().abs().max())
-    top = top if x.ndim else max(top, 1.0)
-    return 10.0 ** round(math.log10(top) + 0.123) if LEAST < top < math.inf else 1.0
+    largest = float(x.detach().double().abs().max())
+    largest = largest if x.ndim else max(largest, 1.0)
+    # the exponent rises at 2.4 times each power of ten
+    return 10.0 ** round(math.log10(largest) + 0.123) if LEAST < largest < math.inf else 1.0
 
 
 def terms(step: Step, inputs: list[Any], truth: Tensor, number: int, seed: int) -> float:
@@ -242,20 +273,27 @@ def terms(step: Step, inputs: list[Any], truth: Tensor, number: int, seed: int) 
     the position of ``truth`` among the scalars that the step returns.
     """
     with torch.enable_grad():
-        slopes = true_slopes(step, inputs, seed, number) or []
-    moved = sum(
-        float((x.double() * g).abs().sum())
-        for x, g in zip(pictures_in(inputs), slopes, strict=False)
+        gradients = true_slopes(step, inputs, seed, number) or []
+    sum_of_terms = sum(
+        float((picture.double() * gradient).abs().sum())
+        for picture, gradient in zip(pictures_in(inputs), gradients, strict=False)
     )
-    return moved * _near(truth) / float(_weight(truth)) if math.isfinite(moved) else 0.0
+    # `true_slopes` is that of a sum in which the scalar has a weight and a scale
+    return (
+        sum_of_terms * _near(truth) / float(_weight(truth)) if math.isfinite(sum_of_terms) else 0.0
+    )
 
 
 def over(a: Tensor, b: Tensor, floor: float) -> float:
     """Return the largest difference of ``a`` and ``b``, divided by the larger of the largest
     ``|b|`` and ``floor``.
     """
-    error, top = largest_error(a, b), float(b.detach().double().abs().max()) if b.numel() else 0.0
-    return error if top >= floor else error * (top or 1.0) / floor
+    error, largest = (
+        largest_error(a, b),
+        float(b.detach().double().abs().max()) if b.numel() else 0.0,
+    )
+    # `largest_error` is over the largest |b|: here over the floor
+    return error if largest >= floor else error * (largest or 1.0) / floor
 
 
 # --- case result ----------------------------------------------------------------------------------
@@ -328,8 +366,9 @@ def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
     """
     changed = list(inputs)
     if case.alike:
+        # only steps that compare two pictures
         if len(changed) < 2 or not all(
-            isinstance(x, Tensor) and is_picture(x) for x in changed[:2]
+            isinstance(tensor, Tensor) and is_picture(tensor) for tensor in changed[:2]
         ):
             return None
         changed[1] = changed[0].clone()
@@ -345,6 +384,10 @@ def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
 
 
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
+    """Compare result and gradient of a step with its reference, and return the outcome.
+
+    A gradient beyond its bound is excused where rounding of the inputs alone moves it as much.
+    """
     with torch.no_grad():
         value, truth = as_used(step, inputs, seed), _truth(step, inputs, seed)
     if not finite(value):
@@ -352,15 +395,25 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     bound = max([step.node.rtol, ROUNDING, *_roundings(value)])
     error = _dim_error(value, truth) if _is_dim(step, case) else _error(value, truth)
     # of a gradient, as of its input
-    coarse = max(_roundings(inputs), default=0.0)
-    slope, slope_bound = slope_error(step, inputs, seed), max(SLOPE, _STEEPER * bound, 2 * coarse)
-    if error > bound and all(x.ndim == 0 for x in tensors_in(truth)):
+    input_rounding = max(_roundings(inputs), default=0.0)
+    gradient_error, gradient_bound = (
+        slope_error(step, inputs, seed),
+        max(SLOPE, _STEEPER * bound, 2 * input_rounding),
+    )
+    # scalars: terms that cancel count with their sum
+    if error > bound and all(tensor.ndim == 0 for tensor in tensors_in(truth)):
         error = _error_beside_terms(step, inputs, value, truth, seed)
-    steep = slope is not None and slope > slope_bound and not coarse
+    beyond_bound = (
+        gradient_error is not None and gradient_error > gradient_bound and not input_rounding
+    )
     precision, unit = _input_precision(step)
-    moved = moved_slopes(step, inputs, seed, _ROUNDINGS, unit) if steep else 0.0
-    cell = _marked(error, bound, slope, max(slope_bound, moved))
-    return _ill_conditioned(cell, moved, precision) if moved > slope_bound else cell
+    moved_by_rounding = moved_slopes(step, inputs, seed, _ROUNDINGS, unit) if beyond_bound else 0.0
+    cell = _marked(error, bound, gradient_error, max(gradient_bound, moved_by_rounding))
+    return (
+        _ill_conditioned(cell, moved_by_rounding, precision)
+        if moved_by_rounding > gradient_bound
+        else cell
+    )
 
 
 def _input_precision(step: Step) -> tuple[str, float]:
@@ -377,7 +430,7 @@ def _overflow(truth: Any) -> Cell:
 
 def _roundings(value: Any) -> list[float]:
     """Return the largest relative rounding of each tensor in half precision, and 0 of others."""
-    return [HALVES.get(x.dtype, 0.0) for x in tensors_in(value)]
+    return [HALVES.get(tensor.dtype, 0.0) for tensor in tensors_in(value)]
 
 
 def _is_dim(step: Step, case: Case) -> bool:
@@ -388,8 +441,12 @@ def _is_dim(step: Step, case: Case) -> bool:
 def _error_beside_terms(step: Step, inputs: list[Any], value: Any, truth: Any, seed: int) -> float:
     """Return the largest error of scalars, each relative to the sum of its terms."""
     errors = []
-    for i, (a, b) in enumerate(zip(tensors_in(value), tensors_in(truth), strict=True)):
-        errors.append(over(a, b, max(LEAST, terms(step, inputs, b, i, seed))))
+    for number, (scalar, true_scalar) in enumerate(
+        zip(tensors_in(value), tensors_in(truth), strict=True)
+    ):
+        errors.append(
+            over(scalar, true_scalar, max(LEAST, terms(step, inputs, true_scalar, number, seed)))
+        )
     return max(errors)
 
 
@@ -405,6 +462,7 @@ def _ill_conditioned(cell: Cell, moved: float, precision: str) -> Cell:
 
 
 def _truth(step: Step, inputs: list[Any], seed: int) -> Any:
+    """Return the result of the node's own reference, or of the node in float64 without one."""
     reference = step.node.hooks.reference
     return run(step, reference, inputs, seed) if reference else in_double(step, inputs, seed)
 
@@ -413,14 +471,14 @@ def _marked(error: float, bound: float, slope: float | None, steeper: float) -> 
     """Return the outcome of a test: pass if errors are below half of their bounds, warn up to
     the bounds, else fail.
     """
-    shares = [error / bound] if slope is None else [error / bound, slope / steeper]
-    within = all(share <= 1.0 for share in shares)  # NaN is not within its bound
-    near = within and max(shares) > _NEAR
+    error_over_bound = [error / bound] if slope is None else [error / bound, slope / steeper]
+    within = all(share <= 1.0 for share in error_over_bound)  # NaN is not within its bound
+    near_bound = within and max(error_over_bound) > _NEAR
     mark: Mark = "pass" if within else "fail"
-    if near:
+    if near_bound:
         mark = "warn"
     return Cell(
-        mark, "near its bound" * near, error, bound, slope, None if slope is None else steeper
+        mark, "near its bound" * near_bound, error, bound, slope, None if slope is None else steeper
     )
 
 
@@ -428,25 +486,37 @@ def _error(value: Any, truth: Any) -> float:
     """Return the largest difference of a result from the reference, relative to the reference's
     largest element.
     """
-    pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
-    return max((over(a, b, LEAST) for a, b in pairs), default=0.0)
+    results_and_truths = list(zip(tensors_in(value), tensors_in(truth), strict=True))
+    return max(
+        (over(tensor, true_tensor, LEAST) for tensor, true_tensor in results_and_truths),
+        default=0.0,
+    )
 
 
 def _dim_error(value: Any, truth: Any) -> float:
     """Return the largest error of the dim elements of a result, relative to the brightest dim
     element.
     """
-    worst = 0.0
-    for a, b in zip(tensors_in(value), tensors_in(truth), strict=True):
-        dim = b.abs() < _DIM * b.abs().max() if b.is_floating_point() and b.ndim >= 2 else None
+    largest_dim_error = 0.0
+    for tensor, true_tensor in zip(tensors_in(value), tensors_in(truth), strict=True):
+        dim = (
+            true_tensor.abs() < _DIM * true_tensor.abs().max()
+            if true_tensor.is_floating_point() and true_tensor.ndim >= 2
+            else None
+        )
         if dim is not None and bool(dim.any()):
-            worst = max(worst, largest_error(a[dim], b[dim]))
-    return worst
+            largest_dim_error = max(largest_dim_error, largest_error(tensor[dim], true_tensor[dim]))
+    return largest_dim_error
 
 
 def _fits_single_precision(truth: Any) -> bool:
-    top = torch.finfo(torch.float32).max
-    return all(bool((x.abs() < top).all()) for x in tensors_in(truth) if x.is_floating_point())
+    """Return True if all numbers of a result are below the largest number in single precision."""
+    largest_number = torch.finfo(torch.float32).max
+    return all(
+        bool((tensor.abs() < largest_number).all())
+        for tensor in tensors_in(truth)
+        if tensor.is_floating_point()
+    )
 
 
 # --- NaN and infinity -----------------------------------------------------------------------------
@@ -457,14 +527,14 @@ def _seen(step: Step, inputs: Sequence[Any], changed: list[Any], case: Case, see
     input picture.
     """
     notes = [
-        _one_seen(step, _with_one_changed(i, inputs, changed), seed)
-        for i in range(len(pictures_in(inputs)))
+        _one_seen(step, _with_one_changed(number, inputs, changed), seed)
+        for number in range(len(pictures_in(inputs)))
     ]
     hidden = [note for note in notes if note.startswith("hidden")]
-    stated = stated_words(step.node, case.name)
-    if hidden and stated is None:
+    documented = stated_words(step.node, case.name)
+    if hidden and documented is None:
         return Cell("fail", hidden[0])
-    return Cell("pass", f"as stated: {stated}" if hidden else "; ".join(dict.fromkeys(notes)))
+    return Cell("pass", f"as stated: {documented}" if hidden else "; ".join(dict.fromkeys(notes)))
 
 
 def _one_seen(step: Step, inputs: list[Any], seed: int) -> str:
@@ -478,16 +548,27 @@ def _one_seen(step: Step, inputs: list[Any], seed: int) -> str:
             return f"refused: {refused}"
         if not finite(value):
             return "seen"
-        bad = next(float(x[~x.isfinite()][0]) for x in pictures_in(inputs) if not finite(x))
-        if math.isnan(bad):
+        not_finite = next(
+            float(tensor[~tensor.isfinite()][0])
+            for tensor in pictures_in(inputs)
+            if not finite(tensor)
+        )
+        if math.isnan(not_finite):
             return "hidden: a finite result in spite of NaN"
-        large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), inputs)
-        limit = run(step, step.node.fn, large, seed)
-        same = finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
-        return "like a large number" if same else "hidden: another result than for a large number"
+        large_inputs = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), inputs)
+        with_large_number = run(step, step.node.fn, large_inputs, seed)
+        like_large_number = finite(with_large_number) and largest_error(
+            value, with_large_number
+        ) <= max(step.node.rtol, ROUNDING)
+        return (
+            "like a large number"
+            if like_large_number
+            else "hidden: another result than for a large number"
+        )
 
 
 def _with_one_changed(which: int, inputs: Sequence[Any], changed: Sequence[Any]) -> list[Any]:
-    swap = {id(pictures_in(inputs)[which]): pictures_in(changed)[which]}
-    only: list[Any] = each_tensor(lambda x: swap.get(id(x), x), list(inputs))
-    return only
+    """Return the inputs with one picture, number ``which``, as the case changed it."""
+    replacement = {id(pictures_in(inputs)[which]): pictures_in(changed)[which]}
+    with_one: list[Any] = each_tensor(lambda x: replacement.get(id(x), x), list(inputs))
+    return with_one

@@ -77,8 +77,13 @@ def stated_words(node: Node, case: str) -> str | None:
     """Return the words about NaN in the docstring of a node, or None if the docstring does not
     have these words.
     """
-    words = _STATED.get((node.path, case))
-    return words if words is not None and words in " ".join((node.__doc__ or "").split()) else None
+    documented_words = _STATED.get((node.path, case))
+    return (
+        documented_words
+        if documented_words is not None
+        and documented_words in " ".join((node.__doc__ or "").split())
+        else None
+    )
 
 
 def middle(value: float) -> Callable[[Tensor], Tensor]:
@@ -86,13 +91,15 @@ def middle(value: float) -> Callable[[Tensor], Tensor]:
 
     def change(x: Tensor) -> Tensor:
         changed = x.clone()
-        changed[tuple(n // 2 for n in x.shape)] = value
+        changed[tuple(side // 2 for side in x.shape)] = value
         return changed
 
     return change
 
 
 def _peak_of(top: float) -> Callable[[Tensor], Tensor]:
+    """Return a function that scales a picture so that its largest absolute value is ``top``."""
+
     def change(x: Tensor) -> Tensor:
         largest = float(x.double().abs().max())
         return (x.double() * (top / largest if largest > 0 else 0.0)).to(x.dtype)
@@ -108,6 +115,8 @@ def _lamp(scene: Tensor) -> Tensor:
 
 
 def _noise(depth: float) -> Callable[[Tensor], Tensor]:
+    """Return a function that replaces a height map by a random one from 0 to ``depth`` m."""
+
     def change(height: Tensor) -> Tensor:
         rng = torch.Generator().manual_seed(11)
         return (depth * torch.rand(height.shape, generator=rng, dtype=torch.float64)).to(
@@ -126,8 +135,9 @@ def _steps(height: Tensor) -> Tensor:
     """Return a checkerboard height map with aliased steps of 0.9 waves at 550 nm in fused
     silica.
     """
-    v, u = (torch.arange(n) for n in height.shape)
-    return ((v[:, None] + u) % 2 * 1.076e-6).to(height.dtype)
+    row, column = (torch.arange(side) for side in height.shape)
+    # phase steps of 0.9 waves: 1.076 um of glass with an index of about 1.46
+    return ((row[:, None] + column) % 2 * 1.076e-6).to(height.dtype)
 
 
 def _opaque(pupil: Pupil) -> Pupil:
@@ -143,6 +153,7 @@ def _off_axis(share: float) -> Callable[[Params], tuple[float, float]]:
     from the centre.
     """
     return lambda p: (
+        # angle (y, x)
         0.0,
         share * field_of_view(p["focal_length"], p["pixel_pitch"], p["shape"])[1],
     )
@@ -153,6 +164,7 @@ def _one_photon(p: Params) -> float:
 
 
 def _scaled(name: str, by: float) -> Callable[[Params], float]:
+    """Return a function that computes the parameter ``name`` times ``by``."""
     return lambda p: float(p[name] * by)
 
 
@@ -358,19 +370,20 @@ def with_losses(recipe: Recipe) -> dict[str, Step]:
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
             node = find_node(path)
-            wires = {
-                to: step.wires[source]
-                for to, source in zip(node.inputs, step.node.inputs, strict=False)
+            inputs = {
+                # the losses have the inputs of the metric, in the same order
+                input_name: step.wires[source]
+                for input_name, source in zip(node.inputs, step.node.inputs, strict=False)
             }
             if "stop" in node.inputs:  # from the mask that this step reads
-                wires["stop"] = recipe.steps[step.sources[0]].wires["stop"]
+                inputs["stop"] = recipe.steps[step.sources[0]].wires["stop"]
             family, _, title = path.partition(".")
             label = (
                 f"{'loss ' if family == 'losses' else ''}{title}{' log' if 'log' in params else ''}"
                 f" of {name}"
             )
             steps[label] = Step(
-                label, node, node.params(**params).model_dump(), wires, step.mark, {}
+                label, node, node.params(**params).model_dump(), inputs, step.mark, {}
             )
     return steps
 
@@ -379,12 +392,18 @@ def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
     """Reduce the pixels, pupil samples and spectral bands of the steps, and keep the pupil
     diameters.
     """
-    largest = [max(step.params["shape"]) for step in steps.values() if step.params.get("shape")]
-    scale = size.pixels / max(largest, default=size.pixels)
+    longest_sides = [
+        max(step.params["shape"]) for step in steps.values() if step.params.get("shape")
+    ]
+    scale = size.pixels / max(longest_sides, default=size.pixels)
     return {name: replace(step, params=_smaller(step, size, scale)) for name, step in steps.items()}
 
 
 def _smaller(step: Step, size: Size, scale: float) -> dict[str, Any]:
+    """Return the parameters of a step at a reduced size; ``scale`` is that of the pixels.
+
+    The pitch grows as the samples become fewer, so that the diameter of the pupil stays.
+    """
     params = dict(step.params)
     if params.get("shape"):
         params["shape"] = tuple(max(1, round(side * scale)) for side in params["shape"])
@@ -397,7 +416,8 @@ def _smaller(step: Step, size: Size, scale: float) -> dict[str, Any]:
         # its samples do not fit the small pupil: a random height map of its depth takes its place
         params["file"] = None
     if params.get("angle"):
-        params["angle"] = tuple(a * min(scale, 1.0) for a in params["angle"])
+        # the direction stays on the smaller sensor
+        params["angle"] = tuple(component * min(scale, 1.0) for component in params["angle"])
     return params | (_limited(params) if step.node.random else {})
 
 
@@ -412,13 +432,18 @@ def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
 
 
 def _changed(step: Step, case: Case) -> dict[str, Any]:
+    """Return the parameters of a step with the values of a case, by ``*.name`` or ``node.name``."""
     params = dict(step.params)
     for name in step.params:
         for path in (f"*.{name}", f"{step.node.path}.{name}"):
-            single = isinstance(params[name], int | float)  # not a range, as of a prior
-            if path in case.params and (single or path[0] != "*"):
-                new = case.params[path]
-                params[name] = new(step.params) if callable(new) else new
+            is_number = isinstance(params[name], int | float)  # not a range, as of a prior
+            if path in case.params and (is_number or path[0] != "*"):
+                value_or_function = case.params[path]
+                params[name] = (
+                    value_or_function(step.params)
+                    if callable(value_or_function)
+                    else value_or_function
+                )
     return params
 
 
@@ -444,8 +469,9 @@ class CaseRecipe:
         """
         steps = with_parameters(with_size(with_losses(recipe), case.size), case)
         chain = cls(recipe, case, steps, usual=usual)
-        for name in in_order({n: s.sources for n, s in steps.items()}, steps):
+        for name in in_order({n: step.sources for n, step in steps.items()}, steps):
             key, _ = key_of(steps[name], chain.keys, recipe.seed, code)
+            # a result that the case changes differs from that of its inputs
             chain.keys[name] = digest(key, case.name) if _put(steps[name], case) else key
         return chain
 
@@ -454,12 +480,19 @@ class CaseRecipe:
         return [self._gathered(self.steps[name].wires.get(i)) for i in self.steps[name].node.inputs]
 
     def _gathered(self, wire: Any) -> Any:
+        """Return the value of a wire: one result, a list of results, or None without a wire."""
         if wire is None or isinstance(wire, str):
             return wire and self._value(wire)
         return [self._value(name) for name in wire]
 
     def _value(self, step: str) -> Any:
-        for name in in_order({n: s.sources for n, s in self.steps.items()}, [step]):
+        """Return the result of a step, computing what is lacking; raise `LookupError` if there is
+        none.
+        """
+        for name in in_order(
+            {step_name: any_step.sources for step_name, any_step in self.steps.items()},
+            [step],
+        ):
             if name not in self.values and name not in self.refused:
                 self._compute(name)
         if step not in self.values:
@@ -467,12 +500,13 @@ class CaseRecipe:
         return self.values[step]
 
     def _compute(self, name: str) -> None:
-        step, usual = self.steps[name], self.usual
-        if usual and usual.keys[name] == self.keys[name]:
+        """Compute one step whose inputs are known, and keep its result or why there is none."""
+        step, usual_recipe = self.steps[name], self.usual
+        if usual_recipe and usual_recipe.keys[name] == self.keys[name]:
             try:
-                self.values[name] = usual._value(name)
+                self.values[name] = usual_recipe._value(name)
             except LookupError:
-                self.refused[name] = usual.refused[name]
+                self.refused[name] = usual_recipe.refused[name]
             return
         if any(source in self.refused for source in step.sources):
             self.refused[name] = "an earlier step gave no result"
@@ -488,11 +522,12 @@ class CaseRecipe:
             # a grey cube, so that later steps are tested
             value = inputs[0].mean(0).expand(len(inputs[1].centres), -1, -1).clone()
             del self.refused[name]
-        put = _put(step, self.case)
-        self.values[name] = put(value) if put else value
+        change = _put(step, self.case)
+        self.values[name] = change(value) if change else value
 
 
 def _put(step: Step, case: Case) -> Any:
+    """Return the function with which a case changes the result of a step, or None."""
     return next(
         (change for path, change in case.values.items() if step.node.path.startswith(path)), None
     )
@@ -505,6 +540,8 @@ def unchanged_steps(chain: CaseRecipe, usual: CaseRecipe) -> Iterator[str]:
     if chain.case is usual.case or chain.case.inputs or chain.case.alike:
         return
     for name, step in chain.steps.items():
-        mine, theirs = ([c.keys[s] for s in step.sources] for c in (chain, usual))
-        if step.params == usual.steps[name].params and mine == theirs:
+        keys_here, usual_keys = (
+            [case_recipe.keys[source] for source in step.sources] for case_recipe in (chain, usual)
+        )
+        if step.params == usual.steps[name].params and keys_here == usual_keys:
             yield name

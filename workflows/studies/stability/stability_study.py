@@ -49,27 +49,33 @@ def grid_picture(entries: Sequence[Entry]) -> Any:
     node, losses last.
     """
     cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
+    # False before True: losses last
     nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
+    # rounded up
     panels = max(1, -(-len(nodes) // _ACROSS))
-    across = max(1, -(-len(nodes) // panels))
-    left, above = (
+    columns = max(1, -(-len(nodes) // panels))
+    # inches: the longest name of a case, and of a node
+    label_width, label_height = (
         _LETTER * max(map(len, names), default=0) for names in ([case for _, case in cases], nodes)
     )
-    width = max(6.0, left + 1.0 + _WIDE * across)
-    figure, axes = canvas(width, panels * (0.8 + 0.8 * above + _TALL * len(cases)), rows=panels)
-    for ax, first in zip(axes[:, 0], range(0, max(1, len(nodes)), across), strict=True):
+    width = max(6.0, label_width + 1.0 + _WIDE * columns)
+    figure, axes = canvas(
+        width, panels * (0.8 + 0.8 * label_height + _TALL * len(cases)), rows=panels
+    )
+    for ax, first_node in zip(axes[:, 0], range(0, max(1, len(nodes)), columns), strict=True):
         _panel(
             ax,
-            [e for e in entries if e[2] in nodes[first : first + across]],
+            # an entry's third element is the node
+            [entry for entry in entries if entry[2] in nodes[first_node : first_node + columns]],
             cases,
-            nodes[first:],
-            across,
+            nodes[first_node:],
+            columns,
         )
-    measure = (
+    measure_text = (
         "largest error over the largest element, of the result or (g) of its gradient, whichever is"
         " nearer its bound"
     )
-    text = f"{measure};  ! warn, × fail;  r refused, s seen, – no number to compare"
+    text = f"{measure_text};  ! warn, × fail;  r refused, s seen, – no number to compare"
     figure.supxlabel(textwrap.fill(text, int(width / _LETTER)), fontsize=9)
     return figure
 
@@ -77,11 +83,13 @@ def grid_picture(entries: Sequence[Entry]) -> Any:
 def _panel(
     ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], nodes: list[str], across: int
 ) -> None:
+    """Draw one panel of the grid: the cells of ``across`` nodes, from the first of ``nodes`` on."""
     for group, case, node, cell in entries:
         column, row = nodes.index(node), cases.index((group, case))
         ax.barh(row, 0.96, 0.92, left=column - 0.48, color=_COLOURS[cell.mark])
         ax.text(column, row, cell_text(cell), ha="center", va="center", color=BLACK, fontsize=9)
     for row in range(1, len(cases)):
+        # a line between two groups of cases
         if cases[row][0] != cases[row - 1][0]:
             ax.axhline(row - 0.5, color="#888888", linewidth=0.8)
     ax.set_xticks(
@@ -109,17 +117,19 @@ def cell_text(cell: Cell) -> str:
         if cell.note.startswith("refused"):
             return f"{sign}r"
         return f"{sign}s" if "seen" in cell.note else f"{sign}–"
-    steep = cell.slope is not None and _share(cell.slope, cell.slope_bound) > _share(
+    # g: the error of the gradient is a larger share of its bound
+    gradient_is_nearer = cell.slope is not None and _share(cell.slope, cell.slope_bound) > _share(
         cell.error, cell.bound
     )
     return (
         f"{sign}{short_number(cell.slope or 0.0)}g"
-        if steep
+        if gradient_is_nearer
         else f"{sign}{short_number(cell.error)}"
     )
 
 
 def _share(value: float, bound: float | None) -> float:
+    """Return an error over its bound, 0 without a bound."""
     return value / bound if bound else 0.0
 
 
@@ -186,8 +196,8 @@ class GridCell:
         """
         cell = self.cell
         pairs = ((cell.error, cell.bound), (cell.slope, cell.slope_bound))
-        shares = [error / bound for error, bound in pairs if error is not None and bound]
-        return ("pass", "warn", "fail").index(cell.mark), max(shares, default=-1.0)
+        error_over_bound = [error / bound for error, bound in pairs if error is not None and bound]
+        return ("pass", "warn", "fail").index(cell.mark), max(error_over_bound, default=-1.0)
 
 
 def study(
@@ -207,19 +217,31 @@ def study(
 def _rows(
     recipe: Recipe, store: Store, cases: Sequence[Case], progress: Progress
 ) -> Iterator[GridCell]:
+    """Yield the result of each step in each case, without steps that have the inputs of the usual
+    case.
+    """
     code = Code(store.code_memo)
-    own = engine("studies.stability.extreme_cases", "studies.stability.case_result")
-    usual = CaseRecipe.of(recipe, USUAL, code)
+    engine_digest = engine("studies.stability.extreme_cases", "studies.stability.case_result")
+    usual_recipe = CaseRecipe.of(recipe, USUAL, code)
     for number, case in enumerate(cases, 1):
-        chain = usual if case is USUAL else CaseRecipe.of(recipe, case, code, usual)
-        cells = list(_row(chain, set(unchanged_steps(chain, usual)), store, own))
+        case_recipe = (
+            usual_recipe if case is USUAL else CaseRecipe.of(recipe, case, code, usual_recipe)
+        )
+        cells = list(
+            _row(case_recipe, set(unchanged_steps(case_recipe, usual_recipe)), store, engine_digest)
+        )
         yield from cells
-        bad = sum(row.cell.mark == "fail" for row in cells)
-        progress(f"[{number}/{len(cases)}] {case.name}: {len(cells)} steps, {bad} fail")
+        failures = sum(row.cell.mark == "fail" for row in cells)
+        progress(f"[{number}/{len(cases)}] {case.name}: {len(cells)} steps, {failures} fail")
     code.save()
 
 
 def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[GridCell]:
+    """Yield the results of one case from the store, or computed now.
+
+    ``same`` names the steps that the case does not change; ``own`` is the digest of the study's
+    code.
+    """
     for name, step in chain.steps.items():
         if name in same:
             continue
@@ -228,14 +250,15 @@ def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[
             own,
             chain.case.name,
             chain.keys[name],
-            [chain.keys[s] for s in step.sources],
+            [chain.keys[source] for source in step.sources],
         )
-        about = {
+        description = {
             "step": f"stability of {name}: {chain.case.name}",
             "recipe": chain.recipe.name,
             "versions": versions(),
         }
-        cell = compute_once(store, key, dict, partial(_judge, chain, name), about, small=True)
+        cell = compute_once(store, key, dict, partial(_judge, chain, name), description, small=True)
+        # empty where there is nothing to test
         if cell:
             yield GridCell(chain.case, name, step.node.path, Cell(**cell))
 
@@ -249,7 +272,7 @@ def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             cell = judge_step(chain.steps[name], inputs, chain.case, chain.recipe.seed)
-    except LookupError:
+    except LookupError:  # an earlier step gave no result
         return {}
     return {} if cell is None else asdict(cell)
 
@@ -258,6 +281,7 @@ def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
 
 
 def _document(rows: Sequence[GridCell]) -> dict[str, Any]:
+    """Return the numbers of cells by outcome."""
     count = {mark: sum(row.cell.mark == mark for row in rows) for mark in ("pass", "warn", "fail")}
     return {
         "cells": len(rows),
@@ -268,8 +292,11 @@ def _document(rows: Sequence[GridCell]) -> dict[str, Any]:
 
 
 def _report(recipe: Recipe, rows: Sequence[GridCell], content: Mapping[str, Any]) -> StudyReport:
-    worst = _worst_by_case_and_node(rows)
-    picture = grid_picture([(row.case.group, row.case.name, row.node, row.cell) for row in worst])
+    """Return the page of the study: the grid, what fails or nearly fails, and the cases."""
+    worst_cells = _worst_by_case_and_node(rows)
+    picture = grid_picture(
+        [(row.case.group, row.case.name, row.node, row.cell) for row in worst_cells]
+    )
     lead = (
         f"{content['cells']} cells, {len({r.case.name for r in rows})} cases by"
         f" {len({r.node for r in rows})} nodes: {content['failed']} fail, {content['warned']}"
@@ -286,12 +313,15 @@ def _report(recipe: Recipe, rows: Sequence[GridCell], content: Mapping[str, Any]
 
 
 def _worst_by_case_and_node(rows: Sequence[GridCell]) -> list[GridCell]:
+    """Return the worst result of each node in each case, over all steps of the node."""
+    # `groupby` needs equal keys side by side
     ordered = sorted(rows, key=lambda r: (CASES.index(r.case) if r.case in CASES else 0, r.node))
     groups = itertools.groupby(ordered, key=lambda r: (r.case.name, r.node))
     return [max(group, key=lambda r: r.severity) for _, group in groups]
 
 
 def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
+    """Yield the tables of what fails, of what nearly fails, and of the cases."""
     headings: dict[Mark, str] = {
         "fail": "What fails",
         "warn": "What uses more than half of its bound",
@@ -302,20 +332,24 @@ def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
         yield Section(heading, "" if lines else "No cell.", _COLUMNS if lines else (), marked)
     cases = {row.case.name: row.case for row in rows}.values()
     yield Section(
-        "The cases", "", ("case", "group", "what"), [(c.name, c.group, c.what) for c in cases]
+        "The cases",
+        "",
+        ("case", "group", "what"),
+        [(case.name, case.group, case.what) for case in cases],
     )
 
 
 def _line(row: GridCell) -> tuple[Any, ...]:
-    c = row.cell
+    """Return the row of a result in the table, with the columns of `_COLUMNS`."""
+    cell = row.cell
     return (
         row.case.name,
         row.step,
         row.node,
-        c.mark,
-        c.error,
-        c.bound,
-        c.slope,
-        c.slope_bound,
-        c.note,
+        cell.mark,
+        cell.error,
+        cell.bound,
+        cell.slope,
+        cell.slope_bound,
+        cell.note,
     )

@@ -70,23 +70,31 @@ def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
     # a quantity that is infinite in a draw has no standard deviation
     with np.errstate(invalid="ignore"):
         mean, sd = values.mean(0), values.std(0, ddof=1)
-        low, high = np.quantile(values, [0.05, 0.95], axis=0)
+        low_quantile, high_quantile = np.quantile(values, [0.05, 0.95], axis=0)
     sd = np.where(sd > _CONSTANT * np.abs(values).max(0), sd, 0.0)
-    worst = values[:, int(sd.argmax())]
+    # the element with the largest standard deviation
+    most_uncertain = values[:, int(sd.argmax())]
     error = 0.0
     if sd.max() > 0:
-        error = _of_sequences(worst, sequences) if sequences else _jackknife(worst)
-    return Scatter(mean, sd, low, high, error)
+        error = (
+            _of_sequences(most_uncertain, sequences) if sequences else _jackknife(most_uncertain)
+        )
+    return Scatter(mean, sd, low_quantile, high_quantile, error)
 
 
 def _jackknife(x: FloatArray) -> float:
     """Estimate the relative standard error of the standard deviation of independent draws ``x``
     by the jackknife.
     """
-    n = len(x)
-    apart = (x - x.mean()) ** 2
-    without = np.sqrt((apart.sum() - apart * n / (n - 1)).clip(0.0) / (n - 2))
-    error = math.sqrt((n - 1) / n * float(((without - without.mean()) ** 2).sum()))
+    count = len(x)
+    squared_distances = (x - x.mean()) ** 2
+    # the standard deviation without each draw in turn
+    deviation_without = np.sqrt(
+        (squared_distances.sum() - squared_distances * count / (count - 1)).clip(0.0) / (count - 2)
+    )
+    error = math.sqrt(
+        (count - 1) / count * float(((deviation_without - deviation_without.mean()) ** 2).sum())
+    )
     return error / float(x.std(ddof=1))
 
 
@@ -95,7 +103,8 @@ def _of_sequences(x: FloatArray, count: int) -> float:
     Sobol sequence.
     """
     squares = (x - x.mean()) ** 2
-    means = np.array([squares[i::count].mean() for i in range(count)])
+    means = np.array([squares[sequence::count].mean() for sequence in range(count)])
+    # the relative error of a square root is half of that of the variance
     return float(means.std(ddof=1) / math.sqrt(count) / means.mean() / 2)
 
 
@@ -149,11 +158,11 @@ class AllowedDraws:
         """Try draws until ``count`` draws have been tried."""
         while self.tried < min(count, self.available):
             block = range(self.tried, min(self.tried + self._block, self.available))
-            problems = [self._inputs.problem(self._draws.values[i]) for i in block]
-            wrong = [problem for problem in problems if problem is not None]
-            if wrong:
+            problems = [self._inputs.problem(self._draws.values[draw]) for draw in block]
+            faults = [problem for problem in problems if problem is not None]
+            if faults:
                 self.left_out += len(block)
-                self.reason = _text(wrong[-1])
+                self.reason = _text(faults[-1])
             else:
                 self._allowed += block
             self.tried = block.stop
@@ -169,19 +178,25 @@ def refuse_combinations(inputs: Inputs, ends: ShapesFloatArray, draws: AllowedDr
     if problems:
         raise RecipeError(problems)
     if draws.left_out:
-        fault = (
+        fault_text = (
             f"{draws.left_out} of the first {draws.tried} draws have values that are not allowed"
             " together"
         )
+        # the place in the recipe at which the first input is written
         value = inputs.uncertain.composed.root.below(inputs.names[0].split("."))
         assert value is not None
         advice = "give narrower or truncated distributions"
         raise RecipeError(
-            [Diagnostic(value.mark, ", ".join(inputs.names), f"{fault} ({draws.reason}): {advice}")]
+            [
+                Diagnostic(
+                    value.mark, ", ".join(inputs.names), f"{fault_text} ({draws.reason}): {advice}"
+                )
+            ]
         )
 
 
 def _text(problem: Diagnostic) -> str:
+    """Return a mistake as text, with the path of its value if it has one."""
     return f"{problem.path}: {problem.message}" if problem.path else problem.message
 
 
@@ -204,6 +219,9 @@ class OutputDraws:
     """
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
+        """Prepare draws of the outputs; ``workers`` processes compute draws on the CPU, 0 means one
+        for each free processor.
+        """
         self.inputs, self.store, self.device = inputs, store, device
         self.workers = workers  #: processes that compute draws; 0 means one for each free processor
         recipe = inputs.recipe
@@ -221,9 +239,13 @@ class OutputDraws:
         """Compute the steps that depend on no uncertain input, and return the recipe as a
         function of the inputs.
         """
-        free = tuple(self.inputs.readers)
+        free_parameters = tuple(self.inputs.readers)
         return as_function(
-            self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device
+            self.inputs.recipe,
+            *free_parameters,
+            outputs=self.outputs,
+            store=self.store,
+            device=self.device,
         )
 
     def ready(self) -> float:
@@ -239,10 +261,13 @@ class OutputDraws:
         store does not have.
         """
         keys = [self.key(row) for row in values]
+        # None for a draw that is not stored
         stored = [record and record["numbers"] for record in map(self._kept, keys)]
-        lacking = [i for i, numbers in enumerate(stored) if numbers is None]
-        for i, result in zip(lacking, self._results([values[i] for i in lacking]), strict=True):
-            stored[i] = self._keep(keys[i], result)
+        lacking = [draw for draw, numbers in enumerate(stored) if numbers is None]
+        for draw, result in zip(
+            lacking, self._results([values[draw] for draw in lacking]), strict=True
+        ):
+            stored[draw] = self._keep(keys[draw], result)
         return [numbers for numbers in stored if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
@@ -251,7 +276,8 @@ class OutputDraws:
         """
         keys = [self.key(row) for row in values]
         pictures_key = digest("uncertainty pictures", keys)
-        if (first := self._kept(keys[0])) is not None and not first["pictures"]:
+        # the first draw tells whether there are pictures at all
+        if (first_record := self._kept(keys[0])) is not None and not first_record["pictures"]:
             return {}
         moments: dict[str, tuple[Tensor, Tensor]]
         moments = compute_once(
@@ -260,13 +286,16 @@ class OutputDraws:
         return moments
 
     def _sums(self, keys: Sequence[str], values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
+        """Compute each draw, keep its numbers, and return mean and standard deviation of each
+        picture.
+        """
         sums = dict[str, _Sum]()
         for key, result in zip(keys, self._results(list(values)), strict=True):
             self._keep(key, result)
             for name, value in result.items():
                 if _is_picture(value):
                     sums.setdefault(name, _Sum()).add(value)
-        return {name: (total.mean, total.sd) for name, total in sums.items()}
+        return {name: (running.mean, running.sd) for name, running in sums.items()}
 
     def key(self, row: FloatArray) -> str:
         """Return the store key of one draw: a digest of the output keys of a run with the
@@ -275,20 +304,28 @@ class OutputDraws:
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
         outputs = [[name, keys[name]] for name in self.outputs]
-        within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device)]
+        tolerance_and_device = [
+            recipe.tolerance,
+            recipe.exact,
+            recipe.estimates,
+            device_kind(self.device),
+        ]
         return digest(
-            "uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within
+            "uncertainty draw",
+            engine("studies.uncertainty.output_draws"),
+            outputs,
+            tolerance_and_device,
         )
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
-        """Return the store keys of steps that depend on the inputs ``theta``; if ``theta`` is
-        empty, of other steps.
+        """Return the store keys of steps: of those that depend on the inputs, with the values
+        ``theta`` by ``step.parameter``; or of all others, if ``theta`` is empty.
         """
         recipe, keys = self.inputs.recipe, dict(self._fixed) if theta else {}
         by_step: dict[str, dict[str, Any]] = {}
         for reader, value in theta.items():
-            reads, _, param = reader.rpartition(".")
-            by_step.setdefault(reads, {})[param] = value
+            reading_step, _, param = reader.rpartition(".")
+            by_step.setdefault(reading_step, {})[param] = value
         for name in self._order:
             if (name in self._live) != bool(theta):
                 continue
@@ -299,16 +336,22 @@ class OutputDraws:
         return keys
 
     def _kept(self, key: str) -> dict[str, Any] | None:
+        """Return the numbers of a draw from the store, or None."""
         with suppress(KeyError):
             record: dict[str, Any] = self.store.get(key)
             return record
         return None
 
     def _keep(self, key: str, result: Mapping[str, Any]) -> Numbers:
+        """Store the numbers of a draw with the names of its pictures, and return the numbers."""
         numbers = quantities(result)
-        shown = [name for name, value in result.items() if _is_picture(value)]
-        about = {**_ABOUT, "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
-        self.store.put_small(key, {"numbers": numbers, "pictures": shown}, about)
+        picture_names = [name for name, value in result.items() if _is_picture(value)]
+        description = {
+            **_ABOUT,
+            "seconds": self.seconds / max(1, self.computed),
+            "date": timestamp(),
+        }
+        self.store.put_small(key, {"numbers": numbers, "pictures": picture_names}, description)
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
@@ -318,6 +361,7 @@ class OutputDraws:
         if not rows:
             return
         self.ready()
+        # time in which the caller uses the result does not count
         began = time.perf_counter()
         _keep_memory()
         workers = workers_for(len(rows), self.workers) if self.device == "cpu" else 1
@@ -331,13 +375,18 @@ class OutputDraws:
                 began = time.perf_counter()
 
     def _result(self, row: FloatArray) -> dict[str, Any]:
+        """Return the outputs for one draw ``row`` (input,); raise `ValueError` that names its
+        values.
+        """
         values = self._named(row)
         try:
             with torch.no_grad():
                 result: dict[str, Any] = self._function(self.inputs.theta(values))
         except (RuntimeError, ValueError) as error:
-            place = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
-            raise ValueError(f"the recipe fails at the input values {place}: {error}") from error
+            values_text = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
+            raise ValueError(
+                f"the recipe fails at the input values {values_text}: {error}"
+            ) from error
         return result
 
     def _named(self, row: FloatArray) -> dict[str, float]:
@@ -354,11 +403,12 @@ def quantities(result: Mapping[str, Any]) -> Numbers:
 
 
 def _reached_steps(inputs: Inputs, order: Sequence[str]) -> set[str]:
-    live = {reader.rpartition(".")[0] for reader in inputs.readers}
+    """Return the steps that depend on an uncertain input; ``order`` has sources before readers."""
+    reached = {reader.rpartition(".")[0] for reader in inputs.readers}
     for name in order:
-        if any(source in live for source in inputs.recipe.steps[name].sources):
-            live.add(name)
-    return live
+        if any(source in reached for source in inputs.recipe.steps[name].sources):
+            reached.add(name)
+    return reached
 
 
 def _is_picture(value: Any) -> bool:
@@ -375,11 +425,12 @@ class _Sum:
         self.mean = self._squares = torch.zeros(())
 
     def add(self, picture: Tensor) -> None:
-        x = picture.detach().cpu().float()
+        new_picture = picture.detach().cpu().float()
         self.count += 1
-        apart = x - self.mean
-        self.mean = self.mean + apart / self.count
-        self._squares = self._squares + apart * (x - self.mean)
+        distance = new_picture - self.mean
+        self.mean = self.mean + distance / self.count
+        # Welford: the distance from the mean before times that from the mean now
+        self._squares = self._squares + distance * (new_picture - self.mean)
 
     @property
     def sd(self) -> Tensor:
@@ -395,5 +446,6 @@ def _keep_memory() -> None:
     if sys.platform.startswith("linux"):
         with suppress(OSError, AttributeError):
             libc = ctypes.CDLL(None)
+            # one arena, no mapping of single blocks, and nothing given back below 2 GiB
             for option, value in ((_ARENAS, 1), (_MAPPED, 0), (_TRIM, 2**31 - 1)):
                 libc.mallopt(option, value)

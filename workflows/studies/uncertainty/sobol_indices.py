@@ -56,14 +56,19 @@ class OrthonormalPolynomials:
         """Compute the recurrence for a distribution (Stieltjes); the degree is lower for a few
         separate values.
         """
-        x, weights = shape.measure()
+        coordinates, weights = shape.measure()
         centres, norms = list[float](), [1.0]
-        before, now = np.zeros_like(x), np.ones_like(x)
-        while len(centres) < min(degree, len(x) - 1):
-            centre = float(weights @ (x * now**2))
-            following = (x - centre) * now - norms[-1] * before if centres else (x - centre) * now
-            norm = float(np.sqrt(weights @ following**2))
-            before, now = now, following / norm
+        previous_polynomial, polynomial = np.zeros_like(coordinates), np.ones_like(coordinates)
+        while len(centres) < min(degree, len(coordinates) - 1):
+            # p_(n+1) = ((x - centre) p_n - norm_n p_(n-1)) / norm_(n+1), under the weights
+            centre = float(weights @ (coordinates * polynomial**2))
+            next_polynomial = (
+                (coordinates - centre) * polynomial - norms[-1] * previous_polynomial
+                if centres
+                else (coordinates - centre) * polynomial
+            )
+            norm = float(np.sqrt(weights @ next_polynomial**2))
+            previous_polynomial, polynomial = polynomial, next_polynomial / norm
             centres.append(centre)
             norms.append(norm)
         return cls(shape, np.array(centres), np.array(norms))
@@ -75,13 +80,15 @@ class OrthonormalPolynomials:
 
     def at(self, z: FloatArray) -> FloatArray:
         """Return the polynomials (degree + 1, draw) at standard normal numbers of the input."""
-        x = self.shape.coordinate(z)
-        values = [np.ones_like(x)]
-        before = np.zeros_like(x)
-        for i, centre in enumerate(self.centres):
-            following = (x - centre) * values[-1] - (self.norms[i] * before if i else 0.0)
-            before = values[-1]
-            values.append(following / self.norms[i + 1])
+        coordinates = self.shape.coordinate(z)
+        values = [np.ones_like(coordinates)]
+        previous_polynomial = np.zeros_like(coordinates)
+        for degree, centre in enumerate(self.centres):
+            next_polynomial = (coordinates - centre) * values[-1] - (
+                self.norms[degree] * previous_polynomial if degree else 0.0
+            )
+            previous_polynomial = values[-1]
+            values.append(next_polynomial / self.norms[degree + 1])
         return np.stack(values)
 
 
@@ -99,15 +106,21 @@ class Candidates:
         degree first.
         """
         bases = [OrthonormalPolynomials.of(shape) for shape in shapes]
-        values = [basis.at(z[:, i]) for i, basis in enumerate(bases)]
+        values = [basis.at(z[:, input_number]) for input_number, basis in enumerate(bases)]
         powers = _low_degrees([basis.degree for basis in bases])
         columns = [_product(values, power) for power in powers]
         norms = np.array([_norm(power) for power in powers])
-        sizes = {int((norms <= largest).sum()) for largest in (*_NORMS, math.inf)}
+        # powers rise in their norm, so that each size is a beginning of the terms
+        sizes = {int((norms <= largest_norm).sum()) for largest_norm in (*_NORMS, math.inf)}
         return cls(powers, np.stack(columns, 1), tuple(sorted(sizes)))
 
 
 def _product(values: Sequence[FloatArray], power: Powers) -> FloatArray:
+    """Return a term (draw,): the product of the polynomials of the inputs at the degrees in
+    ``power``.
+
+    ``values`` has the polynomials (degree + 1, draw) of each input.
+    """
     product = np.ones(values[0].shape[1])
     for input_values, degree in zip(values, power, strict=True):
         if degree:
@@ -118,8 +131,8 @@ def _product(values: Sequence[FloatArray], power: Powers) -> FloatArray:
 def _low_degrees(degrees: Sequence[int]) -> tuple[Powers, ...]:
     """Return the degrees of the candidate terms in rising order of their hyperbolic norm."""
     candidates: list[tuple[float, Powers]] = []
-    for together in range(1, min(_TOGETHER, len(degrees)) + 1):
-        for inputs in combinations(range(len(degrees)), together):
+    for input_count in range(1, min(_TOGETHER, len(degrees)) + 1):
+        for inputs in combinations(range(len(degrees)), input_count):
             for power in _degrees_of(inputs, degrees):
                 candidates.append((_norm(power), power))
     return tuple(power for _, power in sorted(candidates)[:_CANDIDATES])
@@ -132,15 +145,16 @@ def _norm(power: Powers) -> float:
 
 def _degrees_of(inputs: Sequence[int], degrees: Sequence[int]) -> Iterator[Powers]:
     """Yield the degrees of all terms in which exactly the ``inputs`` occur."""
-    power = [0] * len(degrees)
+    degrees_of_term = [0] * len(degrees)
 
     def fill(place: int, left: int) -> Iterator[Powers]:
         if place == len(inputs):
-            yield tuple(power)
+            yield tuple(degrees_of_term)
             return
-        others = len(inputs) - place - 1
-        for degree in range(1, min(degrees[inputs[place]], left - others) + 1):
-            power[inputs[place]] = degree
+        inputs_after = len(inputs) - place - 1
+        # at least 1 for each input after this one
+        for degree in range(1, min(degrees[inputs[place]], left - inputs_after) + 1):
+            degrees_of_term[inputs[place]] = degree
             yield from fill(place + 1, left - degree)
 
     yield from fill(0, _DEGREE)
@@ -178,6 +192,7 @@ def fit_polynomial(
     )
     selections = [_select_terms(columns[:, :count], values) for count in candidates.sizes]
     _, terms = min(selections, key=lambda selection: selection[0])
+    # a column of ones for the constant
     matrix = np.concatenate([np.ones((len(values), 1)), columns[:, terms]], 1)
     solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
     return PolynomialFit(
@@ -186,33 +201,44 @@ def fit_polynomial(
 
 
 def _select_terms(columns: FloatArray, y: FloatArray) -> tuple[float, list[int]]:
-    """Return the terms of a sparse polynomial by orthogonal matching pursuit, with their error
-    of prediction.
+    """Return the terms of a sparse polynomial by orthogonal matching pursuit, with their error of
+    prediction.
+
+    ``columns`` are the candidate terms (draw, term). Returned are the mean squared error and the
+    numbers of the selected terms.
     """
-    count, exact = len(y), _EXACT * len(y) * float(y.var())
+    count, exact_residual = len(y), _EXACT * len(y) * float(y.var())
+    # at least _BY_TERM draws for each term and the constant
     limit = min(columns.shape[1], max(1, count // _BY_TERM) - 1)
+    # orthonormal columns: the constant is the first
     basis = [np.full(count, count**-0.5)]
-    left, leverage = y - y.mean(), np.full(count, 1.0 / count)
+    residual, leverage = y - y.mean(), np.full(count, 1.0 / count)
     lengths = np.sqrt((columns**2).sum(0))
     selected: list[int] = []
-    best, best_error = 0, _error_of_prediction(left, leverage, 1)
-    while len(selected) < limit and len(selected) - best < _PATIENCE and left @ left > exact:
-        term = _next_term(columns, left, lengths)
-        direction = _apart(columns[:, term], basis)
-        norm = float(np.sqrt(direction @ direction))
+    best_count, best_error = 0, _error_of_prediction(residual, leverage, 1)
+    while (
+        len(selected) < limit
+        and len(selected) - best_count < _PATIENCE
+        and residual @ residual > exact_residual
+    ):
+        term = _next_term(columns, residual, lengths)
+        orthogonal_part = _apart(columns[:, term], basis)
+        norm = float(np.sqrt(orthogonal_part @ orthogonal_part))
         independent = norm > _SMALLEST * lengths[term]
+        # not to be taken again
         lengths[term] = np.inf
         if not independent:
             limit = min(limit, int(np.isfinite(lengths).sum()) + len(selected))
             continue
         selected.append(term)
-        basis.append(direction / norm)
-        left = left - (basis[-1] @ left) * basis[-1]
+        basis.append(orthogonal_part / norm)
+        residual = residual - (basis[-1] @ residual) * basis[-1]
+        # diagonal of the projection onto the basis
         leverage = leverage + basis[-1] ** 2
-        error = _error_of_prediction(left, leverage, len(basis))
+        error = _error_of_prediction(residual, leverage, len(basis))
         if error < best_error:
-            best, best_error = len(selected), error
-    return best_error, selected[:best]
+            best_count, best_error = len(selected), error
+    return best_error, selected[:best_count]
 
 
 def _next_term(columns: FloatArray, left: FloatArray, lengths: FloatArray) -> int:
@@ -237,8 +263,9 @@ def _error_of_prediction(left: FloatArray, leverage: FloatArray, terms: int) -> 
     terms.
     """
     count = len(left)
-    alone = (left / (1.0 - leverage).clip(1e-9)) ** 2
-    return float(alone.mean()) * count / max(1, count - terms)
+    # a draw that its own fit leaves out: residual / (1 - leverage)
+    errors_without = (left / (1.0 - leverage).clip(1e-9)) ** 2
+    return float(errors_without.mean()) * count / max(1, count - terms)
 
 
 # --- sobol indices --------------------------------------------------------------------------------
@@ -291,51 +318,64 @@ def indices(shapes: Sequence[Shape], z: FloatArray, y: FloatArray) -> SobolIndic
     `GROUPS` groups; of Sobol sequences each is a group), and above it the share that the polynomial
     does not explain.
     """
-    scale = float(np.abs(y - y.mean()).max())
-    normal = (y - y.mean()) / scale
+    largest_deviation = float(np.abs(y - y.mean()).max())
+    scaled_output = (y - y.mean()) / largest_deviation
     candidates = Candidates.of(shapes, z)
-    fit = fit_polynomial(candidates, normal)
+    fit = fit_polynomial(candidates, scaled_output)
     group = np.arange(len(y)) % GROUPS
-    parts: list[FloatArray] = []
-    missed = np.empty(len(y))
-    for number in range(GROUPS):
-        training = group != number
-        without = fit_polynomial(candidates, normal, training)
-        missed[~training] = normal[~training] - without.at(candidates.columns[~training])
-        parts.append(_shares(without, candidates, len(shapes)))
-    explained = float(np.clip(1.0 - (missed**2).mean() / normal.var(), 0.0, 1.0))
-    scattered = np.stack(parts)
-    spread = (GROUPS - 1) * scattered.var(0)
-    half = _T * np.sqrt(spread)
-    return _with_intervals(_shares(fit, candidates, len(shapes)), half, explained)
+    shares_by_group: list[FloatArray] = []
+    prediction_errors = np.empty(len(y))
+    for left_out_group in range(GROUPS):
+        training = group != left_out_group
+        fit_without_group = fit_polynomial(candidates, scaled_output, training)
+        prediction_errors[~training] = scaled_output[~training] - fit_without_group.at(
+            candidates.columns[~training]
+        )
+        shares_by_group.append(_shares(fit_without_group, candidates, len(shapes)))
+    explained = float(np.clip(1.0 - (prediction_errors**2).mean() / scaled_output.var(), 0.0, 1.0))
+    jackknife_shares = np.stack(shares_by_group)
+    # jackknife: (n - 1) / n times the sum of squares
+    jackknife_variance = (GROUPS - 1) * jackknife_shares.var(0)
+    half_widths = _T * np.sqrt(jackknife_variance)
+    return _with_intervals(_shares(fit, candidates, len(shapes)), half_widths, explained)
 
 
 def _shares(fit: PolynomialFit, candidates: Candidates, inputs: int) -> FloatArray:
     """Return the first and the total index (2, input) in the variance of a fitted polynomial."""
-    powers = np.array([candidates.powers[term] for term in fit.terms]).reshape(-1, inputs) > 0
-    alone = powers & (powers.sum(1, keepdims=True) == 1)
+    # (term, input): whether the input occurs in the term
+    occurs = np.array([candidates.powers[term] for term in fit.terms]).reshape(-1, inputs) > 0
+    occurs_alone = occurs & (occurs.sum(1, keepdims=True) == 1)
     variance = fit.variances.sum()
     if not variance > 0:
         return np.zeros((2, inputs))
     return np.asarray(
-        np.stack([fit.variances @ alone, fit.variances @ powers]) / variance, np.float64
+        np.stack([fit.variances @ occurs_alone, fit.variances @ occurs]) / variance, np.float64
     )
 
 
 def _with_intervals(shares: FloatArray, half: FloatArray, explained: float) -> SobolIndices:
-    """Return the indices in the whole variance; the interval of a first index lies below that of
-    the total index.
+    """Return the indices in the whole variance from first and total shares (2, input) in that of
+    the polynomial.
+
+    ``half`` are half-widths of the intervals. The interval of a first index lies below that of the
+    total index.
     """
     values = explained * shares
     low = np.clip(values - explained * half, 0.0, 1.0)
+    # what the polynomial does not explain may belong to any input
     high = np.clip(values + explained * half + 1.0 - explained, 0.0, 1.0)
+    # row 0: first, row 1: total
     low[1] = np.maximum(low[1], np.minimum(low[0], values[1]))
     high[0] = np.minimum(high[0], np.maximum(high[1], values[0]))
-    rows = [
+    intervals = [
         [
-            IndexInterval(float(values[k, i]), float(low[k, i]), float(high[k, i]))
-            for i in range(shares.shape[1])
+            IndexInterval(
+                float(values[kind, input_number]),
+                float(low[kind, input_number]),
+                float(high[kind, input_number]),
+            )
+            for input_number in range(shares.shape[1])
         ]
-        for k in range(2)
+        for kind in range(2)
     ]
-    return SobolIndices(rows[0], rows[1], explained)
+    return SobolIndices(intervals[0], intervals[1], explained)

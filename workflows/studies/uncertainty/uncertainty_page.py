@@ -63,10 +63,11 @@ def tornado(
     """Draw a tornado diagram of each output number: the values with one input at its 5 % and its
     95 % quantile.
     """
-    longest = max(map(len, swings.values()))
-    figure, axes = panels(len(swings), 2, 6.6, 0.34 * longest + 1.3)
+    most_bars = max(map(len, swings.values()))
+    figure, axes = panels(len(swings), 2, 6.6, 0.34 * most_bars + 1.3)
     figure.get_layout_engine().set(h_pad=_APART)
     for ax, (name, bars) in zip(axes, swings.items(), strict=True):
+        # a bar is (input, value at its 5 %, value at its 95 %)
         _bars(ax, sorted(bars, key=lambda bar: abs(bar[2] - bar[1])), middles[name])
         ax.set_title(name)
     handles, labels = axes[0].get_legend_handles_labels()
@@ -75,11 +76,27 @@ def tornado(
 
 
 def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> None:
-    low = [bar[1] - middle for bar in bars]
-    up = [bar[2] - middle for bar in bars]
-    ax.barh(range(len(bars)), low, 0.7, left=middle, color=BLUE, label="input at its 5 % quantile")
+    """Draw the bars of one number around ``middle``, its value with every input at its median.
+
+    A bar is (input, value with the input at its 5 % quantile, value at its 95 % quantile).
+    """
+    low_offsets = [bar[1] - middle for bar in bars]
+    high_offsets = [bar[2] - middle for bar in bars]
     ax.barh(
-        range(len(bars)), up, 0.7, left=middle, color=ORANGE, label="input at its 95 % quantile"
+        range(len(bars)),
+        low_offsets,
+        0.7,
+        left=middle,
+        color=BLUE,
+        label="input at its 5 % quantile",
+    )
+    ax.barh(
+        range(len(bars)),
+        high_offsets,
+        0.7,
+        left=middle,
+        color=ORANGE,
+        label="input at its 95 % quantile",
     )
     ax.axvline(middle, color=BLACK, linewidth=0.9)
     ax.set_yticks(range(len(bars)), [bar[0] for bar in bars])
@@ -91,9 +108,10 @@ def _few_numbers(ax: Any) -> None:
     """Write few numbers below a diagram, and take what all numbers share out of numbers that
     would be too long.
     """
-    low, high = ax.get_xlim()
-    decimals = max(0, math.ceil(-math.log10((high - low) / _TICKS)))
-    if len(f"{max(abs(low), abs(high)):.{decimals}f}") > _LONGEST:
+    least, greatest = ax.get_xlim()
+    # as many as a step between two numbers needs
+    decimals = max(0, math.ceil(-math.log10((greatest - least) / _TICKS)))
+    if len(f"{max(abs(least), abs(greatest)):.{decimals}f}") > _LONGEST:
         ax.ticklabel_format(axis="x", style="sci", scilimits=(-2, 4), useOffset=True)
     else:
         ax.ticklabel_format(axis="x", useOffset=False)
@@ -111,18 +129,22 @@ def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axi
         5.6 * len(curves), 5.4, 2, len(curves), sharex="col", height_ratios=[2, 1]
     )
     figure.get_layout_engine().set(h_pad=_APART)
-    for (ax, below), (family, (x, members)) in zip(axes.T, curves.items(), strict=True):
-        for (name, draws), colour in zip(members.items(), _COLOURS * len(members), strict=False):
-            _band(ax, below, x, draws, colour, name)
+    for (ax, relative_axis), (family, (abscissa, curves_by_name)) in zip(
+        axes.T, curves.items(), strict=True
+    ):
+        for (name, draws), colour in zip(
+            curves_by_name.items(), _COLOURS * len(curves_by_name), strict=False
+        ):
+            _band(ax, relative_axis, abscissa, draws, colour, name)
         lowest, highest = (
-            min(float(d.min()) for d in members.values()),
-            max(float(d.max()) for d in members.values()),
+            min(float(curve_draws.min()) for curve_draws in curves_by_name.values()),
+            max(float(curve_draws.max()) for curve_draws in curves_by_name.values()),
         )
         if lowest > 0 and highest / lowest > _WIDE:
             ax.set_yscale("log")
         ax.set_title(f"{family}: median and middle 90 %")
-        below.set_xlabel(axis)
-        below.set_ylabel("over the\nmedian (%)")
+        relative_axis.set_xlabel(axis)
+        relative_axis.set_ylabel("over the\nmedian (%)")
         ax.legend()
     return figure
 
@@ -136,13 +158,22 @@ def transfer(draws: FloatArray) -> Any:
     area takes their place.
     """
     figure, axes = canvas(6.6, 5.8, 2, 1, sharex=True, height_ratios=[2, 1])
-    ax, below = axes[:, 0]
+    ax, relative_axis = axes[:, 0]
+    # columns: 0 signal, 1 variance, 2 predicted variance
     signal, predicted = _at_one_signal(draws, 2)
-    flat = _at_one_signal(draws, 1)[1]
-    unclipped = np.median(flat / predicted, axis=0) > _CLIPPED
-    _band(ax, below, signal, predicted, BLUE, "predicted: middle 90 %")
+    # element 1: the signals are the same
+    flat_deviation = _at_one_signal(draws, 1)[1]
+    unclipped = np.median(flat_deviation / predicted, axis=0) > _CLIPPED
+    _band(ax, relative_axis, signal, predicted, BLUE, "predicted: middle 90 %")
     if unclipped.any():
-        _band(ax, below, signal[unclipped], flat[:, unclipped], ORANGE, "flat fields: middle 90 %")
+        _band(
+            ax,
+            relative_axis,
+            signal[unclipped],
+            flat_deviation[:, unclipped],
+            ORANGE,
+            "flat fields: middle 90 %",
+        )
     if not unclipped.all():
         ax.axvspan(
             signal[~unclipped].min(),
@@ -157,8 +188,8 @@ def transfer(draws: FloatArray) -> Any:
     plain_ticks(ax.yaxis)
     ax.set_title("photon-transfer curve: middle 90 % of the draws")
     ax.set_ylabel("standard deviation (DN)")
-    below.set_xlabel("mean above dark (DN)")
-    below.set_ylabel("over the\nmedian (%)")
+    relative_axis.set_xlabel("mean above dark (DN)")
+    relative_axis.set_ylabel("over the\nmedian (%)")
     ax.legend()
     return figure
 
@@ -167,24 +198,31 @@ def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, na
     """Draw the median and the middle 90 % of the draws in ``ax``, and the band relative to the
     median in ``below``.
     """
-    low, middle, up = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
-    ax.fill_between(x, low, up, color=colour, alpha=0.35, linewidth=0, label=name)
-    ax.plot(x, middle, color=colour, linewidth=1.0)
-    visible = np.abs(middle) > _SLIGHT * np.abs(middle).max()
-    share = [100 * (end[visible] / middle[visible] - 1) for end in (low, up)]
-    below.fill_between(x[visible], *share, color=colour, alpha=0.35, linewidth=0.8)
+    low_curve, median, high_curve = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
+    ax.fill_between(x, low_curve, high_curve, color=colour, alpha=0.35, linewidth=0, label=name)
+    ax.plot(x, median, color=colour, linewidth=1.0)
+    visible = np.abs(median) > _SLIGHT * np.abs(median).max()
+    relative_ends = [100 * (end[visible] / median[visible] - 1) for end in (low_curve, high_curve)]
+    below.fill_between(x[visible], *relative_ends, color=colour, alpha=0.35, linewidth=0.8)
 
 
 def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArray]:
-    """Return signals that the curves of all draws reach, and the curve of each draw interpolated
-    at these signals.
+    """Return signals (signal,) that the curves of all draws reach, and the standard deviation of
+    each draw (draw, signal) at these.
+
+    ``column`` is 1 for the variance of the flat fields, 2 for the predicted variance.
     """
-    lit = draws[:, 1:]
-    ends = float(lit[..., 0].clip(1e-9).min(1).max()), float(lit[..., 0].max(1).min())
-    signal = np.geomspace(*ends, _ALONG)
+    # the first level is dark
+    lit_levels = draws[:, 1:]
+    # from the largest of the least signals to the least of the largest ones
+    signal_range = (
+        float(lit_levels[..., 0].clip(1e-9).min(1).max()),
+        float(lit_levels[..., 0].max(1).min()),
+    )
+    signal = np.geomspace(*signal_range, _ALONG)
     curves = [
-        np.interp(np.log(signal), np.log(x.clip(1e-9)), np.sqrt(y.clip(0)))
-        for x, y in lit[..., [0, column]].transpose(0, 2, 1)
+        np.interp(np.log(signal), np.log(signals.clip(1e-9)), np.sqrt(variances.clip(0)))
+        for signals, variances in lit_levels[..., [0, column]].transpose(0, 2, 1)
     ]
     return signal, np.stack(curves)
 
@@ -222,26 +260,28 @@ def pictures(moments: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
     over the colours.
     """
     figure, axes = canvas(9.6, 4.2 * len(moments), len(moments), 2)
-    for (left, right), (name, (mean, sd)) in zip(axes, moments.items(), strict=True):
+    for (mean_axis, deviation_axis), (name, (mean, sd)) in zip(axes, moments.items(), strict=True):
         white = high(mean.clamp_min(0))
-        three = mean.ndim == 3 and mean.shape[0] == 3
-        shown = encoded(mean / white) if three else (mean[0] if mean.ndim == 3 else mean).numpy()
+        is_colour = mean.ndim == 3 and mean.shape[0] == 3
+        shown_mean = (
+            encoded(mean / white) if is_colour else (mean[0] if mean.ndim == 3 else mean).numpy()
+        )
         picture(
-            left,
-            shown,
+            mean_axis,
+            shown_mean,
             f"{name}: mean",
-            **({} if three else {"cmap": "gray", "vmin": 0.0, "vmax": white}),
+            **({} if is_colour else {"cmap": "gray", "vmin": 0.0, "vmax": white}),
         )
         spread = sd.mean(0) if sd.ndim == 3 else sd
         image = picture(
-            right,
+            deviation_axis,
             spread.numpy(),
             f"{name}: standard deviation",
             cmap="viridis",
             vmin=0,
             vmax=high(spread),
         )
-        bar = figure.colorbar(image, ax=right, fraction=0.046, pad=0.03, extend="max")
+        bar = figure.colorbar(image, ax=deviation_axis, fraction=0.046, pad=0.03, extend="max")
         bar.set_label("in the unit of the picture", fontsize=9)
         bar.ax.tick_params(labelsize=9)
     return figure
@@ -297,7 +337,7 @@ class UncertaintyResult:
     @property
     def strange(self) -> list[str]:
         """Return the names of output quantities that are NaN or infinite in at least one draw."""
-        return [name for name, x in self.values.items() if not np.isfinite(x).all()]
+        return [name for name, values in self.values.items() if not np.isfinite(values).all()]
 
     @property
     def failed(self) -> int:
@@ -311,16 +351,18 @@ class UncertaintyResult:
         """Return the name, label, distribution, mean and standard deviation of each uncertain
         input.
         """
-        said, columns = self.inputs.uncertain.said, self.points.values.T
+        law_text_of, columns = self.inputs.uncertain.said, self.points.values.T
         return [
             {
                 "name": name,
                 "label": label,
-                "law": said(name),
-                "mean": float(x.mean()),
-                "sd": float(x.std(ddof=1)),
+                "law": law_text_of(name),
+                "mean": float(column.mean()),
+                "sd": float(column.std(ddof=1)),
             }
-            for name, label, x in zip(self.inputs.names, self.inputs.labels, columns, strict=True)
+            for name, label, column in zip(
+                self.inputs.names, self.inputs.labels, columns, strict=True
+            )
         ]
 
     @property
@@ -335,20 +377,24 @@ def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
     """Draw the pictures of the uncertainty study's page, and return the pictures by name as PNG
     bytes.
     """
-    shown = {}
+    pictures_by_name = {}
     numbers = result.numbers[:_MOST]
     if numbers:
-        middle = {name: result.middle[name][0] for name in numbers}
-        shown["tornado"] = tornado({name: result.swings[name] for name in numbers}, middle)
-        shown["numbers"] = histograms({name: result.values[name][:, 0] for name in numbers}, middle)
+        median_values = {name: result.middle[name][0] for name in numbers}
+        pictures_by_name["tornado"] = tornado(
+            {name: result.swings[name] for name in numbers}, median_values
+        )
+        pictures_by_name["numbers"] = histograms(
+            {name: result.values[name][:, 0] for name in numbers}, median_values
+        )
     if curves := _curves(result):
-        shown["bands"] = bands(*curves)
+        pictures_by_name["bands"] = bands(*curves)
     for name, values in result.values.items():
         if _node_of(result, name) == _TRANSFER and np.isfinite(values).all():
-            shown["transfer"] = transfer(values.reshape(len(values), -1, 3))
+            pictures_by_name["transfer"] = transfer(values.reshape(len(values), -1, 3))
     if result.pictures:
-        shown["pictures"] = pictures(result.pictures)
-    return shown
+        pictures_by_name["pictures"] = pictures(result.pictures)
+    return pictures_by_name
 
 
 def _curves(
@@ -361,19 +407,22 @@ def _curves(
     curves: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
     spectral = True
     for name, values in result.values.items():
+        # an element of a curve is in a column
         count = values.shape[1]
         varies = np.isfinite(values).all() and not result.scatter[name].is_constant
         if count < 3 or not varies or _node_of(result, name) == _TRANSFER:
             continue
-        over_bands = len(wavelengths) == count
-        spectral &= over_bands
-        x = wavelengths if over_bands else np.arange(count, dtype=np.float64)
+        has_bands = len(wavelengths) == count
+        spectral &= has_bands
+        abscissa = wavelengths if has_bands else np.arange(count, dtype=np.float64)
+        # curves such as lsr[mask] and lsr[plain] share one diagram
         family, _, arm = name.partition("[")
-        curves.setdefault(family, (x, {}))[1][arm.rstrip("]") or family] = values
+        curves.setdefault(family, (abscissa, {}))[1][arm.rstrip("]") or family] = values
     return (curves, "wavelength (nm)" if spectral else "element") if curves else None
 
 
 def _wavelengths_nm(result: UncertaintyResult) -> FloatArray:
+    """Return the wavelengths of the recipe's bands in nm; empty without bands."""
     recipe = result.inputs.recipe
     if BANDS not in recipe.steps:
         return np.zeros(0)
@@ -382,6 +431,9 @@ def _wavelengths_nm(result: UncertaintyResult) -> FloatArray:
 
 
 def _node_of(result: UncertaintyResult, quantity: str) -> str:
+    """Return the path of the node that gave a quantity, such as ``step`` or ``step.field``; empty
+    if unknown.
+    """
     steps = result.inputs.recipe.steps
     step = steps.get(quantity) or steps.get(quantity.rpartition(".")[0])
     return step.node.path if step else ""
@@ -389,18 +441,22 @@ def _node_of(result: UncertaintyResult, quantity: str) -> str:
 
 def lead(result: UncertaintyResult) -> str:
     """Return the summary of the uncertainty study in a few sentences."""
-    count, kind = len(result.points.z), "Sobol points" if result.sequences else "independent draws"
+    count, kind_of_draws = (
+        len(result.points.z),
+        "Sobol points" if result.sequences else "independent draws",
+    )
     numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
+    # numbers have one element
     values = [
-        f"{name} {with_uncertainty(float(s.mean[0]), float(s.sd[0]))}"
-        for name, s in numbers.items()
+        f"{name} {with_uncertainty(float(scattered.mean[0]), float(scattered.sd[0]))}"
+        for name, scattered in numbers.items()
     ]
     strange = (
         f" NaN or infinite in some draw: {', '.join(result.strange)}." if result.strange else ""
     )
     precision = "; ".join([*_known(result), *_exceptions(result)])
     return (
-        f"{count} {kind} of {', '.join(result.inputs.names)}:"
+        f"{count} {kind_of_draws} of {', '.join(result.inputs.names)}:"
         f" {precision}.{strange}\n\n{'; '.join(values)}."
     )
 
@@ -408,25 +464,25 @@ def lead(result: UncertaintyResult) -> str:
 def _known(result: UncertaintyResult) -> list[str]:
     """Return how well the standard deviations are known."""
     if len(result.deciding) == len(result.scatter):
-        which, others = "every standard deviation", []
+        which_deviations, on_others = "every standard deviation", []
     else:
-        which, other = (
+        which_deviations, least_known = (
             f"the standard deviation of {', '.join(result.deciding)}",
             worst_known(result.scatter),
         )
-        others = [
-            f"others did not decide, the least known is {other} to"
-            f" {result.scatter[other].error:.1%}"
+        on_others = [
+            f"others did not decide, the least known is {least_known} to"
+            f" {result.scatter[least_known].error:.1%}"
         ]
     if result.error <= result.wanted:
-        return [f"{which} is known to {result.error:.1%}", *others]
+        return [f"{which_deviations} is known to {result.error:.1%}", *on_others]
     sentence = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
-    return [sentence, f"{result.wanted:.1%} was requested", *others]
+    return [sentence, f"{result.wanted:.1%} was requested", *on_others]
 
 
 def _exceptions(result: UncertaintyResult) -> list[str]:
     """Return which numbers do not vary, and how many draws were left out."""
-    constant = [name for name, s in result.scatter.items() if s.is_constant]
+    constant = [name for name, scattered in result.scatter.items() if scattered.is_constant]
     parts = (
         [f"{', '.join(constant)} {'does' if len(constant) == 1 else 'do'} not vary"]
         if constant
@@ -439,10 +495,10 @@ def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Sect
     """Return the sections of the uncertainty study's page; ``shown`` has the PNG bytes of each
     picture by name.
     """
-    parts = [_inputs(result), *_posterior(result), _numbers(result, shown.get("numbers"))]
-    parts += _moves(result, shown.get("tornado"))
+    listed_sections = [_inputs(result), *_posterior(result), _numbers(result, shown.get("numbers"))]
+    listed_sections += _moves(result, shown.get("tornado"))
     if "bands" in shown:
-        parts.append(
+        listed_sections.append(
             Section(
                 "Curves",
                 "The middle 90 % of the draws, element by element.",
@@ -453,53 +509,80 @@ def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Sect
         text = """The curves that a laboratory would measure with the drawn sensors, simulated by
             the recipe's steps. The prediction has no noise. Flat fields have the noise of their
             pixels, because each draw has its own light."""
-        parts.append(Section("Photon-transfer curve", text, picture=shown["transfer"]))
+        listed_sections.append(Section("Photon-transfer curve", text, picture=shown["transfer"]))
     if "pictures" in shown:
         text = """Mean and standard deviation of each pixel over the first 32 draws; the standard
             deviation is known to 13 %. The noise is the same in all draws, so only the inputs
             matter. pictures.npz has the numbers."""
-        parts.append(Section("Pictures", text, picture=shown["pictures"]))
-    return [*parts, *_rest(result)]
+        listed_sections.append(Section("Pictures", text, picture=shown["pictures"]))
+    return [*listed_sections, *_rest(result)]
 
 
 def _inputs(result: UncertaintyResult) -> Section:
+    """Return the section with the drawn inputs, their distributions, and what was
+    left out of them.
+    """
     text = """The drawn values, in SI units. A joint distribution is drawn from independent inputs:
         the first input moves all correlated values, and each further input the part of its value
         that the inputs before it leave free. The same noise is drawn every time, so that only the
         inputs make a difference."""
     notes = result.inputs.notes
-    cut = [
+    notes_on_draws = [
         f"{name} = {result.inputs.uncertain.said(name)}: {note}." for name, note in notes.items()
     ]
     if result.left_out:
-        cut.append(f"Left out: {result.left_out}; all numbers hold for the other draws.")
-    text = "\n\n".join([text, *cut])
+        notes_on_draws.append(f"Left out: {result.left_out}; all numbers hold for the other draws.")
+    text = "\n\n".join([text, *notes_on_draws])
     rows = [
-        (r["name"], r["label"], r["law"], f"{r['mean']:.6g}", r["sd"]) for r in result.input_rows
+        (
+            input_row["name"],
+            input_row["label"],
+            input_row["law"],
+            f"{input_row['mean']:.6g}",
+            input_row["sd"],
+        )
+        for input_row in result.input_rows
     ]
     return Section("Inputs", text, ("value", "drawn as", "law", "mean", "sd"), rows)
 
 
 def _posterior(result: UncertaintyResult) -> list[Section]:
-    standings = [s for s in result.inputs.uncertain.standings if s.path in result.inputs.names]
+    """Return the section that places the recipe's own values in the posterior; none without one."""
+    standings = [
+        standing
+        for standing in result.inputs.uncertain.standings
+        if standing.path in result.inputs.names
+    ]
     if not standings:
         return []
     text = """The position of the recipe's own value in the posterior. A value that the frames only
         limit, or do not determine, is drawn mostly from the prior of the calibration."""
     rows = []
-    for s in standings:
-        is_estimate = s.kind == "estimate"
-        below = Marked(s.below)
+    for standing in standings:
+        is_estimate = standing.kind == "estimate"
+        share_below = Marked(standing.below)
         if is_estimate:
-            below = Marked(s.below, "warn" if s.far else "pass")
-        limit = _CONSTRAINT.get(s.kind, "estimate")
+            share_below = Marked(standing.below, "warn" if standing.far else "pass")
+        limit = _CONSTRAINT.get(standing.kind, "estimate")
         constraint = Marked(limit, None if is_estimate else "warn")
-        rows.append((s.path, s.own, f"{s.mean:.6g}", s.sd, below, constraint))
+        rows.append(
+            (
+                standing.path,
+                standing.own,
+                f"{standing.mean:.6g}",
+                standing.sd,
+                share_below,
+                constraint,
+            )
+        )
     columns = ("value", "recipe", "posterior mean", "sd", "posterior below it", "told")
     return [Section("The recipe beside its posterior", text, columns, rows)]
 
 
 def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
+    """Return the section with the scatter of each quantity; of a curve, at its most uncertain
+    element.
+    """
     method = (
         f"from {result.sequences} scrambled Sobol sequences"
         if result.sequences
@@ -511,18 +594,34 @@ def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
     )
     columns = ("quantity", "at the medians", "mean", "sd", "error", "5 %", "95 %")
     rows = list[Sequence[Any]]()
-    for name, s in result.scatter.items():
-        i = int(s.sd.argmax())
-        label = name if len(s.sd) == 1 else f"{name}, element {i}"
-        numbers = (f"{result.middle[name][i]:.6g}", f"{s.mean[i]:.6g}", float(s.sd[i]))
-        holds = s.error <= result.wanted and name not in result.strange
-        text_of_error = "does not vary" if s.is_constant else f"{s.error:.1%}"
+    for name, scattered in result.scatter.items():
+        # the element of the largest standard deviation
+        element = int(scattered.sd.argmax())
+        label = name if len(scattered.sd) == 1 else f"{name}, element {element}"
+        numbers = (
+            f"{result.middle[name][element]:.6g}",
+            f"{scattered.mean[element]:.6g}",
+            float(scattered.sd[element]),
+        )
+        holds = scattered.error <= result.wanted and name not in result.strange
+        text_of_error = "does not vary" if scattered.is_constant else f"{scattered.error:.1%}"
         error = Marked(text_of_error, "pass" if holds else "fail")
-        rows.append((label, *numbers, error, f"{s.low[i]:.6g}", f"{s.high[i]:.6g}"))
+        rows.append(
+            (
+                label,
+                *numbers,
+                error,
+                f"{scattered.low[element]:.6g}",
+                f"{scattered.high[element]:.6g}",
+            )
+        )
     return Section("Numbers", text, columns, rows, picture)
 
 
 def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
+    """Return the section on the influence of the inputs, with their Sobol indices; none without a
+    picture.
+    """
     if picture is None:
         return []
     text = f"""Each input alone at its 5 % and its 95 % quantile, all others at their medians. The
@@ -544,24 +643,32 @@ def _influence(name: str, labels: Sequence[str], shares: SobolIndices) -> list[S
     """Return a row for each input that moves a quantity; the first row has the mark of the
     polynomial.
     """
-    mark: Mark | None = None if shares.explains_enough else "warn"
+    mark_of_polynomial: Mark | None = None if shares.explains_enough else "warn"
     if shares.explained < _TOO_LITTLE:
-        explained = Marked(f"{shares.explained:.0%}", mark)
+        explained = Marked(f"{shares.explained:.0%}", mark_of_polynomial)
         return [(name, "not judged", None, None, None, None, explained)]
     rows: list[Sequence[Any]] = []
-    for label, first, total in zip(labels, shares.first, shares.total, strict=True):
-        if total.value > _LITTLE:
-            explained = Marked(f"{shares.explained:.1%}", None if rows else mark)
-            effects = (first.value, _between(first), total.value, _between(total))
+    for label, first_index, total_index in zip(labels, shares.first, shares.total, strict=True):
+        if total_index.value > _LITTLE:
+            # marked in the first row alone
+            explained = Marked(f"{shares.explained:.1%}", None if rows else mark_of_polynomial)
+            effects = (
+                first_index.value,
+                _between(first_index),
+                total_index.value,
+                _between(total_index),
+            )
             rows.append((name, label, *effects, explained))
     return rows
 
 
 def _between(index: IndexInterval) -> str:
+    """Return the interval of an index as text."""
     return f"{index.low:.2g} to {index.high:.2g}"
 
 
 def _rest(result: UncertaintyResult) -> list[Section]:
+    """Return the section on what does not vary; none if everything does."""
     sentences = (
         [f"Outputs that depend on no input: {', '.join(result.is_constant)}."]
         if result.is_constant

@@ -113,6 +113,7 @@ class StopRule:
 
 
 def _inputs(recipe: Recipe) -> Inputs:
+    """Return the uncertain inputs of a recipe; raise `StudyRefused` if there are none to vary."""
     try:
         return Inputs.of(recipe, negligible=NEGLIGIBLE)
     except RecipeError:
@@ -122,6 +123,10 @@ def _inputs(recipe: Recipe) -> Inputs:
 
 
 def _points(inputs: Inputs, seed: int, limit: int, points: str) -> InputDraws:
+    """Return ``limit`` draws of the inputs at most: independent ones, or Sobol points.
+
+    Sobol points are as many as `SCRAMBLES` times a power of two.
+    """
     if points == "sobol":
         return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(limit, LEAST) / SCRAMBLES)), seed)
     return inputs.independent(limit if inputs.most is None else min(limit, inputs.most), seed)
@@ -140,10 +145,10 @@ def _one_at_a_time(inputs: Inputs, score: float) -> FloatArray:
     """Return input values with one input at each of two opposite normal scores, and all others
     at their medians.
     """
-    z = []
+    scores = []
     for direction in np.eye(len(inputs.names)):
-        z += [-score * direction, score * direction]
-    return inputs.at(np.stack(z))
+        scores += [-score * direction, score * direction]
+    return inputs.at(np.stack(scores))
 
 
 def _chosen(until: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
@@ -152,16 +157,16 @@ def _chosen(until: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
     """
     if not until:
         return tuple(names)
-    decide = dict[str, None]()
+    deciding = dict[str, None]()
     for name in until:
-        meant = _means(name, names)
-        if not meant:
+        quantities_of_name = _means(name, names)
+        if not quantities_of_name:
             raise StudyRefused(
                 f"--until {name}: no output with numbers has this name; there are"
                 f" {', '.join(names)}"
             )
-        decide |= dict.fromkeys(meant)
-    return tuple(name for name in names if name in decide)
+        deciding |= dict.fromkeys(quantities_of_name)
+    return tuple(name for name in names if name in deciding)
 
 
 def _deciding(
@@ -170,10 +175,10 @@ def _deciding(
     """Return the numbers that decide when to stop; raise `StudyRefused` for an output that
     depends on no input.
     """
-    still = [name for name in until if _means(name, constant) and not _means(name, varying)]
-    if still:
+    constants = [name for name in until if _means(name, constant) and not _means(name, varying)]
+    if constants:
         raise StudyRefused(
-            f"--until {still[0]}: this output depends on no uncertain input, and does not vary"
+            f"--until {constants[0]}: this output depends on no uncertain input, and does not vary"
         )
     return _chosen(until, varying)
 
@@ -190,34 +195,45 @@ def _means(name: str, quantities: Sequence[str]) -> list[str]:
 def _measure(
     inputs: Inputs, draws: OutputDraws, allowed: AllowedDraws, progress: Progress, rule: StopRule
 ) -> UncertaintyResult:
+    """Draw until the standard deviations that decide are known well enough, and
+    return the result.
+    """
     _say_inputs(inputs, draws, rule.sequences, progress)
-    ends = draws.numbers(_ends(inputs))
-    if not ends[0]:
+    end_runs = draws.numbers(_ends(inputs))
+    if not end_runs[0]:
         raise StudyRefused(
             "the outputs are pictures only: add an output with numbers, such as restored_quality"
         )
-    deciding = _deciding(rule.until, list(ends[0]), draws.is_constant)
-    _say_constant(inputs, draws, ends, deciding, progress)
+    # run 0 has all inputs at their medians
+    deciding = _deciding(rule.until, list(end_runs[0]), draws.is_constant)
+    _say_constant(inputs, draws, end_runs, deciding, progress)
     pictures = draws.pictures(allowed.values[:PICTURED])
     numbers = list[Numbers]()
+    # at least one round
     while allowed.tried < allowed.available or not numbers:
         allowed.extend(rule.following(allowed.tried) if numbers else LEAST)
+        # further draws alone: those before are known
         numbers += draws.numbers(allowed.values[len(numbers) :])
         values = _by_quantity(numbers)
-        scattered = {name: scatter(x, rule.sequences) for name, x in values.items()}
-        worst = worst_known({name: scattered[name] for name in deciding})
-        error = scattered[worst].error
+        scattered = {
+            name: scatter(values_of_quantity, rule.sequences)
+            for name, values_of_quantity in values.items()
+        }
+        least_known = worst_known({name: scattered[name] for name in deciding})
+        error = scattered[least_known].error
         needed = rule.needed(len(numbers), error, allowed.available)
-        progress(f"{len(numbers)} draws of about {needed}: {rule.text} to {error:.1%} ({worst})")
+        progress(
+            f"{len(numbers)} draws of about {needed}: {rule.text} to {error:.1%} ({least_known})"
+        )
         if error <= rule.wanted:
             break
-    swings = _swings(inputs, ends, values, scattered)
+    swings = _swings(inputs, end_runs, values, scattered)
     return UncertaintyResult(
         inputs=inputs,
         points=InputDraws(allowed.z, allowed.values),
         values=values,
         scatter=scattered,
-        middle=ends[0],
+        middle=end_runs[0],
         swings=swings,
         shares={name: indices(inputs.shapes, allowed.z, values[name][:, 0]) for name in swings},
         pictures=pictures,
@@ -261,16 +277,16 @@ def _say_constant(
     """Print which numbers do not vary in the first runs; raise `StudyRefused` if none of those
     that decide varies.
     """
-    constant = _constant(ends)
-    if set(deciding) <= set(constant):  # the rare ends of the distributions may tell more
+    same_in_all = _constant(ends)
+    if set(deciding) <= set(same_in_all):  # the rare ends of the distributions may tell more
         ends = [*ends, *draws.numbers(_one_at_a_time(inputs, _RARE))]
-        constant = _constant(ends)
-    if constant:
+        same_in_all = _constant(ends)
+    if same_in_all:
         progress(
-            f"{', '.join(constant)}: the same in the first {len(ends)} runs, one input after"
+            f"{', '.join(same_in_all)}: the same in the first {len(ends)} runs, one input after"
             " another at its ends"
         )
-    if set(deciding) <= set(constant):
+    if set(deciding) <= set(same_in_all):
         raise StudyRefused(
             f"nothing varies: {', '.join(deciding)} {'is' if len(deciding) == 1 else 'are'} the"
             f" same in {len(ends)} runs, with all inputs at their medians, and with each at its 5"
@@ -299,21 +315,32 @@ def _swings(
     proportional to others.
     """
     swings: dict[str, list[tuple[str, float, float]]] = {}
-    for name, x in values.items():
-        finite = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
-        varies = finite and x.shape[1] == 1 and not scattered[name].is_constant
-        if varies and not any(_proportional(x[:, 0], values[other][:, 0]) for other in swings):
+    for name, values_of_number in values.items():
+        is_finite = (
+            np.isfinite(values_of_number).all()
+            and np.isfinite([end_run[name] for end_run in ends]).all()
+        )
+        varies = is_finite and values_of_number.shape[1] == 1 and not scattered[name].is_constant
+        if varies and not any(
+            _proportional(values_of_number[:, 0], values[earlier_number][:, 0])
+            for earlier_number in swings
+        ):
+            # run 0 is at the medians; then each input at its 5 % and its 95 % in turn
             pairs = zip(inputs.labels, ends[1::2], ends[2::2], strict=True)
-            swings[name] = [(label, low[name][0], high[name][0]) for label, low, high in pairs]
+            swings[name] = [
+                (label, low_run[name][0], high_run[name][0]) for label, low_run, high_run in pairs
+            ]
     return swings
 
 
 def _proportional(x: FloatArray, y: FloatArray) -> bool:
+    """Return True if ``x`` is ``y`` times a constant, by their ratio where ``y`` is largest."""
     index = int(np.abs(y).argmax())
     return y[index] != 0 and bool(np.allclose(x * y[index], y * x[index], rtol=1e-9, atol=0.0))
 
 
 def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
+    """Return the numbers of the study as JSON values."""
     return {
         "draws": len(result.points.z),
         "points": "sobol" if result.sequences else "draws",
@@ -335,22 +362,25 @@ def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
 
 
 def _plain(result: UncertaintyResult, name: str) -> dict[str, Any]:
-    s = result.scatter[name]
+    """Return the scatter of one quantity as JSON values."""
+    scattered = result.scatter[name]
     arrays = {
-        statistic: getattr(s, statistic).tolist() for statistic in ("mean", "sd", "low", "high")
+        statistic: getattr(scattered, statistic).tolist()
+        for statistic in ("mean", "sd", "low", "high")
     }
-    return {"error": s.error, "middle": list(result.middle[name]), **arrays}
+    return {"error": scattered.error, "middle": list(result.middle[name]), **arrays}
 
 
 def _report(result: UncertaintyResult) -> StudyReport:
+    """Return the page of the study, with its tables, draws and pictures."""
     pictures = draw_pictures(result)
-    draws = zip(result.inputs.names, result.points.values.T, strict=True)
-    files: dict[str, Content] = {"draws.npz": _npz({**dict(draws), **result.values})}
+    named_draws = zip(result.inputs.names, result.points.values.T, strict=True)
+    files: dict[str, Content] = {"draws.npz": _npz({**dict(named_draws), **result.values})}
     if result.pictures:
         arrays = {}
         for name, moments in result.pictures.items():
-            for statistic, x in zip(_KEPT, moments, strict=True):
-                arrays[f"{name} {statistic}"] = x.numpy()
+            for statistic, moment in zip(_KEPT, moments, strict=True):
+                arrays[f"{name} {statistic}"] = moment.numpy()
         files["pictures.npz"] = _npz(arrays)
     return StudyReport(
         f"{result.inputs.recipe.name}: uncertainty",
@@ -364,14 +394,26 @@ def _report(result: UncertaintyResult) -> StudyReport:
 
 
 def _rows(result: UncertaintyResult) -> list[Sequence[Any]]:
+    """Return the rows of table.csv: one for each element of each quantity."""
     rows: list[Sequence[Any]] = []
-    for name, s in result.scatter.items():
-        columns = zip(result.middle[name], s.mean, s.sd, s.low, s.high, strict=True)
-        rows += [(name, i if len(s.mean) > 1 else "", *row) for i, row in enumerate(columns)]
+    for name, scattered in result.scatter.items():
+        columns = zip(
+            result.middle[name],
+            scattered.mean,
+            scattered.sd,
+            scattered.low,
+            scattered.high,
+            strict=True,
+        )
+        rows += [
+            (name, element if len(scattered.mean) > 1 else "", *row)
+            for element, row in enumerate(columns)
+        ]
     return rows
 
 
 def _npz(arrays: Mapping[str, Any]) -> bytes:
-    out = io.BytesIO()
-    np.savez(out, **arrays)
-    return out.getvalue()
+    """Return arrays as the bytes of a file of NumPy."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
