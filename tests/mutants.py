@@ -120,7 +120,10 @@ MUTANTS = (
             "workflows/recipe/text",
             "extended_recipes.py::test_a_recipe_is_composed_of_what_its_defaults_say",
         ),
-        ("                layers[place] = entry\n                return", "                return"),
+        (
+            "                layers[position] = entry\n                return",
+            "                return",
+        ),
     ),
     Mutant(
         "workflows/recipe/text/extended_recipes.py",
@@ -137,7 +140,7 @@ MUTANTS = (
             "workflows/recipe/text",
             "extended_recipes.py::test_a_wrong_entry_is_one_located_mistake",
         ),
-        ("if any(os.path.realpath(path) == real for path in open_):", "if False:"),
+        ("if any(os.path.realpath(path) == real_path for path in open_):", "if False:"),
         ("        if file in self.extended:", "        if False:"),
         ("if message := _chosen_before(entry, layers, before):", "if message := '':"),
     ),
@@ -184,12 +187,12 @@ MUTANTS = (
             "if text and indent <= self.column and text[0]",
             "if text and indent < self.column and text[0]",
         ),
-        ('if self.text[end : end + 1] == "#":', "if False:"),
+        ('if self.text[end_index : end_index + 1] == "#":', "if False:"),
         ('    if text.rpartition("\\n")[2].isspace():', "    if False:"),
-        ('        if written == ["!"]:', "        if False:"),
+        ('        if tags == ["!"]:', "        if False:"),
         (
-            'free_starts = "]}#" if isinstance(node, CollectionNode)',
-            'free_starts = "" if isinstance(node, CollectionNode)',
+            'exempt_starts = "]}#" if isinstance(node, CollectionNode)',
+            'exempt_starts = "" if isinstance(node, CollectionNode)',
         ),
     ),
     # Faults that no test found once.
@@ -406,8 +409,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/training/training_iteration.py",
-        "largest = math.inf if self.settings.clip is None else self.settings.clip",
-        "largest = 10.0",
+        "norm_limit = math.inf if self.settings.clip is None else self.settings.clip",
+        "norm_limit = 10.0",
         within(
             "workflows/training",
             "training_precision.py::test_the_gradient_of_each_module_has_at_most_the_norm_clip",
@@ -415,8 +418,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/training/lift/lift_iteration.py",
-        "largest = math.inf if self.settings.clip is None else self.settings.clip",
-        "largest = 10.0",
+        "norm_limit = math.inf if self.settings.clip is None else self.settings.clip",
+        "norm_limit = 10.0",
         within(
             "workflows/training/lift",
             "lift_run.py::test_the_gradient_of_all_weights_has_at_most_the_norm_clip",

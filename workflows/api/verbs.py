@@ -169,12 +169,14 @@ def evaluate(
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     run_evaluation = lazy.run_evaluation
-    here, name, words = Path.cwd(), _name(recipe, "evaluate"), _arguments(changes)
-    own = run_evaluation.read_settings(name, words, here)
+    working_folder, name, arguments = Path.cwd(), _name(recipe, "evaluate"), _arguments(changes)
+    recipe_settings = run_evaluation.read_settings(name, arguments, working_folder)
     return run_evaluation.evaluate(
         name,
-        changes=words,
-        **run_evaluation.options_of(own, pipelines, scenes, reference, equal_protection, by, here),
+        changes=arguments,
+        **run_evaluation.options_of(
+            recipe_settings, pipelines, scenes, reference, equal_protection, by, working_folder
+        ),
         data=None if data is None else Path(data).expanduser(),
         strengths=run_evaluation.STRENGTHS if strengths is None else strengths,
         small=small,
@@ -183,7 +185,7 @@ def evaluate(
         command=command,
         progress=progress,
         device=device,
-        folder=here,
+        folder=working_folder,
     )
 
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 # chains.
 
 
+# the ends and the middle of a band of 90 %
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: most points of a chain in the picture
 _LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
@@ -55,36 +56,50 @@ def transfer(
     figure, axes = canvas(
         9.0, 4.8 + 1.2 * rows, rows, 1, sharex=True, height_ratios=(2.2, *(rows - 1) * (1.0,))
     )
-    above = axes[0, 0]
-    order = np.flatnonzero(unclipped)[np.argsort(predicted[0].mean(0)[unclipped])]
-    mean = predicted[0].mean(0)[order]
-    low, middle, high = np.percentile(predicted[1], _BAND, axis=0)[:, order]
-    above.fill_between(
-        mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %"
+    curve_panel = axes[0, 0]
+    unclipped_by_mean = np.flatnonzero(unclipped)[np.argsort(predicted[0].mean(0)[unclipped])]
+    mean = predicted[0].mean(0)[unclipped_by_mean]
+    # percentiles over the draws, of the levels with a prediction
+    variance_low, variance_median, variance_high = np.percentile(predicted[1], _BAND, axis=0)[
+        :, unclipped_by_mean
+    ]
+    curve_panel.fill_between(
+        mean,
+        variance_low,
+        variance_high,
+        color=BLUE,
+        alpha=0.25,
+        linewidth=0,
+        label="predicted, 90 %",
     )
-    above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
-    lowest = max(_LEAST, 0.5 * float(min([*measured[1, unclipped], *middle], default=_LEAST)))
-    for shown, style in (
+    curve_panel.plot(mean, variance_median, color=BLUE, linewidth=1.2, label="predicted, median")
+    # the axis is logarithmic: variances of 0 are drawn at its lower end
+    lowest_drawn_variance = max(
+        _LEAST, 0.5 * float(min([*measured[1, unclipped], *variance_median], default=_LEAST))
+    )
+    for is_drawn, marker_style in (
         (unclipped, {"marker": "o", "color": BLACK, "label": "measured"}),
         (~unclipped, {**_CLIPPED, "label": other}),
     ):
-        if shown.any():
-            above.plot(
-                measured[0, shown],
-                measured[1, shown].clip(lowest),
+        if is_drawn.any():
+            curve_panel.plot(
+                measured[0, is_drawn],
+                measured[1, is_drawn].clip(lowest_drawn_variance),
                 linestyle="",
                 markersize=5,
-                **style,
+                **marker_style,
             )
-    above.set(
+    curve_panel.set(
         xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve"
     )
-    above.set_ylim(bottom=lowest / 2)  # a clipped level does not stretch the axis
-    above.legend(loc="upper left")
-    distance = (measured[1, unclipped] - predicted[1].mean(0)[unclipped]) / predicted[1].std(0)[
-        unclipped
-    ]
-    _distances(axes[1, 0], measured[0, unclipped], distance, "variance: distance\nin sd")
+    # a clipped level does not stretch the axis
+    curve_panel.set_ylim(bottom=lowest_drawn_variance / 2)
+    curve_panel.legend(loc="upper left")
+    # measured less the mean of all draws, over the spread of the draws
+    variance_distance = (measured[1, unclipped] - predicted[1].mean(0)[unclipped]) / predicted[
+        1
+    ].std(0)[unclipped]
+    _distances(axes[1, 0], measured[0, unclipped], variance_distance, "variance: distance\nin sd")
     if means is not None:
         _distances(axes[2, 0], measured[0, unclipped], means[unclipped], "mean: distance\nin sd")
     axes[-1, 0].set_xlabel("mean (DN)")
@@ -98,8 +113,9 @@ def _distances(ax: Any, places: FloatArray, distance: FloatArray, label: str) ->
     ax.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
     ax.axhline(0, color=BLUE, linewidth=1.0)
     ax.plot(places, distance, "o", color=BLACK, markersize=5)
-    reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
-    ax.set(ylabel=label, ylim=(-reach, reach))
+    # at least 3.5, so that the band of two standard deviations looks the same in most pictures
+    half_height = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
+    ax.set(ylabel=label, ylim=(-half_height, half_height))
 
 
 @drawn
@@ -117,30 +133,40 @@ def rings(
     and their squares; ``cut`` (cut,) are the radii of the rings that are cut off.
     """
     figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
-    above, below = axes[0, 0], axes[1, 0]
-    low, middle, high = np.percentile(predicted, _BAND, axis=0)
-    above.fill_between(
-        radius, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %"
+    signal_panel, distance_panel = axes[0, 0], axes[1, 0]
+    signal_low, signal_median, signal_high = np.percentile(predicted, _BAND, axis=0)
+    signal_panel.fill_between(
+        radius,
+        signal_low,
+        signal_high,
+        color=BLUE,
+        alpha=0.25,
+        linewidth=0,
+        label="predicted, 90 %",
     )
-    above.plot(radius, middle, color=BLUE, linewidth=1.2, label="predicted, median")
+    signal_panel.plot(radius, signal_median, color=BLUE, linewidth=1.2, label="predicted, median")
     positive = measured > 0
-    above.plot(
+    signal_panel.plot(
         radius[positive], measured[positive], "o", color=BLACK, markersize=4, label="measured"
     )
     if len(cut):
-        ends = float(cut.min()) - 0.5, float(cut.max()) + 0.5  # a ring is one pixel wide
-        above.axvspan(*ends, color=VERMILION, alpha=0.3, linewidth=0, label="cut off")
-    above.set(
+        cut_edges = float(cut.min()) - 0.5, float(cut.max()) + 0.5  # a ring is one pixel wide
+        signal_panel.axvspan(*cut_edges, color=VERMILION, alpha=0.3, linewidth=0, label="cut off")
+    signal_panel.set(
         xscale="log", yscale="log", ylabel="signal (e- of a pixel)", title="Rings about the source"
     )
-    above.legend(loc="lower left")
-    width = np.sqrt(predicted.var(0) + variance.mean(0))
+    signal_panel.legend(loc="lower left")
+    # spread of the draws and noise of each ring, added as variances
+    total_sd = np.sqrt(predicted.var(0) + variance.mean(0))
     _distances(
-        below, radius, (measured - predicted.mean(0)) / width, "distance in sd\nof the prediction"
+        distance_panel,
+        radius,
+        (measured - predicted.mean(0)) / total_sd,
+        "distance in sd\nof the prediction",
     )
-    below.set_xlabel("distance from the source (pixels)")
-    below.xaxis.set_major_formatter("{x:g}")
-    below.xaxis.set_minor_formatter("{x:g}")
+    distance_panel.set_xlabel("distance from the source (pixels)")
+    distance_panel.xaxis.set_major_formatter("{x:g}")
+    distance_panel.xaxis.set_minor_formatter("{x:g}")
     return figure
 
 
@@ -151,16 +177,16 @@ def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
     """
     count = len(labels)
     figure, axes = canvas(9.0, 1.35 * count + 0.5, count, 1, sharex=True)
-    every = max(1, draws.shape[1] // _POINTS)
+    stride = max(1, draws.shape[1] // _POINTS)
     for i, label in enumerate(labels):
         ax = axes[i, 0]
         for ensemble, colour in zip(
-            draws[:, ::every, :, i], (BLUE, ORANGE, "#009E73", VERMILION), strict=False
+            draws[:, ::stride, :, i], (BLUE, ORANGE, "#009E73", VERMILION), strict=False
         ):
-            low, middle, high = np.percentile(ensemble, _BAND, axis=1)
-            steps = np.arange(len(middle)) * every
-            ax.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
-            ax.plot(steps, middle, color=colour, linewidth=0.8)
+            walker_low, walker_median, walker_high = np.percentile(ensemble, _BAND, axis=1)
+            steps = np.arange(len(walker_median)) * stride
+            ax.fill_between(steps, walker_low, walker_high, color=colour, alpha=0.12, linewidth=0)
+            ax.plot(steps, walker_median, color=colour, linewidth=0.8)
         ax.set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center", labelpad=8)
         ax.ticklabel_format(axis="y", useOffset=False)
     axes[-1, 0].set_xlabel("step after the discarded steps")
@@ -194,16 +220,23 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
     from matplotlib.figure import Figure
 
     count = len(names)
-    size = _SIZE * count + _LEFT
-    text = 10 * max(1.0, size / _PAGE)  # a large picture is shrunk to the width of the page
-    figure = Figure(figsize=(size, size), dpi=100)
+    figure_inches = _SIZE * count + _LEFT
+    # a large picture is shrunk to the width of the page
+    font_size = 10 * max(1.0, figure_inches / _PAGE)
+    figure = Figure(figsize=(figure_inches, figure_inches), dpi=100)
     FigureCanvasAgg(figure)
     ranges = _ranges(draws, nominal)
     for row in range(count):
         for column in range(row + 1):
-            left, low = _LEFT + _SIZE * column, _LEFT + _SIZE * (count - 1 - row)
+            panel_left, panel_bottom = _LEFT + _SIZE * column, _LEFT + _SIZE * (count - 1 - row)
+            # matplotlib counts from below, in shares of the figure
             ax = figure.add_axes(
-                (left / size, low / size, (_SIZE - _GAP) / size, (_SIZE - _GAP) / size)
+                (
+                    panel_left / figure_inches,
+                    panel_bottom / figure_inches,
+                    (_SIZE - _GAP) / figure_inches,
+                    (_SIZE - _GAP) / figure_inches,
+                )
             )
             _panel(
                 ax,
@@ -211,49 +244,68 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
                 [ranges[column], ranges[row]],
                 (nominal[column], nominal[row]),
             )
-            below = names[column] if row == count - 1 else ""
-            beside = names[row] if column == 0 < row else ""
-            _labelled(ax, below, beside, text)
+            x_label = names[column] if row == count - 1 else ""
+            # no label beside the first row: it is a histogram, whose height has no unit
+            y_label = names[row] if column == 0 < row else ""
+            _labelled(ax, x_label, y_label, font_size)
     return figure
 
 
 def _panel(
     ax: Any, pair: FloatArray, ends: Sequence[tuple[float, float]], own: tuple[float, float]
 ) -> None:
-    """Draw the histogram of one parameter, or the histogram of two with its contours, and the
-    recipe's own values.
+    """Draw the histogram of one parameter, or of two with contours.
+
+    `pair` (draw, 2) are the draws of both, `ends` the range of each axis, and `own` the recipe's
+    value of each. On the diagonal of the corner plot both are the same parameter.
     """
     ax.grid(False)
     ax.set_xlim(ends[0])
     ax.axvline(own[0], color=ORANGE, linewidth=1.0)
+    # the diagonal: one parameter against itself
     if np.array_equal(pair[:, 0], pair[:, 1]):
         ax.stairs(*np.histogram(pair[:, 0], _BINS, ends[0]), color=BLUE)
         ax.set(yticks=[], ylim=(0, None))
         return
     counts, x, y = np.histogram2d(pair[:, 0], pair[:, 1], _BINS, np.array(ends))
     ax.imshow(
-        counts.T, origin="lower", extent=(*ends[0], *ends[1]), aspect="auto", cmap="Blues", vmin=0
+        # `histogram2d` has the first parameter down the rows, a picture has it across
+        counts.T,
+        origin="lower",
+        extent=(*ends[0], *ends[1]),
+        aspect="auto",
+        cmap="Blues",
+        vmin=0,
     )
-    heights = _heights(counts)
-    if len(heights):
-        middle = [0.5 * (edges[1:] + edges[:-1]) for edges in (x, y)]
-        ax.contour(*middle, counts.T, levels=heights, colors=BLUE, linewidths=0.8)
+    contour_levels = _heights(counts)
+    if len(contour_levels):
+        bin_centres = [0.5 * (edges[1:] + edges[:-1]) for edges in (x, y)]
+        ax.contour(*bin_centres, counts.T, levels=contour_levels, colors=BLUE, linewidths=0.8)
     ax.axhline(own[1], color=ORANGE, linewidth=1.0)
     ax.set_ylim(ends[1])
 
 
 def _heights(counts: FloatArray) -> FloatArray:
-    """Return the counts of a cell above which the shares `_LEVELS` of all draws lie, rising and
-    different.
+    """Return the contour levels of a histogram, in draws of a cell, rising and without repetition.
+
+    The cells above a level hold one of the shares `_LEVELS` of all draws.
     """
-    rising = np.sort(counts.ravel())[::-1]
-    index = np.searchsorted(np.cumsum(rising), _LEVELS * rising.sum())
-    heights = np.unique(rising[index.clip(max=len(rising) - 1)])
-    inside: FloatArray = heights[(heights > 0) & (heights < rising[0])]
-    return inside
+    falling_counts = np.sort(counts.ravel())[::-1]
+    # the fullest cells first, until they hold each share of all draws
+    last_cell = np.searchsorted(np.cumsum(falling_counts), _LEVELS * falling_counts.sum())
+    # the count of the last cell that belongs to each share
+    contour_levels = np.unique(falling_counts[last_cell.clip(max=len(falling_counts) - 1)])
+    visible_levels: FloatArray = contour_levels[
+        (contour_levels > 0) & (contour_levels < falling_counts[0])
+    ]
+    return visible_levels
 
 
 def _labelled(ax: Any, below: str, left: str, text: float) -> None:
+    """Label the axes of a panel.
+
+    An axis without a label has no ticks either, and `text` is the size of the font.
+    """
     from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
     for axis, label in ((ax.xaxis, below), (ax.yaxis, left)):
@@ -275,18 +327,25 @@ def _ranges(draws: FloatArray, nominal: Sequence[float]) -> list[tuple[float, fl
     """Return the range of each parameter in the corner plot: nearly all draws, and the recipe's
     value if among them.
     """
-    ends = np.quantile(draws, _NEARLY_ALL, axis=0).T
-    rim = 0.1 * (ends[:, 1] - ends[:, 0])
-    shown = np.column_stack([ends[:, 0] - rim, ends[:, 1] + rim]).clip(
+    quantiles = np.quantile(draws, _NEARLY_ALL, axis=0).T
+    margin = 0.1 * (quantiles[:, 1] - quantiles[:, 0])
+    padded_range = np.column_stack([quantiles[:, 0] - margin, quantiles[:, 1] + margin]).clip(
         draws.min(0)[:, None], draws.max(0)[:, None]
     )
-    own = np.asarray(nominal)
-    inside = (own >= draws.min(0)) & (own <= draws.max(0))
-    low = np.where(inside, np.minimum(shown[:, 0], own), shown[:, 0])
-    high = np.where(inside, np.maximum(shown[:, 1], own), shown[:, 1])
+    recipe_value = np.asarray(nominal)
+    is_among_draws = (recipe_value >= draws.min(0)) & (recipe_value <= draws.max(0))
+    axis_low = np.where(
+        is_among_draws, np.minimum(padded_range[:, 0], recipe_value), padded_range[:, 0]
+    )
+    axis_high = np.where(
+        is_among_draws, np.maximum(padded_range[:, 1], recipe_value), padded_range[:, 1]
+    )
     return [
-        (float(a), float(b)) if b > a else (float(a) - 0.5, float(a) + 0.5)
-        for a, b in zip(low, high, strict=True)
+        # a parameter whose draws are all equal still needs an axis of some width
+        (float(lowest), float(highest))
+        if highest > lowest
+        else (float(lowest) - 0.5, float(lowest) + 0.5)
+        for lowest, highest in zip(axis_low, axis_high, strict=True)
     ]
 
 
@@ -314,15 +373,23 @@ def curve_section(result: CalibrationResult) -> Section:
     if isinstance(result.problem.levels, Rings):
         return _rings(result, result.problem.levels)
     levels: Any = result.problem.levels
-    mean, variance, away = _repeated(result)
+    mean, variance, mean_distance = _repeated(result)
     unclipped: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
+    # a level with counted digital numbers has no moments to predict
     unclipped[levels.cell_level.numpy()] = False
-    text, label = _COUNTED, COUNTED
+    text, unused_label = _COUNTED, COUNTED
     if is_camera(result.problem):
         share = f"{result.params['share']:.0%} of saturation"
-        text, label = _EXCLUDED.format(share=share), f"not used: above {share}, or clipped"
+        text, unused_label = (
+            _EXCLUDED.format(share=share),
+            f"not used: above {share}, or clipped",
+        )
     picture = transfer(
-        np.stack(_moments(levels)), np.stack([mean, variance]), unclipped, label, away
+        np.stack(_moments(levels)),
+        np.stack([mean, variance]),
+        unclipped,
+        unused_label,
+        mean_distance,
     )
     return Section("Photon-transfer curve", text, picture=picture)
 
@@ -335,29 +402,38 @@ def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray, FloatA
     standard deviations.
     """
     rng = np.random.default_rng(1)
-    flat = result.walked.flat
-    drawn = flat[rng.integers(len(flat), size=_PREDICTED)]
+    all_draws = result.walked.flat
+    some_draws = all_draws[rng.integers(len(all_draws), size=_PREDICTED)]
     levels: Any = result.problem.levels
-    look = result.problem.likelihood(drawn)
-    freedom = levels.degrees_of_freedom.numpy().clip(1)
-    values = {**result.params, **result.problem.parameters(drawn)}
-    scatter = np.broadcast_to(np.asarray(values.get("scatter", 0.0)), len(drawn))
-    width = np.sqrt(2 / freedom + scatter[:, None] ** 2)
-    variance = look.variance.numpy() * (1 + width * rng.standard_normal(width.shape))
-    away = None
+    prediction = result.problem.likelihood(some_draws)
+    degrees_of_freedom = levels.degrees_of_freedom.numpy().clip(1)
+    values = {**result.params, **result.problem.parameters(some_draws)}
+    scatter = np.broadcast_to(np.asarray(values.get("scatter", 0.0)), len(some_draws))
+    # a sample variance has the relative standard deviation sqrt(2 / degrees of freedom)
+    relative_sd = np.sqrt(2 / degrees_of_freedom + scatter[:, None] ** 2)
+    # what a repeated measurement would find: the predicted variance and its chance
+    variance = prediction.variance.numpy() * (
+        1 + relative_sd * rng.standard_normal(relative_sd.shape)
+    )
+    mean_distance = None
     if is_camera(result.problem):
-        away = np.full(len(freedom), np.nan)
-        away[look.degrees_of_freedom.numpy() > 0] = np.split(look.scaled.numpy(), 4, axis=-1)[
-            2
-        ].mean(0)
-    return look.mean.numpy(), variance, away
+        mean_distance = np.full(len(degrees_of_freedom), np.nan)
+        # residuals are split as in `camera_density._parts`; part 2 are those of the means
+        mean_distance[prediction.degrees_of_freedom.numpy() > 0] = np.split(
+            prediction.scaled.numpy(), 4, axis=-1
+        )[2].mean(0)
+    return prediction.mean.numpy(), variance, mean_distance
 
 
 def _rings(result: CalibrationResult, levels: Rings) -> Section:
-    rng, flat = np.random.default_rng(1), result.walked.flat
-    look = result.problem.likelihood(flat[rng.integers(len(flat), size=_PREDICTED)])
+    """Return the section with the rings about a point source: their signal over the radius."""
+    rng, all_draws = np.random.default_rng(1), result.walked.flat
+    prediction = result.problem.likelihood(all_draws[rng.integers(len(all_draws), size=_PREDICTED)])
     picture = rings(
-        *ring_radii(levels), levels.mean.numpy(), look.mean.numpy(), look.variance.numpy()
+        *ring_radii(levels),
+        levels.mean.numpy(),
+        prediction.mean.numpy(),
+        prediction.variance.numpy(),
     )
     text = """The mean signal of each ring about the source, and the prediction of the posterior for
         a repeated measurement. Rings whose every pixel is cut off only bound the signal from
@@ -370,8 +446,8 @@ def ring_radii(rings: Rings) -> tuple[FloatArray, FloatArray]:
     off, in pixels.
     """
     ring, count = rings.ring.numpy(), rings.weight.numpy()
-    square = np.bincount(ring, count * rings.square.numpy()) / np.bincount(ring, count)
-    return np.sqrt(square), np.sqrt(rings.cut_square.numpy())
+    mean_square_radius = np.bincount(ring, count * rings.square.numpy()) / np.bincount(ring, count)
+    return np.sqrt(mean_square_radius), np.sqrt(rings.cut_square.numpy())
 
 
 def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
@@ -380,24 +456,28 @@ def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
     """
     if isinstance(levels, Levels):
         return levels.mean.numpy(), levels.variance.numpy()
+    # of the levels with a histogram: level number, digital number, number of pixels
     level, value, count = (x.numpy() for x in levels[-3:])
-    total, mean, variance = (x.numpy() for x in (levels.pixels, levels.mean, levels.variance))
-    sums = [np.bincount(level, count * value**n, minlength=len(total)) for n in range(3)]
-    every = total + sums[0]
-    middle = (total * mean + sums[1]) / every
-    square = total * (variance + mean**2) + sums[2]
-    return middle, square / every - middle**2
+    pixels, mean, variance = (x.numpy() for x in (levels.pixels, levels.mean, levels.variance))
+    # sums of the powers 0, 1 and 2 of the digital numbers of each histogram
+    power_sums = [np.bincount(level, count * value**n, minlength=len(pixels)) for n in range(3)]
+    all_pixels = pixels + power_sums[0]
+    # both kinds of levels have sums: of plain moments, and of counted numbers
+    all_mean = (pixels * mean + power_sums[1]) / all_pixels
+    # mean of squares = variance + mean²
+    square_sum = pixels * (variance + mean**2) + power_sums[2]
+    return all_mean, square_sum / all_pixels - all_mean**2
 
 
 def corner_section(result: CalibrationResult) -> Section:
     """Return the section with the distribution of every pair of parameters."""
-    every = max(1, result.chains.flat.shape[0] // _CORNER)
+    stride = max(1, result.chains.flat.shape[0] // _CORNER)
     determined = [r for r in result.rows() if r.kind != "none"]
-    shown = np.stack([result.draws[r.name].reshape(-1)[::every] for r in determined], -1)
+    shown_draws = np.stack([result.draws[r.name].reshape(-1)[::stride] for r in determined], -1)
     text = """Every pair of parameters of which the frames tell a value or a limit; the recipe's own
         values are orange. Gain, offset, noise and efficiency correlate."""
     picture = corners(
-        shown,
+        shown_draws,
         [f"{words_of(r.name)}\n{r.unit}" for r in determined],
         [r.nominal for r in determined],
     )

@@ -88,8 +88,8 @@ def comparisons(
         fit = least_squares(measured)
     except ValueError:
         return []
-    own = _own_fit(measured, estimates, camera)
-    return [_compared(row, fit, own) for row in rows]
+    posterior_fit = _own_fit(measured, estimates, camera)
+    return [_compared(row, fit, posterior_fit) for row in rows]
 
 
 def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
@@ -104,10 +104,10 @@ def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
         f"{label}: least squares {worst.value:.5g}, by the posterior {worst.predicted:.5g},"
         f" {worst.apart:+.1f} sd"
     )
-    good = abs(worst.apart) <= _APART
-    if not good:
+    agrees = abs(worst.apart) <= _APART
+    if not agrees:
         text += ": refused, one of them is wrong, and the frames do not say which"
-    mark: Mark = "pass" if good else "fail"
+    mark: Mark = "pass" if agrees else "fail"
     return [
         Check(
             "the posterior agrees with its least squares",
@@ -164,6 +164,10 @@ def compared(comparisons: Sequence[Comparison]) -> Mapping[str, Mapping[str, flo
 def _own_fit(
     measured: Levels, estimates: Sequence[ParameterEstimate], camera: Mapping[str, Any] | None
 ) -> LeastSquares | None:
+    """Return the standard's fit on the levels that the posterior predicts.
+
+    It is None without a camera, and where the fit is impossible.
+    """
     if camera is None:
         return None
     values = {**camera, **{row.name: row.mean for row in estimates}}
@@ -175,13 +179,22 @@ def _own_fit(
 
 
 def _compared(row: ParameterEstimate, fit: LeastSquares, own: LeastSquares | None) -> Comparison:
+    """Return one row of the comparison.
+
+    `fit` is the standard's fit on the frames, `own` that on the levels that the posterior predicts,
+    if it predicts levels.
+    """
     value, error = _value(fit, row.name)
     predicted = row.mean if own is None else _value(own, row.name)[0]
-    width = abs(predicted) * math.hypot(row.sd / row.mean, error / value) if value else math.inf
-    return Comparison(row.name, value, error, predicted, (value - predicted) / width)
+    # the relative errors of both values, added in quadrature
+    combined_sd = (
+        abs(predicted) * math.hypot(row.sd / row.mean, error / value) if value else math.inf
+    )
+    return Comparison(row.name, value, error, predicted, (value - predicted) / combined_sd)
 
 
 def _reason(measured: Levels) -> str:
+    """Return why the standard's fit of these levels is impossible, in words."""
     try:
         least_squares(measured)
     except ValueError as reason:
@@ -190,6 +203,7 @@ def _reason(measured: Levels) -> str:
 
 
 def _row(row: ParameterEstimate, comparison: Comparison) -> tuple[str, str, str, str, str, float]:
+    """Return the cells of a row of the table, in the order of its columns."""
     value = with_uncertainty(comparison.value, comparison.error)
     posterior = with_uncertainty(row.mean, row.sd)
     return (
@@ -320,15 +334,21 @@ class CalibrationResult:
 
     def rows(self) -> list[ParameterEstimate]:
         """Return the posterior estimate of each sensor parameter."""
-        rows = zip(self.draws.items(), self.mode.shares.tolist(), strict=True)
-        return [self._estimate(name, draws, narrower) for (name, draws), narrower in rows]
+        named_draws = zip(self.draws.items(), self.mode.shares.tolist(), strict=True)
+        return [self._estimate(name, draws, narrower) for (name, draws), narrower in named_draws]
 
     def _estimate(self, name: str, draws: FloatArray, narrower: float) -> ParameterEstimate:
-        low, high = np.quantile(draws, [0.05, 0.95]).tolist()
+        """Return the estimate of one parameter from its draws.
+
+        `narrower` is the width of its posterior over that of its prior.
+        """
+        interval_low, interval_high = np.quantile(draws, [0.05, 0.95]).tolist()
         nominal, kind = float(self.params[name]), self.identifiability.kinds[name]
-        below, unit = float((draws < nominal).mean()), unit_of(name, self.params)
+        share_below, unit = float((draws < nominal).mean()), unit_of(name, self.params)
         mean, sd = float(draws.mean()), float(draws.std())
-        return ParameterEstimate(name, unit, kind, mean, sd, low, high, nominal, below, narrower)
+        return ParameterEstimate(
+            name, unit, kind, mean, sd, interval_low, interval_high, nominal, share_below, narrower
+        )
 
 
 def unit_of(name: str, params: Mapping[str, Any]) -> str:
@@ -346,11 +366,13 @@ def unit_of(name: str, params: Mapping[str, Any]) -> str:
 
 def banner(result: CalibrationResult) -> str:
     """Return a warning that names the failed checks, or an empty text if no check fails."""
-    wrong = [f"{check.name}: {check.found}" for check in result.checks if check.mark == "fail"]
-    if not wrong:
+    failures = [f"{check.name}: {check.found}" for check in result.checks if check.mark == "fail"]
+    if not failures:
         return ""
-    count = f"{len(wrong)} of {len(result.checks)} checks fail{'s' * (len(wrong) == 1)}"
-    return f"Not fit for use: {count}. {'; '.join(wrong)}."
+    failure_share = (
+        f"{len(failures)} of {len(result.checks)} checks fail{'s' * (len(failures) == 1)}"
+    )
+    return f"Not fit for use: {failure_share}. {'; '.join(failures)}."
 
 
 def lead(result: CalibrationResult) -> str:
@@ -360,8 +382,8 @@ def lead(result: CalibrationResult) -> str:
     values = [f"{words_of(row.name)} {row.text}" for row in result.rows()]
     stated = [f"{words_of(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
     return "\n\n".join(
-        f"{opening}{'; '.join(parts)}."
-        for opening, parts in (
+        f"{opening}{'; '.join(items)}."
+        for opening, items in (
             ("", values),
             (
                 (
@@ -372,7 +394,7 @@ def lead(result: CalibrationResult) -> str:
             ),
             ("Not determined by these frames: ", result.identifiability.directions),
         )
-        if parts
+        if items
     )
 
 
@@ -389,15 +411,24 @@ def sections(result: CalibrationResult) -> list[Section]:
     """Return the sections of a calibration's page: parameters, checks, identifiability and
     pictures.
     """
-    models = (_models,) if result.models else ()
-    frames = (_frames,) if result.frames else ()
-    standard = (_standard,) if result.problem.measured is not None else ()
-    parts = (_checks, *frames, _not_determined, curve_section, corner_section, chains_section)
-    budget = budget_sections(result.budgets, stated(result.problem.recipe), result.budget_picture)
+    model_sections = (_models,) if result.models else ()
+    frame_sections = (_frames,) if result.frames else ()
+    standard_sections = (_standard,) if result.problem.measured is not None else ()
+    last_sections = (
+        _checks,
+        *frame_sections,
+        _not_determined,
+        curve_section,
+        corner_section,
+        chains_section,
+    )
+    budget_part = budget_sections(
+        result.budgets, stated(result.problem.recipe), result.budget_picture
+    )
     return [
-        *(section(result) for section in (_parameters, *standard, *models)),
-        *budget,
-        *(section(result) for section in parts),
+        *(section(result) for section in (_parameters, *standard_sections, *model_sections)),
+        *budget_part,
+        *(section(result) for section in last_sections),
     ]
 
 
@@ -411,6 +442,10 @@ def _frames(result: CalibrationResult) -> Section:
 
 
 def _parameters(result: CalibrationResult) -> Section:
+    """Return the table of all parameters.
+
+    It has estimate or limit, interval, and the recipe's own value.
+    """
     text = """A value is given only if the posterior is less than a third as wide as the prior.
         Otherwise there is a limit, which depends on the prior, and a dash stands for an end that
         only the prior gives. The last columns show the share of the draws below the recipe's own
@@ -450,6 +485,7 @@ def _judged_share(r: ParameterEstimate) -> Marked:
 
 
 def _models(result: CalibrationResult) -> Section:
+    """Return the table that compares models of the response with no, one and two more terms."""
     text = """The posterior with a linear response, and with responses of one and of two more terms,
         each with its 90 % interval. The stated value is the mean of the two models with the most
         terms. The stated standard deviation is the larger one of both models and half the distance
@@ -472,24 +508,30 @@ def _between(interval: IntervalEstimate) -> str:
 
 
 def _checks(result: CalibrationResult) -> Section:
+    """Return the table of all checks, with the number of those that fail."""
     rows = [
         (check.name, check.found, check.bar, Marked(check.mark, check.mark))
         for check in result.checks
     ]
     count = count_failures(result.checks)
-    text = f"{count} fail: the posterior is not fit for use." if count else "No check fails."
-    return Section("Checks", text, ("check", "found", "bar", "holds"), rows)
+    summary = f"{count} fail: the posterior is not fit for use." if count else "No check fails."
+    return Section("Checks", summary, ("check", "found", "bar", "holds"), rows)
 
 
 def _not_determined(result: CalibrationResult) -> Section:
+    """Return the table of the singular values.
+
+    The weakest stand last, named by the direction that each belongs to.
+    """
     text = """Singular values of the derivatives of the levels per standard deviation of the prior,
         computed before any sampling. In a direction below 3 the prior constrains the parameters
         more than the frames do."""
     strengths = result.identifiability.strengths
     directions = [line for line in result.identifiability.directions if line != RELATIVE]
-    named = [""] * (len(strengths) - len(directions)) + directions
+    # the weakest directions come last, and only they have a name
+    labels = [""] * (len(strengths) - len(directions)) + directions
     rows = [
         (Marked(strength, "warn" if direction else "pass"), direction)
-        for strength, direction in zip(strengths, named, strict=True)
+        for strength, direction in zip(strengths, labels, strict=True)
     ]
     return Section("What the levels determine", text, ("strength", "not determined"), rows)

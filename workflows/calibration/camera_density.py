@@ -75,13 +75,22 @@ class CameraDensity:
         """Return new samples like ``own`` (draw, free), and the logarithm of the density at
         ``own`` over that there.
         """
-        widths = np.concatenate([own[:, self.others.at], self.widths.draw(len(own), rng)])
-        law, here, added = self.others.law(widths), slice(None, len(own)), slice(len(own), None)
-        drawn = self.others.draw(widths[added], tuple(array[added] for array in law), rng)
-        log = self.widths.log_density(widths) + self.others.log_density(
-            np.concatenate([own, drawn]), law
+        # both densities in one pass: the old samples first, the new ones after them
+        old_and_new_widths = np.concatenate(
+            [own[:, self.others.at], self.widths.draw(len(own), rng)]
         )
-        return drawn, log[here] - log[added]
+        conditional, old_rows, new_rows = (
+            self.others.law(old_and_new_widths),
+            slice(None, len(own)),
+            slice(len(own), None),
+        )
+        new_samples = self.others.draw(
+            old_and_new_widths[new_rows], tuple(array[new_rows] for array in conditional), rng
+        )
+        log_density = self.widths.log_density(old_and_new_widths) + self.others.log_density(
+            np.concatenate([own, new_samples]), conditional
+        )
+        return new_samples, log_density[old_rows] - log_density[new_rows]
 
 
 # --- given widths ---------------------------------------------------------------------------------
@@ -110,35 +119,48 @@ class GivenWidths:
         self.theta = mode.theta
         #: (free,) True for a width
         self.at = np.array([name in problem.coordinates.widths for name in problem.names])
-        middle = problem.whitened(mode.theta[None])[0]
-        steps = problem.whitened(mode.theta + np.eye(len(mode.theta))) - middle
+        mode_in_prior_sd = problem.whitened(mode.theta[None])[0]
+        # change in standard deviations of the prior when one coordinate grows by 1
+        prior_sd_per_coordinate = (
+            problem.whitened(mode.theta + np.eye(len(mode.theta))) - mode_in_prior_sd
+        )
         #: (other,) the mode in standard deviations of the prior, from its middle
-        self.middle = middle[~self.at]
+        self.middle = mode_in_prior_sd[~self.at]
         #: (other,) coordinates of one standard deviation of the prior
-        self.unit = 1 / steps.diagonal()[~self.at]
-        away, _ = _parts(problem.likelihood(mode.theta[None]).scaled.numpy())
+        self.unit = 1 / prior_sd_per_coordinate.diagonal()[~self.at]
+        mode_residuals, _ = _parts(problem.likelihood(mode.theta[None]).scaled.numpy())
         slopes = _parts(mode.scaled_slopes.T)[0].T[:, ~self.at]
-        self._pull = slopes * away[0][:, None]
+        # each residual times its derivatives: their weighted sum is the slope of the log density
+        self._pull = slopes * mode_residuals[0][:, None]
         self._noise, self._shares = self._variances(problem)
+        # each residual's outer product of derivatives, flattened: their weighted sum is the
+        # precision
         self._squares = (slopes[:, :, None] * slopes[:, None]).reshape(len(slopes), -1)
 
     def law(self, widths: FloatArray) -> Law:
         """Return mean (draw, other) and root of the precision (draw, other, other), in units of
         the prior.
         """
-        slope, precision = self.information(widths)
-        step: FloatArray = np.linalg.solve(precision, slope[..., None])[..., 0].astype(np.float64)
-        return step, np.linalg.cholesky(precision).astype(np.float64)
+        log_slope, precision = self.information(widths)
+        # a step of Newton from the mode: the maximum of a normal density
+        mean_shift: FloatArray = np.linalg.solve(precision, log_slope[..., None])[..., 0].astype(
+            np.float64
+        )
+        return mean_shift, np.linalg.cholesky(precision).astype(np.float64)
 
     def information(self, widths: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return slope (draw, other) of the log density at the mode, and precision (draw, other,
         other).
         """
-        squares = np.exp((2 * (widths - self.theta[self.at])).clip(-_FARTHEST, _FARTHEST))
-        weight = 1 / (self._noise + squares @ self._shares)
-        others = self._pull.shape[1]
-        precision = (weight @ self._squares).reshape(-1, others, others) + np.eye(others)
-        return -(weight @ self._pull + self.middle), precision
+        width_variances = np.exp((2 * (widths - self.theta[self.at])).clip(-_FARTHEST, _FARTHEST))
+        # 1 over the variance of each residual, which is linear in the squares of the widths
+        residual_weights = 1 / (self._noise + width_variances @ self._shares)
+        other_count = self._pull.shape[1]
+        # J' W J of the residuals, and the precision 1 of the prior
+        precision = (residual_weights @ self._squares).reshape(
+            -1, other_count, other_count
+        ) + np.eye(other_count)
+        return -(residual_weights @ self._pull + self.middle), precision
 
     def _variances(self, problem: SensorPosterior) -> tuple[FloatArray, FloatArray]:
         """Return the part of the variance of each residual that no width adds, and the part (width,
@@ -146,63 +168,82 @@ class GivenWidths:
 
         The variance is that at the mode, 1, and is linear in the square of each width.
         """
-        change = np.full((2 + self.at.sum(), self.at.sum()), _NONE)
-        change[0] = 0.0
-        np.fill_diagonal(change[2:], _MORE)
-        places = np.repeat(self.theta[None], len(change), 0)
-        places[:, self.at] += change
-        log = _parts(problem.likelihood(places).scaled.numpy())[1]
-        variance = np.exp(2 * (log - log[0]))
-        return variance[1], (variance[2:] - variance[1]).clip(0) * np.exp(-2 * _MORE)
+        log_width_change = np.full((2 + self.at.sum(), self.at.sum()), _NONE)
+        # row 0 is the mode, row 1 has no width, and each further row has one width alone, enlarged
+        log_width_change[0] = 0.0
+        np.fill_diagonal(log_width_change[2:], _MORE)
+        coordinates = np.repeat(self.theta[None], len(log_width_change), 0)
+        coordinates[:, self.at] += log_width_change
+        log_sd = _parts(problem.likelihood(coordinates).scaled.numpy())[1]
+        relative_variance = np.exp(2 * (log_sd - log_sd[0]))
+        # divided by the square of the factor exp(5) by which a width was enlarged
+        return relative_variance[1], (relative_variance[2:] - relative_variance[1]).clip(
+            0
+        ) * np.exp(-2 * _MORE)
 
     def draw(self, widths: FloatArray, law: Law, rng: Random) -> FloatArray:
         """Return samples (draw, free) with the given ``widths`` and their ``law``."""
-        step, root = law
-        samples = np.empty((len(step), len(self.at)))
+        mean_shift, precision_root = law
+        samples = np.empty((len(mean_shift), len(self.at)))
         samples[:, self.at] = widths
-        samples[:, ~self.at] = self.theta[~self.at] + (step + draw_student(root, rng)) * self.unit
+        samples[:, ~self.at] = (
+            self.theta[~self.at] + (mean_shift + draw_student(precision_root, rng)) * self.unit
+        )
         return samples
 
     def log_density(self, samples: FloatArray, law: Law) -> FloatArray:
         """Return the log density of the other parameters at ``samples`` given the widths, up to
         a constant.
         """
-        step, root = law
-        away = (samples[:, ~self.at] - self.theta[~self.at]) / self.unit - step
-        return student_density(away, root) - float(np.log(np.abs(self.unit)).sum())
+        mean_shift, precision_root = law
+        # in standard deviations of the prior, as the law; the change of units is the last term
+        distance = (samples[:, ~self.at] - self.theta[~self.at]) / self.unit - mean_shift
+        return student_density(distance, precision_root) - float(np.log(np.abs(self.unit)).sum())
 
 
 def draw_student(root: FloatArray, rng: Random) -> FloatArray:
     """Return distances (draw, other) from the mean, with the ``root`` (draw, other, other) of
     their precision.
     """
-    normal = rng.standard_normal(root.shape[:2]) / np.sqrt(
+    # a normal draw over the root of chi² / degrees of freedom has Student's distribution
+    student_draws = rng.standard_normal(root.shape[:2]) / np.sqrt(
         rng.chisquare(_TAIL, (len(root), 1)) / _TAIL
     )
-    away: FloatArray = np.linalg.solve(np.swapaxes(root, 1, 2), normal[..., None])[..., 0].astype(
-        np.float64
-    )
-    return away
+    distance: FloatArray = np.linalg.solve(np.swapaxes(root, 1, 2), student_draws[..., None])[
+        ..., 0
+    ].astype(np.float64)
+    return distance
 
 
 def student_density(away: FloatArray, root: FloatArray) -> FloatArray:
     """Return the log density at distances from the mean, up to the constant that `Mixture`
     leaves out too.
     """
-    half, others = 0.5 * _TAIL, away.shape[1]
-    square = (np.einsum("nij,ni->nj", root, away) ** 2).sum(1)
-    level = math.lgamma(half + 0.5 * others) - math.lgamma(half) - 0.5 * others * math.log(_TAIL)
-    level += np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
-    log: FloatArray = level - (half + 0.5 * others) * np.log1p(square / _TAIL)
-    return log
+    half_freedom, dimension = 0.5 * _TAIL, away.shape[1]
+    squared_distance = (np.einsum("nij,ni->nj", root, away) ** 2).sum(1)
+    # log density of a Student distribution: its peak, less the decay with the squared distance
+    log_peak = (
+        math.lgamma(half_freedom + 0.5 * dimension)
+        - math.lgamma(half_freedom)
+        - 0.5 * dimension * math.log(_TAIL)
+    )
+    log_peak += np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
+    log_density: FloatArray = log_peak - (half_freedom + 0.5 * dimension) * np.log1p(
+        squared_distance / _TAIL
+    )
+    return log_density
 
 
 def _parts(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (..., residual) and logarithms of their widths from the rows of the
-    likelihood of a camera.
+    """Return residuals (..., residual) and logarithms of their standard deviations.
+
+    The rows of a camera's likelihood have four equal parts: residuals of the variances, the
+    logarithms of their widths, residuals of the means, the logarithms of theirs.
     """
-    variance, narrow, mean, width = np.split(rows, 4, axis=-1)
-    return np.concatenate([variance, mean], -1), np.concatenate([narrow, width], -1)
+    variance_residuals, log_variance_sd, mean_residuals, log_mean_sd = np.split(rows, 4, axis=-1)
+    return np.concatenate([variance_residuals, mean_residuals], -1), np.concatenate(
+        [log_variance_sd, log_mean_sd], -1
+    )
 
 
 # --- value near zero ------------------------------------------------------------------------------
@@ -232,15 +273,16 @@ class NearZero:
 
     def __init__(self, others: GivenWidths, number: int, spread: float) -> None:
         self.at, self._theta = others.at, others.theta
-        self._others, own = others, np.arange(len(others.theta)) == number
-        self._own, self._rest = own[~others.at], ~own & ~others.at
+        self._others, is_parameter = others, np.arange(len(others.theta)) == number
+        self._own, self._rest = is_parameter[~others.at], ~is_parameter & ~others.at
         self._number, self._unit = number, float(others.unit[self._own][0])
         self._units, self._scale = others.unit[~self._own], float(np.log(np.abs(others.unit)).sum())
         self._middle = float(others.middle[self._own][0])
-        narrow = abs(spread / self._unit)
-        low, high = np.arcsinh((np.array([-_REACH, _REACH]) - self._middle) / narrow)
+        grid_scale = abs(spread / self._unit)
+        # points are equal steps of asinh: dense about the mode, sparse far from it
+        grid_start, grid_end = np.arcsinh((np.array([-_REACH, _REACH]) - self._middle) / grid_scale)
         #: from the mode, in units of the prior
-        self._points = narrow * np.sinh(np.linspace(low, high, _CELLS + 1))
+        self._points = grid_scale * np.sinh(np.linspace(grid_start, grid_end, _CELLS + 1))
         self._sizes = np.diff(self._points)
         #: of the trapezoidal rule
         self._counts = 0.5 * (np.append(self._sizes, 0.0) + np.append(0.0, self._sizes))
@@ -254,67 +296,86 @@ class NearZero:
         of the parameter, its change (draw, other) with the parameter, and the root (draw, other,
         other) of their precision. All are in units of the prior.
         """
-        slope, precision = self._others.information(widths)
-        own, others = self._own, ~self._own
+        log_slope, precision = self._others.information(widths)
+        is_own, is_other = self._own, ~self._own
         # the prior of the parameter is that of its logarithm and joins on the grid
-        slope_own = slope[:, own][:, 0] + self._middle
-        own_own = precision[:, own][:, :, own][:, 0, 0] - 1
-        across = precision[:, others][:, :, own]
-        root = np.linalg.cholesky(precision[:, others][:, :, others])
-        both = np.concatenate([slope[:, others][..., None], across], -1)
-        solved = np.linalg.solve(root, both)
-        steps, pull = np.moveaxis(np.linalg.solve(np.swapaxes(root, 1, 2), solved), -1, 0)
-        curve = (own_own - (solved[..., 1] ** 2).sum(1)).clip(0)
-        tilt = slope_own - (solved[..., 0] * solved[..., 1]).sum(1)
-        log = tilt[:, None] * self._value - 0.5 * curve[:, None] * self._value**2 + self._prior
-        log -= log.max(1, keepdims=True)
-        density = (1 - _SAFE) * self._normalised(np.exp(log)) + _SAFE * self._normalised(
-            np.exp(_POWER * log)
+        own_slope = log_slope[:, is_own][:, 0] + self._middle
+        own_precision = precision[:, is_own][:, :, is_own][:, 0, 0] - 1
+        cross_precision = precision[:, is_other][:, :, is_own]
+        precision_root = np.linalg.cholesky(precision[:, is_other][:, :, is_other])
+        # both right sides in one solution: columns 0 of the slope, 1 of the coupling
+        right_sides = np.concatenate([log_slope[:, is_other][..., None], cross_precision], -1)
+        solved = np.linalg.solve(precision_root, right_sides)
+        steps, coupling = np.moveaxis(
+            np.linalg.solve(np.swapaxes(precision_root, 1, 2), solved), -1, 0
         )
-        return density, steps, -pull, root.astype(np.float64)
+        # Schur complement: what is left for the parameter after all others are integrated out
+        marginal_precision = (own_precision - (solved[..., 1] ** 2).sum(1)).clip(0)
+        marginal_slope = own_slope - (solved[..., 0] * solved[..., 1]).sum(1)
+        # some of the density has wider tails, so that no weight becomes too large
+        # on the grid: a parabola in the parameter itself, and the prior of its logarithm
+        log_density = (
+            marginal_slope[:, None] * self._value
+            - 0.5 * marginal_precision[:, None] * self._value**2
+            + self._prior
+        )
+        log_density -= log_density.max(1, keepdims=True)
+        density = (1 - _SAFE) * self._normalised(np.exp(log_density)) + _SAFE * self._normalised(
+            np.exp(_POWER * log_density)
+        )
+        return density, steps, -coupling, precision_root.astype(np.float64)
 
     def draw(self, widths: FloatArray, law: Law, rng: Random) -> FloatArray:
         """Return samples (draw, free) with the given ``widths`` and their ``law``."""
-        density, steps, pull, root = law
-        place = self._place(density, uniform(len(widths), rng))
+        density, steps, coupling, precision_root = law
+        position = self._place(density, uniform(len(widths), rng))
         samples = np.empty((len(widths), len(self.at)))
         samples[:, self.at] = widths
-        samples[:, self._number] = self._theta[self._number] + place * self._unit
-        away = steps + self._value_at(place)[:, None] * pull + draw_student(root, rng)
-        samples[:, self._rest] = self._theta[self._rest] + away * self._units
+        samples[:, self._number] = self._theta[self._number] + position * self._unit
+        distance = (
+            steps + self._value_at(position)[:, None] * coupling + draw_student(precision_root, rng)
+        )
+        samples[:, self._rest] = self._theta[self._rest] + distance * self._units
         return samples
 
     def log_density(self, samples: FloatArray, law: Law) -> FloatArray:
         """Return the log density of all parameters but the widths at ``samples``, up to a
         constant.
         """
-        density, steps, pull, root = law
-        place = (samples[:, self._number] - self._theta[self._number]) / self._unit
-        cell, share = self._cell(place)
-        draw = np.arange(len(place))
-        height = (1 - share) * density[draw, cell] + share * density[draw, cell + 1]
+        density, steps, coupling, precision_root = law
+        position = (samples[:, self._number] - self._theta[self._number]) / self._unit
+        cell, cell_fraction = self._cell(position)
+        draw_number = np.arange(len(position))
+        # linear between the points of the grid, 0 beyond its ends
+        own_density = (1 - cell_fraction) * density[draw_number, cell] + cell_fraction * density[
+            draw_number, cell + 1
+        ]
         # as `Mixture`
-        own = np.log(np.where((share >= 0) & (share <= 1), height, 0.0).clip(_BARE)) + math.lgamma(
-            0.5
-        )
-        away = (
+        # the constant is the one that `Mixture` leaves out too
+        own_log_density = np.log(
+            np.where((cell_fraction >= 0) & (cell_fraction <= 1), own_density, 0.0).clip(_BARE)
+        ) + math.lgamma(0.5)
+        distance = (
             (samples[:, self._rest] - self._theta[self._rest]) / self._units
             - steps
-            - self._value_at(place)[:, None] * pull
+            - self._value_at(position)[:, None] * coupling
         )
-        log: FloatArray = own + student_density(away, root) - self._scale
-        return log
+        log_density: FloatArray = (
+            own_log_density + student_density(distance, precision_root) - self._scale
+        )
+        return log_density
 
     def _value_at(self, place: FloatArray) -> FloatArray:
         """Return the change of the parameter from the mode to each place, in units that are
         those of a small change.
         """
-        value: FloatArray = (
+        change: FloatArray = (
             np.expm1((place * self._unit).clip(max=_FARTHEST_NEAR_ZERO)) / self._unit
         )
-        return value
+        return change
 
     def _normalised(self, density: FloatArray) -> FloatArray:
+        """Return each density (draw, point) divided by its integral over the grid."""
         normalised: FloatArray = density / (density @ self._counts)[:, None]
         return normalised
 
@@ -324,21 +385,36 @@ class NearZero:
         return cell, (place - self._points[cell]) / self._sizes[cell]
 
     def _place(self, density: FloatArray, chance: FloatArray) -> FloatArray:
-        """Return the place below which lies the probability ``chance`` of each draw."""
-        size = self._sizes
-        below = np.cumsum(0.5 * (density[:, 1:] + density[:, :-1]) * size, 1)
-        cell = (below < (chance * below[:, -1])[:, None]).sum(1).clip(max=_CELLS - 1)
-        draw = np.arange(len(chance))
-        left = chance * below[:, -1] - np.where(cell > 0, below[draw, cell - 1], 0.0)
-        first, last = density[draw, cell], density[draw, cell + 1]
+        """Return the position on the grid below which the probability `chance` (draw,) lies.
+
+        It is the inverse of the distribution function of each density (draw, point), which is
+        linear in a cell.
+        """
+        cell_sizes = self._sizes
+        # trapezoidal rule, cell by cell
+        cumulative = np.cumsum(0.5 * (density[:, 1:] + density[:, :-1]) * cell_sizes, 1)
+        # the number of cells that lie wholly below
+        cell = (cumulative < (chance * cumulative[:, -1])[:, None]).sum(1).clip(max=_CELLS - 1)
+        draw_number = np.arange(len(chance))
+        remainder = chance * cumulative[:, -1] - np.where(
+            cell > 0, cumulative[draw_number, cell - 1], 0.0
+        )
+        left_density, right_density = density[draw_number, cell], density[draw_number, cell + 1]
         # the root of first * t + (last - first) * t^2 / 2 = left / size, in the form that loses no
         # digits
-        area = left / size[cell]
-        share = (
-            2 * area / (first + np.sqrt((first**2 + 2 * (last - first) * area).clip(0))).clip(_BARE)
+        mean_height = remainder / cell_sizes[cell]
+        cell_fraction = (
+            2
+            * mean_height
+            / (
+                left_density
+                + np.sqrt(
+                    (left_density**2 + 2 * (right_density - left_density) * mean_height).clip(0)
+                )
+            ).clip(_BARE)
         )
-        place: FloatArray = self._points[cell] + share.clip(0, 1) * size[cell]
-        return place
+        position: FloatArray = self._points[cell] + cell_fraction.clip(0, 1) * cell_sizes[cell]
+        return position
 
 
 # --- tail density ---------------------------------------------------------------------------------
@@ -376,8 +452,8 @@ class TailDensity(Density):
 
     def log_density(self, samples: FloatArray) -> FloatArray:
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
-        body, tails = self.body.log_density(samples), self.tails.log_density(samples)
-        return log_sum(np.stack([body + np.log1p(-_SHARE), tails + np.log(_SHARE)], -1))
+        body_log, tail_log = self.body.log_density(samples), self.tails.log_density(samples)
+        return log_sum(np.stack([body_log + np.log1p(-_SHARE), tail_log + np.log(_SHARE)], -1))
 
 
 def hardly_told(problem: SensorPosterior, mode: LaplaceFit, doubt: float = _DOUBT) -> list[int]:
@@ -386,10 +462,14 @@ def hardly_told(problem: SensorPosterior, mode: LaplaceFit, doubt: float = _DOUB
 
     These have logarithms with a standard deviation above ``doubt`` at the mode.
     """
-    spread = np.sqrt(np.diagonal(mode.covariance))
-    other = problem.coordinates.linear | problem.coordinates.widths
-    numbers = [i for i, name in enumerate(problem.names) if name not in other and spread[i] > doubt]
-    return sorted(numbers, key=lambda i: -spread[i])
+    log_sd = np.sqrt(np.diagonal(mode.covariance))
+    not_logarithms = problem.coordinates.linear | problem.coordinates.widths
+    numbers = [
+        i
+        for i, name in enumerate(problem.names)
+        if name not in not_logarithms and log_sd[i] > doubt
+    ]
+    return sorted(numbers, key=lambda i: -log_sd[i])
 
 
 def with_tails(body: Density, numbers: Sequence[int], mode: LaplaceFit) -> Density:
@@ -421,51 +501,58 @@ def with_prior_tails(
     ``body``. The shares of the parts follow from ``weighted``: samples (draw, width) of the
     posterior and their weights (draw,).
     """
-    middle = problem.whitened(mode.theta[None])[0]
-    units = (1 / (problem.whitened(mode.theta + np.eye(len(mode.theta))) - middle).diagonal())[
-        is_width
-    ]
+    mode_in_prior_sd = problem.whitened(mode.theta[None])[0]
+    # coordinates of one standard deviation of the prior of each width
+    prior_sd = (
+        1 / (problem.whitened(mode.theta + np.eye(len(mode.theta))) - mode_in_prior_sd).diagonal()
+    )[is_width]
     mean = body.shares @ body.centres
-    away = body.centres - mean
-    covariance = np.einsum("k,kij,klj->il", body.shares, body.roots, body.roots) + away.T @ (
-        body.shares[:, None] * away
-    )
+    centre_distance = body.centres - mean
+    # of the whole mixture: that of its parts, and that of their centres
+    covariance = np.einsum(
+        "k,kij,klj->il", body.shares, body.roots, body.roots
+    ) + centre_distance.T @ (body.shares[:, None] * centre_distance)
     centres, roots = np.repeat(mean[None], len(mean), 0), []
-    for i, unit in enumerate(units):
-        centres[i, i] = mode.theta[is_width][i] - middle[is_width][i] * unit
+    for i, unit in enumerate(prior_sd):
+        # the middle of the prior of this width
+        centres[i, i] = mode.theta[is_width][i] - mode_in_prior_sd[is_width][i] * unit
         roots.append(_root(_given(covariance, i), i, unit))
-    parts = [
+    width_tails = [
         Mixture(np.ones(1), centre[None], root[None], _TAIL_SHARE)
         for centre, root in zip(centres, roots, strict=True)
     ]
-    first, *shares = _shares([body, *parts], *weighted)
-    tails = np.broadcast_to(body.tails, body.shares.shape)
+    # the shares with which all parts together are most like the samples
+    body_share, *tail_shares = _shares([body, *width_tails], *weighted)
+    body_freedom = np.broadcast_to(body.tails, body.shares.shape)
     return Mixture(
-        np.concatenate([first * body.shares, shares]),
+        np.concatenate([body_share * body.shares, tail_shares]),
         np.concatenate([body.centres, centres]),
         np.concatenate([body.roots, np.stack(roots)]),
-        np.concatenate([tails, np.full(len(shares), _TAIL_SHARE)]),
+        np.concatenate([body_freedom, np.full(len(tail_shares), _TAIL_SHARE)]),
     )
 
 
 def _shares(parts: Sequence[Mixture], samples: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the share of each part with which a density is most like weighted samples; no part
-    has less than a few.
+    """Return the share of each part with which a density is most like weighted samples.
+
+    Each share is at least `_LEAST` before the shares are normalised. Steps of expectation
+    maximisation: the share of a part is the mean probability that a sample belongs to it.
     """
-    logs = np.stack([mixture.log_density(samples) for mixture in parts], -1)
-    shares = np.full(len(parts), 1 / len(parts))
+    log_densities = np.stack([mixture.log_density(samples) for mixture in parts], -1)
+    part_shares = np.full(len(parts), 1 / len(parts))
     for _ in range(_STEPS):
-        joint = logs + np.log(shares)
-        shares = np.maximum(weight @ np.exp(joint - log_sum(joint)[:, None]), _LEAST)
-        shares /= shares.sum()
-    return shares
+        log_joint = log_densities + np.log(part_shares)
+        part_shares = np.maximum(weight @ np.exp(log_joint - log_sum(log_joint)[:, None]), _LEAST)
+        part_shares /= part_shares.sum()
+    return part_shares
 
 
 def _tail(theta: FloatArray, covariance: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
-    """Return centre and root of the part for the logarithm ``i``."""
-    centre = theta - covariance[:, i] / covariance[i, i]
-    centre[i] = theta[i] - _TAIL_REACH
-    return centre, _root(_given(covariance, i), i, _TAIL_REACH / np.sqrt(2))
+    """Return centre (free,) and root (free, free) of the part for the tail of the logarithm `i`."""
+    # the other parameters follow their regression on `i`
+    tail_centre = theta - covariance[:, i] / covariance[i, i]
+    tail_centre[i] = theta[i] - _TAIL_REACH
+    return tail_centre, _root(_given(covariance, i), i, _TAIL_REACH / np.sqrt(2))
 
 
 def _given(covariance: FloatArray, i: int) -> FloatArray:
@@ -477,8 +564,9 @@ def _given(covariance: FloatArray, i: int) -> FloatArray:
 
 
 def _root(covariance: FloatArray, i: int, spread: float) -> FloatArray:
-    """Return the root of a ``covariance`` given the value of ``i``, to which ``i`` joins with
-    its own ``spread``.
+    """Return the Cholesky root of a covariance in which `i` is independent and has its own spread.
+
+    `covariance` is that of all others for a known value of `i`, and is changed in place.
     """
     covariance[i], covariance[:, i] = 0.0, 0.0
     covariance[i, i] = spread**2

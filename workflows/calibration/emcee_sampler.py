@@ -80,18 +80,25 @@ class Walk:
 
     def propose(self, split: int) -> FloatArray:
         """Return the proposed coordinates (walker, free parameter) for one part of the walkers."""
-        sets = [self._state.coords[self._part == other] for other in range(self.move.nsplits)]
-        others = sets[:split] + sets[split + 1 :]
-        self._proposed, self._factors = self.move.get_proposal(sets[split], others, self.random)
+        sets = [
+            self._state.coords[self._part == part_number]
+            for part_number in range(self.move.nsplits)
+        ]
+        other_parts = sets[:split] + sets[split + 1 :]
+        self._proposed, self._factors = self.move.get_proposal(
+            sets[split], other_parts, self.random
+        )
         proposed: FloatArray = self._proposed
         return proposed
 
     def decide(self, split: int, log: FloatArray) -> None:
         """Accept or reject the proposed coordinates of one part of the walkers."""
-        own = np.flatnonzero(self._part == split)
-        gain = self._factors + log - self._state.log_prob[own]
-        accepted = gain > np.log(self.random.rand(len(own)))
-        moved = own[accepted]
+        walker_numbers = np.flatnonzero(self._part == split)
+        # rule of Metropolis and Hastings: density of the new place over that of the old one, times
+        # the factor
+        log_acceptance = self._factors + log - self._state.log_prob[walker_numbers]
+        accepted = log_acceptance > np.log(self.random.rand(len(walker_numbers)))
+        moved = walker_numbers[accepted]
         self._state.coords[moved], self._state.log_prob[moved] = (
             self._proposed[accepted],
             log[accepted],
@@ -113,22 +120,29 @@ def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
     """Advance the ensembles until each has ``steps`` steps; ensembles with the fewest steps go
     first.
     """
-    while (now := min(walk.iteration for walk in walks)) < steps:
-        behind = [walk for walk in walks if walk.iteration == now]
-        until = min([steps, *(walk.iteration for walk in walks if walk.iteration > now)])
-        _together(behind, until - now, weigh)
+    while (fewest_steps := min(walk.iteration for walk in walks)) < steps:
+        walks_to_advance = [walk for walk in walks if walk.iteration == fewest_steps]
+        next_stop = min(
+            [steps, *(walk.iteration for walk in walks if walk.iteration > fewest_steps)]
+        )
+        _together(walks_to_advance, next_stop - fewest_steps, weigh)
 
 
 def _together(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
+    """Advance ensembles of equal length by `steps` steps.
+
+    The proposals of all ensembles are weighed in one call, because many samples at once cost little
+    more than one.
+    """
     for walk in walks:
         walk.prepare(steps, weigh)
     for _ in range(steps):
         for walk in walks:
             walk.begin_step()
         for split in range(walks[0].move.nsplits):
-            log = weigh(np.concatenate([walk.propose(split) for walk in walks]))
-            for walk, own in zip(walks, np.split(log, len(walks)), strict=True):
-                walk.decide(split, own)
+            log_posteriors = weigh(np.concatenate([walk.propose(split) for walk in walks]))
+            for walk, own_log in zip(walks, np.split(log_posteriors, len(walks)), strict=True):
+                walk.decide(split, own_log)
         for walk in walks:
             walk.end_step()
     for walk in walks:
@@ -167,9 +181,11 @@ class GuidedMove:
         acceptance.
         """
         proposed, factors = self.move.get_proposal(own, others, random)
-        drawn, ratio = self.density.propose(own, random)
-        guided = random.random_sample(len(own)) < _SHARE
-        return np.where(guided[:, None], drawn, proposed), np.where(guided, ratio, factors)
+        from_density, density_factors = self.density.propose(own, random)
+        takes_density = random.random_sample(len(own)) < _SHARE
+        return np.where(takes_density[:, None], from_density, proposed), np.where(
+            takes_density, density_factors, factors
+        )
 
 
 # --- emcee sampler --------------------------------------------------------------------------------
@@ -250,32 +266,39 @@ def sample(
         start_ensemble(problem, mode, file, index, seed, walkers, moves, guide)
         for index in range(ENSEMBLES)
     ]
-    before, steps = _round(min(run.iteration for run in runs))
-    tau_before, stored = _longest_time(runs, before) if before else np.inf, True
+    # a run that continues stops at the same steps as one without interruption
+    steps_before, round_end = _round(min(run.iteration for run in runs))
+    tau_before, is_stored = _longest_time(runs, steps_before) if steps_before else np.inf, True
     while True:
-        walk_until(runs, steps, problem.log_posterior)
-        warn = progress if stored else silent
-        stored = _keep(file, [run.backend for run in runs], warn)
+        walk_until(runs, round_end, problem.log_posterior)
+        # a disk that is full is reported once
+        warn = progress if is_stored else silent
+        is_stored = _keep(file, [run.backend for run in runs], warn)
         tau = _longest_time(runs)
-        chains = _gathered(runs, tau, steps, _are_long(steps, tau, tau_before))
-        size = chains.flat.shape[0] / tau
-        ends = _are_enough(chains, size, effective_size)
+        chains = _gathered(runs, tau, round_end, _are_long(round_end, tau, tau_before))
+        effective = chains.flat.shape[0] / tau
+        is_finished = _are_enough(chains, effective, effective_size)
+        # for the message: this round, or what the present rates ask for
         needed = (
-            steps
-            if ends
-            else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, effective_size))
+            round_end
+            if is_finished
+            else max(
+                int(_GROWTH * round_end), _steps_needed(round_end, tau, effective, effective_size)
+            )
         )
-        where = f"{steps} of about {needed} steps of {ENSEMBLES} x {walkers} walkers"
-        progress(f"{where}: tau {tau:.1f}, effective sample size {size:.0f}")
-        if ends:
+        progress_text = f"{round_end} of about {needed} steps of {ENSEMBLES} x {walkers} walkers"
+        progress(f"{progress_text}: tau {tau:.1f}, effective sample size {effective:.0f}")
+        if is_finished:
             return chains
-        tau_before, steps = tau, int(_GROWTH * steps)
+        tau_before, round_end = tau, int(_GROWTH * round_end)
 
 
 def _are_long(steps: int, tau: float, tau_before: float) -> bool:
     """Return True if the chains are many autocorrelation times long, and this time is settled."""
-    change = abs(tau - tau_before) / tau
-    return steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
+    relative_change = abs(tau - tau_before) / tau
+    return steps >= (_TAUS + _BURN) * tau and (
+        relative_change < _CHANGE or steps >= (_SURELY + _BURN) * tau
+    )
 
 
 def _are_enough(chains: Chains, size: float, effective_size: int) -> bool:
@@ -291,6 +314,7 @@ def _steps_needed(steps: int, tau: float, size: float, effective_size: int) -> i
 
 
 def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
+    """Return the longest autocorrelation time, in steps, of all ensembles' first `steps` steps."""
     return max(autocorrelation_time(run.backend.get_chain()[:steps]) for run in runs)
 
 
@@ -298,10 +322,10 @@ def _round(iteration: int) -> tuple[int, int]:
     """Return the numbers of steps at which two successive rounds of sampling end, before and
     after ``iteration``.
     """
-    before, steps = 0, _FIRST
+    steps_before, steps = 0, _FIRST
     while steps < iteration:
-        before, steps = steps, int(_GROWTH * steps)
-    return before, steps
+        steps_before, steps = steps, int(_GROWTH * steps)
+    return steps_before, steps
 
 
 def start_ensemble(
@@ -324,6 +348,7 @@ def start_ensemble(
         random.set_state(backend.random_state)
         return Walk(backend, moves, random, None)
     rng = np.random.default_rng([seed, index])
+    # emcee needs the old kind of generator
     random = np.random.RandomState(rng.integers(1 << 32, size=8, dtype=np.uint32))
     backend = emcee.backends.Backend()
     backend.reset(walkers, dimensions)
@@ -337,13 +362,14 @@ def _alive(
     """Return starting points (walker, parameter) near the posterior mode, where the posterior is
     not almost zero.
     """
-    points = np.empty((0, len(mode.theta)))
+    likely_points = np.empty((0, len(mode.theta)))
+    # each round keeps the likely ones of four times as many candidates
     for _ in range(50):
-        drawn = mode.draw(4 * walkers, rng)
-        likely = problem.log_posterior(drawn) > mode.log - _BESIDE * (1 + len(mode.theta))
-        points = np.concatenate([points, drawn[likely]])
-        if len(points) >= walkers:
-            return points[:walkers]
+        candidates = mode.draw(4 * walkers, rng)
+        is_likely = problem.log_posterior(candidates) > mode.log - _BESIDE * (1 + len(mode.theta))
+        likely_points = np.concatenate([likely_points, candidates[is_likely]])
+        if len(likely_points) >= walkers:
+            return likely_points[:walkers]
     raise ValueError(
         "samples around the mode have almost no posterior density, so no chain can start there:"
         " give narrower priors"
@@ -363,14 +389,18 @@ def stranded(log: FloatArray) -> int:
     """Return the number of walkers whose log posterior ``log`` (..., step, walker) is far below
     that of the others.
     """
-    middle = np.median(log, -2)
-    return int((middle < np.median(middle) - STRANDED).sum())
+    walker_medians = np.median(log, -2)
+    return int((walker_medians < np.median(walker_medians) - STRANDED).sum())
 
 
 def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chains:
-    burn = min(int(_BURN * tau) + 1, steps // 2)
-    draws = np.stack([run.backend.get_chain(discard=burn) for run in runs])
-    log = np.stack([run.backend.get_log_prob(discard=burn) for run in runs])
+    """Return the chains of all ensembles without the discarded steps, with the measures of mixing.
+
+    `tau` is the longest autocorrelation time, `steps` the length and `long` if that is enough.
+    """
+    discarded_steps = min(int(_BURN * tau) + 1, steps // 2)
+    draws = np.stack([run.backend.get_chain(discard=discarded_steps) for run in runs])
+    log = np.stack([run.backend.get_log_prob(discard=discarded_steps) for run in runs])
     accepted = float(np.mean([run.backend.accepted / run.iteration for run in runs]))
     return Chains(draws, log, accepted, tau, steps, long)
 
@@ -387,35 +417,38 @@ def _read(file: Path, index: int) -> Any:
         with TemporaryDirectory(prefix="neusee-") as folder:
             copy = Path(folder) / "draws.h5"
             copy.write_bytes(content)
-            memory = _unpacked(copy, index)
+            backend = _unpacked(copy, index)
     except (OSError, LookupError, AttributeError, ValueError, TypeError, RuntimeError):
         return None
-    return memory if _is_whole(memory) else None
+    return backend if _is_whole(backend) else None
 
 
 def _unpacked(file: Path, index: int) -> Any:
-    stored = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
-    memory = emcee.backends.Backend()
-    with stored.open() as opened:
-        hdf5_needs(file, [opened[stored.name]])
-    memory.reset(*stored.shape)
-    memory.chain, memory.log_prob = stored.get_chain(), stored.get_log_prob()
-    memory.accepted, memory.iteration = stored.accepted, stored.iteration
-    memory.random_state = stored.random_state
-    np.random.RandomState().set_state(memory.random_state)
-    return memory
+    """Read the draws of one ensemble from an HDF5 file into a backend of emcee in memory."""
+    stored_draws = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
+    backend = emcee.backends.Backend()
+    with stored_draws.open() as hdf5_file:
+        # refuses a file whose arrays would not fit into memory
+        hdf5_needs(file, [hdf5_file[stored_draws.name]])
+    backend.reset(*stored_draws.shape)
+    backend.chain, backend.log_prob = stored_draws.get_chain(), stored_draws.get_log_prob()
+    backend.accepted, backend.iteration = stored_draws.accepted, stored_draws.iteration
+    backend.random_state = stored_draws.random_state
+    # raises here if the stored state is no state of a random stream
+    np.random.RandomState().set_state(backend.random_state)
+    return backend
 
 
 def _is_whole(memory: Any) -> bool:
     """Return True if draws and log densities of every step are there and are numbers."""
     steps = memory.iteration
-    shapes = memory.chain.shape == (steps, *memory.shape) and memory.log_prob.shape == (
+    has_all_shapes = memory.chain.shape == (steps, *memory.shape) and memory.log_prob.shape == (
         steps,
         memory.shape[0],
     )
     return (
         steps > 0
-        and shapes
+        and has_all_shapes
         and bool(np.isfinite(memory.chain).all() and np.isfinite(memory.log_prob).all())
     )
 
@@ -444,11 +477,14 @@ def _write(file: Path, backends: Sequence[Any]) -> None:
         with TemporaryDirectory(prefix="neusee-") as folder:
             draws_file = Path(folder) / "draws.h5"
             _write_draws(draws_file, backends)
-            content = draws_file.read_bytes()[_SEAL:]
-        with open(temporary, "wb") as written:
-            written.write(seal_file("draws", file.stem, content).ljust(_SEAL, b"\0") + content)
-            written.flush()
-            os.fsync(written.fileno())
+            # the first bytes are kept free for the seal, which is computed of the rest
+            draws_content = draws_file.read_bytes()[_SEAL:]
+        with open(temporary, "wb") as temporary_file:
+            temporary_file.write(
+                seal_file("draws", file.stem, draws_content).ljust(_SEAL, b"\0") + draws_content
+            )
+            temporary_file.flush()
+            os.fsync(temporary_file.fileno())
         os.replace(temporary, file)
     finally:
         temporary.unlink(missing_ok=True)
@@ -458,16 +494,18 @@ def _write_draws(path: Path, backends: Sequence[Any]) -> None:
     """Write the draws of all ensembles to an HDF5 file whose first bytes are free for the seal."""
     import h5py
 
+    # HDF5 leaves a block of this size before its own content
     with h5py.File(path, "w", userblock_size=_SEAL):
         pass
     for index, memory in enumerate(backends):
         backend = emcee.backends.HDFBackend(str(path), name=f"ensemble{index}")
         backend.reset(*memory.shape)
         backend.grow(memory.iteration, None)
-        with backend.open("a") as opened:
-            group = opened[backend.name]
+        with backend.open("a") as hdf5_file:
+            group = hdf5_file[backend.name]
             group["chain"][...], group["log_prob"][...] = memory.chain, memory.log_prob
             group["accepted"][...] = memory.accepted
             group.attrs["iteration"] = memory.iteration
+            # the state of the random stream is a tuple, which HDF5 holds number by number
             for i, value in enumerate(memory.random_state):
                 group.attrs[f"random_state_{i}"] = value

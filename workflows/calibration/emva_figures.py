@@ -40,12 +40,23 @@ def photon_transfer(sheet: EmvaSheet) -> Any:
     and saturation.
     """
     figure, axes = canvas(_WIDTH, _HEIGHT)
-    ax, transfer, k = axes[0, 0], sheet.transfer, sheet["K"].value
+    ax, transfer, gain = axes[0, 0], sheet.transfer, sheet["K"].value
     ax.plot(transfer.signal, transfer.excess, label="measured", **_DOTS)
-    limit = 0.7 * float(transfer.signal[transfer.saturation])
-    if k is not None:
-        ax.plot([0, limit], [0, k * limit], color=BLUE, label=f"0 to 70 %: K = {k:.4g} DN/e-")
-        ax.plot([limit, limit / 0.7], [k * limit, k * limit / 0.7], color=BLUE, linestyle=":")
+    linear_limit = 0.7 * float(transfer.signal[transfer.saturation])
+    if gain is not None:
+        ax.plot(
+            [0, linear_limit],
+            [0, gain * linear_limit],
+            color=BLUE,
+            label=f"0 to 70 %: K = {gain:.4g} DN/e-",
+        )
+        ax.plot(
+            # dotted where the line was not fitted
+            [linear_limit, linear_limit / 0.7],
+            [gain * linear_limit, gain * linear_limit / 0.7],
+            color=BLUE,
+            linestyle=":",
+        )
     _saturation(ax, sheet, float(transfer.signal[transfer.saturation]))
     ax.set(xlabel="μ_y - μ_y.dark (DN)", ylabel="σ²_y - σ²_y.dark (DN²)", title="Photon transfer")
     ax.set_ylim(bottom=min(0.0, 1.1 * float(transfer.excess.min())))
@@ -56,12 +67,15 @@ def photon_transfer(sheet: EmvaSheet) -> Any:
 def sensitivity(sheet: EmvaSheet) -> Any:
     """Draw the signal above the dark over the photons, with the line of the responsivity."""
     figure, axes = canvas(_WIDTH, _HEIGHT)
-    ax, transfer, slope = axes[0, 0], sheet.transfer, sheet["R"].value
+    ax, transfer, responsivity = axes[0, 0], sheet.transfer, sheet["R"].value
     ax.plot(transfer.photons, transfer.signal, label="measured", **_DOTS)
-    if slope is not None:
-        end = 0.7 * float(transfer.signal[transfer.saturation]) / slope
+    if responsivity is not None:
+        last_photons = 0.7 * float(transfer.signal[transfer.saturation]) / responsivity
         ax.plot(
-            [0, end], [0, slope * end], color=BLUE, label=f"0 to 70 %: R = {slope:.4g} DN/photon"
+            [0, last_photons],
+            [0, responsivity * last_photons],
+            color=BLUE,
+            label=f"0 to 70 %: R = {responsivity:.4g} DN/photon",
         )
     _saturation(ax, sheet, float(transfer.photons[transfer.saturation]))
     ax.set(xlabel=_light(sheet), ylabel="μ_y - μ_y.dark (DN)", title="Sensitivity")
@@ -75,14 +89,14 @@ def signal_to_noise(sheet: EmvaSheet) -> Any:
     """
     figure, axes = canvas(_WIDTH, _HEIGHT)
     ax, transfer = axes[0, 0], sheet.transfer
-    shown = (
+    is_drawn = (
         (transfer.signal > 0)
         & (transfer.variance > 0)
         & (np.arange(len(transfer.signal)) <= transfer.saturation)
     )
     ax.plot(
-        transfer.photons[shown],
-        transfer.signal[shown] / np.sqrt(transfer.variance[shown]),
+        transfer.photons[is_drawn],
+        transfer.signal[is_drawn] / np.sqrt(transfer.variance[is_drawn]),
         label="measured",
         **_DOTS,
     )
@@ -102,22 +116,24 @@ def signal_to_noise(sheet: EmvaSheet) -> Any:
 
 def _modelled_ratio(ax: Any, sheet: EmvaSheet) -> None:
     """Draw the ratio of the linear model from threshold to saturation, if the frames tell both."""
-    eta, k, threshold, saturation = (
+    efficiency, gain, threshold, saturation = (
         sheet[key].value for key in ("eta", "K", "mu_p_min", "mu_p_sat")
     )
-    if eta is None or k is None or threshold is None or saturation is None:
+    if efficiency is None or gain is None or threshold is None or saturation is None:
         return
-    light = np.geomspace(threshold, saturation, _BINS)
-    electrons = eta / 100 * light
-    noise = (sheet["sigma_y_dark"].value or 0.0) ** 2 / k**2 + electrons
-    ax.plot(light, electrons / np.sqrt(noise), color=BLUE, label="linear model")
-    ax.plot(light, np.sqrt(light), color=GREEN, linestyle="-.", label="ideal sensor")
+    photons = np.geomspace(threshold, saturation, _BINS)
+    # the efficiency is in percent
+    electrons = efficiency / 100 * photons
+    # electrons squared: dark noise from DN by the gain, and shot noise
+    noise_variance = (sheet["sigma_y_dark"].value or 0.0) ** 2 / gain**2 + electrons
+    ax.plot(photons, electrons / np.sqrt(noise_variance), color=BLUE, label="linear model")
+    ax.plot(photons, np.sqrt(photons), color=GREEN, linestyle="-.", label="ideal sensor")
     dsnu, prnu = sheet["DSNU1288"].value, sheet["PRNU1288"].value
     if dsnu is not None and prnu is not None:
-        total = noise + dsnu**2 + (prnu / 100 * electrons) ** 2
+        total_variance = noise_variance + dsnu**2 + (prnu / 100 * electrons) ** 2
         ax.plot(
-            light,
-            electrons / np.sqrt(total),
+            photons,
+            electrons / np.sqrt(total_variance),
             color=ORANGE,
             linestyle="--",
             label="total SNR, with DSNU and PRNU",
@@ -135,22 +151,25 @@ def general(sheet: EmvaSheet) -> Any:
     if model is None:
         return None
     figure, axes = canvas(_WIDTH, _HEIGHT, 1, 2)
-    left, right = axes[0]
-    left.errorbar(
+    slope_panel, ratio_panel = axes[0]
+    # the first slope is that of the dark level, which has no light to be drawn over
+    slope_panel.errorbar(
         model.photons, model.slope[1:], model.slope[1:] * model.error[1:], ecolor="#777777", **_DOTS
     )
-    left.set(xlabel=_light(sheet), ylabel="slope (DN per photon)", title="Slope of the response")
-    left.set_ylim(0, 1.15 * float((model.slope * (1 + model.error)).max()))
-    left.locator_params(axis="x", nbins=5)
-    right.plot(model.photons, model.ratio, **_DOTS)
-    right.set(
+    slope_panel.set(
+        xlabel=_light(sheet), ylabel="slope (DN per photon)", title="Slope of the response"
+    )
+    slope_panel.set_ylim(0, 1.15 * float((model.slope * (1 + model.error)).max()))
+    slope_panel.locator_params(axis="x", nbins=5)
+    ratio_panel.plot(model.photons, model.ratio, **_DOTS)
+    ratio_panel.set(
         xscale="log",
         yscale="log",
         xlabel=_light(sheet),
         ylabel="SNR of the light",
         title="SNR, no linear model",
     )
-    right.xaxis.set_minor_formatter("")
+    ratio_panel.xaxis.set_minor_formatter("")
     return figure
 
 
@@ -159,32 +178,45 @@ def linearity(sheet: EmvaSheet) -> Any:
     of saturation.
     """
     figure, axes = canvas(_WIDTH, 6.0, 2, 1, sharex=True, height_ratios=(1.4, 1.0))
-    above, below, transfer, linear = axes[0, 0], axes[1, 0], sheet.transfer, sheet.transfer.linear
-    above.plot(transfer.photons, transfer.signal, label="measured", **_DOTS)
-    above.set(ylabel="μ_y - μ_y.dark (DN)", title="Linearity")
+    response_panel, deviation_panel, transfer, in_fit = (
+        axes[0, 0],
+        axes[1, 0],
+        sheet.transfer,
+        sheet.transfer.linear,
+    )
+    response_panel.plot(transfer.photons, transfer.signal, label="measured", **_DOTS)
+    response_panel.set(ylabel="μ_y - μ_y.dark (DN)", title="Linearity")
     if sheet.linearity is not None:
-        ends = np.array([transfer.photons[linear].min(), transfer.photons[linear].max()])
-        fitted = sheet.linearity.start + sheet.linearity.slope * ends
-        above.plot(ends, fitted, color=BLUE, label="line of least relative deviation, 5 to 95 %")
-        below.plot(transfer.photons[linear], sheet.linearity.deviation, **_DOTS)
+        first_and_last = np.array([transfer.photons[in_fit].min(), transfer.photons[in_fit].max()])
+        line_signal = sheet.linearity.start + sheet.linearity.slope * first_and_last
+        response_panel.plot(
+            first_and_last,
+            line_signal,
+            color=BLUE,
+            label="line of least relative deviation, 5 to 95 %",
+        )
+        deviation_panel.plot(transfer.photons[in_fit], sheet.linearity.deviation, **_DOTS)
         for key in ("LE_min", "LE_max"):
-            below.axhline(sheet[key].value, color=VERMILION, linestyle=":")
+            deviation_panel.axhline(sheet[key].value, color=VERMILION, linestyle=":")
             text = f"{sheet[key].symbol} = {sheet[key].text}"
-            side, up = ("top", -4) if key == "LE_min" else ("bottom", 4)
+            # the text of the lower limit hangs below its line, that of the upper one stands on it
+            text_side, text_offset = ("top", -4) if key == "LE_min" else ("bottom", 4)
             placement: Any = {
                 "xy": (1, sheet[key].value),
                 "xycoords": ("axes fraction", "data"),
-                "xytext": (0, up),
+                "xytext": (0, text_offset),
             }
-            below.annotate(
-                text, **placement, textcoords="offset points", ha="right", va=side, fontsize=9
+            deviation_panel.annotate(
+                text, **placement, textcoords="offset points", ha="right", va=text_side, fontsize=9
             )
-        below.margins(y=0.35)
+        deviation_panel.margins(y=0.35)
     else:
-        below.text(0.5, 0.5, sheet["LE_min"].reason, transform=below.transAxes, ha="center")
-    below.axhline(0, color=BLUE, linewidth=1)
-    below.set(xlabel=_light(sheet), ylabel="deviation (%)")
-    above.legend(loc="upper left")
+        deviation_panel.text(
+            0.5, 0.5, sheet["LE_min"].reason, transform=deviation_panel.transAxes, ha="center"
+        )
+    deviation_panel.axhline(0, color=BLUE, linewidth=1)
+    deviation_panel.set(xlabel=_light(sheet), ylabel="deviation (%)")
+    response_panel.legend(loc="upper left")
     return figure
 
 
@@ -217,9 +249,10 @@ def spectrograms(sheet: EmvaSheet) -> Any:
     figure, axes = canvas(_WIDTH, 3.4 * len(images), len(images), 2)
     for row, ((name, unit), directions) in zip(axes, images.items(), strict=True):
         quantity = sheet[f"{name}1288_DN" if name == "DSNU" else f"{name}1288"]
-        single, average = emva_sheet.noise_in_time(sheet, name)
+        frame_noise, average_noise = emva_sheet.noise_in_time(sheet, name)
         for ax, (direction, spectrogram) in zip(row, directions.items(), strict=True):
             ax.plot(
+                # the frequency 0 is the mean
                 spectrogram.frequency[1:],
                 spectrogram.amplitude[1:].clip(1e-12),
                 color=BLACK,
@@ -232,14 +265,17 @@ def spectrograms(sheet: EmvaSheet) -> Any:
                     linestyle="--",
                     label=f"{quantity.symbol}: {quantity.text}",
                 )
-            ax.axhline(single, color=GREEN, linestyle="-.", label="noise in time of one frame")
-            ax.axhline(average, color=BLUE, linestyle=":", label="noise in time of the average")
+            ax.axhline(frame_noise, color=GREEN, linestyle="-.", label="noise in time of one frame")
+            ax.axhline(
+                average_noise, color=BLUE, linestyle=":", label="noise in time of the average"
+            )
             ax.set(
                 yscale="log",
                 xlabel="cycles per pixel",
                 ylabel=f"amplitude ({unit})",
                 title=f"{name}, {direction}",
             )
+            # room for the legend above the curves
             ax.set_ylim(top=12 * ax.get_ylim()[1])
             ax.legend(loc="upper right")
     return figure
@@ -273,8 +309,10 @@ def defect_pixels(sheet: EmvaSheet) -> Any:
     if not histograms:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(histograms), len(histograms), 2)
-    for (left, right), ((name, unit), histogram) in zip(axes, histograms.items(), strict=True):
-        left.step(
+    for (logarithmic_panel, accumulated_panel), ((name, unit), histogram) in zip(
+        axes, histograms.items(), strict=True
+    ):
+        logarithmic_panel.step(
             histogram.deviation,
             histogram.pixels,
             where="post",
@@ -282,26 +320,26 @@ def defect_pixels(sheet: EmvaSheet) -> Any:
             linewidth=0.9,
             label="pixels",
         )
-        left.plot(
+        logarithmic_panel.plot(
             histogram.deviation,
             histogram.normal,
             color=VERMILION,
             linestyle="--",
             label="normal distribution",
         )
-        left.set(
+        logarithmic_panel.set(
             yscale="log", xlabel=f"deviation from the mean ({unit})", ylabel="pixels of a class"
         )
-        left.set(title=f"{name}: logarithmic histogram")
-        left.set_ylim(0.5, 8 * float(histogram.pixels.max()))
-        left.legend(loc="upper right")
-        right.plot(histogram.distance, histogram.beyond, color=BLACK)
-        right.set(
+        logarithmic_panel.set(title=f"{name}: logarithmic histogram")
+        logarithmic_panel.set_ylim(0.5, 8 * float(histogram.pixels.max()))
+        logarithmic_panel.legend(loc="upper right")
+        accumulated_panel.plot(histogram.distance, histogram.beyond, color=BLACK)
+        accumulated_panel.set(
             yscale="log",
             xlabel=f"deviation from the mean, amount ({unit})",
             ylabel="pixels beyond (%)",
         )
-        right.set(title=f"{name}: accumulated histogram")
+        accumulated_panel.set(title=f"{name}: accumulated histogram")
     return figure
 
 
@@ -334,15 +372,21 @@ def _picture(draw: Draw, sheet: EmvaSheet) -> bytes | None:
 
 
 def _saturation(ax: Any, sheet: EmvaSheet, level: float) -> None:
+    """Draw a vertical line at the saturation, or at the brightest level if it is not reached.
+
+    `level` is its place on the horizontal axis of `ax`.
+    """
     label = "saturation" if sheet.transfer.saturated else "brightest level: saturation not reached"
     ax.axvline(level, color=VERMILION, linestyle="--", label=label)
 
 
 def _light(sheet: EmvaSheet) -> str:
+    """Return the label of the axis of light; without a quantum efficiency the light is relative."""
     return "light (relative)" if sheet["eta"].value is None else "μ_p (photons per pixel)"
 
 
 def _straight(x: Any, y: Any) -> Any:
+    """Return the values at `x` of the line of least squares through the points (x, y)."""
     return np.polyval(np.polyfit(x, y, 1), x)
 
 
@@ -364,17 +408,17 @@ def pdf(sheet: EmvaSheet, title: str, lines: list[str], budgets: Sequence[Budget
     """
     from matplotlib.backends.backend_pdf import PdfPages
 
-    out = io.BytesIO()
+    pdf_file = io.BytesIO()
     # equal frames give equal bytes
-    about = {"Title": title, "Creator": "neusee", "CreationDate": None}
-    with styled(), PdfPages(out, metadata=about) as pages:
+    metadata = {"Title": title, "Creator": "neusee", "CreationDate": None}
+    with styled(), PdfPages(pdf_file, metadata=metadata) as pages:
         pages.savefig(_summary(sheet, title, lines, {b.key: b for b in budgets}))
-        for draw in PICTURES.values():
-            if (figure := draw(sheet)) is not None:
+        for draw_picture in PICTURES.values():
+            if (figure := draw_picture(sheet)) is not None:
                 pages.savefig(figure, bbox_inches="tight", pad_inches=0.3)
-        if named := [budget for budget in budgets if budget.key in BUDGETED]:
-            pages.savefig(budget_figure(named), bbox_inches="tight", pad_inches=0.3)
-    return out.getvalue()
+        if shown_budgets := [budget for budget in budgets if budget.key in BUDGETED]:
+            pages.savefig(budget_figure(shown_budgets), bbox_inches="tight", pad_inches=0.3)
+    return pdf_file.getvalue()
 
 
 def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[str, Budget]) -> Any:
@@ -388,9 +432,9 @@ def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[st
     axes[0, 0].text(
         0, 1, title, fontsize=14, fontweight="bold", va="top", transform=axes[0, 0].transAxes
     )
-    shown = "\n".join(itertools.chain(*(textwrap.wrap(text, _LINE) for text in lines)))
+    wrapped_text = "\n".join(itertools.chain(*(textwrap.wrap(text, _LINE) for text in lines)))
     axes[0, 0].text(
-        0, 0.86, shown, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes
+        0, 0.86, wrapped_text, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes
     )
     rows = [(q.symbol, q.name, q.text, _expanded(budgets.get(q.key))) for q in sheet.quantities]
     table = axes[1, 0].table(

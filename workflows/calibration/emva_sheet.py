@@ -116,15 +116,17 @@ def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = Non
     descriptor states one.
     Raises: ValueError for a recipe that reads neither frames, a descriptor nor a table.
     """
-    if described := _steps_of(recipe, "calibrate.descriptor"):
-        stated = descriptor_release(described[0].params["file"])
+    if descriptor_steps := _steps_of(recipe, "calibrate.descriptor"):
+        stated = descriptor_release(descriptor_steps[0].params["file"])
         release = release or ("3" if stated and float(stated) < _STEADY else "4")
-        return _described(described[0], _SCATTER[release])._replace(release=release, stated=stated)
+        return _described(descriptor_steps[0], _SCATTER[release])._replace(
+            release=release, stated=stated
+        )
     release = release or "4"
-    if reduced := _steps_of(recipe, "calibrate.reduce"):
-        return _reduced(recipe, store, reduced, _SCATTER[release])._replace(release=release)
-    if tables := _steps_of(recipe, "calibrate.table"):
-        return _tabled(recipe, store, tables[0].name)
+    if reduce_steps := _steps_of(recipe, "calibrate.reduce"):
+        return _reduced(recipe, store, reduce_steps, _SCATTER[release])._replace(release=release)
+    if table_steps := _steps_of(recipe, "calibrate.table"):
+        return _tabled(recipe, store, table_steps[0].name)
     raise ValueError(
         f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames"
         " of a sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`"
@@ -138,8 +140,9 @@ def _steps_of(recipe: Recipe, node: str) -> list[Step]:
 def _tabled(recipe: Recipe, store: Store, name: str) -> EmvaFrames:
     """Return the levels of a table of moments, which has no series."""
     measured = run(recipe, store, (name,)).values[name]
-    dark = measured.variance[measured.photons == 0]
-    tests = [coarse(float(dark.min()), exact=False)] if len(dark) else []
+    dark_variances = measured.variance[measured.photons == 0]
+    tests = [coarse(float(dark_variances.min()), exact=False)] if len(dark_variances) else []
+    # a table has the moments of two frames or more, and no averaged frames
     return EmvaFrames(measured, Nonuniformity(None, None), 2, tests)
 
 
@@ -150,15 +153,19 @@ _SCATTER: dict[Release, Any] = {"4": "steady", "3": "temporal"}
 
 
 def _described(step: Step, scatter: Any) -> EmvaFrames:
+    """Return levels, series and tests of the frames that a descriptor file names."""
     files = step.params["file"]
     measured = descriptor(file=files, scatter=scatter)
-    series = [spatial_series(*entry) for entry in descriptor_series(files)]
+    averaged_series = [spatial_series(*entry) for entry in descriptor_series(files)]
     stacks = (
         Stack(name, light, time, scatter, frames)
         for name, light, time, frames in descriptor_frames(files)
     )
     return EmvaFrames(
-        measured, _nearest_half(series, measured), 2, inspect_frames(stacks, False, _FITTED)
+        measured,
+        _nearest_half(averaged_series, measured),
+        2,
+        inspect_frames(stacks, False, _FITTED),
     )
 
 
@@ -166,35 +173,46 @@ def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) 
     """Return levels and series of the steps that reduce frames; the levels of most frames are
     the series.
     """
-    parts, counts = [], []
+    level_parts, frame_counts = [], []
     for step in steps:
         frames = _frames(recipe, store, step)
-        parts.append(reduce(frames, photons=_of(step)[0], exposure=_of(step)[1], scatter=scatter))
-        counts.append(len(frames))
-    measured: Levels = levels(parts)
-    largest = max(counts)
-    fullest = [step for step, count in zip(steps, counts, strict=True) if count == largest]
-    pair = _dark_and_half([_of(step) for step in fullest], measured)
-    series = (spatial_series(*_of(fullest[i]), _frames(recipe, store, fullest[i])) for i in pair)
+        level_parts.append(
+            reduce(frames, photons=_of(step)[0], exposure=_of(step)[1], scatter=scatter)
+        )
+        frame_counts.append(len(frames))
+    measured: Levels = levels(level_parts)
+    # a series for spatial quantities has more frames than the other levels
+    largest = max(frame_counts)
+    fullest = [step for step, count in zip(steps, frame_counts, strict=True) if count == largest]
+    dark_and_half = _dark_and_half([_of(step) for step in fullest], measured)
+    averaged_series = (
+        spatial_series(*_of(fullest[i]), _frames(recipe, store, fullest[i])) for i in dark_and_half
+    )
     stacks = (Stack(step.name, *_of(step), scatter, _frames(recipe, store, step)) for step in steps)
-    return EmvaFrames(measured, _pair(series), min(counts), inspect_frames(stacks, False, _FITTED))
+    return EmvaFrames(
+        measured, _pair(averaged_series), min(frame_counts), inspect_frames(stacks, False, _FITTED)
+    )
 
 
 def _of(step: Step) -> tuple[float, float]:
+    """Return photons per pixel and exposure in s of a step that reduces frames."""
     return float(step.params["photons"]), float(step.params["exposure"])
 
 
 def _frames(recipe: Recipe, store: Store, step: Step) -> Any:
+    """Return the frames that a step of `calibrate.reduce` receives."""
     source = str(step.wires["frames"])
     return run(recipe, store, (source,)).values[source]
 
 
 def _nearest_half(series: Sequence[SpatialSeries], measured: Levels) -> Nonuniformity:
-    light = [(averaged.photons, averaged.exposure) for averaged in series]
-    return _pair(series[i] for i in _dark_and_half(light, measured))
+    """Return the dark series and the lit series nearest to half of saturation."""
+    photons_and_exposure = [(averaged.photons, averaged.exposure) for averaged in series]
+    return _pair(series[i] for i in _dark_and_half(photons_and_exposure, measured))
 
 
 def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
+    """Return the dark and the lit one of at most two series; a series without photons is dark."""
     dark: SpatialSeries | None = None
     lit: SpatialSeries | None = None
     for averaged in series:
@@ -208,16 +226,18 @@ def _dark_and_half(light: Sequence[tuple[float, float]], measured: Levels) -> li
 
     ``light`` has photons and exposure of each series.
     """
-    dark = [i for i, (photons, _) in enumerate(light) if photons == 0]
-    dark_times = [light[i][1] for i in dark]
-    top = float(measured.photons[measured.variance.argmax()])
-    half = _half_of_saturation(light, top, dark_times)
-    indices = [] if half is None else [half]
-    if dark:
-        time = min(dark_times) if half is None else light[half][1]
-        nearest = int(np.abs(np.array(dark_times) - time).argmin())
-        indices.insert(0, dark[nearest])
-    return indices
+    dark_numbers = [i for i, (photons, _) in enumerate(light) if photons == 0]
+    dark_times = [light[i][1] for i in dark_numbers]
+    # EMVA 1288: saturation is where the variance is greatest
+    saturating_photons = float(measured.photons[measured.variance.argmax()])
+    half_number = _half_of_saturation(light, saturating_photons, dark_times)
+    numbers = [] if half_number is None else [half_number]
+    if dark_numbers:
+        # the dark with the exposure of the lit series, if can be
+        exposure = min(dark_times) if half_number is None else light[half_number][1]
+        nearest_dark = int(np.abs(np.array(dark_times) - exposure).argmin())
+        numbers.insert(0, dark_numbers[nearest_dark])
+    return numbers
 
 
 def _half_of_saturation(
@@ -226,9 +246,11 @@ def _half_of_saturation(
     """Return the index of the lit series nearest to half of ``top``, if can be among those with
     the exposure of a dark one; None without a lit series.
     """
-    lit = [i for i, (photons, _) in enumerate(light) if photons > 0]
-    with_dark = [i for i in lit if light[i][1] in dark_times]
-    return min(with_dark or lit, key=lambda i: abs(light[i][0] - _HALF * top), default=None)
+    lit_numbers = [i for i, (photons, _) in enumerate(light) if photons > 0]
+    lit_with_dark = [i for i in lit_numbers if light[i][1] in dark_times]
+    return min(
+        lit_with_dark or lit_numbers, key=lambda i: abs(light[i][0] - _HALF * top), default=None
+    )
 
 
 # --- emva patterns --------------------------------------------------------------------------------
@@ -238,6 +260,7 @@ def _half_of_saturation(
 
 
 _DIRECTIONS = {"horizontal": False, "vertical": True}
+# the sum over 5 x 5 pixels, so that whole numbers stay whole
 _HIGHPASS = 25  #: by which `without_trend` multiplies
 _SPECTROGRAMS = ("frame", "unit", "direction", "cycles_per_pixel", "amplitude")
 _PROFILES = ("frame", "direction", "pixel", *Profiles._fields)
@@ -283,10 +306,14 @@ def defect_histograms(sheet: EmvaSheet) -> dict[tuple[str, str], DefectHistogram
     if dark is not None:
         histograms["DSNU", "DN"] = defects(dark.total, 1 / dark.count)
     if dark is not None and lit is not None and (signal := signal_of(dark, lit)) > 0:
-        parts = math.gcd(dark.count, lit.count)
-        trendless = without_trend((lit.total * dark.count - dark.total * lit.count) // parts)
+        # sums of whole numbers stay whole: both means times the least common multiple of the counts
+        common_divisor = math.gcd(dark.count, lit.count)
+        trendless = without_trend(
+            (lit.total * dark.count - dark.total * lit.count) // common_divisor
+        )
+        # the second argument turns the whole numbers into percent of the signal
         histograms["PRNU", "%"] = defects(
-            trendless, 100 * parts / (_HIGHPASS * dark.count * lit.count * signal)
+            trendless, 100 * common_divisor / (_HIGHPASS * dark.count * lit.count * signal)
         )
     return histograms
 
@@ -299,8 +326,9 @@ def noise_in_time(sheet: EmvaSheet, name: str) -> tuple[float, float]:
     assert dark is not None
     if name == "DSNU" or lit is None:
         return math.sqrt(dark.temporal), math.sqrt(dark.temporal / dark.count)
-    share = 100 / signal_of(dark, lit)
-    return share * math.sqrt(lit.temporal), share * math.sqrt(
+    percent_per_dn = 100 / signal_of(dark, lit)
+    # the average of frames less the average of the darks: both variances of a mean add up
+    return percent_per_dn * math.sqrt(lit.temporal), percent_per_dn * math.sqrt(
         lit.temporal / lit.count + dark.temporal / dark.count
     )
 
@@ -331,6 +359,7 @@ def _histogram_rows(
 
 
 def _spectrogram_rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
+    """Yield a row of the table for each frequency of each spectrogram."""
     for key, directions in spectrograms(sheet).items():
         for direction, transform in directions.items():
             yield from (
@@ -339,6 +368,7 @@ def _spectrogram_rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
 
 
 def _profile_rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
+    """Yield a row of the table for each pixel of each profile."""
     for key, directions in line_profiles(sheet).items():
         for direction, profile in directions.items():
             yield from (
@@ -472,18 +502,18 @@ def banner(sheet: EmvaSheet, tests: Sequence[FrameTest] = ()) -> str:
     """Return why the linear model of the standard does not hold for these frames, or an empty
     text.
     """
-    coarse = sheet["sigma_y_dark"].bound != ""
+    is_coarse = sheet["sigma_y_dark"].bound != ""
     reasons: list[str] = []
-    if coarse:
+    if is_coarse:
         reasons.append(_COARSE)
     elif sheet["K"].value is None:
         reasons.append(f"K is not told: {sheet['K'].reason}")
-    wrong = (
+    refusals = (
         test
         for test in tests
-        if test.verdict == "refused" and not (coarse and test.name == _ROUNDING)
+        if test.verdict == "refused" and not (is_coarse and test.name == _ROUNDING)
     )
-    reasons += [f"{test.name}: {test.sentence}" for test in wrong]
+    reasons += [f"{test.name}: {test.sentence}" for test in refusals]
     return f"Not fit for use: {'; '.join(reasons)}." if reasons else ""
 
 
@@ -498,15 +528,16 @@ def temporal_variance(frames: EmvaFrames, by_user: bool) -> str:
         return (
             f"{text}: `--release {frames.release}`. The descriptor states release {frames.stated}."
         )
-    other = {"3": "`--release 4` excludes it", "4": "`--release 3` includes it"}
+    alternative = {"3": "`--release 4` excludes it", "4": "`--release 3` includes it"}
     return (
-        f"{text}, because the descriptor states release {frames.stated}; {other[frames.release]}."
+        f"{text}, because the descriptor states release {frames.stated};"
+        f" {alternative[frames.release]}."
     )
 
 
 def lead(sheet: EmvaSheet, variance: str) -> str:
     """Return the summary of the page; ``variance`` is the sentence of `temporal_variance`."""
-    named = (
+    keys = (
         "eta",
         "K",
         "sigma_d",
@@ -518,7 +549,7 @@ def lead(sheet: EmvaSheet, variance: str) -> str:
         "PRNU1288",
     )
     quantities = "; ".join(
-        f"{sheet[key].symbol} {sheet[key].text}" for key in named if sheet[key].value is not None
+        f"{sheet[key].symbol} {sheet[key].text}" for key in keys if sheet[key].value is not None
     )
     return f"The quantities of EMVA 1288, release 4.0 Linear: {quantities}. {variance}"
 
@@ -580,12 +611,16 @@ def group_of(quantity: Quantity, sheet: EmvaSheet) -> str:
     position = keys.index(quantity.key)
     return next(
         name
-        for name, (first, last) in _TABLES.items()
-        if keys.index(first) <= position <= keys.index(last)
+        for name, (first_key, last_key) in _TABLES.items()
+        if keys.index(first_key) <= position <= keys.index(last_key)
     )
 
 
 def _section(sheet: EmvaSheet, heading: str, text: str, picture: bytes | None) -> Section:
+    """Return one section of the page, with its table of quantities if its heading has one.
+
+    The column of reasons is left out where no quantity has a reason.
+    """
     rows: list[Sequence[Any]] = []
     columns: Sequence[str] = ("symbol", "quantity", "value", "why not, or why a limit")
     candidates = sheet.quantities if heading in _TABLES else ()
@@ -601,17 +636,18 @@ def _section(sheet: EmvaSheet, heading: str, text: str, picture: bytes | None) -
 
 
 def _compliance(sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any]) -> Section:
+    """Return the section that lists the demands of the standard, and which of them are met."""
     demands = requirements(sheet, frames, statements)
     rows = [
         (row.demand, row.found, Marked("yes" if row.mark == "pass" else "no", row.mark))
         for row in demands
     ]
-    open_ones = sum(row.mark != "pass" for row in demands)
+    open_demands = sum(row.mark != "pass" for row in demands)
     text = f"""The quantities are computed as EMVA 1288, release 4.0 Linear, says. This is a
         computation from frames and no certificate: geometry, homogeneity and calibration of the
         light are the laboratory's part, and frames do not show them.
 
-        {open_ones} of {len(rows)} demands of the standard are not met, or not shown here. Only
+        {open_demands} of {len(rows)} demands of the standard are not met, or not shown here. Only
         those who measured can state that the measurement complies."""
     return Section(
         "Compliance: what was measured and told",
@@ -622,22 +658,31 @@ def _compliance(sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, A
 
 
 def _of_transfer(sheet: EmvaSheet, frames: EmvaFrames) -> Iterator[Requirement]:
+    """Yield the demands on the levels and their darks.
+
+    They are of number, exposures, saturation and dark noise.
+    """
     transfer, noise = sheet.transfer, sheet["sigma_y_dark"]
-    count, times = len(transfer.photons), len(np.unique(transfer.dark_exposure))
-    pairs = set(transfer.exposure.tolist()) <= set(transfer.dark_exposure.tolist())
-    top = "reached" if transfer.saturated else "not reached"
-    yield _asked(f"{_LEVELS} or more lit levels", f"{count}", count >= _LEVELS)
+    level_count, dark_exposures = len(transfer.photons), len(np.unique(transfer.dark_exposure))
+    has_own_darks = set(transfer.exposure.tolist()) <= set(transfer.dark_exposure.tolist())
+    saturation_text = "reached" if transfer.saturated else "not reached"
+    yield _asked(f"{_LEVELS} or more lit levels", f"{level_count}", level_count >= _LEVELS)
     yield _asked("two frames or more at each level", f"{frames.frames}", frames.frames >= 2)
-    text = "yes" if pairs else "of the nearest exposure"
-    yield _asked("dark frames at the exposure of each lit level", text, pairs)
-    yield _asked("levels from dark to saturation", f"saturation {top}", transfer.saturated)
+    text = "yes" if has_own_darks else "of the nearest exposure"
+    yield _asked("dark frames at the exposure of each lit level", text, has_own_darks)
+    yield _asked(
+        "levels from dark to saturation", f"saturation {saturation_text}", transfer.saturated
+    )
     mark: Mark = "fail" if noise.bound else "pass"
     yield Requirement("temporal dark noise of 0.49 DN or more", noise.text, mark)
-    text = f"{times} exposure{'s' * (times != 1)}"
-    yield _asked(f"dark current from {_EXPOSURES} or more exposures", text, times >= _EXPOSURES)
+    text = f"{dark_exposures} exposure{'s' * (dark_exposures != 1)}"
+    yield _asked(
+        f"dark current from {_EXPOSURES} or more exposures", text, dark_exposures >= _EXPOSURES
+    )
 
 
 def _of_series(sheet: EmvaSheet) -> Iterator[Requirement]:
+    """Yield the demands on the dark and the lit series. The spatial quantities come from these."""
     dark, lit = sheet.spatial
     for name, series in (("dark", dark), ("lit", lit)):
         demand = f"series of {_SERIES} or more {name} frames for spatial quantities"
@@ -648,16 +693,17 @@ def _of_series(sheet: EmvaSheet) -> Iterator[Requirement]:
         yield _asked(
             "both series at one exposure", _exposures(dark, lit), dark.exposure == lit.exposure
         )
-        full = float(sheet.transfer.signal[sheet.transfer.saturation])
-        share = float(lit.average.mean() - dark.average.mean()) / full
+        saturation_signal = float(sheet.transfer.signal[sheet.transfer.saturation])
+        saturation_share = float(lit.average.mean() - dark.average.mean()) / saturation_signal
         yield _asked(
             "lit series at 50 % of saturation",
-            f"{share:.1%}",
-            _HALF_OF_PAGE[0] <= share <= _HALF_OF_PAGE[1],
+            f"{saturation_share:.1%}",
+            _HALF_OF_PAGE[0] <= saturation_share <= _HALF_OF_PAGE[1],
         )
 
 
 def _of_told(statements: Mapping[str, Any]) -> Iterator[Requirement]:
+    """Yield one demand for each statement of the operating point; `statements` has them by key."""
     for key, name in OPERATING_POINT.items():
         value = statements.get(key)
         text = "not stated" if value is None else str(value)
@@ -678,6 +724,7 @@ def _elsewhere() -> Iterator[Requirement]:
 
 
 def _asked(demand: str, text: str, met: bool) -> Requirement:
+    """Return a demand that is met, or that warns if it is not."""
     mark: Mark = "pass" if met else "warn"
     return Requirement(demand, text, mark)
 

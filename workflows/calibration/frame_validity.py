@@ -97,16 +97,17 @@ def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpr
     Raises: `ValueError` if there are too few levels, no mode is found, or the effective sample size
             is too small.
     """
-    full = SensorPosterior.of(recipe, store)
-    if not isinstance(full.levels, Levels):
+    full_problem = SensorPosterior.of(recipe, store)
+    if not isinstance(full_problem.levels, Levels):
         raise ValueError(
             f"the likelihood of {recipe.name} assumes identical pixels: use the node"
             " calibrate.camera instead"
         )
-    terms = [name for name in TERMS if name in full.names]
-    _check_levels(full, full.levels, terms)
+    terms = [name for name in TERMS if name in full_problem.names]
+    _check_levels(full_problem, full_problem.levels, terms)
     rng = np.random.default_rng(seed)
-    models = [_without(recipe, full.step, terms[count:]) for count in range(len(terms) + 1)]
+    # model k keeps the first k terms of the response and fixes the others at zero
+    models = [_without(recipe, full_problem.step, terms[count:]) for count in range(len(terms) + 1)]
     problems = [SensorPosterior.of(model, store) for model in models]
     posteriors = [_posterior(problem, rng) for problem in problems]
     return [_spread(name, problems[0], posteriors) for name in problems[0].names]
@@ -119,13 +120,14 @@ def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) ->
     For 60 simulated cameras and two terms, 90 % intervals contained the truth in 93 % with 4 lit
     levels, and in 58 % with 2 lit levels.
     """
-    fitted = problem.likelihood(initial_theta(problem)[None]).degrees_of_freedom > 0
-    lit = len(set(levels.photons[fitted & (levels.photons > 0)].tolist()))
-    if lit < len(terms) + 2:
+    is_fitted = problem.likelihood(initial_theta(problem)[None]).degrees_of_freedom > 0
+    lit_levels = len(set(levels.photons[is_fitted & (levels.photons > 0)].tolist()))
+    if lit_levels < len(terms) + 2:
         raise ValueError(
-            f"{lit} lit levels do not separate a response of {len(terms)} terms from a drifting"
+            f"{lit_levels} lit levels do not separate a response of {len(terms)} terms from a"
+            " drifting"
             f" lamp: give {len(terms) + 2} or more levels of different light below saturation, or"
-            f" fix {' and '.join(terms[max(0, lit - 2) :])} at 0"
+            f" fix {' and '.join(terms[max(0, lit_levels - 2) :])} at 0"
         )
 
 
@@ -143,26 +145,39 @@ def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
 
 
 def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior:
+    """Return mean and standard deviation of each coordinate.
+
+    They come from importance samples of the posterior.
+    """
     mode = search_mode(problem)
     if not mode.settled:
         raise ValueError(
             f"no posterior mode of {', '.join(problem.names)} was found: give narrower priors"
         )
-    samples, log = draw_samples(problem, mode, rng)
-    weight = normalised(log)
-    centre = weight @ samples
-    width = np.sqrt(weight @ (samples - centre) ** 2)
-    return dict(zip(problem.names, zip(centre.tolist(), width.tolist(), strict=True), strict=True))
+    samples, log_weight = draw_samples(problem, mode, rng)
+    weight = normalised(log_weight)
+    mean = weight @ samples
+    sd = np.sqrt(weight @ (samples - mean) ** 2)
+    return dict(zip(problem.names, zip(mean.tolist(), sd.tolist(), strict=True), strict=True))
 
 
 def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -> ModelSpread:
-    linear = name in problem.coordinates.linear
+    """Return the intervals of parameter `name` with each model, and the interval to report.
+
+    `posteriors` are those of the models, with rising numbers of terms.
+    """
+    is_linear = name in problem.coordinates.linear
     models = [posterior[name] for posterior in posteriors]
-    (low, narrow), (high, wide) = models[-2:] if len(models) > 1 else models * 2
-    middle = 0.5 * (low + high)
-    width = math.hypot(width_of_mean(narrow, wide), 0.5 * (high - low))
+    # without a free term there is one model, and it is compared with itself
+    (fewer_mean, fewer_sd), (richer_mean, richer_sd) = (
+        models[-2:] if len(models) > 1 else models * 2
+    )
+    stated_mean = 0.5 * (fewer_mean + richer_mean)
+    stated_sd = math.hypot(width_of_mean(fewer_sd, richer_sd), 0.5 * (richer_mean - fewer_mean))
     return ModelSpread(
-        name, tuple(_interval(*model, linear) for model in models), _interval(middle, width, linear)
+        name,
+        tuple(_interval(*model, is_linear) for model in models),
+        _interval(stated_mean, stated_sd, is_linear),
     )
 
 
@@ -183,10 +198,14 @@ def width_of_mean(fewer: float, richer: float) -> float:
 
 
 def _interval(centre: float, width: float, linear: bool) -> IntervalEstimate:
-    low, high = centre - Z_90 * width, centre + Z_90 * width
+    """Return the central 90 % interval of a normal distribution of a coordinate.
+
+    A coordinate that is not linear is the logarithm of its parameter.
+    """
+    low_end, high_end = centre - Z_90 * width, centre + Z_90 * width
     if linear:
-        return IntervalEstimate(centre, low, high)
-    return IntervalEstimate(float(np.exp(centre)), float(np.exp(low)), float(np.exp(high)))
+        return IntervalEstimate(centre, low_end, high_end)
+    return IntervalEstimate(float(np.exp(centre)), float(np.exp(low_end)), float(np.exp(high_end)))
 
 
 # --- frame validity -------------------------------------------------------------------------------
@@ -218,13 +237,16 @@ def inspect_recipe(recipe: Recipe, store: Store) -> list[FrameTest]:
     if weighing.node.path == "calibrate.stray_light":
         return []
     steps = list(_upstream(recipe, weighing))
-    exact = weighing.node.path == "calibrate.density"
+    # this likelihood counts each digital number, so that rounding does no harm
+    is_exact = weighing.node.path == "calibrate.density"
     if any(step.node.path in ("calibrate.reduce", "calibrate.descriptor") for step in steps):
-        return inspect_frames(_stacks(recipe, store, steps), exact, _share(weighing, steps))
+        return inspect_frames(_stacks(recipe, store, steps), is_exact, _share(weighing, steps))
     source = str(weighing.wires[weighing.node.inputs[0]])
     levels = run(recipe, store, (source,)).values[source]
-    dark = levels.variance[levels.photons == 0] if isinstance(levels, Levels) else torch.zeros(0)
-    return [coarse(float(dark.min()), exact)] if len(dark) else []
+    dark_variances = (
+        levels.variance[levels.photons == 0] if isinstance(levels, Levels) else torch.zeros(0)
+    )
+    return [coarse(float(dark_variances.min()), is_exact)] if len(dark_variances) else []
 
 
 def _share(weighing: Step, steps: Sequence[Step]) -> float | None:
@@ -238,20 +260,26 @@ def _share(weighing: Step, steps: Sequence[Step]) -> float | None:
 
 def _upstream(recipe: Recipe, step: Step) -> Iterator[Step]:
     """Yield all steps on which a step depends, in the order of the recipe."""
-    names, new = set[str](), [step.name]
-    while new:
-        sources = recipe.steps[new.pop()].sources
-        new += [name for name in sources if name not in names]
-        names.update(sources)
-    return (source for name, source in recipe.steps.items() if name in names)
+    upstream_names, to_visit = set[str](), [step.name]
+    while to_visit:
+        sources = recipe.steps[to_visit.pop()].sources
+        to_visit += [name for name in sources if name not in upstream_names]
+        upstream_names.update(sources)
+    return (source for name, source in recipe.steps.items() if name in upstream_names)
 
 
 def _stacks(recipe: Recipe, store: Store, steps: Sequence[Step]) -> Iterator[Stack]:
+    """Yield the frames of each level.
+
+    Photons, exposure and the scatter that the step measures are with them.
+    """
     for step in steps:
         scatter: Any = step.params.get("scatter")
         if step.node.path == "calibrate.reduce":
-            light = step.params["photons"], step.params["exposure"]
-            yield Stack(step.name, *light, scatter, *frames_and_mask(recipe, store, step))
+            photons_and_exposure = step.params["photons"], step.params["exposure"]
+            yield Stack(
+                step.name, *photons_and_exposure, scatter, *frames_and_mask(recipe, store, step)
+            )
         elif step.node.path == "calibrate.descriptor":
             for name, photons, exposure, frames in descriptor_frames(step.params["file"]):
                 yield Stack(name, photons, exposure, scatter, frames)
@@ -301,13 +329,15 @@ def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[
     hidden = hidden_faults(tests, may_hide)
     if not hidden:
         return []
-    words = [f"{name} by {100 * size:.2g} %" for name, size in open_errors(hidden).items() if size]
+    error_texts = [
+        f"{name} by {100 * size:.2g} %" for name, size in open_errors(hidden).items() if size
+    ]
     faults = " and ".join(sorted({fault.fault for fault in hidden}))
     bar = (
         "more pixels hide less; a fault that the camera cannot have is `none` in the step of the"
         " priors"
     )
-    text = f"{' and '.join(words)}, which the frames show or may hide; nothing is corrected"
+    text = f"{' and '.join(error_texts)}, which the frames show or may hide; nothing is corrected"
     return [Check(f"intervals include {faults}", text, bar, "pass")]
 
 
@@ -316,19 +346,24 @@ def data_check(pairs: float) -> Check:
 
     ``pairs`` is the number of pairs of pixels in the lit levels that the fit uses.
     """
-    side = 10 * math.ceil(math.sqrt(CLEAN_PAIRS / 10) / 10)
+    # 10 levels of side² pixels, rounded up to whole tens
+    picture_side = 10 * math.ceil(math.sqrt(CLEAN_PAIRS / 10) / 10)
     text = f"{pairs:.3g} pairs of pixels in the lit levels of the fit"
-    enough = pairs >= CLEAN_PAIRS
-    if not enough:
+    are_enough = pairs >= CLEAN_PAIRS
+    if not are_enough:
         text += (
             ": intervals are wider than by statistics alone, because so few may hide mixing and lag"
         )
-    bar = f"at least {CLEAN_PAIRS:.2g}, such as 10 levels of 2 frames of {side} x {side} pixels"
-    mark: Mark = "pass" if enough else "warn"
+    bar = (
+        f"at least {CLEAN_PAIRS:.2g}, such as 10 levels of 2 frames of {picture_side} x"
+        f" {picture_side} pixels"
+    )
+    mark: Mark = "pass" if are_enough else "warn"
     return Check("the frames are numerous enough", text, bar, mark)
 
 
 def _bar(test: FrameTest) -> str:
+    """Return number and limit of a test in words; a negative limit is a lower one."""
     return (
         f"{abs(test.number):.3g}, {'at least' if test.limit < 0 else 'at most'}"
         f" {abs(test.limit):.3g}"
@@ -367,8 +402,8 @@ def hidden_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> list[
     """
     faults: list[Hidden] = []
     for test in tests:
-        failed = test.verdict != "passed"
-        faults += [hidden for hidden in test.hidden if failed or hidden.fault in may_hide]
+        was_found = test.verdict != "passed"
+        faults += [hidden for hidden in test.hidden if was_found or hidden.fault in may_hide]
     return faults
 
 
@@ -395,14 +430,17 @@ def widened(
     if max(errors.values()) < _SMALL:
         return chains
     generator = torch.Generator().manual_seed(seed)
-    normal = torch.randn(2, chains.log.size, generator=generator, dtype=torch.float64)
-    gain = errors["gain"] * normal[0].view(chains.log.shape)
-    noise = errors["noise"] * normal[1].view(chains.log.shape)
+    normal_draws = torch.randn(2, chains.log.size, generator=generator, dtype=torch.float64)
+    # small relative errors, as errors of the logarithm
+    log_gain_error = errors["gain"] * normal_draws[0].view(chains.log.shape)
+    log_noise_error = errors["noise"] * normal_draws[1].view(chains.log.shape)
     values = problem.parameters(chains.draws)
     if "gain" in values:
-        values["gain"] = values["gain"] * gain.exp()
-        values |= {name: values[name] * (-gain).exp() for name in _IN_ELECTRONS if name in values}
-    values |= {name: values[name] * noise.exp() for name in _NOISES if name in values}
+        values["gain"] = values["gain"] * log_gain_error.exp()
+        values |= {
+            name: values[name] * (-log_gain_error).exp() for name in _IN_ELECTRONS if name in values
+        }
+    values |= {name: values[name] * log_noise_error.exp() for name in _NOISES if name in values}
     return replace(chains, draws=problem.theta(values))
 
 
@@ -422,24 +460,30 @@ def open_by_tests(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[
     hidden faults leave.
     """
     tests = list(tests)
-    hidden, shifts = open_errors(hidden_faults(tests, may_hide)), relative_shifts(tests)
-    return {name: math.hypot(hidden[name], shifts[name]) for name in ("gain", "noise")}
+    hidden_errors, test_errors = open_errors(hidden_faults(tests, may_hide)), relative_shifts(tests)
+    return {name: math.hypot(hidden_errors[name], test_errors[name]) for name in ("gain", "noise")}
 
 
 def errors_of_parameters(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, float]:
     """Return the relative standard deviation that the frames leave open, by the parameter."""
     errors = open_by_tests(tests, may_hide)
-    gain, noise = errors["gain"], math.hypot(errors["gain"], errors["noise"])
-    return {"gain": gain, **dict.fromkeys(_IN_ELECTRONS, gain), **dict.fromkeys(_NOISES, noise)}
+    # a noise in electrons is one in DN over the gain
+    gain_error, electron_noise_error = errors["gain"], math.hypot(errors["gain"], errors["noise"])
+    return {
+        "gain": gain_error,
+        **dict.fromkeys(_IN_ELECTRONS, gain_error),
+        **dict.fromkeys(_NOISES, electron_noise_error),
+    }
 
 
 def wider(interval: IntervalEstimate, shift: float) -> IntervalEstimate:
     """Return an interval of a positive value with a further relative standard deviation."""
     if shift < _SMALL:
         return interval
+    # each half of the interval widens in the logarithm, its own width and the shift in quadrature
     factors = [
-        math.exp(math.hypot(math.log(interval.value / end), Z_90 * shift))
-        for end in (interval.low, interval.high)
+        math.exp(math.hypot(math.log(interval.value / interval_end), Z_90 * shift))
+        for interval_end in (interval.low, interval.high)
     ]
     return IntervalEstimate(
         interval.value, interval.value / factors[0], interval.value * factors[1]

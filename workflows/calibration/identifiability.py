@@ -75,21 +75,29 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
     """Find the parameters that the light levels determine, by singular values of the levels'
     derivatives.
     """
-    _, s, v = np.linalg.svd(mode.scaled_slopes)
-    s = np.concatenate([s, np.zeros(len(v) - len(s))])
+    _, singular_values, directions = np.linalg.svd(mode.scaled_slopes)
+    # directions without a singular value of their own have the value 0
+    singular_values = np.concatenate(
+        [singular_values, np.zeros(len(directions) - len(singular_values))]
+    )
+    # a direction of the singular value decomposition that is weak leaves parameters to the prior
     kinds = {
-        n: "estimate" if own else "none" for n, own in zip(problem.names, _own(s, v), strict=True)
+        name: "estimate" if is_own else "none"
+        for name, is_own in zip(problem.names, _own(singular_values, directions), strict=True)
     }
-    weak = _sorted_out(v[s < WEAK])
+    weak = _sorted_out(directions[singular_values < WEAK])
     sentences = [_weak_direction(problem, mode, row, kinds) for row in weak]
     for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
         if _as_good(problem, mode, ridge):
             kinds |= ridge.kinds
             sentences.append(ridge.text)
     sentences = withheld_electrons(kinds, sentences)
-    count = f"{len(weak)} of {len(problem.names)} parameters cannot be determined from these frames"
-    refused = f"{count}: {'; '.join(sentences)}" if 2 * len(weak) > len(problem.names) else ""
-    return Identifiability(kinds, sentences, s.tolist(), refused)
+    weak_count = (
+        f"{len(weak)} of {len(problem.names)} parameters cannot be determined from these frames"
+    )
+    # more than half of the parameters are not determined
+    refused = f"{weak_count}: {'; '.join(sentences)}" if 2 * len(weak) > len(problem.names) else ""
+    return Identifiability(kinds, sentences, singular_values.tolist(), refused)
 
 
 def _weak_direction(
@@ -98,13 +106,20 @@ def _weak_direction(
     """Return a text about a direction that the light levels do not determine; set the kind of its
     parameter in ``kinds`` if it is nearly that of one parameter.
     """
-    parts = [(n, x) for n, x in zip(problem.names, direction, strict=True) if abs(x) >= _PART]
-    if len(parts) > 1 and max(abs(x) for _, x in parts) <= _ALONE:
-        return _together(parts)
-    name = max(parts, key=lambda pair: abs(pair[1]))[0]
-    kinds[name] = _limit(problem, mode, name)
-    reason = _REASONS.get((name, kinds[name]), "")
-    return f"{words_of(name)}: {KINDS[kinds[name]]}{reason}"
+    large_components = [
+        (parameter, component)
+        for parameter, component in zip(problem.names, direction, strict=True)
+        if abs(component) >= _PART
+    ]
+    if (
+        len(large_components) > 1
+        and max(abs(component) for _, component in large_components) <= _ALONE
+    ):
+        return _together(large_components)
+    largest_parameter = max(large_components, key=lambda pair: abs(pair[1]))[0]
+    kinds[largest_parameter] = _limit(problem, mode, largest_parameter)
+    reason = _REASONS.get((largest_parameter, kinds[largest_parameter]), "")
+    return f"{words_of(largest_parameter)}: {KINDS[kinds[largest_parameter]]}{reason}"
 
 
 def identify_from_draws(
@@ -122,20 +137,20 @@ def identify_from_draws(
     draws of the prior that are possible; where parameters far along a ridge fit as well, the limits
     are those of the ridge.
     """
-    z, alone = problem.whitened(samples), _possible(problem)
+    prior_units, prior_draws = problem.whitened(samples), _possible(problem)
     kinds = {}
     for index, name in enumerate(problem.names):
-        kinds[name] = _kind_from_draws(z[:, index], alone[:, index], weight)
-    sentences, named = [], set()
+        kinds[name] = _kind_from_draws(prior_units[:, index], prior_draws[:, index], weight)
+    sentences, ridge_names = [], set()
     for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
         estimated = "estimate" in [kinds.get(name) for name in ridge.kinds]
         if ridge.text in about_mode.directions and not estimated:
             # the data alone give no limit along the ridge, whatever the priors say
             kinds |= ridge.kinds
             sentences.append(ridge.text)
-            named |= set(ridge.kinds)
+            ridge_names |= set(ridge.kinds)
     undetermined = [
-        name for name, kind in kinds.items() if kind != "estimate" and name not in named
+        name for name, kind in kinds.items() if kind != "estimate" and name not in ridge_names
     ]
     sentences += [f"{words_of(name)}: {KINDS[kinds[name]]}" for name in undetermined]
     sentences = withheld_electrons(kinds, sentences)
@@ -147,13 +162,14 @@ def _kind_from_draws(z: FloatArray, alone: FloatArray, weight: FloatArray) -> st
 
     ``z`` has its weighted draws, ``alone`` those of its prior, both in units of the prior.
     """
+    # narrower than a third of the prior
     if float(np.sqrt(weight @ (z - weight @ z) ** 2)) < 1 / WEAK:
         return "estimate"
-    low, high = weighted_quantiles(z, weight, _ENDS)
-    low_alone, high_alone = np.quantile(alone, _ENDS)
-    tells = bool(low > low_alone + _TELLS), bool(high < high_alone - _TELLS)
+    low_end, high_end = weighted_quantiles(z, weight, _ENDS)
+    prior_low, prior_high = np.quantile(alone, _ENDS)
+    inside_prior = bool(low_end > prior_low + _TELLS), bool(high_end < prior_high - _TELLS)
     limits = {(True, False): "lower", (False, True): "upper", (True, True): "between"}
-    return limits.get(tells, "none")
+    return limits.get(inside_prior, "none")
 
 
 def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[str]:
@@ -169,13 +185,13 @@ def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[
     ]
     kinds |= dict.fromkeys(withheld, "none")
     subjects = tuple(f"{words_of(name)}: " for name in withheld)
-    others = [text for text in sentences if not text.startswith(subjects)]
+    other_sentences = [text for text in sentences if not text.startswith(subjects)]
     return [
         *(
             f"{words_of(name)}: {KINDS['none']}: no value in electrons without the gain"
             for name in withheld
         ),
-        *others,
+        *other_sentences,
     ]
 
 
@@ -184,32 +200,36 @@ def weighted_quantiles(
 ) -> FloatArray:
     """Return the values below which the ``shares`` of the weights lie."""
     order = np.argsort(values)
-    index = np.searchsorted(np.cumsum(weight[order]), shares).clip(0, len(values) - 1)
-    quantiles: FloatArray = values[order][index]
+    position = np.searchsorted(np.cumsum(weight[order]), shares).clip(0, len(values) - 1)
+    quantiles: FloatArray = values[order][position]
     return quantiles
 
 
 def _possible(problem: SensorPosterior) -> FloatArray:
-    """Return draws of the prior (draw, free) at which the posterior is not zero, in its standard
-    deviations.
+    """Return draws of the prior (draw, free) at which the posterior is not zero.
+
+    They are in standard deviations of the prior from its middle.
     """
-    z = np.random.default_rng(0).standard_normal((_ALONE_DRAWS, len(problem.names)))
-    places = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(z)))
-    inside = np.flatnonzero(np.isfinite(places).all(1))
-    possible: FloatArray = z[inside[np.isfinite(problem.log_posterior(places[inside]))]]
-    return possible
+    prior_draws = np.random.default_rng(0).standard_normal((_ALONE_DRAWS, len(problem.names)))
+    coordinates = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(prior_draws)))
+    is_finite = np.flatnonzero(np.isfinite(coordinates).all(1))
+    possible_draws: FloatArray = prior_draws[
+        is_finite[np.isfinite(problem.log_posterior(coordinates[is_finite]))]
+    ]
+    return possible_draws
 
 
 def _as_good(problem: SensorPosterior, mode: LaplaceFit, ridge: Ridge) -> bool:
     """Return True if parameters far from the mode fit as well, the priors of the limited
     parameters left out.
     """
-    places = np.stack([ridge.place.numpy(), mode.theta])
-    limited = [problem.names.index(name) for name in ridge.kinds]
-    without = problem.log_posterior(places) + 0.5 * (problem.whitened(places)[:, limited] ** 2).sum(
-        1
-    )
-    return bool(without[1] - without[0] < _FALLS)
+    ridge_and_mode = np.stack([ridge.place.numpy(), mode.theta])
+    limited_columns = [problem.names.index(name) for name in ridge.kinds]
+    # the normal prior of the limited parameters is taken out again
+    log_without_prior = problem.log_posterior(ridge_and_mode) + 0.5 * (
+        problem.whitened(ridge_and_mode)[:, limited_columns] ** 2
+    ).sum(1)
+    return bool(log_without_prior[1] - log_without_prior[0] < _FALLS)
 
 
 def _own(s: FloatArray, v: FloatArray) -> FloatArray:
@@ -219,9 +239,12 @@ def _own(s: FloatArray, v: FloatArray) -> FloatArray:
     The posterior of such a parameter is less than a third as wide as its prior, and hardly widens
     with doubled priors.
     """
-    sd, wide = ((v.T**2 / (s**2 + width**-2)).sum(1) ** 0.5 for width in (1.0, 2.0))
-    own: FloatArray = (sd < 1 / WEAK) & (wide < _WIDER * sd)
-    return own
+    # of the normal posterior: precision s² of the levels and 1/width² of the prior, by direction
+    posterior_sd, sd_of_doubled = (
+        (v.T**2 / (s**2 + prior_width**-2)).sum(1) ** 0.5 for prior_width in (1.0, 2.0)
+    )
+    is_determined: FloatArray = (posterior_sd < 1 / WEAK) & (sd_of_doubled < _WIDER * posterior_sd)
+    return is_determined
 
 
 def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
@@ -230,41 +253,45 @@ def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
 
     A mixture of weak directions is weak too, so that any basis of the same space is allowed.
     """
-    alone = np.flatnonzero((weak**2).sum(0) > _ALONE**2)
-    units = np.eye(weak.shape[1])[alone]
-    _, _, v = np.linalg.svd(weak - (weak @ units.T) @ units)
-    return [*units, *v[: len(weak) - len(alone)]]
+    # parameters that lie nearly whole in the space of weak directions
+    single_columns = np.flatnonzero((weak**2).sum(0) > _ALONE**2)
+    unit_directions = np.eye(weak.shape[1])[single_columns]
+    _, _, combinations = np.linalg.svd(weak - (weak @ unit_directions.T) @ unit_directions)
+    return [*unit_directions, *combinations[: len(weak) - len(single_columns)]]
 
 
 def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
-    """Return the limit that the light levels set on a parameter (upper, lower, none), with all
-    others at the mode.
+    """Return the limit that the light levels set on a parameter: upper, lower or none.
+
+    All other parameters stay at the mode.
     """
     index = problem.names.index(name)
-    z = np.repeat(problem.whitened(mode.theta)[None], 2, 0)
-    z[:, index] = _FAR, -_FAR
-    samples = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(z)))
+    whitened_points = np.repeat(problem.whitened(mode.theta)[None], 2, 0)
+    # row 0 far above the middle of the prior, row 1 far below it
+    whitened_points[:, index] = _FAR, -_FAR
+    samples = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(whitened_points)))
     likelihood = problem.likelihood(np.concatenate([samples, mode.theta[None]]))
-    above, below, best = likelihood.log.nan_to_num(nan=-np.inf, neginf=-np.inf).tolist()
-    falls = best - above > _FALLS, best - below > _FALLS
-    return {(True, False): "upper", (False, True): "lower"}.get(falls, "none")
+    log_above, log_below, log_mode = likelihood.log.nan_to_num(nan=-np.inf, neginf=-np.inf).tolist()
+    falls_to = log_mode - log_above > _FALLS, log_mode - log_below > _FALLS
+    return {(True, False): "upper", (False, True): "lower"}.get(falls_to, "none")
 
 
 def _together(parts: Sequence[tuple[str, float]]) -> str:
     """Return a text about several parameters that the light levels determine only in
     combination.
     """
-    first = max(parts, key=lambda pair: abs(pair[1]))
-    others = [(name, bool(x * first[1] > 0)) for name, x in parts if name != first[0]]
-    raised = [words_of(name) for name, rises in others if rises]
-    lowered = [words_of(name) for name, rises in others if not rises]
+    largest = max(parts, key=lambda pair: abs(pair[1]))
+    # which parameters rise with the largest one along the direction
+    other_changes = [(name, bool(x * largest[1] > 0)) for name, x in parts if name != largest[0]]
+    raised = [words_of(name) for name, rises in other_changes if rises]
+    lowered = [words_of(name) for name, rises in other_changes if not rises]
     changes: list[str] = []
     if raised:
         changes.append(f"more {_listed(raised)}")
     if lowered:
         changes.append(f"less {_listed(lowered)}")
     names = _listed([words_of(name) for name, _ in parts])
-    return f"{names} only together: more {words_of(first[0])} with {_listed(changes)}"
+    return f"{names} only together: more {words_of(largest[0])} with {_listed(changes)}"
 
 
 def words_of(name: str) -> str:
@@ -273,6 +300,7 @@ def words_of(name: str) -> str:
 
 
 def _listed(words: Sequence[str]) -> str:
+    """Return words as a list in a sentence: `a, b and c`."""
     if len(words) < 2:
         return "".join(words)
     return f"{', '.join(words[:-1])} and {words[-1]}"

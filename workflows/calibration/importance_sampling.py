@@ -71,13 +71,15 @@ def fit_about_mode(
     lower tails of further parameters (`camera_density`), and new samples are drawn from it, whose
     own effective sample size the caller must check.
     """
-    tailed = hardly_told(problem, mode)
-    others = (
+    near_zero = hardly_told(problem, mode)
+    # only a real camera has widths among its parameters
+    law_of_others = (
         _given_widths(problem, mode)
         if problem.coordinates.widths.intersection(problem.names)
         else None
     )
-    in_mixture = others.at if others else np.ones(len(mode.theta), dtype=bool)
+    in_mixture = law_of_others.at if law_of_others else np.ones(len(mode.theta), dtype=bool)
+    # begins as one component with the mode and the covariance there
     mixture = Mixture(
         np.ones(1),
         mode.theta[None, in_mixture],
@@ -86,29 +88,32 @@ def fit_about_mode(
     )
     mixtures: list[Mixture] = []
     samples: list[FloatArray] = []
-    logs: list[FloatArray] = []
-    best, best_mixture = -1.0, mixture
+    log_densities: list[FloatArray] = []
+    best_fraction, best_mixture = -1.0, mixture
     for number in range(1, _ROUNDS + 1):
-        proposal: Density = CameraDensity(mixture, others) if others else mixture
-        drawn, log = weighed(problem, proposal, _TRIED, rng)
+        proposal: Density = CameraDensity(mixture, law_of_others) if law_of_others else mixture
+        new_samples, log_weights = weighed(problem, proposal, _TRIED, rng)
         mixtures.append(mixture)
-        samples.append(drawn[:, in_mixture])
-        logs.append(log + mixture.log_density(drawn[:, in_mixture]))
-        fraction = effective(log)
-        if fraction > best:
-            best, best_mixture = fraction, mixture
-        if number >= _LEAST and best >= _ENOUGH:
+        samples.append(new_samples[:, in_mixture])
+        # weight times density: the log density of the posterior, for any later mixture
+        log_densities.append(log_weights + mixture.log_density(new_samples[:, in_mixture]))
+        fraction = effective(log_weights)
+        if fraction > best_fraction:
+            best_fraction, best_mixture = fraction, mixture
+        if number >= _LEAST and best_fraction >= _ENOUGH:
             break
-        mixture = _next(mixtures, np.concatenate(samples), np.concatenate(logs), rng)
-    if others:
-        weighted = (
+        # fitted to the samples of all rounds so far
+        mixture = _next(mixtures, np.concatenate(samples), np.concatenate(log_densities), rng)
+    if law_of_others:
+        weighted_widths = (
             np.concatenate(samples),
-            normalised(_logs(mixtures, np.concatenate(samples), np.concatenate(logs))),
+            normalised(_logs(mixtures, np.concatenate(samples), np.concatenate(log_densities))),
         )
-        widths = with_prior_tails(best_mixture, problem, mode, in_mixture, weighted)
-        density = with_tails(CameraDensity(widths, others), tailed[1:], mode)
+        width_density = with_prior_tails(best_mixture, problem, mode, in_mixture, weighted_widths)
+        # `others` has the tail of the first one itself
+        density = with_tails(CameraDensity(width_density, law_of_others), near_zero[1:], mode)
     else:
-        density = with_tails(best_mixture, tailed, mode)
+        density = with_tails(best_mixture, near_zero, mode)
     return density, *weighed(problem, density, count, rng)
 
 
@@ -116,11 +121,13 @@ def _given_widths(problem: SensorPosterior, mode: LaplaceFit) -> Others:
     """Return the distribution of all others given the widths, with a long lower tail of the
     least certain one.
     """
-    others, tailed = GivenWidths(problem, mode), hardly_told(problem, mode, _DOUBT)
+    linear_law, near_zero = GivenWidths(problem, mode), hardly_told(problem, mode, _DOUBT)
     return (
-        NearZero(others, tailed[0], float(mode.covariance[tailed[0], tailed[0]] ** 0.5))
-        if tailed
-        else others
+        NearZero(
+            linear_law, near_zero[0], float(mode.covariance[near_zero[0], near_zero[0]] ** 0.5)
+        )
+        if near_zero
+        else linear_law
     )
 
 
@@ -130,21 +137,24 @@ def _next(
     """Return the mixture for the next round from the ``samples`` of all rounds and their log
     density ``log``.
     """
-    like, wide = (
+    # one mixture like the posterior, one like its square root, which has wider tails
+    same_shape, wider_tails = (
         _fitted(samples, normalised(softened(_logs(mixtures, samples, power * log))), rng)
         for power in (1.0, _POWER)
     )
+    # both mixtures as one
     return Mixture(
-        np.concatenate([(1 - _SAFE) * like.shares, _SAFE * wide.shares]),
-        np.concatenate([like.centres, wide.centres]),
-        np.concatenate([like.roots, wide.roots]),
+        np.concatenate([(1 - _SAFE) * same_shape.shares, _SAFE * wider_tails.shares]),
+        np.concatenate([same_shape.centres, wider_tails.centres]),
+        np.concatenate([same_shape.roots, wider_tails.roots]),
         np.repeat([_TAIL, _SAFE_TAIL], _PARTS),
     )
 
 
 def _logs(mixtures: list[Mixture], samples: FloatArray, log: FloatArray) -> FloatArray:
-    """Return the logarithms of the weights of samples of all mixtures, of a density with the
-    logarithm ``log``.
+    """Return the log weights of samples that were drawn from all `mixtures` together.
+
+    `log` is the log density that they shall represent.
     """
     return finite(
         log - log_sum(np.stack([mixture.log_density(samples) for mixture in mixtures], -1))
@@ -154,10 +164,11 @@ def _logs(mixtures: list[Mixture], samples: FloatArray, log: FloatArray) -> Floa
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
     """Return the normal mixture that expectation and maximisation find for weighted samples."""
     _, covariance = moments(samples, weight)
-    starts = rng.choice(len(samples), size=_PARTS, p=weight)
+    start_numbers = rng.choice(len(samples), size=_PARTS, p=weight)
     mixture = Mixture(
         np.full(_PARTS, 1 / _PARTS),
-        samples[starts],
+        samples[start_numbers],
+        # narrower than all samples, so that the components can separate
         np.repeat(0.7 * _root(covariance)[None], _PARTS, 0),
     )
     for _ in range(_STEPS):
@@ -168,6 +179,7 @@ def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -
 
 
 def _root(covariance: FloatArray) -> FloatArray:
+    """Return the Cholesky root of a covariance, made firm against rounding."""
     return np.linalg.cholesky(firm(covariance)).astype(np.float64)
 
 
@@ -228,6 +240,7 @@ def draw_guide(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Genera
 
 
 def _refuse_few(problem: SensorPosterior, fraction: float) -> None:
+    """Raise ValueError if the effective fraction of the draws is too small for a posterior."""
     if fraction < _LEAST_SAMPLES:
         raise ValueError(
             f"{DRAWS} draws of {', '.join(problem.names)} have an effective sample size of"

@@ -55,14 +55,14 @@ def laboratory_of(recipe: Recipe) -> Laboratory:
     """
     statements = stated(recipe)
     stated_names = statements.temperature.coefficients
-    wrong = [name for name in stated_names if name not in WITH_COEFFICIENT]
-    if wrong:
-        hint = nearest(wrong[0], WITH_COEFFICIENT)
+    unknown_names = [name for name in stated_names if name not in WITH_COEFFICIENT]
+    if unknown_names:
+        hint = nearest(unknown_names[0], WITH_COEFFICIENT)
         raise ValueError(
-            f"traceability.temperature.coefficients: {wrong[0]} has no coefficient; {hint}"
+            f"traceability.temperature.coefficients: {unknown_names[0]} has no coefficient; {hint}"
         )
-    width = statements.lamp.centroid_uncertainty
-    width_in_nm = None if width is None else 1e9 * width
+    width_in_m = statements.lamp.centroid_uncertainty
+    width_in_nm = None if width_in_m is None else 1e9 * width_in_m
     return Laboratory(
         photons=statements.photons.relative_uncertainty,
         photons_distribution=statements.photons.distribution,
@@ -116,32 +116,35 @@ def _factors(
     rng = np.random.default_rng([seed, _STREAM])
     factors: dict[str, FloatArray] = {}
     if EFFICIENCY in names:
-        for law, width in laboratory.light:
-            by = _drawn(rng, law, width, shape)
-            factors[EFFICIENCY] = factors.get(EFFICIENCY, np.ones(shape)) * (1 + by)
+        for distribution, width in laboratory.light:
+            relative_error = _drawn(rng, distribution, width, shape)
+            factors[EFFICIENCY] = factors.get(EFFICIENCY, np.ones(shape)) * (1 + relative_error)
     if laboratory.temperature is not None:
-        kelvin = _drawn(rng, "normal", laboratory.temperature, shape)
+        # one error of the temperature moves all parameters together
+        kelvin_error = _drawn(rng, "normal", laboratory.temperature, shape)
         for name, coefficient in laboratory.coefficients.items():
             if name in names:
-                factors[name] = factors.get(name, np.ones(shape)) * (1 + coefficient * kelvin)
+                factors[name] = factors.get(name, np.ones(shape)) * (1 + coefficient * kelvin_error)
     return factors
 
 
 def _drawn(rng: np.random.Generator, law: str, width: float, shape: tuple[int, ...]) -> FloatArray:
     """Return draws of a law with the mean 0 and the standard deviation ``width``."""
     if law == "rectangular":
-        half = math.sqrt(3) * width
-        return rng.uniform(-half, half, shape)
+        # a rectangle of this half width has the standard deviation `width`
+        half_width = math.sqrt(3) * width
+        return rng.uniform(-half_width, half_width, shape)
     return width * rng.standard_normal(shape)
 
 
 def relative_widths(laboratory: Laboratory, names: Sequence[str]) -> Mapping[str, float]:
     """Return the relative standard uncertainty that light and temperature add to each parameter."""
-    kelvin = laboratory.temperature or 0.0
-    light = math.hypot(*(u for _, u in laboratory.light), 0.0)
+    kelvin_error = laboratory.temperature or 0.0
+    light_error = math.hypot(*(uncertainty for _, uncertainty in laboratory.light), 0.0)
     return {
         name: math.hypot(
-            light * (name == EFFICIENCY), kelvin * laboratory.coefficients.get(name, 0.0)
+            light_error * (name == EFFICIENCY),
+            kelvin_error * laboratory.coefficients.get(name, 0.0),
         )
         for name in names
     }

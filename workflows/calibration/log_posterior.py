@@ -73,36 +73,38 @@ class SensorPosterior:
         """Return the posterior of a recipe; raise `ValueError` unless the recipe has one
         likelihood and one prior.
         """
-        density = only_step(recipe, *_KINDS)
-        prior_node, kind = _KINDS[density.node.path]
-        prior = only_step(recipe, prior_node)
-        source = str(density.wires[density.node.inputs[0]])
+        likelihood_step = only_step(recipe, *_KINDS)
+        prior_node, coordinate_kind = _KINDS[likelihood_step.node.path]
+        prior_step = only_step(recipe, prior_node)
+        source = str(likelihood_step.wires[likelihood_step.node.inputs[0]])
+        # the statistics of all frames, from which those of the likelihood may be a selection
         levels_step = (
             str(recipe.steps[source].wires["levels"])
             if recipe.steps[source].node.path == "calibrate.sufficient"
             else source
         )
-        done = run(recipe, store, (density.name, prior.name, source, levels_step))
-        coordinates = kind.of(done[prior.name], density.params)
+        results = run(recipe, store, (likelihood_step.name, prior_step.name, source, levels_step))
+        coordinates = coordinate_kind.of(results[prior_step.name], likelihood_step.params)
         if isinstance(coordinates, ScatterCoordinates):
-            coordinates = coordinates.seen_by(done[source], density.params)
-        free = [f"{density.name}.{name}" for name in coordinates.names]
-        quick = replace(density, params={**density.params, "told": False})
+            coordinates = coordinates.seen_by(results[source], likelihood_step.params)
+        free_inputs = [f"{likelihood_step.name}.{name}" for name in coordinates.names]
+        # without what only a report needs
+        quick_step = replace(likelihood_step, params={**likelihood_step.params, "told": False})
 
         def function(step: Step) -> _Function:
             changed = replace(recipe, steps={**recipe.steps, step.name: step})
-            return as_function(changed, *free, outputs=[step.name], store=store)
+            return as_function(changed, *free_inputs, outputs=[step.name], store=store)
 
-        key = digest(*(done.keys[step.name] for step in (density, prior)))
-        measured = done[levels_step] if isinstance(done[levels_step], Levels) else None
+        key = digest(*(results.keys[step.name] for step in (likelihood_step, prior_step)))
+        measured = results[levels_step] if isinstance(results[levels_step], Levels) else None
         return cls(
             recipe,
-            density.name,
+            likelihood_step.name,
             key,
             coordinates,
-            done[source],
-            function(quick),
-            function(density),
+            results[source],
+            function(quick_step),
+            function(likelihood_step),
             measured,
         )
 
@@ -138,13 +140,13 @@ class SensorPosterior:
         """
         with torch.no_grad(), one_thread():
             parameters = self.parameters(samples)
-            total = self.weigh(self._named(parameters))[self.step].log + self.coordinates.log_prior(
-                parameters
-            )
-        log: FloatArray = total.nan_to_num(
+            log_sum = self.weigh(self._named(parameters))[
+                self.step
+            ].log + self.coordinates.log_prior(parameters)
+        log_density: FloatArray = log_sum.nan_to_num(
             nan=-torch.inf, posinf=-torch.inf, neginf=-torch.inf
         ).numpy()
-        return log
+        return log_density
 
     def whitened(self, samples: FloatArray) -> FloatArray:
         """Convert samples to distances from the middle of the prior, in standard deviations of
@@ -221,24 +223,39 @@ def initial_theta(problem: SensorPosterior) -> FloatArray:
     Raises: `ValueError` if the posterior is zero at all points.
     """
     coordinates = problem.coordinates
-    middle = coordinates.from_whitened(torch.zeros(len(problem.names), dtype=torch.float64))
-    believed = {**coordinates.held, **{name: float(x) for name, x in middle.items()}}
+    prior_middle = coordinates.from_whitened(torch.zeros(len(problem.names), dtype=torch.float64))
+    believed = {
+        **coordinates.held,
+        **{name: float(values) for name, values in prior_middle.items()},
+    }
     guessed = _guessed(problem, believed)
-    first, last = (
-        problem.theta({name: x[name] for name in problem.names}) for x in (guessed, believed)
+    guess_theta, middle_theta = (
+        problem.theta({name: values[name] for name in problem.names})
+        for values in (guessed, believed)
     )
-    samples = np.stack([first, *(last + (first - last) * share for share in _NARROWER), last])
-    alive = np.isfinite(problem.log_posterior(samples))
-    if not alive.any():
+    # on a straight line from the guess to the middle of the prior, each half as far from it
+    samples = np.stack(
+        [
+            guess_theta,
+            *(middle_theta + (guess_theta - middle_theta) * share for share in _NARROWER),
+            middle_theta,
+        ]
+    )
+    is_possible = np.isfinite(problem.log_posterior(samples))
+    if not is_possible.any():
         raise ValueError(
             "no sensor allowed by the priors can produce these numbers: check rounding, bits and"
             " priors, then run least_squares"
         )
-    start: FloatArray = samples[int(alive.argmax())]
+    start: FloatArray = samples[int(is_possible.argmax())]
     return start
 
 
 def _guessed(problem: SensorPosterior, believed: dict[str, float]) -> dict[str, float]:
+    """Return a rough value of each parameter by name, from which the search starts.
+
+    `believed` are the values in the middle of the prior.
+    """
     params, levels = problem.recipe.steps[problem.step].params, problem.levels
     if isinstance(levels, Levels):
         return guess_camera(levels, believed, params)
@@ -259,6 +276,7 @@ def search_mode(problem: SensorPosterior) -> LaplaceFit:
     for starts in (_TRIED, 4 * _TRIED):
         fits += [find_mode(problem, theta) for theta in _best_draws(problem, starts)]
         settled = [fit for fit in fits if fit.settled]
+        # unless a search that stopped on the way is much higher: then more starts are tried
         if settled and _highest(fits).log <= _highest(settled).log + _HIGHER:
             return _highest(settled)
     if problem.coordinates.bent:
@@ -273,25 +291,33 @@ def _highest(fits: Sequence[LaplaceFit]) -> LaplaceFit:
 def _best_draws(problem: SensorPosterior, starts: int) -> list[FloatArray]:
     """Return the draws of the prior with the highest density of the posterior, of ``starts``."""
     random = torch.Generator().manual_seed(starts)
-    drawn = problem.theta(problem.coordinates.draw(starts, random))
-    drawn = drawn[np.isfinite(drawn).all(1)]
-    logs = problem.log_posterior(drawn)
-    return [drawn[row] for row in np.argsort(-logs)[:_BEST] if np.isfinite(logs[row])]
+    draws = problem.theta(problem.coordinates.draw(starts, random))
+    draws = draws[np.isfinite(draws).all(1)]
+    log_posteriors = problem.log_posterior(draws)
+    return [
+        draws[row]
+        for row in np.argsort(-log_posteriors)[:_BEST]
+        if np.isfinite(log_posteriors[row])
+    ]
 
 
 def _unsettled(problem: SensorPosterior, fits: list[LaplaceFit]) -> str:
-    best = max(fits, key=lambda fit: fit.log)
+    """Return the message of a search without a mode.
+
+    It has the values at which the highest search stops.
+    """
+    highest_fit = max(fits, key=lambda fit: fit.log)
     values = ", ".join(
-        f"{name} {float(x):.3g}" for name, x in problem.parameters(best.theta).items()
+        f"{name} {float(x):.3g}" for name, x in problem.parameters(highest_fit.theta).items()
     )
-    well = (
+    well_hint = (
         ". If the well of this sensor ends the electrons before the read noise is added, set share:"
         " 0.7 in the step of calibrate.sufficient"
     )
     return (
         f"none of {len(fits)} searches ends at a mode of the posterior (the highest stops at"
         f" {values}), so the model does not describe these levels: run least_squares, and check"
-        f" levels, rounding and bits{well if 'full_well' in problem.coordinates.every else ''}"
+        f" levels, rounding and bits{well_hint if 'full_well' in problem.coordinates.every else ''}"
     )
 
 
@@ -301,34 +327,44 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
 
     In a direction that no level constrains, the distribution is as wide as the prior.
     """
-    theta, step_of = initial_theta, np.full(len(initial_theta), _SHORT)
-    log = float(problem.log_posterior(theta[None])[0])
-    if not np.isfinite(log):
+    theta, difference_steps = initial_theta, np.full(len(initial_theta), _SHORT)
+    log_posterior = float(problem.log_posterior(theta[None])[0])
+    if not np.isfinite(log_posterior):
         raise ValueError(
             "the sensor at the start of the search cannot produce these levels: run "
             "least_squares, and "
             "check rounding and bits against the camera"
         )
     for _ in range(_ROUNDS):
-        rows, prior = _slopes(problem, theta, step_of)
-        covariance = _covariance(rows, prior)
-        step_of = np.sqrt(covariance.diagonal()).clip(max=_WIDEST) * _STEP
-        gradient = _gradient(problem, theta, step_of)
-        free = _free(problem, theta, step_of, gradient)
-        within = _within(covariance, free != gradient) @ free
-        if free @ within < _CLOSE:
+        # Fisher's information at this point gives the widths of the posterior
+        level_slopes, prior_slopes = _slopes(problem, theta, difference_steps)
+        covariance = _covariance(level_slopes, prior_slopes)
+        # in proportion to the width of the posterior along each coordinate
+        difference_steps = np.sqrt(covariance.diagonal()).clip(max=_WIDEST) * _STEP
+        gradient = _gradient(problem, theta, difference_steps)
+        free_gradient = _free(problem, theta, difference_steps, gradient)
+        # the step of Newton among the coordinates that no edge holds
+        free_step = _within(covariance, free_gradient != gradient) @ free_gradient
+        # twice the gain that the step promises
+        if free_gradient @ free_step < _CLOSE:
             break
-        theta, log, moved = _climb(problem, theta, log, covariance @ gradient, within)
-        if not moved:
+        theta, log_posterior, has_moved = _climb(
+            problem, theta, log_posterior, covariance @ gradient, free_step
+        )
+        if not has_moved:
             break
-    rows, prior = _slopes(problem, theta, step_of)
-    covariance = _covariance(rows, prior)
-    gradient = _gradient(problem, theta, step_of)
-    free = _free(problem, theta, step_of, gradient)
-    settled = bool(free @ _within(covariance, free != gradient) @ free < _NEXT)
-    scaled_slopes = rows @ np.linalg.inv(prior)
-    shares = np.sqrt((prior @ covariance @ prior.T).diagonal())
-    return LaplaceFit(theta, log, covariance, scaled_slopes, shares, settled)
+    level_slopes, prior_slopes = _slopes(problem, theta, difference_steps)
+    covariance = _covariance(level_slopes, prior_slopes)
+    gradient = _gradient(problem, theta, difference_steps)
+    free_gradient = _free(problem, theta, difference_steps, gradient)
+    # no step among the free coordinates promises more
+    settled = bool(
+        free_gradient @ _within(covariance, free_gradient != gradient) @ free_gradient < _NEXT
+    )
+    # per standard deviation of the prior
+    scaled_slopes = level_slopes @ np.linalg.inv(prior_slopes)
+    shares = np.sqrt((prior_slopes @ covariance @ prior_slopes.T).diagonal())
+    return LaplaceFit(theta, log_posterior, covariance, scaled_slopes, shares, settled)
 
 
 def _climb(
@@ -340,11 +376,18 @@ def _climb(
     The points change all coordinates, or all except one, which may be at an edge; or they lie along
     ``within``, which leaves each coordinate that is at an edge.
     """
-    ways = np.concatenate([step[None], within[None], step * (1 - np.eye(len(step)))])
-    tries = (theta + ways[:, None] * 0.5 ** np.arange(24)[:, None]).reshape(-1, len(theta))
-    logs = problem.log_posterior(tries)
-    best = int(logs.argmax())
-    return (tries[best], float(logs[best]), True) if logs[best] > log else (theta, log, False)
+    step_directions = np.concatenate([step[None], within[None], step * (1 - np.eye(len(step)))])
+    # each direction at 24 lengths: the whole step, half of it, and so on
+    candidates = (theta + step_directions[:, None] * 0.5 ** np.arange(24)[:, None]).reshape(
+        -1, len(theta)
+    )
+    log_posteriors = problem.log_posterior(candidates)
+    highest = int(log_posteriors.argmax())
+    return (
+        (candidates[highest], float(log_posteriors[highest]), True)
+        if log_posteriors[highest] > log
+        else (theta, log, False)
+    )
 
 
 def _differences(
@@ -356,46 +399,56 @@ def _differences(
     """Return the derivatives of ``function`` by finite differences; ``sides`` selects steps up
     and steps down.
     """
-    apart = np.diag(step)
-    high, low = np.split(
-        function(np.concatenate([theta + apart * sides[0], theta - apart * sides[1]])), 2
+    offsets = np.diag(step)
+    upper, lower = np.split(
+        function(np.concatenate([theta + offsets * sides[0], theta - offsets * sides[1]])), 2
     )
-    slopes: FloatArray = (high - low).T / (step * sides.sum(0).clip(1))
+    # two steps give a central difference, one step a one-sided one
+    slopes: FloatArray = (upper - lower).T / (step * sides.sum(0).clip(1))
     return slopes
 
 
 def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return 1 for each step up or down that meets no edge of the posterior, such as a full
-    well, and 0 for others.
+    """Return (2, free), first the steps up, then the steps down: 1 where a step meets no edge.
+
+    An edge is a place beyond which the posterior falls at once, such as a full well.
     """
-    apart = np.diag(step)
-    log = problem.log_posterior(np.concatenate([theta[None], theta + apart, theta - apart]))
-    possible: FloatArray = (log[1:] > log[0] - _EDGE).reshape(2, -1).astype(np.float64)
-    return possible
+    offsets = np.diag(step)
+    log_posteriors = problem.log_posterior(
+        np.concatenate([theta[None], theta + offsets, theta - offsets])
+    )
+    is_possible: FloatArray = (
+        (log_posteriors[1:] > log_posteriors[0] - _EDGE).reshape(2, -1).astype(np.float64)
+    )
+    return is_possible
 
 
 def _slopes(
     problem: SensorPosterior, theta: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives of light levels and prior by coordinate; their Gram matrix is Fisher's
-    information.
+    """Return the derivatives (row, free) of the levels and (free, free) of the whitened prior.
+
+    Their Gram matrix is Fisher's information.
     """
-    rows = _differences(
+    level_slopes = _differences(
         lambda p: problem.likelihood(p).scaled.numpy(), theta, step, _sides(problem, theta, step)
     )
-    rounded = problem.recipe.steps[problem.step].params.get("rounding") in ("nearest", "truncation")
-    for name in problem.coordinates.edged.intersection(problem.names) if rounded else ():
+    is_rounded = problem.recipe.steps[problem.step].params.get("rounding") in (
+        "nearest",
+        "truncation",
+    )
+    for name in problem.coordinates.edged.intersection(problem.names) if is_rounded else ():
         # levels depend on this parameter only at edges, where they have no derivative
         column = problem.names.index(name)
-        rows[:, column] = 0.0
-        rows[-1, column] = float(problem.likelihood(theta[None]).scaled[0, -1])
-    return rows, _differences(problem.whitened, theta, step, np.ones((2, len(step))))
+        level_slopes[:, column] = 0.0
+        level_slopes[-1, column] = float(problem.likelihood(theta[None]).scaled[0, -1])
+    return level_slopes, _differences(problem.whitened, theta, step, np.ones((2, len(step))))
 
 
 def _gradient(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
     """Return the gradient of the log posterior with respect to the free parameters."""
-    sides = _sides(problem, theta, step)
-    gradient: FloatArray = _differences(problem.log_posterior, theta, step, sides)
+    possible_sides = _sides(problem, theta, step)
+    gradient: FloatArray = _differences(problem.log_posterior, theta, step, possible_sides)
     return gradient
 
 
@@ -405,23 +458,29 @@ def _free(
     """Return the gradient, with 0 for each component that leads to parameters where the
     posterior is zero.
     """
-    up, down = _sides(problem, theta, step) == 0
-    return np.where((up & (gradient > 0)) | (down & (gradient < 0)), 0.0, gradient)
+    blocked_up, blocked_down = _sides(problem, theta, step) == 0
+    return np.where((blocked_up & (gradient > 0)) | (blocked_down & (gradient < 0)), 0.0, gradient)
 
 
 def _within(covariance: FloatArray, held: NDArray[np.bool_]) -> FloatArray:
     """Return the covariance of all coordinates where those that are ``held`` stay as they are."""
     if not held.any():
         return covariance
-    across = covariance[:, held]
-    within: FloatArray = covariance - across @ np.linalg.solve(across[held], across.T)
-    return within
+    held_columns = covariance[:, held]
+    # Schur complement: the covariance given the held coordinates
+    conditional: FloatArray = covariance - held_columns @ np.linalg.solve(
+        held_columns[held], held_columns.T
+    )
+    return conditional
 
 
 def _covariance(rows: FloatArray, prior: FloatArray) -> FloatArray:
     """Return the covariance of the parameters from an SVD of derivatives, which is more precise
     than an inversion.
     """
-    _, s, v = np.linalg.svd(np.concatenate([rows, prior]), full_matrices=False)
-    covariance: FloatArray = (v.T / s**2) @ v
+    # the inverse of A'A is V diag(1 / s²) V' for A = U diag(s) V'
+    _, singular_values, right_vectors = np.linalg.svd(
+        np.concatenate([rows, prior]), full_matrices=False
+    )
+    covariance: FloatArray = (right_vectors.T / singular_values**2) @ right_vectors
     return covariance

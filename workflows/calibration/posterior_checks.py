@@ -83,47 +83,58 @@ def misfits(
     deviations = left_out(problem, samples, weights)
     yield _prediction(deviations)
     if deviations.lit.sum() >= _LEAST:
-        for name, z in (
+        for name, deviation in (
             ("variances", deviations.variance[deviations.lit]),
             ("means", deviations.mean[deviations.lit]),
         ):
-            p = min(1.0, 2 * min(runs(z), waves(z)))
+            # two tests, so that the smaller probability counts twice
+            p_value = min(1.0, 2 * min(runs(deviation), waves(deviation)))
             text = (
-                f"{_signs(z)} runs of sign over {len(z)} levels, waves of {_strength(z):.1f}; p ="
-                f" {p:.2g}"
+                f"{_signs(deviation)} runs of sign over {len(deviation)} levels, waves of"
+                f" {_strength(deviation):.1f}; p ="
+                f" {p_value:.2g}"
             )
             yield Misfit(
-                f"the {name} deviate without a trend", text, f"a p-value above {ALARM}", p >= ALARM
+                f"the {name} deviate without a trend",
+                text,
+                f"a p-value above {ALARM}",
+                p_value >= ALARM,
             )
     yield from _widths(problem, theta)
 
 
 def _prediction(deviations: Deviations) -> Misfit:
     """Return the test of the level that deviates most from its prediction by the others."""
-    limit = _limit(ALARM / (4 * len(deviations.variance)))
-    quantity, z = max(
+    # two quantities of each level, two sides: Bonferroni's share of the probability
+    largest_allowed = _limit(ALARM / (4 * len(deviations.variance)))
+    quantity, worst_deviations = max(
         (("variance", deviations.variance), ("mean", deviations.mean)),
         key=lambda pair: np.abs(pair[1]).max(),
     )
-    worst = int(np.abs(z).argmax())
+    level_number = int(np.abs(worst_deviations).argmax())
     light = (
-        f"of {deviations.photons[worst]:.5g} photons"
-        if deviations.photons[worst]
+        f"of {deviations.photons[level_number]:.5g} photons"
+        if deviations.photons[level_number]
         else "without light"
     )
     text = (
-        f"the {quantity} of the level {light} and {deviations.exposure[worst]:.4g} s deviates by"
-        f" {z[worst]:+.1f} sd from its "
+        f"the {quantity} of the level {light} and {deviations.exposure[level_number]:.4g} s"
+        f" deviates by {worst_deviations[level_number]:+.1f} sd from its "
     )
-    text, good = f"{text}prediction by the other levels", abs(z[worst]) <= limit
-    if not good:
+    text, is_good = (
+        f"{text}prediction by the other levels",
+        abs(worst_deviations[level_number]) <= largest_allowed,
+    )
+    if not is_good:
         why = (
             "its light or exposure may not be as stated"
             if quantity == "mean"
             else "its frames may be disturbed"
         )
         text += f": {why}; measure it again, or leave it out"
-    return Misfit("each level is predicted by the others", text, f"at most {limit:.1f} sd", good)
+    return Misfit(
+        "each level is predicted by the others", text, f"at most {largest_allowed:.1f} sd", is_good
+    )
 
 
 def _widths(problem: SensorPosterior, theta: FloatArray) -> Iterator[Misfit]:
@@ -150,22 +161,41 @@ def left_out(problem: SensorPosterior, samples: FloatArray, weights: FloatArray)
     from scipy.special import ndtr, ndtri
 
     rng = np.random.default_rng(3)
-    drawn = samples[rng.choice(len(samples), _DRAWS, p=weights)]
-    look = problem.likelihood(drawn)
-    variance, narrow, mean, width = np.split(look.scaled.numpy(), 4, axis=-1)  # (draw, level)
-    log = -0.5 * (variance**2 + mean**2) - narrow - width
-    weight = np.exp(-(log - log.min(0)))
+    draws = samples[rng.choice(len(samples), _DRAWS, p=weights)]
+    prediction = problem.likelihood(draws)
+    # (draw, level)
+    variance_residual, log_variance_sd, mean_residual, log_mean_sd = np.split(
+        prediction.scaled.numpy(), 4, axis=-1
+    )
+    log_likelihood = (
+        -0.5 * (variance_residual**2 + mean_residual**2) - log_variance_sd - log_mean_sd
+    )
+    # the inverse of the likelihood of a level takes that level out of the posterior
+    inverse_weight = np.exp(-(log_likelihood - log_likelihood.min(0)))
     # truncated importance sampling
-    weight = np.minimum(weight, weight.mean(0) * math.sqrt(len(weight)))
-    weight /= weight.sum(0)
+    inverse_weight = np.minimum(
+        inverse_weight, inverse_weight.mean(0) * math.sqrt(len(inverse_weight))
+    )
+    inverse_weight /= inverse_weight.sum(0)
     tiny = 1e-12
-    z = [ndtri(np.clip((weight * ndtr(x)).sum(0), tiny, 1 - tiny)) for x in (variance, mean)]
+    # probability of less than was measured, as standard deviations of a normal distribution
+    normal_scores = [
+        ndtri(np.clip((inverse_weight * ndtr(x)).sum(0), tiny, 1 - tiny))
+        for x in (variance_residual, mean_residual)
+    ]
     levels = problem.levels
     assert isinstance(levels, Levels)
-    fitted = look.degrees_of_freedom.numpy() > 0
-    order = np.argsort(levels.mean.numpy()[fitted])
+    is_fitted = prediction.degrees_of_freedom.numpy() > 0
+    by_mean = np.argsort(levels.mean.numpy()[is_fitted])
     return Deviations(
-        *(x[order] for x in (*z, levels.photons.numpy()[fitted], levels.exposure.numpy()[fitted]))
+        *(
+            x[by_mean]
+            for x in (
+                *normal_scores,
+                levels.photons.numpy()[is_fitted],
+                levels.exposure.numpy()[is_fitted],
+            )
+        )
     )
 
 
@@ -175,15 +205,18 @@ def runs(z: FloatArray) -> float:
     """
     from scipy.special import ndtr
 
-    up, down = int((z > 0).sum()), int((z <= 0).sum())
-    if not up or not down:
+    above_count, below_count = int((z > 0).sum()), int((z <= 0).sum())
+    if not above_count or not below_count:
+        # all of one sign: either sign, with the probability 1/2 for each level
         return float(2.0 ** (1 - len(z)))
-    expected = 1 + 2 * up * down / len(z)
-    variance = (expected - 1) * (expected - 2) / (len(z) - 1)
-    return float(ndtr((_signs(z) + 0.5 - expected) / math.sqrt(max(variance, 1e-12))))
+    expected_runs = 1 + 2 * above_count * below_count / len(z)
+    variance = (expected_runs - 1) * (expected_runs - 2) / (len(z) - 1)
+    # half a run corrects for whole numbers
+    return float(ndtr((_signs(z) + 0.5 - expected_runs) / math.sqrt(max(variance, 1e-12))))
 
 
 def _signs(z: FloatArray) -> int:
+    """Return the number of runs of equal sign."""
     return 1 + int((np.diff(z > 0)).sum())
 
 
@@ -194,16 +227,22 @@ def _strength(z: FloatArray) -> float:
     from scipy.fft import dct
 
     scale = max(1.0, float(np.square(z).mean()))
+    # the cosine transform has its slowest components first
     return float((dct(z, norm="ortho")[:_SLOW] ** 2).sum() / scale)
 
 
 def waves(z: FloatArray) -> float:
     """Return the probability that chance alone gives so strong slow waves over the levels."""
+    # the share of white noise in k of n components has a beta distribution
     from scipy.special import betainc
 
-    total = float(np.square(z).sum())
-    share = min(1.0, _strength(z) * max(1.0, float(np.square(z).mean())) / total) if total else 0.0
-    return float(1 - betainc(_SLOW / 2, (len(z) - _SLOW) / 2, share))
+    square_sum = float(np.square(z).sum())
+    slow_share = (
+        min(1.0, _strength(z) * max(1.0, float(np.square(z).mean())) / square_sum)
+        if square_sum
+        else 0.0
+    )
+    return float(1 - betainc(_SLOW / 2, (len(z) - _SLOW) / 2, slow_share))
 
 
 def _limit(probability: float) -> float:
@@ -221,7 +260,9 @@ def _limit(probability: float) -> float:
 Mark = Literal["pass", "warn", "fail"]
 MISFIT = 1e-3  #: probability below which chance does not explain a deviance
 _NEVER = -1e6  #: log weight of an impossible sample
+# R-hat; effective sample size; shares of accepted moves
 _RHAT, _INDEPENDENT, _ACCEPTED = 1.01, 1000.0, (0.1, 0.7)
+# k-hat; relative difference of widths; of means in sd; nats of the best draw below the mode
 _TAIL, _SD, _MEAN, _BELOW = 0.5, 0.05, 0.1, 2.0
 _WEIGHTED = 0.1  #: least effective share of weighted draws
 #: slowest waves over the rings, and probability below which chance does not explain them
@@ -303,11 +344,13 @@ def arviz() -> Any:
 def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) -> ImportanceSamples:
     """Draw importance samples from the posterior, and return them with Pareto-smoothed weights."""
     guide = draw_guide(problem, mode, np.random.default_rng(seed))
-    log = guide.log
+    log_weights = guide.log
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        smooth, tail = arviz().psislw(np.where(np.isfinite(log), log - log.max(), _NEVER))
-    return ImportanceSamples(guide.samples, normalised(smooth), float(tail), guide)
+        smoothed, tail = arviz().psislw(
+            np.where(np.isfinite(log_weights), log_weights - log_weights.max(), _NEVER)
+        )
+    return ImportanceSamples(guide.samples, normalised(smoothed), float(tail), guide)
 
 
 def checks(
@@ -328,43 +371,48 @@ def checks(
 
 
 def _of_chains(chains: Chains) -> Iterator[Check]:
+    """Yield the checks of the chains themselves.
+
+    They are of length, agreement, effective size, acceptance and stranded walkers.
+    """
     from neusee.workflows.calibration import emcee_sampler
 
-    taus = chains.steps / chains.tau
+    length_in_tau = chains.steps / chains.tau
     yield Check(
         "chains are long enough",
-        f"the chains are {taus:.0f} autocorrelation times long",
+        f"the chains are {length_in_tau:.0f} autocorrelation times long",
         "at least 50 autocorrelation times, with a stable estimate",
         _mark(chains.long),
     )
     coordinates = np.moveaxis(chains.draws, -1, 0)
     rhat = max(map(_rhat, coordinates))
     yield Check("ensembles agree", f"R-hat {rhat:.4f}", f"at most {_RHAT}", _mark(rhat <= _RHAT))
-    bulk, tail = (
+    bulk_size, tail_size = (
         min(_effective_sample_size(draws, method) for draws in coordinates)
         for method in ("bulk", "tail")
     )
     yield Check(
         "draws are numerous enough",
-        f"effective sample size {bulk:.0f}, {tail:.0f} in the tails",
+        f"effective sample size {bulk_size:.0f}, {tail_size:.0f} in the tails",
         f"each at least {_INDEPENDENT:.0f} draws",
-        _mark(min(bulk, tail) >= _INDEPENDENT),
+        _mark(min(bulk_size, tail_size) >= _INDEPENDENT),
     )
-    low, high = _ACCEPTED
-    well = low <= chains.accepted <= high
+    least_accepted, largest = _ACCEPTED
+    is_accepted = least_accepted <= chains.accepted <= largest
     yield Check(
         "moves are accepted",
         f"{chains.accepted:.0%} of the moves",
-        f"{low:.0%} to {high:.0%}",
-        _mark(well, "warn"),
+        f"{least_accepted:.0%} to {largest:.0%}",
+        _mark(is_accepted, "warn"),
     )
     # R-hat cannot see stranded walkers that all ensembles have
-    lost = emcee_sampler.stranded(chains.log)
+    stranded_walkers = emcee_sampler.stranded(chains.log)
     text = (
-        f"{lost} of {chains.log.shape[0] * chains.log.shape[2]} lie {emcee_sampler.STRANDED:.0f}"
+        f"{stranded_walkers} of {chains.log.shape[0] * chains.log.shape[2]} lie"
+        f" {emcee_sampler.STRANDED:.0f}"
         " nats below the rest"
     )
-    yield Check("no walker is stranded", text, "none", _mark(lost == 0))
+    yield Check("no walker is stranded", text, "none", _mark(stranded_walkers == 0))
 
 
 def _of_peak(
@@ -374,15 +422,16 @@ def _of_peak(
     chains: Chains,
     law: ImportanceSamples,
 ) -> Iterator[Check]:
-    search = "settled" if mode.settled else "the search stopped"
-    yield Check("the search found the mode", search, "settled", _mark(mode.settled))
-    below = mode.log - float(chains.log.max())
-    distance = f"{abs(below):.2g} nats {'below' if below > 0 else 'above'} the mode"
+    """Yield the checks that search, chains and importance sampling found the same peak."""
+    search_text = "settled" if mode.settled else "the search stopped"
+    yield Check("the search found the mode", search_text, "settled", _mark(mode.settled))
+    nats_below = mode.log - float(chains.log.max())
+    distance = f"{abs(nats_below):.2g} nats {'below' if nats_below > 0 else 'above'} the mode"
     yield Check(
         "the best draw is near the mode",
         distance,
         f"within {_BELOW:.0f} nats",
-        _mark(abs(below) <= _BELOW),
+        _mark(abs(nats_below) <= _BELOW),
     )
     bent = problem.coordinates.bent
     columns = [
@@ -398,27 +447,36 @@ def _of_peak(
 
 
 def _of_weights(law: ImportanceSamples) -> Check:
+    """Return the check of the effective size of the weighted draws.
+
+    It is 1 over the sum of the squared weights.
+    """
     count = len(law.weights)
-    size = 1 / float((law.weights**2).sum())
+    effective_draws = 1 / float((law.weights**2).sum())
     return Check(
         "weighted draws are numerous enough",
-        f"effective sample size {size:.0f} of {count}",
+        f"effective sample size {effective_draws:.0f} of {count}",
         f"at least {_WEIGHTED * count:.0f}",
-        _mark(size >= _WEIGHTED * count, "warn"),
+        _mark(effective_draws >= _WEIGHTED * count, "warn"),
     )
 
 
 def _of_agreement(chains: Chains, law: ImportanceSamples, columns: list[int]) -> Check:
     """Return if the chains and importance sampling have the same widths and means."""
     sd, mean = law.sd()[columns], law.mean()[columns]
-    flat = chains.flat[:, columns]
-    apart = np.abs(flat.std(0) / sd - 1)
-    off = np.max(np.abs(flat.mean(0) - mean) / sd)
-    allowed = np.maximum(_SD, _LUCK * law.doubt(flat))
-    worst = int(np.argmax(apart / allowed))
-    text = f"widths within {apart[worst]:.1%}, means {off:.2f} sd; k-hat {law.tail:.2f}"
-    bar = f"{allowed[worst]:.0%} and {_MEAN} sd, where k-hat is below {_TAIL}"
-    agrees = bool((apart <= allowed).all()) and off <= _MEAN
+    chain_draws = chains.flat[:, columns]
+    width_difference = np.abs(chain_draws.std(0) / sd - 1)
+    mean_difference = np.max(np.abs(chain_draws.mean(0) - mean) / sd)
+    # chance alone explains a few standard errors of a width
+    allowed_difference = np.maximum(_SD, _LUCK * law.doubt(chain_draws))
+    worst_column = int(np.argmax(width_difference / allowed_difference))
+    text = (
+        f"widths within {width_difference[worst_column]:.1%}, means {mean_difference:.2f} sd;"
+        f" k-hat {law.tail:.2f}"
+    )
+    bar = f"{allowed_difference[worst_column]:.0%} and {_MEAN} sd, where k-hat is below {_TAIL}"
+    agrees = bool((width_difference <= allowed_difference).all()) and mean_difference <= _MEAN
+    # weights with a heavy tail prove nothing
     failure: Mark = "fail" if law.tail < _TAIL else "warn"
     return Check("importance sampling agrees with the chains", text, bar, _mark(agrees, failure))
 
@@ -429,9 +487,14 @@ def _of_data(
     identifiability: Identifiability,
     law: ImportanceSamples,
 ) -> Iterator[Check]:
-    look = problem.likelihood(mode.theta[None])
-    if float(look.degrees_of_freedom.sum()) > len(identifiability.estimated):
-        fit = goodness_of_fit(look, len(identifiability.estimated))
+    """Yield the checks of the data.
+
+    The model must describe them, and they must determine the parameters.
+    """
+    mode_likelihood = problem.likelihood(mode.theta[None])
+    # without a degree of freedom there is nothing to test
+    if float(mode_likelihood.degrees_of_freedom.sum()) > len(identifiability.estimated):
+        fit = goodness_of_fit(mode_likelihood, len(identifiability.estimated))
         text = (
             f"deviance {fit.deviance:.1f} of {fit.freedom:.0f} degrees of freedom, p = {fit.p:.2g}"
         )
@@ -447,8 +510,8 @@ def _of_data(
     if isinstance(problem.levels, Rings):
         yield from _of_rings(problem, law, law.guide)
     count = len(identifiability.directions)
-    weak = f"{count} of {len(identifiability.strengths)} directions are not determined"
-    text = weak if count else "all parameters are determined"
+    weak_text = f"{count} of {len(identifiability.strengths)} directions are not determined"
+    text = weak_text if count else "all parameters are determined"
     yield Check(
         "the levels determine the parameters",
         text,
@@ -458,23 +521,27 @@ def _of_data(
 
 
 def _of_rings(problem: SensorPosterior, law: ImportanceSamples, guide: Guide) -> Iterator[Check]:
-    best = guide.samples[[int(problem.log_posterior(guide.samples).argmax())]]
-    look = problem.likelihood(best)
-    away = problem.levels.mean.numpy() - look.mean.numpy().reshape(-1)
-    strength, p = slow_waves(away / np.sqrt(look.variance.numpy().reshape(-1)))
+    """Yield the checks of a lens.
+
+    The rings must have no trend, and priors and picture must agree.
+    """
+    best_sample = guide.samples[[int(problem.log_posterior(guide.samples).argmax())]]
+    prediction = problem.likelihood(best_sample)
+    deviation = problem.levels.mean.numpy() - prediction.mean.numpy().reshape(-1)
+    strength, p = slow_waves(deviation / np.sqrt(prediction.variance.numpy().reshape(-1)))
     yield Check(
         "the rings deviate from the model without a trend",
         f"slow waves of the deviations over the radius: {strength:.1f}, p = {p:.2g}",
         f"a p-value above {_SMOOTH}; else one surface does not describe this lens",
         _mark(p >= _SMOOTH, "warn"),
     )
-    middle = law.weights @ problem.whitened(guide.samples)
-    worst = int(np.abs(middle).argmax())
+    prior_distance = law.weights @ problem.whitened(guide.samples)
+    worst_column = int(np.abs(prior_distance).argmax())
     text = (
-        f"{problem.names[worst].replace('_', ' ')} {middle[worst]:+.1f} sd of its prior from the"
-        " middle"
+        f"{problem.names[worst_column].replace('_', ' ')} {prior_distance[worst_column]:+.1f}"
+        " sd of its prior from the middle"
     )
-    surprised = abs(float(middle[worst])) > _SURPRISE
+    surprised = abs(float(prior_distance[worst_column])) > _SURPRISE
     bar = f"each mean within {_SURPRISE} sd; else prior and picture contradict each other"
     yield Check("the priors agree with the picture", text, bar, _mark(not surprised, "warn"))
 
@@ -524,6 +591,7 @@ def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
 
 
 def _mark(good: bool, else_: Mark = "fail") -> Mark:
+    """Return the mark of a check: `pass`, or `else_` if it does not hold."""
     return "pass" if good else else_
 
 
@@ -538,6 +606,7 @@ def _effective_sample_size(draws: FloatArray, method: str) -> float:
     """Return the effective sample size of draws (ensemble, step, walker) in the ``bulk`` or in
     the ``tail``.
     """
+    # each walker is a chain of its own here
     chains = draws.transpose(0, 2, 1).reshape(-1, draws.shape[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # short chains fail by their effective sample size

@@ -28,6 +28,7 @@ _KEPT = 0.5  #: effective sample fraction that a larger power leaves
 #: most sweeps at one power; accepted moves of each particle at which the power grows
 _SWEEPS, _MOVED = 12, 1.5
 _POWERS = 200  #: most powers
+# 2.38 / sqrt(2 free) suits a normal distribution
 _SHARES = (1.0, 0.5, 0.2)  #: lengths of a move in units of that which suits a normal distribution
 _LEAP = 0.1  #: share of moves by a whole difference, from mode to mode
 _BLUR = 1e-5  #: coordinates, added to each move
@@ -57,20 +58,23 @@ def follow_posterior(
     """Return the coordinates of particles (particle, free) near the posterior, and the log
     posterior of each.
     """
+    # from the prior (power 0) to the posterior (power 1) of prior times likelihood ** power
     particles, power = _from_prior(problem, count, rng), 0.0
     for _ in range(_POWERS):
-        gain = particles.log - particles.prior
-        before, power = power, _next_power(gain, power)
-        weight = np.exp((power - before) * (gain - gain.max()))
-        edges = np.cumsum(weight / weight.sum())
-        numbers = np.searchsorted(edges, (rng.random() + np.arange(len(gain))) / len(gain)).clip(
-            0, len(gain) - 1
-        )
-        particles.take(rng.permutation(numbers))
-        moved = 0.0
+        log_likelihood = particles.log - particles.prior
+        power_before, power = power, _next_power(log_likelihood, power)
+        weights = np.exp((power - power_before) * (log_likelihood - log_likelihood.max()))
+        # systematic resampling: one random offset, equal steps
+        cumulative_weights = np.cumsum(weights / weights.sum())
+        resampled = np.searchsorted(
+            cumulative_weights,
+            (rng.random() + np.arange(len(log_likelihood))) / len(log_likelihood),
+        ).clip(0, len(log_likelihood) - 1)
+        particles.take(rng.permutation(resampled))
+        moves_per_particle = 0.0
         for _ in range(_SWEEPS):
-            moved += _sweep(problem, particles, power, rng)
-            if moved > _MOVED:
+            moves_per_particle += _sweep(problem, particles, power, rng)
+            if moves_per_particle > _MOVED:
                 break
         if power == 1.0:
             break
@@ -79,18 +83,20 @@ def follow_posterior(
 
 def _from_prior(problem: SensorPosterior, count: int, rng: np.random.Generator) -> _Particles:
     """Return up to ``count`` draws of the prior at which the posterior is not zero."""
-    drawn = torch.from_numpy(rng.standard_normal((_SPARE * count, len(problem.names))))
-    place = problem.theta(problem.coordinates.from_whitened(drawn))
-    place = place[np.isfinite(place).all(1)]
-    prior, log = _logs(problem, place)
-    alive = np.flatnonzero(np.isfinite(log))[:count]
-    if len(alive) < 2 * len(problem.names):
+    prior_draws = torch.from_numpy(rng.standard_normal((_SPARE * count, len(problem.names))))
+    coordinates = problem.theta(problem.coordinates.from_whitened(prior_draws))
+    coordinates = coordinates[np.isfinite(coordinates).all(1)]
+    prior, log = _logs(problem, coordinates)
+    possible = np.flatnonzero(np.isfinite(log))[:count]
+    # moves are differences of two others, which must span all parameters
+    if len(possible) < 2 * len(problem.names):
         raise ValueError(
-            f"{len(alive)} of {len(drawn)} draws of the priors of {', '.join(problem.names)} can "
+            f"{len(possible)} of {len(prior_draws)} draws of the priors of"
+            f" {', '.join(problem.names)} can "
             "produce "
             "these numbers: give priors of lenses that scatter less than all light"
         )
-    return _Particles(place[alive], prior[alive], log[alive])
+    return _Particles(coordinates[possible], prior[possible], log[possible])
 
 
 def _logs(problem: SensorPosterior, place: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -106,46 +112,66 @@ def _next_power(gain: FloatArray, power: float) -> float:
     """
 
     def left(step: float) -> float:
-        weight = np.exp(step * (gain - gain.max()))
-        return float(weight.sum() ** 2 / (weight**2).sum() / len(weight))
+        weights = np.exp(step * (gain - gain.max()))
+        # effective sample fraction: (sum of weights)² over sum of squared weights
+        return float(weights.sum() ** 2 / (weights**2).sum() / len(weights))
 
     if left(1.0 - power) >= _KEPT:
         return 1.0
-    low, high = 1e-12, 1.0 - power
+    # bisection of the logarithm of the step
+    low_step, high_step = 1e-12, 1.0 - power
     for _ in range(40):
-        middle = (low * high) ** 0.5
-        low, high = (middle, high) if left(middle) >= _KEPT else (low, middle)
-    return power + low
+        middle_step = (low_step * high_step) ** 0.5
+        low_step, high_step = (
+            (middle_step, high_step) if left(middle_step) >= _KEPT else (low_step, middle_step)
+        )
+    return power + low_step
 
 
 def _sweep(
     problem: SensorPosterior, particles: _Particles, power: float, rng: np.random.Generator
 ) -> float:
-    """Propose one move of each particle by a difference of two of the other half; return the
-    share that is accepted.
+    """Propose one move of each particle, and return the share of moves that are accepted.
+
+    The move is a difference of two particles of the other half (differential evolution).
     """
-    halves, moved = np.array_split(rng.permutation(len(particles.log)), 2), 0
-    free = particles.place.shape[1]
-    for own, other in (halves, halves[::-1]):
-        first, second = (
-            particles.place[other[rng.integers(len(other), size=len(own))]] for _ in range(2)
+    halves, accepted_moves = np.array_split(rng.permutation(len(particles.log)), 2), 0
+    dimension = particles.place.shape[1]
+    for moved_half, other_half in (halves, halves[::-1]):
+        one_end, other_end = (
+            particles.place[other_half[rng.integers(len(other_half), size=len(moved_half))]]
+            for _ in range(2)
         )
-        step = rng.choice(_SHARES, size=len(own)) * 2.38 / (2 * free) ** 0.5
-        step = np.where(rng.random(len(own)) < _LEAP, 1.0, step)
-        new = particles.place[own] + step[:, None] * (first - second)
-        new = new + _BLUR * rng.standard_normal(new.shape)
-        prior, log = _logs(problem, new)
+        # 2.38 / sqrt(2 d) is the best length of such moves for a normal distribution of d
+        # coordinates
+        scale = rng.choice(_SHARES, size=len(moved_half)) * 2.38 / (2 * dimension) ** 0.5
+        # a whole difference leads from one mode to another
+        scale = np.where(rng.random(len(moved_half)) < _LEAP, 1.0, scale)
+        proposals = particles.place[moved_half] + scale[:, None] * (one_end - other_end)
+        proposals = proposals + _BLUR * rng.standard_normal(proposals.shape)
+        prior, log = _logs(problem, proposals)
         with np.errstate(invalid="ignore"):
-            rise = (1 - power) * (prior - particles.prior[own]) + power * (log - particles.log[own])
-        accepted = np.log(rng.random(len(own))) < np.where(np.isfinite(rise), rise, -np.inf)
-        replaced = own[accepted]
-        particles.place[replaced], particles.prior[replaced], particles.log[replaced] = (
-            new[accepted],
+            # of prior times likelihood to the power: log prior + power * (log posterior - log
+            # prior)
+            log_ratio = (1 - power) * (prior - particles.prior[moved_half]) + power * (
+                log - particles.log[moved_half]
+            )
+        # the rule of Metropolis
+        accepted = np.log(rng.random(len(moved_half))) < np.where(
+            np.isfinite(log_ratio), log_ratio, -np.inf
+        )
+        moved_numbers = moved_half[accepted]
+        (
+            particles.place[moved_numbers],
+            particles.prior[moved_numbers],
+            particles.log[moved_numbers],
+        ) = (
+            proposals[accepted],
             prior[accepted],
             log[accepted],
         )
-        moved += int(accepted.sum())
-    return moved / len(particles.log)
+        accepted_moves += int(accepted.sum())
+    return accepted_moves / len(particles.log)
 
 
 # --- posterior mixture ----------------------------------------------------------------------------
@@ -181,8 +207,8 @@ class Density(Protocol):
         """Return new samples like ``own`` (draw, free), and the logarithm of the density at
         ``own`` over that there.
         """
-        drawn = self.draw(len(own), rng)
-        return drawn, self.log_density(own) - self.log_density(drawn)
+        new_samples = self.draw(len(own), rng)
+        return new_samples, self.log_density(own) - self.log_density(new_samples)
 
 
 @dataclass(frozen=True)
@@ -197,19 +223,22 @@ class Mixture(Density):
     def draw(self, count: int, rng: Random) -> FloatArray:
         """Draw samples (count, free)."""
         component = rng.choice(len(self.shares), size=count, p=self.shares)
-        normal = rng.standard_normal((count, self.centres.shape[1]))
-        tail = np.broadcast_to(self.tails, self.shares.shape)[component]
-        off = normal / np.sqrt(rng.chisquare(tail) / tail)[:, None]
+        normal_draws = rng.standard_normal((count, self.centres.shape[1]))
+        freedom = np.broadcast_to(self.tails, self.shares.shape)[component]
+        # a normal draw over the root of chi² / degrees of freedom has Student's distribution
+        student_draws = normal_draws / np.sqrt(rng.chisquare(freedom) / freedom)[:, None]
         samples: FloatArray = self.centres[component] + np.einsum(
-            "nij,nj->ni", self.roots[component], off
+            "nij,nj->ni", self.roots[component], student_draws
         )
         return samples
 
     def log_density(self, samples: FloatArray) -> FloatArray:
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
-        power = 0.5 * (self.tails + self.centres.shape[1])
+        exponent = 0.5 * (self.tails + self.centres.shape[1])
         return log_sum(
-            self._levels + self._constants - power * np.log1p(self._squares(samples) / self.tails)
+            self._levels
+            + self._constants
+            - exponent * np.log1p(self._squares(samples) / self.tails)
         )
 
     def normal_shares(self, samples: FloatArray) -> FloatArray:
@@ -222,9 +251,10 @@ class Mixture(Density):
 
     @cached_property
     def _levels(self) -> FloatArray:
-        widths = np.diagonal(self.roots, axis1=1, axis2=2)
-        levels: FloatArray = np.log(self.shares.clip(1e-300)) - np.log(widths).sum(1)
-        return levels
+        """Return what share and width of each component (component,) add to its log density."""
+        scales = np.diagonal(self.roots, axis1=1, axis2=2)
+        log_heights: FloatArray = np.log(self.shares.clip(1e-300)) - np.log(scales).sum(1)
+        return log_heights
 
     @cached_property
     def _constants(self) -> FloatArray:
@@ -233,9 +263,11 @@ class Mixture(Density):
         """
         from scipy.special import gammaln
 
-        half, free = 0.5 * np.asarray(self.tails), self.centres.shape[1]
+        half_freedom, dimension = 0.5 * np.asarray(self.tails), self.centres.shape[1]
         constants: FloatArray = (
-            gammaln(half + 0.5 * free) - gammaln(half) - 0.5 * free * np.log(2 * half)
+            gammaln(half_freedom + 0.5 * dimension)
+            - gammaln(half_freedom)
+            - 0.5 * dimension * np.log(2 * half_freedom)
         )
         return constants
 
@@ -247,9 +279,9 @@ class Mixture(Density):
         """Return the squared distance (draw, component) from each centre, in widths of the
         component.
         """
-        away = self._inverses @ (samples.T[None] - self.centres[:, :, None])
-        squares: FloatArray = (away**2).sum(1).T
-        return squares
+        scaled_distance = self._inverses @ (samples.T[None] - self.centres[:, :, None])
+        squared_distance: FloatArray = (scaled_distance**2).sum(1).T
+        return squared_distance
 
 
 def fit_mixture(
@@ -264,17 +296,20 @@ def fit_mixture(
     largest effective sample size is kept, and new samples are drawn from it, whose own effective
     sample size the caller must check.
     """
-    points = _start(problem, mode, rng)
-    first = mixture = best_mixture = _fitted(points, np.full(len(points), 1 / len(points)), rng)
-    best = -1.0
+    start_points = _start(problem, mode, rng)
+    first_mixture = mixture = best_mixture = _fitted(
+        start_points, np.full(len(start_points), 1 / len(start_points)), rng
+    )
+    best_fraction = -1.0
     for _ in range(_ROUNDS):
-        samples, log = weighed(problem, mixture, _TRIED, rng)
-        fraction = effective(log)
-        if fraction > best:
-            best, best_mixture = fraction, mixture
+        samples, log_weights = weighed(problem, mixture, _TRIED, rng)
+        fraction = effective(log_weights)
+        if fraction > best_fraction:
+            best_fraction, best_mixture = fraction, mixture
         if fraction >= _ENOUGH:
             break
-        mixture = _joined(first, _fitted(samples, normalised(softened(log)), rng))
+        # the first mixture stays half of every next one
+        mixture = _joined(first_mixture, _fitted(samples, normalised(softened(log_weights)), rng))
     return best_mixture, *weighed(problem, best_mixture, count, rng)
 
 
@@ -298,11 +333,11 @@ def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator)
     """Return particles and draws about the mode (point, free), without those that are lost far
     below the best.
     """
-    places, logs = follow_posterior(problem, _PARTICLES, rng)
-    beside = mode.draw(_BESIDE, rng)
-    places = np.concatenate([places, beside])
-    logs = np.concatenate([logs, problem.log_posterior(beside)])
-    return places[logs > max(float(logs.max()), mode.log) - _FAR]
+    points, log_posteriors = follow_posterior(problem, _PARTICLES, rng)
+    near_mode = mode.draw(_BESIDE, rng)
+    points = np.concatenate([points, near_mode])
+    log_posteriors = np.concatenate([log_posteriors, problem.log_posterior(near_mode)])
+    return points[log_posteriors > max(float(log_posteriors.max()), mode.log) - _FAR]
 
 
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
@@ -310,32 +345,41 @@ def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -
     broad component.
     """
     centre, covariance = moments(samples, weight)
-    root = np.linalg.cholesky(firm(covariance))
-    starts = _apart(np.linalg.solve(root, (samples - centre).T).T, weight, rng)
+    overall_root = np.linalg.cholesky(firm(covariance))
+    start_numbers = _apart(np.linalg.solve(overall_root, (samples - centre).T).T, weight, rng)
     mixture = Mixture(
-        np.full(_PARTS, 1 / _PARTS), samples[starts], np.repeat(0.5 * root[None], _PARTS, 0)
+        # narrower than all samples, so that the components can separate
+        np.full(_PARTS, 1 / _PARTS),
+        samples[start_numbers],
+        np.repeat(0.5 * overall_root[None], _PARTS, 0),
     )
     for _ in range(_STEPS):
-        parts = weight[:, None] * mixture.normal_shares(samples)
-        mixture = maximised(samples, parts, covariance)
+        weighted_shares = weight[:, None] * mixture.normal_shares(samples)
+        mixture = maximised(samples, weighted_shares, covariance)
     return Mixture(
         np.append((1 - _BROAD) * mixture.shares, _BROAD),
         np.concatenate([mixture.centres, centre[None]]),
-        np.concatenate([mixture.roots, _WIDER * root[None]]),
+        np.concatenate([mixture.roots, _WIDER * overall_root[None]]),
     )
 
 
 def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> list[int]:
-    """Return the numbers of samples to start the components from: every second one is far from
-    those before.
+    """Return the numbers of the samples at which the components start.
+
+    Every second one is drawn by its squared distance from those before, as in k-means++, the others
+    by weight.
     """
+    # drawn by weight, so that a uniform choice of the pool is one by weight
     pool = rng.choice(len(places), size=4 * _PARTICLES // 10, p=weight)
-    starts, away = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
+    starts, squared_distance = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
     for number in range(1, _PARTS):
-        far = number % 2 and away.sum() > 0
-        chances = away / away.sum() if far else None
+        takes_far = number % 2 and squared_distance.sum() > 0
+        chances = squared_distance / squared_distance.sum() if takes_far else None
         starts.append(int(rng.choice(pool, p=chances)))
-        away = np.minimum(away, ((places[pool] - places[starts[-1]]) ** 2).sum(1))
+        # to the nearest start so far
+        squared_distance = np.minimum(
+            squared_distance, ((places[pool] - places[starts[-1]]) ** 2).sum(1)
+        )
     return starts
 
 
@@ -350,10 +394,13 @@ def maximised(
     """
     shares = parts.sum(0)
     centres = parts.T @ samples / shares.clip(1e-300)[:, None]
-    away = samples[None] - centres[:, None]
-    sums = np.swapaxes(away * parts.T[:, :, None], 1, 2) @ away
-    added = borrowed / len(shares)
-    covariance = (sums + added * overall) / (shares + added)[:, None, None]
+    deviations = samples[None] - centres[:, None]
+    scatter_matrices = np.swapaxes(deviations * parts.T[:, :, None], 1, 2) @ deviations
+    borrowed_each = borrowed / len(shares)
+    # with some of the covariance of all samples, so that no component collapses
+    covariance = (scatter_matrices + borrowed_each * overall) / (shares + borrowed_each)[
+        :, None, None
+    ]
     roots = np.linalg.cholesky(firm(covariance)).astype(np.float64)
     return Mixture(shares / shares.sum(), centres, roots)
 
@@ -361,16 +408,16 @@ def maximised(
 def moments(samples: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the mean and the covariance of weighted samples."""
     centre = weight @ samples
-    away = samples - centre
-    return centre, away.T @ (weight[:, None] * away)
+    deviations = samples - centre
+    return centre, deviations.T @ (weight[:, None] * deviations)
 
 
 def firm(covariance: FloatArray) -> FloatArray:
     """Return covariances (..., free, free) whose rounding cannot make a variance negative."""
-    firm = covariance.copy()
-    diagonal = np.arange(covariance.shape[-1])
-    firm[..., diagonal, diagonal] *= 1 + 1e-9
-    return firm
+    firmed = covariance.copy()
+    index = np.arange(covariance.shape[-1])
+    firmed[..., index, index] *= 1 + 1e-9
+    return firmed
 
 
 def uniform(count: int, rng: Random) -> FloatArray:
@@ -384,11 +431,16 @@ def softened(log: FloatArray) -> FloatArray:
     """
     if effective(log) >= _SOFT:
         return log
-    low, high = 1e-12, 1.0
+    # bisection of the logarithm of the factor
+    low_factor, high_factor = 1e-12, 1.0
     for _ in range(40):
-        middle = (low * high) ** 0.5
-        low, high = (middle, high) if effective(middle * log) >= _SOFT else (low, middle)
-    return low * log
+        middle_factor = (low_factor * high_factor) ** 0.5
+        low_factor, high_factor = (
+            (middle_factor, high_factor)
+            if effective(middle_factor * log) >= _SOFT
+            else (low_factor, middle_factor)
+        )
+    return low_factor * log
 
 
 def effective(log: FloatArray) -> float:
@@ -400,8 +452,8 @@ def effective(log: FloatArray) -> float:
 
 def normalised(log: FloatArray) -> FloatArray:
     """Return weights with a sum of 1 from the logarithms of unnormalised weights."""
-    weight = np.exp(log - log.max())
-    weights: FloatArray = weight / weight.sum()
+    unnormalised = np.exp(log - log.max())
+    weights: FloatArray = unnormalised / unnormalised.sum()
     return weights
 
 
@@ -412,6 +464,7 @@ def finite(log: FloatArray) -> FloatArray:
 
 def log_sum(logs: FloatArray) -> FloatArray:
     """Return the logarithm of the sum of exponentials along the last axis."""
-    top = logs.max(-1)
-    total: FloatArray = top + np.log(np.exp(logs - top[..., None]).sum(-1))
-    return total
+    # taken out first, so that no exponential overflows
+    largest = logs.max(-1)
+    log_total: FloatArray = largest + np.log(np.exp(logs - largest[..., None]).sum(-1))
+    return log_total

@@ -141,6 +141,7 @@ def find_posterior(
     from neusee.workflows.calibration import emcee_sampler
 
     emcee_sampler.move(move)  # raises for a wrong name before anything is computed
+    # raises before anything is computed where ArviZ is missing
     arviz()
     laboratory = laboratory_of(recipe)
     tests = _accepted_frames(recipe, store, progress)
@@ -149,10 +150,11 @@ def find_posterior(
     identifiability = identify(problem, mode)
     if identifiability.refused:
         raise CalibrationRefused(identifiability.refused)
-    law = importance_samples(problem, mode, recipe.seed)
+    samples = importance_samples(problem, mode, recipe.seed)
+    # a long, bent posterior is not like that about its mode
     if problem.coordinates.bent:
         identifiability = identify_from_draws(
-            problem, mode, identifiability, law.samples, law.weights
+            problem, mode, identifiability, samples.samples, samples.weights
         )
     for line in identifiability.directions:
         progress(f"not identifiable: {line}")
@@ -165,19 +167,20 @@ def find_posterior(
         move_name=move,
         effective_size=draws,
         progress=progress,
-        guide=law.guide,
+        guide=samples.guide,
     )
     models = _models_of_response(recipe, store, problem)
-    tested = [
+    all_checks = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
         *_data_checks(problem, mode, tests),
-        *checks(problem, mode, identifiability, chains, law),
+        *checks(problem, mode, identifiability, chains, samples),
     ]
-    result = CalibrationResult(problem, mode, identifiability, chains, tested, models, tests)
+    result = CalibrationResult(problem, mode, identifiability, chains, all_checks, models, tests)
     result = _widened(result, laboratory)
+    # only of a real camera the standard's fit and the posterior must agree
     if not is_camera(problem):
         return result
-    return replace(result, checks=[*tested, *agreement(result.beside)])
+    return replace(result, checks=[*all_checks, *agreement(result.beside)])
 
 
 def _models_of_response(
@@ -207,10 +210,10 @@ def _data_checks(
     if not checks or not isinstance(problem.levels, Levels):
         return checks
     levels = problem.levels
-    fitted = problem.likelihood(mode.theta[None]).degrees_of_freedom > 0
+    is_fitted = problem.likelihood(mode.theta[None]).degrees_of_freedom > 0
     return [
         *checks,
-        data_check(float(levels.degrees_of_freedom[fitted & (levels.photons > 0)].sum())),
+        data_check(float(levels.degrees_of_freedom[is_fitted & (levels.photons > 0)].sum())),
     ]
 
 
@@ -262,32 +265,33 @@ def _refused_document(refused: FramesRefused) -> dict[str, Any]:
 def _refused_report(
     recipe: Recipe, document: Mapping[str, Any], refused: FramesRefused
 ) -> StudyReport:
-    lead = (
+    """Return the page of a calibration whose frames are refused: their tests, and no parameter."""
+    lead_text = (
         "The frames are refused, and nothing was drawn: no likelihood describes them, so no"
         " parameter is stated."
     )
     files: dict[str, Content] = {"posterior.json": as_json(document)}
-    wrong = f"Not fit for use: {document['failed']} tests of the frames fail. {refused}."
+    banner_text = f"Not fit for use: {document['failed']} tests of the frames fail. {refused}."
     return StudyReport(
         f"{recipe.name}: frames refused",
-        lead,
+        lead_text,
         [frame_section(refused.tests)],
         files=files,
-        banner=wrong,
+        banner=banner_text,
     )
 
 
 def _document(result: CalibrationResult) -> dict[str, Any]:
     """Return the results of a calibration for ``posterior.json``."""
-    problem, flat = result.problem, result.chains.flat
-    determined = [i for i, name in enumerate(problem.names) if name in result.identifiability.told]
+    problem, all_draws = result.problem, result.chains.flat
+    columns = [i for i, name in enumerate(problem.names) if name in result.identifiability.told]
     return {
         "failed": count_failures(result.checks),
         "parameters": {row.name: _plain(asdict(row)) for row in result.rows()},
         "gaussian": {
-            "coordinates": [problem.coordinates.labels[i] for i in determined],
-            "mean": flat[:, determined].mean(0).tolist(),
-            "covariance": np.cov(flat[:, determined].T).reshape(len(determined), -1).tolist(),
+            "coordinates": [problem.coordinates.labels[i] for i in columns],
+            "mean": all_draws[:, columns].mean(0).tolist(),
+            "covariance": np.cov(all_draws[:, columns].T).reshape(len(columns), -1).tolist(),
         },
         "stated": {model.name: asdict(model.stated) for model in estimated_models(result)},
         "least_squares": compared(result.beside),
@@ -300,19 +304,21 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
 def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
     """Return the results of a parameter, without the numbers that the frames do not give."""
     not_told = NOT_TOLD[row["kind"]]
-    determined = {name: value for name, value in row.items() if name not in not_told}
+    stated_values = {name: value for name, value in row.items() if name not in not_told}
     return {
         name: None if isinstance(x, float) and not math.isfinite(x) else x
-        for name, x in determined.items()
+        for name, x in stated_values.items()
     }
 
 
 def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyReport:
-    parts = sections(result)
-    curve = "rings" if isinstance(result.problem.levels, Rings) else "transfer"
+    """Return page, pictures, tables and files of a calibration."""
+    page_sections = sections(result)
+    first_name = "rings" if isinstance(result.problem.levels, Rings) else "transfer"
     pictures: dict[str, bytes | None] = {
         name: section.picture
-        for name, section in zip((curve, "corner", "chains"), parts[-3:], strict=True)
+        # the last three sections are those of curve, pairs and chains
+        for name, section in zip((first_name, "corner", "chains"), page_sections[-3:], strict=True)
     }
     pictures["budget"] = result.budget_picture
     files: dict[str, Content] = {
@@ -323,20 +329,22 @@ def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyRepo
     }
     title = f"{result.problem.recipe.name}: posterior"
     tables: dict[str, CsvTable] = {"budget.csv": (COLUMNS, budget_rows(result.budgets))}
-    return StudyReport(title, lead(result), parts, pictures, tables, files, banner=banner(result))
+    return StudyReport(
+        title, lead(result), page_sections, pictures, tables, files, banner=banner(result)
+    )
 
 
 def _draws(result: CalibrationResult) -> bytes:
     """Return the bytes of an npz file with posterior draws of each parameter that the frames
     tell, evenly from all.
     """
-    every = max(1, result.chains.flat.shape[0] // _KEPT)
-    out = io.BytesIO()
+    stride = max(1, result.chains.flat.shape[0] // _KEPT)
+    npz_file = io.BytesIO()
     draws: dict[str, Any] = {
-        name: result.draws[name].reshape(-1)[::every] for name in result.identifiability.told
+        name: result.draws[name].reshape(-1)[::stride] for name in result.identifiability.told
     }
-    np.savez(out, **draws)
-    return out.getvalue()
+    np.savez(npz_file, **draws)
+    return npz_file.getvalue()
 
 
 def _inference_data(result: CalibrationResult) -> Any:

@@ -109,20 +109,25 @@ def _report(
     document: Mapping[str, Any],
     budgets: Sequence[Budget],
 ) -> StudyReport:
+    """Return page, pictures, tables and files of an EMVA 1288 sheet."""
     title, pictures = f"{recipe.name}: EMVA 1288", emva_figures.pictures(sheet)
-    named = [budget for budget in budgets if budget.key in BUDGETED]
-    budget = {"budget": budget_picture(named)} if named else {}
-    traced = budget_sections(named, stated(recipe), budget.get("budget"), _MORE)
-    summary = [
+    main_budgets = [
+        budget_pictures for budget_pictures in budgets if budget_pictures.key in BUDGETED
+    ]
+    budget_pictures = {"budget": budget_picture(main_budgets)} if main_budgets else {}
+    uncertainty_sections = budget_sections(
+        main_budgets, stated(recipe), budget_pictures.get("budget"), _MORE
+    )
+    pdf_lines = [
         f"{name}: {'not stated' if statements[key] is None else statements[key]}"
         for key, name in OPERATING_POINT.items()
     ]
-    summary += [document["temporal variance"], _PLUS, document["fails"]]
+    pdf_lines += [document["temporal variance"], _PLUS, document["fails"]]
     return StudyReport(
         title,
         lead(sheet, document["temporal variance"]),
-        sections(sheet, frames, statements, pictures, traced),
-        pictures | budget,
+        sections(sheet, frames, statements, pictures, uncertainty_sections),
+        pictures | budget_pictures,
         tables={
             "emva1288.csv": (_COLUMNS, _rows(sheet)),
             "transfer.csv": (_TRANSFER, _levels(sheet)),
@@ -132,17 +137,19 @@ def _report(
         files={
             "emva1288.json": as_json(document),
             "budget.json": as_json(budget_document(budgets, stated(recipe))),
-            "emva1288.pdf": emva_pdf.pdf(sheet, title, summary, budgets),
+            "emva1288.pdf": emva_pdf.pdf(sheet, title, pdf_lines, budgets),
         },
         banner=document["fails"],
     )
 
 
 def _rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
+    """Yield a row of ``emva1288.csv`` for each quantity."""
     for q in sheet.quantities:
         value = "" if q.value is None else repr(q.value)
         yield group_of(q, sheet), q.key, q.symbol, q.name, q.bound, value, q.unit, q.reason
 
 
 def _levels(sheet: EmvaSheet) -> Iterator[tuple[float, ...]]:
+    """Yield a row of ``transfer.csv`` for each lit level."""
     yield from zip(*(getattr(sheet.transfer, name).tolist() for name in _TRANSFER), strict=True)

@@ -156,14 +156,18 @@ _LINE_COLUMNS = (
 
 
 def _row(budget: Budget) -> tuple[Any, ...]:
-    value, _, error = with_uncertainty(budget.value, budget.combined).partition(" ± ")
-    relative = f"{budget.combined / abs(budget.value):.2%}" if budget.value else "–"
+    """Return the cells of a quantity in the table of budgets, in the order of its columns.
+
+    Value and error are rounded together, so that both end at the same digit.
+    """
+    value_text, _, error_text = with_uncertainty(budget.value, budget.combined).partition(" ± ")
+    relative_text = f"{budget.combined / abs(budget.value):.2%}" if budget.value else "–"
     return (
         _named(budget),
-        value,
+        value_text,
         budget.unit,
-        error,
-        relative,
+        error_text,
+        relative_text,
         _freedom(budget.freedom),
         f"{budget.factor:.2f}",
         budget.expanded,
@@ -172,6 +176,10 @@ def _row(budget: Budget) -> tuple[Any, ...]:
 
 
 def _lines(budget: Budget) -> Iterator[tuple[Any, ...]]:
+    """Yield a line of the table of sources for each source that enters the quantity.
+
+    A source that is not stated has its reason in place of a distribution, and no numbers.
+    """
     name = budget.symbol or budget.name
     for c in budget.contributions:
         if c.reason == NOT_INVOLVED:
@@ -205,11 +213,12 @@ def _freedom(freedom: float) -> str:
 
 
 def _traced(traceability: Traceability) -> list[Section]:
+    """Return the section with what the block `traceability` states, as a list of one."""
     text = """What the block `traceability` of the recipe states of the light and of the
         temperature, so that a value can be traced to a standard."""
-    unstated = Marked("not stated", "warn")
+    warning = Marked("not stated", "warn")
     rows = [
-        (name, unstated if value in (None, "not stated") else value)
+        (name, warning if value in (None, "not stated") else value)
         for name, value in statements(traceability)
     ]
     return [Section("Traceability", text, ("statement", "value"), rows)]
@@ -258,6 +267,7 @@ def of_traceability(traceability: Traceability) -> dict[str, str | None]:
 
 
 def _nm(length: float | None, width: float | None = None) -> str | None:
+    """Return a length in m as text in nm, with its uncertainty if stated; None for no length."""
     return (
         None
         if length is None
@@ -275,6 +285,7 @@ def budget_rows(budgets: Sequence[Budget]) -> Iterator[tuple[Any, ...]]:
         for c in b.contributions:
             numbers = [c.uncertainty, c.unit, c.sensitivity, c.freedom, c.share]
             if c.share is None:
+                # a source that is not stated has only its reason
                 numbers = [""] * 5
             yield (
                 b.key,
@@ -305,6 +316,7 @@ def budget_document(budgets: Sequence[Budget], traceability: Traceability) -> di
 
 
 def _budget(b: Budget) -> dict[str, Any]:
+    """Return a budget as a mapping for JSON, with its sources."""
     return {
         "name": b.name,
         "symbol": b.symbol,
@@ -320,6 +332,7 @@ def _budget(b: Budget) -> dict[str, Any]:
 
 
 def _contribution(c: Contribution) -> dict[str, Any]:
+    """Return a source as a mapping for JSON; one that is not stated has its reason alone."""
     if c.share is None:
         return {"source": c.source, "kind": c.kind, "reason": c.reason}
     values = {name: value for name, value in asdict(c).items() if name != "reason"}
@@ -344,14 +357,15 @@ def budget_figure(budgets: Sequence[Budget]) -> Any:
     sources = _shown_sources(budgets)
     colours = {source: _COLOURS[i % len(_COLOURS)] for i, source in enumerate(sources)}
     figure, axes = canvas(9.0, 1.5 + 0.36 * len(budgets) + 0.24 * len(sources))
-    ax, shown = axes[0, 0], set[str]()
+    ax, labelled = axes[0, 0], set[str]()
     for i, budget in enumerate(budgets):
-        left = 0.0
+        bar_start = 0.0
         for source, percent in _percentages(budget):
-            label = None if source in shown else source
-            shown.add(source)
-            ax.barh(i, percent, left=left, color=colours[source], label=label, height=0.7)
-            left += percent
+            # each source once in the legend
+            label = None if source in labelled else source
+            labelled.add(source)
+            ax.barh(i, percent, left=bar_start, color=colours[source], label=label, height=0.7)
+            bar_start += percent
         text = f"U = {two_digits(budget.expanded)} {budget.unit}".rstrip()
         ax.text(101, i, text, va="center", fontsize=9)
     ax.set_yticks(range(len(budgets)), [b.symbol or b.name for b in budgets])
@@ -423,28 +437,38 @@ def _calibration_budget(
     freedom: Mapping[str, float],
     laboratory: Laboratory,
 ) -> Budget:
+    """Return the budget of one estimated parameter.
+
+    `shares` are those of the sources in the variance of its posterior, `freedom` their degrees of
+    freedom.
+    """
     estimate = _estimate(result, row)
-    photons = -estimate.value if row.name == EFFICIENCY else 0.0
-    lines = (
+    # the efficiency is inverse to the photons, so that a relative error changes its sign
+    photon_sensitivity = -estimate.value if row.name == EFFICIENCY else 0.0
+    contributions = (
         *_of_posterior(estimate, row.unit, shares, freedom),
         _of_model(row.name, estimate, row.unit),
         _of_tests(result, row, estimate.value),
-        *laboratory_contributions(row.name, estimate.value, photons, laboratory),
+        *laboratory_contributions(row.name, estimate.value, photon_sensitivity, laboratory),
     )
-    return Budget(row.name, row.name.replace("_", " "), "", row.unit, estimate.value, lines)
+    return Budget(row.name, row.name.replace("_", " "), "", row.unit, estimate.value, contributions)
 
 
 def _of_posterior(
     estimate: _Estimate, unit: str, shares: Mapping[str, float], freedom: Mapping[str, float]
 ) -> Iterator[Contribution]:
+    """Yield one contribution for each source of the levels' scatter, and one of the prior."""
     for source, share in shares.items():
         kind: Literal["A", "B"] = "B" if source == _PRIOR else "A"
-        nu = math.inf if source == _PRIOR else freedom.get(source, math.inf)
-        deviation = estimate.posterior * math.sqrt(share)
-        yield Contribution(source, kind, "normal", deviation, unit, 1.0, nu)
+        degrees_of_freedom = math.inf if source == _PRIOR else freedom.get(source, math.inf)
+        standard_uncertainty = estimate.posterior * math.sqrt(share)
+        yield Contribution(
+            source, kind, "normal", standard_uncertainty, unit, 1.0, degrees_of_freedom
+        )
 
 
 def _of_model(name: str, estimate: _Estimate, unit: str) -> Contribution:
+    """Return the contribution of the choice of a model; a term of the response itself has none."""
     if name in TERMS:
         return Contribution(MODEL, "B", reason=NOT_INVOLVED)
     if estimate.model is None:
@@ -453,32 +477,44 @@ def _of_model(name: str, estimate: _Estimate, unit: str) -> Contribution:
 
 
 def _of_tests(result: CalibrationResult, row: ParameterEstimate, value: float) -> Contribution:
+    """Return the contribution of what the tests of the frames leave open."""
     if len(result.frames) < 2:
         return Contribution(_TESTS, "B", reason=f"{NOT_STATED}: only moments are given")
     errors = errors_of_parameters(result.frames, result.problem.coordinates.prior.may_hide)
-    width = errors.get(row.name, 0.0)
-    if not width:
+    relative_error = errors.get(row.name, 0.0)
+    if not relative_error:
         return Contribution(_TESTS, "B", reason=NOT_INVOLVED)
-    return Contribution(_TESTS, "B", "normal", width, "relative", value)
+    return Contribution(_TESTS, "B", "normal", relative_error, "relative", value)
 
 
 def _estimate(result: CalibrationResult, row: ParameterEstimate) -> _Estimate:
+    """Return value and standard uncertainties of a parameter.
+
+    Where the response has several models, they are from the two models with the most terms.
+    """
     models = {model.name: model for model in result.models}
     if row.name not in models:
         return _Estimate(row.mean, result.unwidened[row.name], None)
     model = models[row.name]
-    linear = row.name in result.problem.coordinates.linear
-    pairs = [
-        _centre_and_width(variant.value, variant.low, variant.high, linear)
+    is_linear = row.name in result.problem.coordinates.linear
+    means_and_sds = [
+        _centre_and_width(variant.value, variant.low, variant.high, is_linear)
         for variant in model.models[-2:]
     ]
-    (fewer, narrow), (richer, wide) = pairs[0], pairs[-1]
-    scale = 1.0 if linear else model.stated.value
-    apart = abs(fewer - richer) / 2
-    return _Estimate(model.stated.value, scale * width_of_mean(narrow, wide), scale * apart)
+    (fewer_mean, fewer_sd), (richer_mean, richer_sd) = means_and_sds[0], means_and_sds[-1]
+    # a coordinate that is not linear is a logarithm: its width is relative
+    scale = 1.0 if is_linear else model.stated.value
+    half_distance = abs(fewer_mean - richer_mean) / 2
+    return _Estimate(
+        model.stated.value, scale * width_of_mean(fewer_sd, richer_sd), scale * half_distance
+    )
 
 
 def _centre_and_width(value: float, low: float, high: float, linear: bool) -> tuple[float, float]:
+    """Return mean and standard deviation of a coordinate from a value and its 90 % interval.
+
+    A coordinate that is not linear is the logarithm of its parameter.
+    """
     if linear:
         return value, (high - low) / (2 * Z_90)
     return math.log(value), math.log(high / low) / (2 * Z_90)
@@ -492,12 +528,13 @@ def _shares(result: CalibrationResult) -> dict[str, dict[str, float]]:
     if isinstance(problem.levels, Levels):
         values = {name: float(x) for name, x in problem.parameters(mode.theta).items()}
         sources = camera_sources(problem.levels, {**result.params, **values})
-    z = torch.from_numpy(problem.whitened(mode.theta))
+    whitened_mode = torch.from_numpy(problem.whitened(mode.theta))
     shares: dict[str, dict[str, float]] = {}
-    for name, along in _derivatives(result, z.numpy()).items():
-        of_sources = variance_shares(slopes, sources, torch.from_numpy(along))
+    for name, derivative in _derivatives(result, whitened_mode.numpy()).items():
+        source_shares = variance_shares(slopes, sources, torch.from_numpy(derivative))
         shares[name] = {
-            _PRIOR if source == "prior" else source: share for source, share in of_sources.items()
+            _PRIOR if source == "prior" else source: share
+            for source, share in source_shares.items()
         }
     return shares
 
@@ -507,12 +544,15 @@ def _derivatives(result: CalibrationResult, z: FloatArray) -> dict[str, FloatArr
     the mode.
     """
     coordinates = result.problem.coordinates
-    step = _STEP * np.eye(len(z))
-    high, low = (coordinates.from_whitened(torch.from_numpy(z + sign * step)) for sign in (1, -1))
-    return {name: ((high[name] - low[name]) / (2 * _STEP)).numpy() for name in high}
+    offsets = _STEP * np.eye(len(z))
+    upper, lower = (
+        coordinates.from_whitened(torch.from_numpy(z + sign * offsets)) for sign in (1, -1)
+    )
+    return {name: ((upper[name] - lower[name]) / (2 * _STEP)).numpy() for name in upper}
 
 
 def _calibration_freedom(result: CalibrationResult) -> dict[str, float]:
+    """Return the degrees of freedom of each source of the levels' scatter; none for rings."""
     levels = result.problem.levels
     if isinstance(levels, Levels):
         return source_freedom(levels, dict(result.params), result.problem.names)

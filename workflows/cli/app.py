@@ -99,21 +99,22 @@ def main(arguments: list[str] | None = None) -> None:
     said.clear()
     _print_any_character()
     try:
-        code = _run(arguments)
+        exit_code = _run(arguments)
         # typer, too, ends at an interrupt
-        if code == INTERRUPTED or (interrupts.came and code != DONE):
-            code = _stopped()
+        if exit_code == INTERRUPTED or (interrupts.came and exit_code != DONE):
+            exit_code = _stopped()
     except BrokenPipeError:
         sys.stderr.close()
-        code = DONE
+        exit_code = DONE
     except KeyboardInterrupt:
-        code = _stopped()
+        exit_code = _stopped()
     except Exception as error:
         if "--debug" in arguments:
             raise
-        code = _stopped() if interrupts.came else _explained(error)
+        exit_code = _stopped() if interrupts.came else _explained(error)
+    # from here on an interrupt ends the process at once
     interrupts.end()
-    sys.exit(code)
+    sys.exit(exit_code)
 
 
 def _print_any_character() -> None:
@@ -126,40 +127,49 @@ def _print_any_character() -> None:
 
 
 def _stopped() -> int:
+    """Say that the command was stopped, and return its exit code."""
     say_stopped()
     return INTERRUPTED
 
 
 def _run(arguments: list[str]) -> int:
-    completes = "_NEUSEE_COMPLETE" in os.environ
+    """Run the command in the arguments, and return its exit code.
+
+    The help page and a stored answer are printed without an import of the program.
+    """
+    is_completion = "_NEUSEE_COMPLETE" in os.environ
     if (
         arguments in (["--help"], ["-h"])
-        and not completes
+        and not is_completion
+        # a narrower page is wrapped by typer itself
         and get_terminal_size().columns >= COLUMNS
     ):
         print(help_page())
         return DONE
-    repeatable = not completes and arguments[:1] and arguments[0] in REPEATED
-    if repeatable and lazy.repetition.say_stored_answer(arguments):
+    # such a command may have a stored answer
+    may_repeat = not is_completion and arguments[:1] and arguments[0] in REPEATED
+    if may_repeat and lazy.repetition.say_stored_answer(arguments):
         return DONE
 
     command = arguments[0] if arguments else ""
     settle_threads(command)
     with warnings.catch_warnings():
         warnings.showwarning = lazy.command_frame.print_warning
-        return lazy.program_options.run_program(arguments, completes)
+        return lazy.program_options.run_program(arguments, is_completion)
 
 
 def _explained(error: Exception) -> int:
     """Print an error as one line; return the exit code for a wrong argument or for a failed run."""
-    message = getattr(error, "format_message", None)
-    if message is not None:
+    typer_message = getattr(error, "format_message", None)
+    if typer_message is not None:
         is_multirun = getattr(error, "option_name", None) in ("-m", "--multirun")
         advice = ADVICE_ON_MULTIRUN if is_multirun else "try `neusee --help`"
-        print(f"{message()} ({advice})", file=sys.stderr)
+        print(f"{typer_message()} ({advice})", file=sys.stderr)
         return BAD
 
-    cause = type(error).__name__
-    text = str(error) if cause in ("RunError", "UnfollowedCode") else f"{cause}: {error}"
+    error_class = type(error).__name__
+    text = (
+        str(error) if error_class in ("RunError", "UnfollowedCode") else f"{error_class}: {error}"
+    )
     print(lazy.diagnostics.visible(f"{text}   (--debug shows where)"), file=sys.stderr)
-    return BAD if cause == "UnfollowedCode" else FAILED
+    return BAD if error_class == "UnfollowedCode" else FAILED

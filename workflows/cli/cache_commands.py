@@ -120,22 +120,24 @@ def ls_lines(store: Store, every: bool = False) -> Iterator[str]:
     pins = store.pinned()
     if every or not store.journal.is_long():
         rows, values, size = _every_row(store, pins)
-        receipts, by = len(rows) - values, ""
+        receipts, origin_of_totals = len(rows) - values, ""
     else:
         rows = _newest_rows(store, pins)
         values, size, receipts = store.journal.totals()
-        by = " by the journal"
-    shown = rows if every else rows[-_PAGE:]
-    yield from _aligned(shown)
-    if values + receipts > len(shown):
-        yield f"the newest {len(shown)}; `neusee cache ls --all` lists all"
-    last = f"{_count(values, 'result')}, {format_size(size)}{by}, in {store.root}"
+        origin_of_totals = " by the journal"
+    shown_rows = rows if every else rows[-_PAGE:]
+    yield from _aligned(shown_rows)
+    if values + receipts > len(shown_rows):
+        yield f"the newest {len(shown_rows)}; `neusee cache ls --all` lists all"
+    last_line = (
+        f"{_count(values, 'result')}, {format_size(size)}{origin_of_totals}, in {store.root}"
+    )
     if receipts:
-        last += f"; of {_count(receipts, 'more result')} the receipt alone"
-    last += _answers_text(stored_answer.answers(store.disk))
+        last_line += f"; of {_count(receipts, 'more result')} the receipt alone"
+    last_line += _answers_text(stored_answer.answers(store.disk))
     if store.budget is not None:
-        last += f"; the budget is {format_size(store.budget)}"
-    yield last
+        last_line += f"; the budget is {format_size(store.budget)}"
+    yield last_line
 
 
 def _every_row(store: Store, pins: set[str]) -> tuple[list[str], int, int]:
@@ -143,10 +145,11 @@ def _every_row(store: Store, pins: set[str]) -> tuple[list[str], int, int]:
     bytes.
     """
     rows, values, size = list[str](), 0, 0
-    for key, about in store.entries():
-        rows.append("\0".join(_row(key, about, key in pins)))
-        if is_kept(about):
-            values, size = values + 1, size + _size(about)
+    for key, metadata in store.entries():
+        # one text a row, because many results must fit into memory
+        rows.append("\0".join(_row(key, metadata, key in pins)))
+        if is_kept(metadata):
+            values, size = values + 1, size + _size(metadata)
     return sorted(rows, key=_row_date), values, size
 
 
@@ -154,13 +157,19 @@ def _newest_rows(store: Store, pins: set[str]) -> list[str]:
     """Return the rows of the newest results of the journal that still have metadata, in order of
     time.
     """
-    newest = dict.fromkeys(row["key"] for row in reversed(store.journal.latest()))
-    entries = ((key, store.about(key)) for key in newest)
-    some = itertools.islice(((key, about) for key, about in entries if about is not None), _PAGE)
-    return sorted(("\0".join(_row(key, about, key in pins)) for key, about in some), key=_row_date)
+    newest_keys = dict.fromkeys(row["key"] for row in reversed(store.journal.latest()))
+    entries = ((key, store.about(key)) for key in newest_keys)
+    newest_entries = itertools.islice(
+        ((key, metadata) for key, metadata in entries if metadata is not None), _PAGE
+    )
+    return sorted(
+        ("\0".join(_row(key, metadata, key in pins)) for key, metadata in newest_entries),
+        key=_row_date,
+    )
 
 
 def _row_date(row: str) -> str:
+    """Return the date of a row, which is its first cell; dates as text sort by time."""
     return row[: row.index("\0")]
 
 
@@ -180,29 +189,29 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
     damaged results.
     """
     files = DerivedFiles(store)
-    sizes, damaged = list[int](), list[str]()
+    sizes, damaged_lines = list[int](), list[str]()
     for entry in store.check():
-        about = entry.about or {}
-        problem = entry.problem or _picture_problem(files, entry.key, about)
+        metadata = entry.about or {}
+        problem = entry.problem or _picture_problem(files, entry.key, metadata)
         if problem:
-            damaged.append(f"{entry.key}  {about.get('step') or '?'}  {problem}")
-        elif is_kept(about):
-            sizes.append(_size(about))
-    answers, broken = stored_answer.check(store.disk)
-    damaged += [
+            damaged_lines.append(f"{entry.key}  {metadata.get('step') or '?'}  {problem}")
+        elif is_kept(metadata):
+            sizes.append(_size(metadata))
+    answers, broken_answers = stored_answer.check(store.disk)
+    damaged_lines += [
         f"{answer.name}  the answer of a command, which is not what was written"
-        for answer in broken
+        for answer in broken_answers
     ]
-    last = (
+    last_line = (
         f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}{_answers_text(answers)}, as"
         " written"
     )
-    if damaged:
-        last += (
-            f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes"
-            " those it needs"
+    if damaged_lines:
+        last_line += (
+            f"; {len(damaged_lines)} damaged, put aside in {store.root / 'bad'}: the next run"
+            " computes those it needs"
         )
-    return [*damaged, last], len(damaged)
+    return [*damaged_lines, last_line], len(damaged_lines)
 
 
 def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list[str]:
@@ -213,23 +222,30 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
     """
     limit = None if budget is None else parse_size(budget)
     swept = store.gc(limit, dry)
-    full = limit is not None and _is_beyond(store, swept.left, limit)
-    old = stored_answer.sweep(store.disk, dry, everything=full)
-    abouts = ((key, store.about(key)) for key in swept.evicted)  # the receipts of what went
-    rows = [[*_row(key, about, False)[1:4], key[:8]] for key, about in abouts if about is not None]
-    went = (
+    is_full = limit is not None and _is_beyond(store, swept.left, limit)
+    # answers of commands go too where the values alone cannot keep to the budget
+    old_answers = stored_answer.sweep(store.disk, dry, everything=is_full)
+    # the receipts of what went
+    removed_metadata = ((key, store.about(key)) for key in swept.evicted)
+    # bytes, seconds and step of the removed value, and the first digits of its key
+    rows = [
+        [*_row(key, metadata, False)[1:4], key[:8]]
+        for key, metadata in removed_metadata
+        if metadata is not None
+    ]
+    removed_text = (
         f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged"
         " to no result"
     )
-    freed, left = format_size(swept.freed), format_size(swept.left)
+    freed_text, left_text = format_size(swept.freed), format_size(swept.left)
     verb = "would go" if dry else "went"
-    last = f"{went} {verb}: {freed}; {left} stay in {store.root}"
+    last_line = f"{removed_text} {verb}: {freed_text}; {left_text} stay in {store.root}"
     lines = list(columns(rows)) if rows else []
     if swept.refused:
         lines.append(f"{_count(len(swept.refused), 'value')} of other users could not be removed")
-    if old:
-        lines.append(f"{_answers_text(old)[2:]} {verb}")
-    return [*lines, last]
+    if old_answers:
+        lines.append(f"{_answers_text(old_answers)[2:]} {verb}")
+    return [*lines, last_line]
 
 
 def _is_beyond(store: Store, left: int, budget: int) -> bool:
@@ -242,7 +258,7 @@ def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
     or several matches.
     """
     if pin:
-        keys = {key for key, about in store.entries() if is_kept(about)}
+        keys = {key for key, metadata in store.entries() if is_kept(metadata)}
         key = _only_key(keys, prefix, "value")
         store.pin(key)
     else:
@@ -254,12 +270,16 @@ def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
 
 def _only_key(keys: Iterable[str], prefix: str, noun: str) -> str:
     """Return the key that begins with ``prefix``; raise `ValueError` for no or several matches."""
-    named = sorted(key for key in keys if key.startswith(prefix.lower()))
-    if len(named) == 1:
-        return named[0]
-    few = f"it matches {', '.join(key[:12] for key in named[:5])}" if named else "it matches no key"
+    matching_keys = sorted(key for key in keys if key.startswith(prefix.lower()))
+    if len(matching_keys) == 1:
+        return matching_keys[0]
+    matches = (
+        f"it matches {', '.join(key[:12] for key in matching_keys[:5])}"
+        if matching_keys
+        else "it matches no key"
+    )
     raise ValueError(
-        f"{prefix!r} must be the start of the key of one {noun}: {few} (`neusee cache ls` lists"
+        f"{prefix!r} must be the start of the key of one {noun}: {matches} (`neusee cache ls` lists"
         " keys)"
     )
 
@@ -281,7 +301,9 @@ def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> st
 
 
 def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
-    took = f"{about.get('seconds') or 0.0:.3f}"
+    """Return the cells of a stored result in the order of `_HEAD`."""
+    seconds_text = f"{about.get('seconds') or 0.0:.3f}"
+    # to the second, without the time zone
     date = str(about.get("date") or "")[:19].replace("T", " ")
     mark = "" if is_kept(about) else "receipt"
     if pinned:
@@ -289,7 +311,7 @@ def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
     return [
         date,
         format_size(_size(about)),
-        took,
+        seconds_text,
         about.get("step") or "",
         about.get("recipe") or "",
         key[:8],

@@ -121,14 +121,20 @@ def _say_results(folder: Path, quiet: bool, as_json: bool) -> None:
         say(_lines(document["parameters"]))
     say_folder(folder, as_json)
     if count := document["failed"]:
-        wrong = "; ".join(
-            f"{c['name']}: {c['found']}" for c in document["checks"] if c["mark"] == "fail"
+        failed_checks = "; ".join(
+            f"{check['name']}: {check['found']}"
+            for check in document["checks"]
+            if check["mark"] == "fail"
         )
         checks = "1 check fails" if count == 1 else f"{count} checks fail"
-        fail(f"not fit for use: {checks} ({wrong}); see {folder / 'report.html'}", MISSED)
+        fail(f"not fit for use: {checks} ({failed_checks}); see {folder / 'report.html'}", MISSED)
 
 
 def _target(sensor: str) -> Path | None:
+    """Return the file of the sensor group that ``--sensor`` names, or None.
+
+    A wrong name ends the command.
+    """
     if not sensor:
         return None
 
@@ -173,10 +179,11 @@ def _write_sensor(
 
 
 def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
+    """Return a line for each parameter in the document of a calibration."""
     # what the frames do not tell is not in the file
     unknown = dict.fromkeys(("mean", "sd", "low", "high"), math.nan)
-    estimate = lazy.calibration_page.ParameterEstimate
-    rows = [estimate(**{**unknown, **row}) for row in parameters.values()]  # type: ignore[arg-type]
+    row_type = lazy.calibration_page.ParameterEstimate
+    rows = [row_type(**{**unknown, **row}) for row in parameters.values()]  # type: ignore[arg-type]
     return [f"{row.name.replace('_', ' '):20s} {row.text}" for row in rows]
 
 
@@ -233,13 +240,19 @@ def sheet(
     red banner and the exit code is 3.
     """
     recipe, command = _loaded_camera(words, quiet or as_json)
-    facts, edition = state or (), _edition(release)
+    stated_facts, edition = state or (), _edition(release)
     command += option_words({"release": edition, "relative": relative})
-    for fact in facts:
+    for fact in stated_facts:
         command += ["--state", fact]
     with failing(lazy.run_error.RunError, code=FAILED), failing(ValueError):
         folder = lazy.run_sheet.write_sheet(
-            recipe, the_store(), out, command, release=edition, relative=relative, state=facts
+            recipe,
+            the_store(),
+            out,
+            command,
+            release=edition,
+            relative=relative,
+            state=stated_facts,
         )
     document = json.loads(text_of(folder / "emva1288.json"))
     if not quiet and not as_json:
@@ -284,8 +297,13 @@ def _loaded_camera(words: list[str] | None, quiet: bool) -> tuple[Recipe, list[s
 
 
 def _line(quantity: dict[str, object]) -> str:
+    """Return the line of a quantity in the document of a sheet.
+
+    It has symbol, value and name, and in brackets a reason why there is no value or only a limit.
+    """
     fields = {name: value for name, value in quantity.items() if name != "section"}
-    stated = lazy.calibrate.Quantity(**fields)  # type: ignore[arg-type]
-    return f"{stated.symbol:18s} {stated.text:22s} {stated.name}" + f" ({stated.reason})" * bool(
-        stated.reason
+    quantity_of_sheet = lazy.calibrate.Quantity(**fields)  # type: ignore[arg-type]
+    return (
+        f"{quantity_of_sheet.symbol:18s} {quantity_of_sheet.text:22s} {quantity_of_sheet.name}"
+        + f" ({quantity_of_sheet.reason})" * bool(quantity_of_sheet.reason)
     )

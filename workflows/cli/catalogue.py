@@ -84,9 +84,9 @@ def nodes(
     `reading` lists how the paper is read where it contradicts itself. `glossary` lists the terms of
     the field, one a line.
     """
-    own = _own(recipe)
+    own_families = _own(recipe)
     with failing(LookupError):
-        lines = node_lines(name, own) if name else nodes_lines(own)
+        lines = node_lines(name, own_families) if name else nodes_lines(own_families)
         say(lines)
 
 
@@ -132,8 +132,9 @@ def nodes_lines(own: Own = MappingProxyType({})) -> list[str]:
         lines += ["", first_sentence(lazy.node_families.family_title(family, own))]
         lines += [f"{path:<{width}}  {first_sentence(nodes[path].__doc__)}" for path in paths]
     lines += _networks(own)
-    broken = lazy.node_families.broken_families().values()
-    return [*lines[1:], *([""] if broken else []), *broken]
+    broken_texts = lazy.node_families.broken_families().values()
+    # without the empty line before the first family
+    return [*lines[1:], *([""] if broken_texts else []), *broken_texts]
 
 
 def _networks(own: Own) -> list[str]:
@@ -141,9 +142,10 @@ def _networks(own: Own) -> list[str]:
     lines = ["", "Network classes, for restore.network"]
     for family, module in own.items():
         lines += [
-            f"{family}.{name}  {first_sentence(vars(x).get('__doc__'))}"
-            for name, x in lazy.own_modules.network_classes(module).items()
+            f"{family}.{name}  {first_sentence(vars(network).get('__doc__'))}"
+            for name, network in lazy.own_modules.network_classes(module).items()
         ]
+    # more than the heading
     return lines if len(lines) > 2 else []
 
 
@@ -158,12 +160,12 @@ def node_lines(name: str, own: Own = MappingProxyType({})) -> list[str]:
     nodes = dict(lazy.node_families.all_nodes(own))
     if name not in nodes:
         raise LookupError(f"there is no node {name}: {nearest(name, nodes)}")
-    uses = list(_uses(name))
-    paths = dict.fromkeys(chain.from_iterable(_readings_of(step) for _, step in uses))
+    files_and_steps = list(_uses(name))
+    paths = dict.fromkeys(chain.from_iterable(_readings_of(step) for _, step in files_and_steps))
     lines = [name, "", *_signature_lines(nodes[name])]
     for path in paths:
         lines += ["", *_reading(path)]
-    recipes = dict.fromkeys(file for file, _ in uses)
+    recipes = dict.fromkeys(file for file, _ in files_and_steps)
     return [*lines, "", f"written in  {', '.join(recipes) or 'no recipe'}"]
 
 
@@ -179,7 +181,10 @@ def _reading_lines() -> list[str]:
 
 def _signature_lines(node: Node) -> list[str]:
     """Return the docstring of a node, its inputs and its parameters."""
-    inputs = [f"  {i}{' (optional)' if i in node.optional else ''}" for i in node.inputs]
+    inputs = [
+        f"  {input_name}{' (optional)' if input_name in node.optional else ''}"
+        for input_name in node.inputs
+    ]
     rows = [[f"  {name}", words] for name, words in parameter_rows(node)]
     return [
         *inspect.cleandoc(node.__doc__ or "").splitlines(),
@@ -248,9 +253,10 @@ def _quantity(hint: Any) -> str:
         or number_range.greatest is None
     ):
         return ""
-    name, usual = _QUANTITIES[number_range.si]
+    name, usual_example = _QUANTITIES[number_range.si]
     example = next(
-        (text for kind, text in _EXAMPLES.items() if hint == getattr(lazy.units, kind)), usual
+        (text for kind, text in _EXAMPLES.items() if hint == getattr(lazy.units, kind)),
+        usual_example,
     )
     in_words = lazy.units.in_words
     greatest = in_words(number_range.greatest, number_range.si)
@@ -266,23 +272,28 @@ def _quantity(hint: Any) -> str:
 
 
 def _limits(hint: Any) -> str:
+    """Return the limits of a number in words, such as ``>= 0 and < 1``.
+
+    They are read from the text of its annotation.
+    """
     signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
     limits = re.findall(r"\b(?:Ge|Gt|Le|Lt)\((ge|gt|le|lt)=([^)]+)\)", repr(hint))
     return " and ".join(f"{signs[sign]} {limit}" for sign, limit in limits)
 
 
 def _composed(hint: Any, arguments: tuple[Any, ...]) -> str:
+    """Return the words for a type that is made of others: choices, unions, mappings and lists."""
     if all(isinstance(argument, str) for argument in arguments):
         return " | ".join(arguments)
-    parts = [_kind(argument) for argument in arguments if argument is not Ellipsis]
+    part_kinds = [_kind(argument) for argument in arguments if argument is not Ellipsis]
     if get_origin(hint) in (Union, UnionType):
-        return " or ".join(parts)
+        return " or ".join(part_kinds)
     if get_origin(hint) is dict:
-        return f"mapping of {parts[0]}: {parts[-1]}"
+        return f"mapping of {part_kinds[0]}: {part_kinds[-1]}"
     return (
-        f"list of {parts[0]}"
-        if Ellipsis in arguments or len(parts) == 1
-        else f"[{', '.join(parts)}]"
+        f"list of {part_kinds[0]}"
+        if Ellipsis in arguments or len(part_kinds) == 1
+        else f"[{', '.join(part_kinds)}]"
     )
 
 
@@ -317,7 +328,7 @@ def _reading(path: str) -> list[str]:
     """Return lines about a contradiction in the paper: its text, both interpretations and their
     options.
     """
-    row = next((r for r in READINGS if r.path == path), None)
+    row = next((reading for reading in READINGS if reading.path == path), None)
     if row is None:
         return [path]
     return [

@@ -46,12 +46,13 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
     ``before`` is the number of arguments that stand before ``words`` on the command line.
     """
     words = list(words or [])
-    named = bool(words) and not _is_change(words[0])
-    name = words.pop(0) if named else DEFAULT
+    is_named = bool(words) and not _is_change(words[0])
+    name = words.pop(0) if is_named else DEFAULT
     for number, word in enumerate(words):
         if not _is_change(word):
             fail(f"{word}: not a change of a value: {_fix(words, number)}")
-    return name, words, 1 + named + before
+    # arguments count from 1
+    return name, words, 1 + is_named + before
 
 
 def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
@@ -60,17 +61,21 @@ def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
 
     A file may have the sign = in its name if it exists.
     """
-    count = next(
-        (n for n, word in enumerate(words) if _is_change(word) and not Path(word).exists()),
+    frame_count = next(
+        (
+            position
+            for position, word in enumerate(words)
+            if _is_change(word) and not Path(word).exists()
+        ),
         len(words),
     )
-    frames, changes = words[:count], words[count:]
+    frames, changes = words[:frame_count], words[frame_count:]
     for number, word in enumerate(changes):
         if not _is_change(word):
             fail(f"{word}: not a change of a value: {_fix(changes, number)}")
     if not frames:
         fail("no frame is named: neusee restore FRAME --camera RECIPE, then changes of values")
-    return frames, changes, 1 + count
+    return frames, changes, 1 + frame_count
 
 
 def _fix(words: list[str], number: int) -> str:
@@ -106,13 +111,17 @@ def load(
     """Return the recipe that the arguments ``words`` name and change, and the command line that
     runs this recipe.
     """
-    name, changes, first = split(words, before)
+    name, changes, first_number = split(words, before)
 
     with refusing():
-        recipe = lazy.loading.load(name, changes, first=first)
+        recipe = lazy.loading.load(name, changes, first=first_number)
     search_for_garbage()
-    again = ["neusee", *command, name, *changes]
-    return (replace(recipe, exact=True), [*again, "--exact"]) if exact else (recipe, again)
+    command_line = ["neusee", *command, name, *changes]
+    return (
+        (replace(recipe, exact=True), [*command_line, "--exact"])
+        if exact
+        else (recipe, command_line)
+    )
 
 
 @contextmanager
@@ -240,8 +249,8 @@ def kept_training(out: Path, recipe: str) -> str:
     with suppress(ValueError):
         state = lazy.resumable_loop.StateFile(newest).read(strict=False)
     stage = f" of stage {state['stage']}" if state.get("stage") else ""
-    upto = f" up to iteration {state['iteration']}{stage}" if "iteration" in state else ""
-    return f"the training{upto} is kept in {newest.parent}"
+    progress_text = f" up to iteration {state['iteration']}{stage}" if "iteration" in state else ""
+    return f"the training{progress_text} is kept in {newest.parent}"
 
 
 def say_json(document: dict[str, Any]) -> None:

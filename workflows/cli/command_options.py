@@ -75,6 +75,7 @@ Out = Annotated[
 ]
 
 
+# such as ``stage 1, iteration 3 of 20`` or ``30/100``
 _COUNT = re.compile(
     r"(?P<what>(?:stage \d, )?\D{0,20})(?P<done>\d+)(?: draws)?(?: of |/)(?:about )?(?P<all>\d+)\b"
 )
@@ -98,19 +99,27 @@ class ProgressLines:
             print(f"{line}{self._left(line)}", flush=True)
 
     def _left(self, line: str) -> str:
-        now, before = self._clock(), self._before
-        self._before = now
+        """Return the time that is left, as the end of a line with a count.
+
+        Other lines, and a first count, have an empty text.
+        """
+        present_time, previous_time = self._clock(), self._before
+        self._before = present_time
         if not (count := _COUNT_AT_END.search(line) or _COUNT.match(line)):
             return ""
-        task, done, total = count["what"], int(count["done"]), int(count["all"])
+        task, done_count, total = count["what"], int(count["done"]), int(count["all"])
         # a stopped study may begin with any count
-        if task not in self._began or done <= self._last[task]:
-            self._began[task] = (before, 0) if done == 1 else (now, done)
-        self._last[task] = done
-        began, first = self._began[task]
-        if done == first:
+        # the rate is that since the first count of a kind of line
+        if task not in self._began or done_count <= self._last[task]:
+            # a count of 1 began at the line before it
+            self._began[task] = (
+                (previous_time, 0) if done_count == 1 else (present_time, done_count)
+            )
+        self._last[task] = done_count
+        start_time, first_count = self._began[task]
+        if done_count == first_count:
             return ""
-        seconds = (now - began) / (done - first) * (total - done)
+        seconds = (present_time - start_time) / (done_count - first_count) * (total - done_count)
         return f"; about {lasts(seconds)} left" if seconds >= 1 else ""
 
 
@@ -126,17 +135,18 @@ class FewLines(ProgressLines):
         self._began_at, self._next, self._open = clock(), 30.0, False
 
     def __call__(self, line: str) -> None:
-        counted = _STEPS.match(line) is not None
-        left = self._left(line)
-        passed = self._clock() - self._began_at
-        if self._quiet or (counted and not sys.stdout.isatty() and passed < self._next):
+        has_count = _STEPS.match(line) is not None
+        time_left = self._left(line)
+        seconds_so_far = self._clock() - self._began_at
+        if self._quiet or (has_count and not sys.stdout.isatty() and seconds_so_far < self._next):
             return
-        if counted and sys.stdout.isatty():
-            print(f"\r\x1b[K{line}{left}", end="", flush=True)
+        if has_count and sys.stdout.isatty():
+            print(f"\r\x1b[K{line}{time_left}", end="", flush=True)
         else:
-            self._next = 2 * passed if counted else self._next
-            print(f"{chr(10) * self._open}{line}{left}", flush=True)
-        self._open = counted and sys.stdout.isatty()
+            self._next = 2 * seconds_so_far if has_count else self._next
+            # a line feed behind a line that was to be overwritten
+            print(f"{chr(10) * self._open}{line}{time_left}", flush=True)
+        self._open = has_count and sys.stdout.isatty()
 
 
 def progress_lines(quiet: bool) -> Callable[[str], None]:
@@ -205,6 +215,7 @@ def executor_of(
         yield None
         return
     try:
+        # fails here, before the work, if the package is missing
         import distributed  # noqa: F401
 
         cluster = lazy.dask_cluster.cluster

@@ -81,6 +81,7 @@ def help_page() -> str:
 
 
 def _list(texts: Mapping[str, str]) -> str:
+    """Return names and texts as a list in two columns."""
     indent = max(map(len, texts)) + 4
     return "\n".join(
         _filled(f"  {name}".ljust(indent), text, " " * indent) for name, text in texts.items()
@@ -88,4 +89,8 @@ def _list(texts: Mapping[str, str]) -> str:
 
 
 def _filled(before: str, text: str, indent: str) -> str:
+    """Return a text wrapped to the width of a page.
+
+    `before` stands in front of it, and `indent` in front of its later lines.
+    """
     return fill(text, COLUMNS - 2, initial_indent=before, subsequent_indent=indent)

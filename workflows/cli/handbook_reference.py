@@ -103,6 +103,7 @@ def _anchor(name: str) -> str:
 
 
 def _node(name: str, node: Node, files: list[str]) -> Iterator[str]:
+    """Yield the lines on a node: docstring, inputs, parameters, and the files that use it."""
     yield from (
         f"## {name} {{ #{_anchor(name)} }}",
         "",
@@ -159,18 +160,23 @@ def _command(command: Any, context: typer.Context, level: int) -> Iterator[str]:
         for parameter in command.params
     ]
     yield from (*(table(["", "meaning", "default"], rows) if rows else ()), "")
+    # only a group has commands below it
     for name in command.list_commands(context) if hasattr(command, "list_commands") else ():
-        inner = command.get_command(context, name)
-        yield from _command(inner, typer.Context(inner, info_name=name, parent=context), level + 1)
+        inner_command = command.get_command(context, name)
+        yield from _command(
+            inner_command, typer.Context(inner_command, info_name=name, parent=context), level + 1
+        )
 
 
 def _spelled(parameter: Any) -> str:
+    """Return how a parameter is written: all spellings of an option, the name of an argument."""
     if parameter.param_type_name == "option":
         return ", ".join(f"`{word}`" for word in (*parameter.opts, *parameter.secondary_opts))
     return f"`{parameter.metavar or parameter.name.upper()}`"
 
 
 def _default(parameter: Any) -> str:
+    """Return the default of a parameter; an empty text for a flag, and for none."""
     value = parameter.default
-    shown = isinstance(value, int | float | str) and not isinstance(value, bool) and value != ""
-    return f"`{value}`" if shown or isinstance(value, Path) else ""
+    is_shown = isinstance(value, int | float | str) and not isinstance(value, bool) and value != ""
+    return f"`{value}`" if is_shown or isinstance(value, Path) else ""

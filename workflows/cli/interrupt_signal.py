@@ -59,14 +59,15 @@ class Interrupts:
             signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        now = time.monotonic()
+        """Raise KeyboardInterrupt at the first interrupt, and end the process at a later one."""
+        present_time = time.monotonic()
         if self.came and not self._was_swallowed:
-            if now - self._first > _ONE_PRESS:
+            if present_time - self._first > _ONE_PRESS:
                 stderr = sys.__stderr__.fileno() if sys.__stderr__ else 2
                 os.write(stderr, b"stopped at once\n")
                 os._exit(INTERRUPTED)
             return  # the second signal of the same press would interrupt what ends the command
-        self._first, self._was_swallowed = now, False
+        self._first, self._was_swallowed = present_time, False
         raise KeyboardInterrupt
 
     def _swallowed(self, problem: UnraisableHookArgs) -> None:

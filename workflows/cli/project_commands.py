@@ -69,12 +69,12 @@ def init(
     as it is. No file is replaced.
     """
     _refuse_inside_file(folder)
-    existing = [name for name in FILES if _is_taken(folder / name)]
-    if existing:
-        where = "here" if folder == Path() else f"in {folder}"
+    existing_names = [name for name in FILES if _is_taken(folder / name)]
+    if existing_names:
+        place_text = "here" if folder == Path() else f"in {folder}"
         fail(
-            f"{', '.join(existing)}: there is such a file {where} already, and none is replaced:"
-            " name an empty folder"
+            f"{', '.join(existing_names)}: there is such a file {place_text} already, and"
+            " none is replaced: name an empty folder"
         )
     with failing(OSError):
         for name, (start, called) in FILES.items():
@@ -84,10 +84,11 @@ def init(
 
 def _refuse_inside_file(folder: Path) -> None:
     """End the command for a folder that is a file, or that would be inside a file."""
-    above = [path for path in (folder, *folder.parents) if path.exists()]
-    if above and not above[0].is_dir():
+    existing_folders = [path for path in (folder, *folder.parents) if path.exists()]
+    if existing_folders and not existing_folders[0].is_dir():
         fail(
-            f"{above[0]} is a file, so that no project can be made in {folder}: name another folder"
+            f"{existing_folders[0]} is a file, so that no project can be made in {folder}:"
+            " name another folder"
         )
 
 
@@ -107,9 +108,9 @@ def _write_start(path: Path, start: str, name: str) -> None:
 
 def _say_written(paths: Iterable[Path], folder: Path, commands: Iterable[str]) -> None:
     """Print the files that were written, and the commands to try next."""
-    place = [] if folder == Path() else [f"  cd {folder}"]
-    written = [f"written  {path}" for path in paths]
-    say([*written, "", "next", *place, *(f"  {command}" for command in commands)])
+    change_folder = [] if folder == Path() else [f"  cd {folder}"]
+    written_lines = [f"written  {path}" for path in paths]
+    say([*written_lines, "", "next", *change_folder, *(f"  {command}" for command in commands)])
 
 
 # --- new command ----------------------------------------------------------------------------------
@@ -177,8 +178,8 @@ def new(
     paths = {folder / path.replace("NAME", name): start for path, start in names.items()}
     if existing := [str(path) for path in paths if path.exists()]:
         fail(f"{', '.join(existing)}: there is such a file already, and none is replaced")
-    if "NAME.py" in names and (taken := _taken(name)):
-        fail(f"{name} is the name of {taken}: take another name, because both cannot be imported")
+    if "NAME.py" in names and (owner := _taken(name)):
+        fail(f"{name} is the name of {owner}: take another name, because both cannot be imported")
     with failing(OSError):
         for path, start in paths.items():
             _write_start(path, start, name)
@@ -200,6 +201,7 @@ def _taken(name: str) -> str:
         spec = find_spec(name)
     except (ImportError, ValueError):
         return ""
+    # the module that is to be written may be there already
     if spec is None or (spec.origin and Path(spec.origin).resolve().is_relative_to(Path.cwd())):
         return ""
     return f"a module of Python or of an installed package ({spec.origin or name})"
@@ -231,20 +233,30 @@ def check(
         nodes, networks = _found(place)
 
         by_name = lazy.node_contract.check_all(nodes, networks, process)
-    failed = sum(f.ok is False for f in chain.from_iterable(by_name.values()))
+    failure_count = sum(finding.ok is False for finding in chain.from_iterable(by_name.values()))
     if as_json:
         document = {name: list(map(asdict, findings)) for name, findings in by_name.items()}
         say([json.dumps(document, indent=1)])
     else:
         _say_findings(by_name)
-        say([f"{_count(len(nodes), len(networks))}: {_verdict(failed)}"])
-    code = MISSED if failed else DONE
+        say([f"{_count(len(nodes), len(networks))}: {_verdict(failure_count)}"])
+    code = MISSED if failure_count else DONE
     raise typer.Exit(code)
 
 
 def _say_findings(by_name: Mapping[str, Sequence[Finding]]) -> None:
+    """Print each node or network with its findings: the mark, the rule and a text."""
     for name, findings in by_name.items():
-        say([name, *(f"  {_MARKS[f.ok]:<4}  {f.rule:<11}  {f.text}" for f in findings), ""])
+        say(
+            [
+                name,
+                *(
+                    f"  {_MARKS[finding.ok]:<4}  {finding.rule:<11}  {finding.text}"
+                    for finding in findings
+                ),
+                "",
+            ]
+        )
 
 
 def _verdict(failed: int) -> str:
@@ -280,6 +292,7 @@ def _is_module(place: str) -> bool:
 
 def _count(nodes: int, networks: int) -> str:
     """Return the numbers of nodes and networks as text, such as ``2 nodes and 1 network``."""
+    # nodes are counted even if there are none, unless there are networks
     counts = [(nodes, "node")] * (nodes > 0 or not networks) + [(networks, "network")] * (
         networks > 0
     )
@@ -294,8 +307,10 @@ def _found(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
     if not place.endswith(".py") and "/" not in place and lazy.node_families.is_known(family):
         if place == family:
             module = _installed(family)
-            networks = lazy.node_contract.whole_networks(module) if module else {}
-            return _within(family, lazy.node_families.nodes_of(family)), _within(family, networks)
+            network_classes = lazy.node_contract.whole_networks(module) if module else {}
+            return _within(family, lazy.node_families.nodes_of(family)), _within(
+                family, network_classes
+            )
         if not _is_module(place):
             return {place: lazy.node_families.find_node(place)}, {}
     module = lazy.node_families.import_own(place, Path.cwd())

@@ -105,20 +105,24 @@ def run(
     first_light. The folder of results holds report.html, the numbers, the pictures and the recipe
     with every final value.
     """
-    jobs, again = job or [], rerun or []
-    check_executor(executor, jobs)
+    job_options, steps_to_rerun = job or [], rerun or []
+    check_executor(executor, job_options)
     with within_memory(memory) as limit:
         recipe, command = load(words, "run", exact=exact)
-    _check_rerun(recipe, again)
+    _check_rerun(recipe, steps_to_rerun)
 
     check_device(device)
-    silent = as_json or quiet
-    before = _opening(recipe, command, silent)
+    is_silent = as_json or quiet
+    # the lines are kept, so that a repetition can print them again
+    printed_before = _opening(recipe, command, is_silent)
     store = the_store()
-    predicted = _predicted(recipe, store, device, limit, executor == "local", silent)
-    cheaper = lazy.cheaper_steps.with_substitutions(recipe, lazy.wanted_steps.wanted(recipe))
+    predicted_seconds = _predicted(recipe, store, device, limit, executor == "local", is_silent)
+    cheaper_recipe = lazy.cheaper_steps.with_substitutions(recipe, lazy.wanted_steps.wanted(recipe))
     table = lazy.console.RunTable(
-        cheaper, lazy.wanted_steps.steps_of(cheaper), lazy.console.mode_for(silent), predicted
+        cheaper_recipe,
+        lazy.wanted_steps.steps_of(cheaper_recipe),
+        lazy.console.mode_for(is_silent),
+        predicted_seconds,
     )
     simulate = lazy.simulate_recipe.simulate
     with (
@@ -127,21 +131,32 @@ def run(
                 store, f"{table.finished} steps are finished, and results that take time are"
             )
         ),
-        executor_of(executor, store, jobs, _speaker(silent)) as cluster,
+        executor_of(executor, store, job_options, _speaker(is_silent)) as cluster,
         table,
     ):
-        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, again)
-    if silent:
+        simulation = simulate(
+            cheaper_recipe, store, out, command, device, table.watch, cluster, limit, steps_to_rerun
+        )
+    if is_silent:
         hints = []
-        _say_briefly(done, as_json)
+        _say_briefly(simulation, as_json)
     else:
+        # without `neusee run`, and without --exact
         recipe_words = command[2:-1] if exact else command[2:]
         hints = commands_to_try(recipe, recipe_words, _loads)
-        say(lazy.console.closing(done.document, str(done.page), hints))
-    if done.document["missed"]:
+        say(lazy.console.closing(simulation.document, str(simulation.page), hints))
+    if simulation.document["missed"]:
         raise typer.Exit(MISSED)
-    if executor == "local" and not again:
-        keep_run(_text([*before, *table.printed()], done, hints), as_json, out, done, recipe, store)
+    # such a run can be answered from what is stored
+    if executor == "local" and not steps_to_rerun:
+        keep_run(
+            _text([*printed_before, *table.printed()], simulation, hints),
+            as_json,
+            out,
+            simulation,
+            recipe,
+            store,
+        )
 
 
 def _speaker(silent: bool) -> Callable[[str], None]:
@@ -233,9 +248,9 @@ def _refuse_beyond_memory(plan: Plan, memory: int | None) -> None:
 
 def _forecast_of(plan: Plan) -> str:
     """Return the line that says how long a run will take, or an empty text."""
-    unknown = sum(not estimate.known for estimate in plan.expected.values())
+    unknown_count = sum(not estimate.known for estimate in plan.expected.values())
     seconds = plan.schedule.makespan if plan.schedule else 0.0
-    return lazy.console.forecast_line(seconds, len(plan.expected), unknown)
+    return lazy.console.forecast_line(seconds, len(plan.expected), unknown_count)
 
 
 def _loads(words: Sequence[str]) -> bool:
@@ -301,6 +316,7 @@ def plan(
         if as_json
         else "\n".join(forecast.lines)
     )
+    # the answer holds while every result is stored
     if forecast.totals.get("steps") == 0 and not forecast.refused:
         say_and_keep(text, recipe, store, forecast.totals["memory_of_report"] or 0.0)
     else:
@@ -428,21 +444,23 @@ def sweep(
     Write values as a=1,2,3 or b='linspace(450 nm, 650 nm, 5)'. All combinations run unless --zip
     pairs them. Run the same command again to continue a sweep that was stopped.
     """
-    name, words, first = split(words)
+    name, words, first_number = split(words)
     if on_error not in ("stop", "continue"):
         fail(f"--on-error {on_error}: write stop or continue")
     check_device(device)
     store = the_store()
 
-    policy: OnError = "continue" if on_error == "continue" else "stop"
+    # the comparison tells the type checker that the text is one of the two
+    error_policy: OnError = "continue" if on_error == "continue" else "stop"
     with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
+        # many points make garbage, which the program otherwise never searches
         search_for_garbage()
         code = lazy.sweep_screen.run_sweep(
             name,
             words,
-            first=first,
+            first=first_number,
             zip=paired,
-            on_error=policy,
+            on_error=error_policy,
             netcdf=netcdf,
             device=device,
             out=out,
@@ -497,13 +515,15 @@ def restore(
     frames of point sources, and its error enters the uncertainty. The page has the picture, the
     uncertainty of each pixel, and what is invented because pixels were saturated.
     """
-    frames, changes, first = split_frames(words)
+    frames, changes, first_number = split_frames(words)
     check_device(device)
     folder = Path.cwd()
 
     with within_memory(memory) as limit, refusing():
         files = lazy.frame_recipes.named_frames(frames, folder)
-        recipes = lazy.frame_recipes.recipes_of(files, camera, mask, changes, folder, first, psf)
+        recipes = lazy.frame_recipes.recipes_of(
+            files, camera, mask, changes, folder, first_number, psf
+        )
     store, silent = the_store(), quiet or as_json
     options = option_words({"camera": camera, "mask": mask, "psf": psf})
 
@@ -513,8 +533,8 @@ def restore(
     ):
         for file, recipe in zip(files, recipes, strict=True):
             command = ["neusee", "restore", str(file), *changes, *options]
-            done = _restored(recipe, store, out, command, (device, limit), silent)
-            _say(done, as_json, quiet)
+            simulation = _restored(recipe, store, out, command, (device, limit), silent)
+            _say(simulation, as_json, quiet)
 
 
 def _restored(
@@ -526,6 +546,7 @@ def _restored(
     silent: bool,
 ) -> Simulation:
     """Run the recipe of a frame, with the lines of its steps unless the command is silent."""
+    # the limit of memory in bytes, or None
     device, limit = place
     _refuse_beyond_memory(
         lazy.run_forecast.planned(
@@ -535,16 +556,20 @@ def _restored(
     )
     if not silent:
         say(lazy.console.opening(recipe, shlex.join(command[1:])))
-    cheaper = lazy.cheaper_steps.with_substitutions(recipe, lazy.wanted_steps.wanted(recipe))
+    cheaper_recipe = lazy.cheaper_steps.with_substitutions(recipe, lazy.wanted_steps.wanted(recipe))
     with lazy.console.RunTable(
-        cheaper, lazy.wanted_steps.steps_of(cheaper), lazy.console.mode_for(silent), {}
+        cheaper_recipe,
+        lazy.wanted_steps.steps_of(cheaper_recipe),
+        lazy.console.mode_for(silent),
+        {},
     ) as table:
         return lazy.simulate_recipe.simulate(
-            cheaper, store, out, command, device, table.watch, None, limit
+            cheaper_recipe, store, out, command, device, table.watch, None, limit
         )
 
 
 def _say(done: Simulation, as_json: bool, quiet: bool) -> None:
+    """Print the result of one frame: its document, its page, or the lines of its story."""
     if as_json:
         say_json({"report": str(done.page), **done.document})
     elif quiet:

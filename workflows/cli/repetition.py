@@ -30,8 +30,9 @@ def say_stored_answer(words: Sequence[str]) -> bool:
     """
     if _COMPUTED & set(words):
         return False
-    shown = [[stream.isatty(), stream.encoding] for stream in (sys.stdout, sys.stderr)]
-    command = repeated_command.begin(words, [*get_terminal_size(), *shown])
+    # the text depends on the width and on whether a terminal reads it
+    streams = [[stream.isatty(), stream.encoding] for stream in (sys.stdout, sys.stderr)]
+    command = repeated_command.begin(words, [*get_terminal_size(), *streams])
     text = command.answer() if command else None
     if text is None:
         return False

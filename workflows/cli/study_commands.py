@@ -297,15 +297,19 @@ def _run(
     refuse: Callable[[Recipe, dict[str, Any]], None] = _any_recipe,
     **options: Any,
 ) -> None:
+    """Run a study of a recipe and print its page.
+
+    The exit code is 1 if something in the study does not hold.
+    """
     recipe, command = load(words, "study", kind)
     refuse(recipe, options)
     store = the_store()
 
     command += option_words(options)
     progress = progress_lines(quiet or as_json)
-    stopping = resumable(lambda: kept_in(store, "the parts that are finished are"))
+    when_stopped = resumable(lambda: kept_in(store, "the parts that are finished are"))
     with (
-        stopping,
+        when_stopped,
         failing(lazy.run_error.RunError, ImportError, code=FAILED),
         failing(ValueError, code=BAD),
         refusing(),
@@ -391,7 +395,7 @@ def evaluate(
         "small": small,
         "reference": reference,
     }
-    shared = {"pipelines": pipelines, "equal-protection": equal_protection, "by": by}
+    pipeline_options = {"pipelines": pipelines, "equal-protection": equal_protection, "by": by}
     folder = _evaluate(
         name,
         changes=changes,
@@ -406,17 +410,21 @@ def evaluate(
         device=device,
         out=out,
         progress=progress_lines(quiet or as_json),
-        command=["neusee", "evaluate", name, *changes, *option_words(options | shared)],
+        command=["neusee", "evaluate", name, *changes, *option_words(options | pipeline_options)],
     )
     say_folder(folder, as_json)
 
 
 def _evaluate(name: str, **options: Any) -> Path:
+    """Run an evaluation and return its folder.
+
+    Each kind of error ends the command with a message.
+    """
     store = the_store()
 
-    stopping = resumable(lambda: kept_in(store, "the points that are finished are"))
+    when_stopped = resumable(lambda: kept_in(store, "the points that are finished are"))
     with (
-        stopping,
+        when_stopped,
         failing(lazy.pipelines.EvaluationRefused),
         failing(lazy.run_error.RunError, code=FAILED),
         refusing(),
@@ -425,6 +433,7 @@ def _evaluate(name: str, **options: Any) -> Path:
 
 
 def _numbers(text: str) -> list[float]:
+    """Return the numbers in a text with commas; end the command for a word that is no number."""
     numbers = []
     for word in text.split(","):
         try:

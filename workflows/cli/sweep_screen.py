@@ -64,25 +64,34 @@ def run_sweep(
     """
     if netcdf:
         require_xarray("--netcdf")
-    began, place = time.perf_counter(), Path().absolute()
-    work = Sweeping(
-        recipe, read_words(words, place, first), place, store or open_store(), zip, device
+    start_time, folder = time.perf_counter(), Path().absolute()
+    sweeping = Sweeping(
+        recipe, read_words(words, folder, first), folder, store or open_store(), zip, device
     )
     options = {"zip": zip, "netcdf": netcdf, "on-error": on_error, "device": device, "out": out}
-    again = ["neusee", "sweep", recipe, *words, *_words_of(options)]
+    command_line = ["neusee", "sweep", recipe, *words, *_words_of(options)]
     silent = quiet or as_json
     if not silent:
-        print(*_opening(work), sep="\n", flush=True)
-    done, state, error = _run_points(work, on_error, silent, work.workers(workers))
-    if error is not None and not (on_error == "stop" and done and done[-1].state == "failed"):
+        print(*_opening(sweeping), sep="\n", flush=True)
+    outcomes_so_far, state, error = _run_points(
+        sweeping, on_error, silent, sweeping.workers(workers)
+    )
+    # a failed last point has said why the sweep stopped
+    if error is not None and not (
+        on_error == "stop" and outcomes_so_far and outcomes_so_far[-1].state == "failed"
+    ):
         raise error
-    result = work.sweep(done, state)
-    path = write_sweep(work, result, again, out, netcdf, time.perf_counter() - began)
+    result = sweeping.sweep(outcomes_so_far, state)
+    path = write_sweep(
+        sweeping, result, command_line, out, netcdf, time.perf_counter() - start_time
+    )
     if silent:
-        _say_briefly(result, path, again, as_json)
+        _say_briefly(result, path, command_line, as_json)
     else:
         print(
-            *_closing(result, path, again, time.perf_counter() - began, work.store.failure),
+            *_closing(
+                result, path, command_line, time.perf_counter() - start_time, sweeping.store.failure
+            ),
             sep="\n",
             flush=True,
         )
@@ -118,7 +127,8 @@ def _document(result: Sweep, path: Path, again: Sequence[str]) -> dict[str, Any]
         "state": result.state,
         "points": result.points,
         "failed": [
-            {"point": o.point.number, "step": o.step, "message": o.message} for o in result.failed
+            {"point": outcome.point.number, "step": outcome.step, "message": outcome.message}
+            for outcome in result.failed
         ],
         "rows": result.rows,
     }
@@ -148,12 +158,12 @@ def _run_points(
     Ctrl-C or a failure.
     """
     table = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
-    running = outcomes(
+    running_points = outcomes(
         work.plan, work.store, on_error, work.device, table.started, table.watch, workers
     )
     try:
-        with table, closing(running):
-            for outcome in running:
+        with table, closing(running_points):
+            for outcome in running_points:
                 table.finished(outcome)
     except KeyboardInterrupt:
         return table.outcomes, "interrupted", None
@@ -164,7 +174,9 @@ def _run_points(
 
 def _words_of(options: Mapping[str, Any]) -> list[str]:
     """Return the words of the options that are not as usual."""
-    return option_words({name: x for name, x in options.items() if x != _USUAL.get(name)})
+    return option_words(
+        {name: value for name, value in options.items() if value != _USUAL.get(name)}
+    )
 
 
 def _closing(
@@ -183,6 +195,7 @@ def _closing(
 
 
 def _failures(result: Sweep) -> Iterator[str]:
+    """Yield a line for each failed point, with the first line of its error."""
     for outcome in result.failed:
         yield (
             f"failed: point {outcome.point.number}, {outcome.point.shown}:"
@@ -203,15 +216,18 @@ class SweepTable(ProgressTable):
         self.header = [
             "done",
             "point",
-            *(c.header for c in columns),
+            *(column.header for column in columns),
             "state",
             "seconds",
             "left",
             "results",
         ]
-        widest = [max(map(len, (c.header, *map(cell_text, c.cells)))) for c in columns]
-        count = len(str(points))
-        self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
+        value_widths = [
+            max(map(len, (column.header, *map(cell_text, column.cells)))) for column in columns
+        ]
+        digits = len(str(points))
+        # in the order of the header
+        self.widths = [max(4, 2 * digits + 1), max(5, digits), *value_widths, 6, 8, 12, 0]
 
     def started(self, point: Point) -> None:
         """Record that the run of a parameter set of the sweep begins."""
@@ -242,22 +258,23 @@ class SweepTable(ProgressTable):
         values = map(cell_text, point_cells(outcome.point, self.columns))
         numbers = list(headline(outcome.numbers).items())[:_NUMBERS]
         results = "  ".join(f"{name} {value}" for name, value in numbers)
-        done = f"{len(self.outcomes)}/{self.points}"
-        left = lasts(outcome.left) if outcome.left else ""
+        done_text = f"{len(self.outcomes)}/{self.points}"
+        time_left = lasts(outcome.left) if outcome.left else ""
         return [
-            done,
+            done_text,
             str(outcome.point.number),
             *values,
             outcome.state,
             f"{outcome.seconds:.3f}",
-            left,
+            time_left,
             results,
         ]
 
     def live_rows(self) -> Iterator[tuple[list[str], str]]:
         """Yield the table rows of the last parameter sets, each with its state."""
-        state = len(self.columns) + 2
-        yield from ((line, line[state]) for line in self.lines[-_LAST:])
+        # behind the two columns before the values
+        state_column = len(self.columns) + 2
+        yield from ((line, line[state_column]) for line in self.lines[-_LAST:])
 
     def caption(self) -> str:
         """Return the number of the running parameter set, its running step, and the remaining
@@ -265,7 +282,7 @@ class SweepTable(ProgressTable):
         """
         if self.running is None:
             return ""
-        left = self.outcomes[-1].left if self.outcomes else 0.0
-        about = f"about {lasts(left)} left" if left else ""
+        seconds_left = self.outcomes[-1].left if self.outcomes else 0.0
+        time_text = f"about {lasts(seconds_left)} left" if seconds_left else ""
         point = f"point {len(self.outcomes) + 1} of {self.points}: {self.running.shown}"
-        return "; ".join(filter(None, (point, self.step, about)))
+        return "; ".join(filter(None, (point, self.step, time_text)))

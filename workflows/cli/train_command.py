@@ -84,18 +84,21 @@ def train(
         check_device(device)
         return _lift(recipe, command, out, device, quiet, as_json)
 
-    device, (rank, world) = lazy.process_mesh.device_here(device), lazy.process_mesh.processes()
+    device, (rank, process_count) = (
+        lazy.process_mesh.device_here(device),
+        lazy.process_mesh.processes(),
+    )
     check_device(device)
     silent = quiet or as_json or rank > 0
-    who = f"process {rank}: " if world > 1 else ""
+    prefix = f"process {rank}: " if process_count > 1 else ""
     learnt = recipe.training.learnt if recipe.training else ()
     stages = _NUMBERS.get(stage, learnt)
     command += ["--stage", stage.value]
     lengths = _lengths(recipe, stages)
     with (
         resumable(lambda: kept_training(out, recipe.name)),
-        failing(lazy.run_error.RunError, ValueError, ArithmeticError, code=FAILED, before=who),
-        failing(lazy.process_mesh.MeshError, before=who),
+        failing(lazy.run_error.RunError, ValueError, ArithmeticError, code=FAILED, before=prefix),
+        failing(lazy.process_mesh.MeshError, before=prefix),
         refusing(),
         lazy.process_mesh.joined(device) as processes_here,
         _loss_bar(silent, lengths) as watch,
@@ -133,8 +136,8 @@ def _say_results(folder: Path, as_json: bool, lines: list[str]) -> None:
     """Print ``lines`` and the folder of a training, or the document of the training as JSON."""
     if not as_json:
         return say([*lines, str(folder)])
-    files = (folder / name for name in ("mask.json", "training.json"))
-    documents = {path.stem: json.loads(text_of(path)) for path in files if path.is_file()}
+    document_files = (folder / name for name in ("mask.json", "training.json"))
+    documents = {path.stem: json.loads(text_of(path)) for path in document_files if path.is_file()}
     say_json({"folder": str(folder), **documents})
 
 
@@ -160,12 +163,12 @@ def _lift(
             watch=watch,
         )
     weights = folder / "mst_plus_plus.safetensors"
-    again = ["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"]
+    next_command = ["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"]
     lines = [
         f"weights: {weights}",
         f"curves:  {folder / 'curves.png'}",
         f"judged:  {folder / 'training.json'}",
-        f"next:    {shlex.join(again)}",
+        f"next:    {shlex.join(next_command)}",
     ]
     if silent:
         lines = []
@@ -173,6 +176,7 @@ def _lift(
 
 
 def _next(folder: Path, stage: Stages) -> list[str]:
+    """Return lines on the files that a training wrote, and on its page."""
     if stage is Stages.MASK:
         return [f"mask:    {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
     lines: list[str] = []
@@ -210,8 +214,10 @@ def _loss_bar(
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
-    hidden = quiet or not console.is_terminal
-    bar = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console, disable=hidden)
+    is_hidden = quiet or not console.is_terminal
+    bar = Progress(
+        *columns, TextColumn("{task.fields[losses]}"), console=console, disable=is_hidden
+    )
     lines = ProgressLines(quiet)
     titles = {stage: f"stage {stage}" if stage else "lift" for stage in lengths}
     tasks = {
@@ -224,8 +230,8 @@ def _loss_bar(
         text = " ".join(f"{name} {losses[name]:.3g}" for name in names)
         bar.update(tasks[stage], completed=done, losses=text)
         if bar.disable and not quiet and done % max(1, lengths[stage] // _LINES) == 0:
-            where = f"stage {stage}, " if stage else ""
-            lines(f"{where}iteration {done} of {lengths[stage]}: {text}")
+            stage_text = f"stage {stage}, " if stage else ""
+            lines(f"{stage_text}iteration {done} of {lengths[stage]}: {text}")
 
     with bar:
         yield watch

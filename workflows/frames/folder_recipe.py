@@ -63,12 +63,12 @@ def descriptor_of(path: Path) -> Path:
     descriptors = descriptors_in(path)
     if len(descriptors) == 1:
         return descriptors[0]
-    has = (
+    finding = (
         f"has {len(descriptors)} descriptors"
         if descriptors
         else "has no descriptor, a .txt with levels in lines b and d"
     )
-    raise ValueError(f"{path} {has}: name one file")
+    raise ValueError(f"{path} {finding}: name one file")
 
 
 def quoted(text: str) -> str:
@@ -171,17 +171,26 @@ def recipe_of_folder(
             all mistakes of
     ``changes``.
     """
-    name = "".join(c if c.isalnum() else "_" for c in folder.absolute().name) or "frames"
+    name = (
+        "".join(character if character.isalnum() else "_" for character in folder.absolute().name)
+        or "frames"
+    )
     if descriptors_in(folder):
         return _described(descriptor_of(folder), name, store, changes)
     levels, scale = find_levels(folder, progress), 1.0
-    needs = _corrections(levels, progress, every_pixel)
-    fit = _fit(_loaded(name, _read(folder, levels, scale, needs) + "outputs: [measured]\n"), store)
+    corrections = _corrections(levels, progress, every_pixel)
+    # a first recipe without model, whose levels give the first estimates
+    fit = _fit(
+        _loaded(name, _read(folder, levels, scale, corrections) + "outputs: [measured]\n"), store
+    )
     if levels.light != "photons":
+        # relative light is scaled so that a usual efficiency comes out
         scale = float(fit.efficiency) / _EFFICIENCY
-    times = len({level.exposure for level in levels.levels if level.dark})
-    model_text = _rest(fit, float(fit.efficiency) / scale, times, levels.light != "photons")
-    return _loaded(name, _read(folder, levels, scale, needs) + model_text, changes)
+    dark_exposures = len({level.exposure for level in levels.levels if level.dark})
+    model_text = _rest(
+        fit, float(fit.efficiency) / scale, dark_exposures, levels.light != "photons"
+    )
+    return _loaded(name, _read(folder, levels, scale, corrections) + model_text, changes)
 
 
 def _corrections(levels: FolderLevels, progress: Progress, every_pixel: bool) -> _Corrections:
@@ -194,19 +203,19 @@ def _corrections(levels: FolderLevels, progress: Progress, every_pixel: bool) ->
         )
     if every_pixel:
         return _Corrections(divisor, ())
-    darkest = max(
+    longest_dark = max(
         (level for level in levels.levels if level.dark), key=lambda level: level.exposure
     )
-    mask = hot_pixels(files=darkest.files, divisor=divisor)
+    mask = hot_pixels(files=longest_dark.files, divisor=divisor)
     count = int(mask.sum())
     if not count:
         return _Corrections(divisor, ())
     share = f"{count} of {mask.numel()} pixels ({count / mask.numel():.2%})"
     progress(
-        f"{share} are hot in the dark frames of {darkest.exposure:g} s: they are left out of all"
-        " levels"
+        f"{share} are hot in the dark frames of {longest_dark.exposure:g} s: they are left"
+        " out of all levels"
     )
-    return _Corrections(divisor, darkest.files)
+    return _Corrections(divisor, longest_dark.files)
 
 
 def _shift(levels: FolderLevels) -> int:
@@ -218,21 +227,30 @@ def _shift(levels: FolderLevels) -> int:
         divisor = int(np.gcd(divisor, frame_divisor(level.files[0])))
         if divisor == 1:
             return 1
+    # 16 bits less those of the converter: by so many a number is shifted
     return divisor if divisor in [2 ** (16 - bits) for bits in _BITS] else 1
 
 
 def _described(file: Path, name: str, store: Store, changes: Sequence[str]) -> Recipe:
     """Return the recipe of a calibration of the frames that a descriptor of EMVA 1288 names."""
     refuse_descriptor(file)
-    head = _DESCRIBED.format(folder=name, name=file.name, file=quoted(str(file.absolute())))
-    recipe = _loaded(name, head + "outputs: [measured]\n")
+    measured_text = _DESCRIBED.format(
+        folder=name, name=file.name, file=quoted(str(file.absolute()))
+    )
+    recipe = _loaded(name, measured_text + "outputs: [measured]\n")
     levels = run(recipe, store, ("measured",)).values["measured"]
     fit = _fit(recipe, store)
-    times = len(set(levels.exposure[levels.photons == 0].tolist()))
-    return _loaded(name, head + _rest(fit, float(fit.efficiency), times, False), changes)
+    dark_exposures = len(set(levels.exposure[levels.photons == 0].tolist()))
+    return _loaded(
+        name, measured_text + _rest(fit, float(fit.efficiency), dark_exposures, False), changes
+    )
 
 
 def _fit(recipe: Recipe, store: Store) -> LeastSquares:
+    """Return the standard's fit of the levels of a recipe.
+
+    Raise `FolderRefused` where it is impossible.
+    """
     try:
         fit: LeastSquares = least_squares(run(recipe, store, ("measured",)).values["measured"])
     except ValueError as error:
@@ -241,20 +259,28 @@ def _fit(recipe: Recipe, store: Store) -> LeastSquares:
 
 
 def _loaded(name: str, text: str, changes: Sequence[str] = ()) -> Recipe:
+    """Return the recipe in a text, with changes by the user.
+
+    It is read from a temporary file, whose folder the sources of its values do not name.
+    """
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
         recipe = load(path, changes)
     settings = recipe.config.settings.items()
-    temporary = f"{path.parent.name}/"  # the sources of values name no folder that is gone
-    named = {
-        key: replace(setting, source=setting.source.rpartition(temporary)[-1])
+    temporary_name = f"{path.parent.name}/"  # the sources of values name no folder that is gone
+    renamed_settings = {
+        key: replace(setting, source=setting.source.rpartition(temporary_name)[-1])
         for key, setting in settings
     }
-    return replace(recipe, config=Config(named))
+    return replace(recipe, config=Config(renamed_settings))
 
 
 def _read(folder: Path, folder_levels: FolderLevels, scale: float, needs: _Corrections) -> str:
+    """Return the text of a recipe up to its levels, from frames, their light and their corrections.
+
+    `scale` is the factor from the light of the folder to photons.
+    """
     levels = "\n".join(_level(level, scale) for level in folder_levels.levels)
     divisor = f", divisor: {needs.divisor}" if needs.divisor > 1 else ""
     hot, source_of_level = "", "frames"
@@ -272,10 +298,12 @@ def _read(folder: Path, folder_levels: FolderLevels, scale: float, needs: _Corre
 
 
 def _listed(files: Sequence[Path]) -> str:
+    """Return the paths of files as the items of a YAML list."""
     return ", ".join(quoted(str(file.absolute())) for file in files)
 
 
 def _level(level: FolderLevel, scale: float) -> str:
+    """Return the line of a level: its photons, its exposure and its files."""
     files = _listed(level.files)
     return (
         f"  {level.name}: {{photons: {level.light * scale:.8g}, exposure: {level.exposure:.9g} s,"
@@ -290,6 +318,7 @@ def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> s
     gain, noise = float(fit.gain), max(float(fit.temporal_dark_noise), 0.1)
     dark = float(fit.dark_current)
     if not dark > 0:  # NaN where all darks have one exposure
+        # 1 e-/s to begin with, or 0 where all darks have one exposure
         dark = float(times > 1)
     current = "null   # all darks have one exposure"
     if times > 1:
@@ -297,6 +326,7 @@ def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> s
     traced = _RELATIVE if relative else ""
     return _REST.format(
         gain=gain,
+        # first estimates must be inside the priors
         efficiency=min(max(efficiency, 0.02), 0.98),
         signal=float(fit.dark_signal),
         noise=noise,

@@ -65,22 +65,27 @@ def read_name(file: Path, folder: Path) -> NamedFrame:
     Folders count as parts of the name: ``dark/10ms/1.png``. An exposure is a number and its unit in
     either order: ``10ms``, ``10p5ms``, ``exp_ms_10``, or a fraction of a second such as ``1-200s``.
     """
-    parts = file.relative_to(folder).with_suffix("").parts
-    text = "/".join(parts).lower()
-    exposure, light = _exposure(text), _last(_AFTER, text) or _last(_BEFORE, text)
+    path_parts = file.relative_to(folder).with_suffix("").parts
+    text = "/".join(path_parts).lower()
+    exposure_match, light_match = _exposure(text), _last(_AFTER, text) or _last(_BEFORE, text)
     dark = _DARK.search(text) is not None
     photons: float | None = None
     if dark:
         photons = 0.0
-    elif light is not None:
-        photons = _float(light[1])
-    left = text.replace(exposure.written, "") if exposure else text
-    left = left.replace(light[0], "") if light else left
-    level = _INDEX.sub("", left).strip(" /._-")
-    seconds, written = (exposure.seconds, exposure.written) if exposure else (None, "")
+    elif light_match is not None:
+        photons = _float(light_match[1])
+    # the name without exposure, light and number of the frame tells its level
+    remaining_text = text.replace(exposure_match.written, "") if exposure_match else text
+    remaining_text = remaining_text.replace(light_match[0], "") if light_match else remaining_text
+    level = _INDEX.sub("", remaining_text).strip(" /._-")
+    seconds, written = (
+        (exposure_match.seconds, exposure_match.written) if exposure_match else (None, "")
+    )
     doubtful = _last(_DOUBTFUL, text)
-    unsure = doubtful[0] if doubtful and not _last(_FRACTION, text) else ""
-    return NamedFrame(level, dark or photons == 0, seconds, photons, written.strip(" =_-"), unsure)
+    doubtful_text = doubtful[0] if doubtful and not _last(_FRACTION, text) else ""
+    return NamedFrame(
+        level, dark or photons == 0, seconds, photons, written.strip(" =_-"), doubtful_text
+    )
 
 
 def _exposure(text: str) -> _Exposure | None:
@@ -97,11 +102,13 @@ def _exposure(text: str) -> _Exposure | None:
 
 
 def _last(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:
+    """Return the last match of a pattern in a text, or None."""
     matches = list(pattern.finditer(text))
     return matches[-1] if matches else None
 
 
 def _float(number: str) -> float:
+    """Return a number of a file name, in which a comma or a p may stand for the point."""
     return float(number.replace(",", ".").replace("p", "."))
 
 
@@ -160,6 +167,7 @@ def read_table(table: Path) -> list[TableRow]:
 
 
 def _header(table: Path) -> list[str]:
+    """Return the headings of a table in small letters; none for a file that cannot be read."""
     try:
         return next(([cell.strip().lower() for cell in row] for _, row in csv_rows(table)), [])
     except ValueError:
@@ -167,15 +175,18 @@ def _header(table: Path) -> list[str]:
 
 
 def _read(table: Path) -> Iterator[TableRow | str]:
+    """Yield each line of a table, or in its place a message with the mistake in it."""
     lines = csv_rows(table)
     names = [cell.strip().lower() for cell in next(lines)[1]]
-    time = next((name for name in names if name in _TIMES), "")
-    if strange := [name for name in names if name not in (*_TIMES, "file", "photons", "light")]:
-        yield f"{table.name}:1: column {strange[0]} is unknown: write {_COLUMNS}"
+    time_column = next((name for name in names if name in _TIMES), "")
+    if unknown_columns := [
+        name for name in names if name not in (*_TIMES, "file", "photons", "light")
+    ]:
+        yield f"{table.name}:1: column {unknown_columns[0]} is unknown: write {_COLUMNS}"
     for line, cells in lines:
         row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
         try:
-            yield _table_row(table, line, row, time)
+            yield _table_row(table, line, row, time_column)
         except ValueError as error:
             yield f"{table.name}:{line}: {error}"
 
@@ -192,11 +203,17 @@ def _table_row(table: Path, line: int, row: Mapping[str, str], time: str) -> Tab
 
 
 def _exposure_of_row(text: str, column: str) -> float | None:
+    """Return the exposure of a row in s, or None for an empty cell.
+
+    The heading of the column may give the unit, or the text itself, as in ``10 ms`` or ``1/200 s``.
+    """
     if not text:
         return None
     scale = _TIMES[column]
     if fraction := _FRACTION_IN_TABLE.fullmatch(text):
+        # a fraction has the unit of the column, unless its own s says seconds
         number, unit = float(fraction[1]) / float(fraction[2]), "s" if scale or fraction[3] else ""
+        # 0 stands for no unit in the heading: the number is in s already
         scale = 0.0 if fraction[3] else scale
     else:
         number, unit = (float(text), "s") if scale else read_any(text)
@@ -209,6 +226,10 @@ def _exposure_of_row(text: str, column: str) -> float | None:
 
 
 def _light(row: Mapping[str, str], column: str) -> float | None:
+    """Return the light of a row, or None for an empty cell.
+
+    Raise ValueError for anything but a number of 0 or more.
+    """
     text = row.get(column, "")
     if not text:
         return None
@@ -246,30 +267,42 @@ def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
     """Yield a sentence for each level whose frames differ too much in their means, or one if
     darks are not dark.
     """
-    means = [_means(files) for _, _, files in levels]
-    middles = [float(np.median([mean for _, mean, _ in of_level])) for of_level in means]
-    darks = _of_kind(middles, levels, dark=True)
-    lit = _of_kind(middles, levels, dark=False)
-    half_of_lit = float(np.median(lit))
-    if half_of_lit <= max(darks):
+    frame_means_of_levels = [_means(files) for _, _, files in levels]
+    level_medians = [
+        float(np.median([mean for _, mean, _ in of_level])) for of_level in frame_means_of_levels
+    ]
+    dark_medians = _of_kind(level_medians, levels, dark=True)
+    lit_medians = _of_kind(level_medians, levels, dark=False)
+    # half of the lit levels must be brighter than every dark
+    half_of_lit = float(np.median(lit_medians))
+    if half_of_lit <= max(dark_medians):
         yield (
-            f"{folder}: dark frames have means up to {max(darks):.0f} DN, and half of the lit "
-            "levels no more than "
+            f"{folder}: dark frames have means up to {max(dark_medians):.0f} DN, and half of"
+            " the lit levels no more than "
             f"{half_of_lit:.0f} DN: cover the lens, or check which files are dark"
         )
         return
-    black, bright = min(darks), max(middles)
-    for (_, dark, _), of_level, middle in zip(levels, means, middles, strict=True):
-        room = _OFF * (0.0 if dark else middle - black) + _FLOOR * (bright - black)
-        room += _CHANCE * max(error for _, _, error in of_level)
+    darkest, brightest = min(dark_medians), max(level_medians)
+    for (_, dark, _), of_level, level_median in zip(
+        levels, frame_means_of_levels, level_medians, strict=True
+    ):
+        # a share of the signal of the level, a share of the range of all, and chance
+        allowed_difference = _OFF * (0.0 if dark else level_median - darkest) + _FLOOR * (
+            brightest - darkest
+        )
+        allowed_difference += _CHANCE * max(error for _, _, error in of_level)
         frames = [(file, mean) for file, mean, _ in of_level]
-        if _spread(frames) > room:
-            yield _odd(frames, middle, room, folder)
+        if _spread(frames) > allowed_difference:
+            yield _odd(frames, level_median, allowed_difference, folder)
 
 
 def _of_kind(middles: Sequence[float], levels: Sequence[Files], dark: bool) -> list[float]:
     """Return the middle values of the dark or of the lit levels."""
-    return [middle for middle, level in zip(middles, levels, strict=True) if level[1] == dark]
+    return [
+        level_median
+        for level_median, level in zip(middles, levels, strict=True)
+        if level[1] == dark
+    ]
 
 
 def _spread(frames: Sequence[tuple[Path, float]]) -> float:
@@ -282,12 +315,12 @@ def _odd(frames: Sequence[tuple[Path, float]], middle: float, room: float, folde
     """Return which frame of a level does not fit the others, or both of a pair."""
     values = [mean for _, mean in frames]
     if len(values) == 2:
-        (a, first_mean), (b, second_mean) = frames
-        both = (
-            f"{_name(a, folder)} and {_name(b, folder)} count as one level, but have means of"
-            f" {first_mean:.1f} and"
+        (first_file, first_mean), (second_file, second_mean) = frames
+        both_named = (
+            f"{_name(first_file, folder)} and {_name(second_file, folder)} count as one"
+            f" level, but have means of {first_mean:.1f} and"
         )
-        return f"{both} {second_mean:.1f} DN: check names and table"
+        return f"{both_named} {second_mean:.1f} DN: check names and table"
     file, mean = max(frames, key=lambda pair: abs(pair[1] - middle))
     return (
         f"{_name(file, folder)} has a mean of {mean:.1f} DN, but its level {middle:.1f} DN, "
@@ -387,16 +420,17 @@ def find_levels(folder: Path, progress: Progress = silent) -> FolderLevels:
     Raises: `FolderRefused` with every reason why they are no measurement.
     """
     frames, source, problems = _found(folder)
-    unread = sorted(path for path in folder.rglob("*") if path.suffix.lower() in NOT_READ)
+    unread_files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in NOT_READ)
     problems += [*_sizes(frames, folder), *_unknown(frames, folder)]
     if problems or not frames:
-        raise FolderRefused("\n".join(problems or [_no_frames(folder, unread)]))
-    for line in (*_exposures(frames, folder), *_left(unread, folder)):
+        raise FolderRefused("\n".join(problems or [_no_frames(folder, unread_files)]))
+    for line in (*_exposures(frames, folder), *_left(unread_files, folder)):
         progress(line)
     light = _kind_of_light(frames)
     groups = _groups(frames, light)
     levels = tuple(_named(groups))
     problems = [*_numbers(groups, levels, folder), *_light_problems(levels, light)]
+    # the frames are read only if everything else is right
     if not problems:
         problems = list(
             misplaced_frames([(level.name, level.dark, level.files) for level in levels], folder)
@@ -411,14 +445,14 @@ def _no_frames(folder: Path, unread: Sequence[Path]) -> str:
     if not unread:
         return f"{folder}: no frames: {_HOW}"
     kinds = "/".join(sorted({path.suffix.lower() for path in unread}))
-    lossy = all(path.suffix.lower() in _LOSSY for path in unread)
-    why = (
+    are_lossy = all(path.suffix.lower() in _LOSSY for path in unread)
+    reason = (
         "JPEG and its like change the noise of each pixel"
-        if lossy
+        if are_lossy
         else "no raw grey numbers are read from them"
     )
     return (
-        f"{_some(unread, folder)}: {kinds} cannot be calibrated: {why}; save the raw frames of "
+        f"{_some(unread, folder)}: {kinds} cannot be calibrated: {reason}; save the raw frames of "
         "one channel as PNG "
         f"or TIFF of 16 bits, FITS or NumPy, and {_HOW}"
     )
@@ -431,15 +465,19 @@ def _exposures(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
     by_source: dict[tuple[bool, float, str], list[Path]] = defaultdict(list)
     for frame in frames:
         by_source[not frame.dark, frame.exposure or 0.0, frame.told].append(frame.file)
-    for (lit, seconds, text), files in sorted(by_source.items()):
-        kind, count = "lit" if lit else "dark", f"{len(files)} file{'s' * (len(files) != 1)}"
+    for (is_lit, exposure, source), files in sorted(by_source.items()):
+        kind, count_text = (
+            "lit" if is_lit else "dark",
+            f"{len(files)} file{'s' * (len(files) != 1)}",
+        )
         yield (
-            f"{kind}: exposure {_readable(seconds)}, from {text}: {count} such as"
+            f"{kind}: exposure {_readable(exposure)}, from {source}: {count_text} such as"
             f" {_short(files[0], folder)}"
         )
 
 
 def _readable(seconds: float) -> str:
+    """Return a time in the largest unit in which it is 1 or more."""
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if seconds >= scale:
             return f"{seconds / scale:.6g} {unit}"
@@ -447,6 +485,7 @@ def _readable(seconds: float) -> str:
 
 
 def _left(unread: Sequence[Path], folder: Path) -> Iterator[str]:
+    """Yield a line with the pictures of the folder that are of other kinds, if there are any."""
     if unread:
         yield f"not read: {_some(unread, folder)}"
 
@@ -458,11 +497,12 @@ def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
         rows = read_table(table) if table else []
     except ValueError as error:
         return [], "", [str(error)]
-    listed = {row.file.resolve(): row for row in rows}
+    row_of_file = {row.file.resolve(): row for row in rows}
+    # a table says which files count
     files = [row.file for row in rows] if rows else _frame_files(folder)
     frames, problems = list[Frame](), list[str]()
     for file in files:
-        name, row = read_name(file, folder), listed.get(file.resolve())
+        name, row = read_name(file, folder), row_of_file.get(file.resolve())
         try:
             header = frame_header(file)
         except ValueError as error:
@@ -491,9 +531,10 @@ def _frame(
     """Return a frame with what a table says of it, else its name, else its header."""
     photons, exposure = (row.photons, row.exposure) if row else (name.photons, name.exposure)
     light = row.light if row else None
+    # a light above 0 in the table counts before the word dark in a name
     dark = 0.0 in (photons, light, header.photons) or (name.dark and not photons and not light)
     table_of_row = table if row else None
-    told = _source(exposure, name, table_of_row)
+    source = _source(exposure, name, table_of_row)
     if exposure is None:
         exposure = header.exposure
     if photons is None:
@@ -506,7 +547,7 @@ def _frame(
         exposure=exposure,
         photons=photons,
         light=light,
-        told=told,
+        told=source,
     )
 
 
@@ -521,11 +562,19 @@ def _contradiction(
     frame: Frame, name: NamedFrame, row: TableRow | None, table: Path | None, folder: Path
 ) -> Iterator[str]:
     """Yield a problem where a name or a table says another exposure than the header."""
-    said, header = row.exposure if row else name.exposure, frame.header.exposure
-    if said is None or header is None or abs(said - header) <= 0.01 * header:
+    stated_exposure, header_exposure = row.exposure if row else name.exposure, frame.header.exposure
+    # 1 %, because names have rounded times
+    if (
+        stated_exposure is None
+        or header_exposure is None
+        or abs(stated_exposure - header_exposure) <= 0.01 * header_exposure
+    ):
         return
-    who = f"{table.name}:{row.line}" if table and row else "its name"
-    yield f"{_short(frame.file, folder)}: {who} says {said:g} s, its header {header:g} s"
+    speaker = f"{table.name}:{row.line}" if table and row else "its name"
+    yield (
+        f"{_short(frame.file, folder)}: {speaker} says {stated_exposure:g} s, its header"
+        f" {header_exposure:g} s"
+    )
 
 
 def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) -> Iterator[str]:
@@ -535,8 +584,9 @@ def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) 
     if not name.doubtful or frame.header.exposure is not None:
         return
     text = str(frame.file.relative_to(folder)).lower()
-    second = text.replace(name.doubtful, "2" + name.doubtful[1:])
-    if second in (str(path.relative_to(folder)).lower() for path in files):
+    # the same name with a 2 in place of the 1
+    name_of_second = text.replace(name.doubtful, "2" + name.doubtful[1:])
+    if name_of_second in (str(path.relative_to(folder)).lower() for path in files):
         return
     seconds = float(re.findall(r"\d+", name.doubtful)[-1])
     yield (
@@ -547,12 +597,14 @@ def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) 
 
 
 def _short(file: Path, folder: Path) -> str:
+    """Return the path of a file relative to the folder, if it lies in it."""
     if file.is_relative_to(folder):
         return str(file.resolve().relative_to(folder.resolve()))
     return str(file)
 
 
 def _some(files: Sequence[Path], folder: Path) -> str:
+    """Return the names of the first files, and how many more there are."""
     names = ", ".join(_short(file, folder) for file in files[:_SHOWN])
     return names + f" and {len(files) - _SHOWN} more" * (len(files) > _SHOWN)
 
@@ -560,33 +612,38 @@ def _some(files: Sequence[Path], folder: Path) -> str:
 def _sizes(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
     """Yield a problem where frames differ in size or in the bits of a number from most others."""
     sizes = [f"{frame.header.shape[1]} x {frame.header.shape[0]}" for frame in frames]
-    for quantity, has in (
+    for quantity, values in (
         ("pixels", sizes),
         ("bits", [str(frame.header.bits) for frame in frames]),
     ):
-        counts = Counter(has)
+        counts = Counter(values)
         if len(counts) > 1:
-            usual = counts.most_common(1)[0][0]
-            odd = [frame.file for frame, text in zip(frames, has, strict=True) if text != usual]
-            others = ", ".join(sorted(counts.keys() - {usual}))
+            usual_value = counts.most_common(1)[0][0]
+            unusual_files = [
+                frame.file
+                for frame, text in zip(frames, values, strict=True)
+                if text != usual_value
+            ]
+            other_values = ", ".join(sorted(counts.keys() - {usual_value}))
             yield (
-                f"{_some(odd, folder)}: {others} {quantity}, but {counts[usual]} files have {usual}"
+                f"{_some(unusual_files, folder)}: {other_values} {quantity}, but"
+                f" {counts[usual_value]} files have {usual_value}"
                 f" {quantity}: give frames of one sensor and one setting"
             )
 
 
 def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
     """Yield what is not known of the frames: exposures, darks, or the light of some."""
-    if timeless := [frame.file for frame in frames if frame.exposure is None]:
-        yield f"{_some(timeless, folder)}: the exposure is unknown: {_HOW}"
-    lit = [frame for frame in frames if not frame.dark]
-    if frames and len(lit) == len(frames):
+    if without_exposure := [frame.file for frame in frames if frame.exposure is None]:
+        yield f"{_some(without_exposure, folder)}: the exposure is unknown: {_HOW}"
+    lit_frames = [frame for frame in frames if not frame.dark]
+    if frames and len(lit_frames) == len(frames):
         yield (
             f"{folder}: no dark frames: cover the lens, take two or more, and name them such as"
             " dark_10ms_1.png"
         )
-    yield from _partly_known("photons", lit, folder)
-    yield from _partly_known("light", lit, folder)
+    yield from _partly_known("photons", lit_frames, folder)
+    yield from _partly_known("light", lit_frames, folder)
 
 
 def _partly_known(name: str, lit: Sequence[Frame], folder: Path) -> Iterator[str]:
@@ -600,10 +657,14 @@ def _partly_known(name: str, lit: Sequence[Frame], folder: Path) -> Iterator[str
 
 
 def _kind_of_light(frames: Sequence[Frame]) -> Light:
-    lit = [frame for frame in frames if not frame.dark]
-    if all(frame.photons is not None for frame in lit):
+    """Return how the light of the lit frames is known.
+
+    It is known in photons, relatively, or by the exposure alone.
+    """
+    lit_frames = [frame for frame in frames if not frame.dark]
+    if all(frame.photons is not None for frame in lit_frames):
         return "photons"
-    return "relative" if all(frame.light is not None for frame in lit) else "exposure"
+    return "relative" if all(frame.light is not None for frame in lit_frames) else "exposure"
 
 
 _Key = tuple[bool, float, float, str]
@@ -619,26 +680,30 @@ def _groups(frames: Sequence[Frame], light: Light) -> dict[_Key, list[Frame]]:
     groups: dict[_Key, list[Frame]] = defaultdict(list)
     for frame in frames:
         assert frame.exposure is not None
-        time = float(f"{frame.exposure:.6g}")
+        # six digits, so that rounding in headers makes no levels of its own
+        rounded_exposure = float(f"{frame.exposure:.6g}")
         if frame.dark:
-            groups[True, 0.0, time, ""].append(frame)
+            groups[True, 0.0, rounded_exposure, ""].append(frame)
         elif light == "exposure":
-            groups[False, time, time, frame.level].append(frame)
+            groups[False, rounded_exposure, rounded_exposure, frame.level].append(frame)
         else:
-            amount = frame.photons if light == "photons" else frame.light
-            groups[False, float(amount or 0.0), time, ""].append(frame)
+            light_amount = frame.photons if light == "photons" else frame.light
+            groups[False, float(light_amount or 0.0), rounded_exposure, ""].append(frame)
+    # darks first
     return dict(sorted(groups.items(), key=lambda item: (not item[0][0], *item[0][1:])))
 
 
 def _named(groups: dict[_Key, list[Frame]]) -> Iterator[FolderLevel]:
-    lit = 0
-    for (dark, light, time, _), frames in groups.items():
-        lit += not dark
-        name = f"dark_{_time(time)}" if dark else f"lit_{lit:02d}"
-        yield FolderLevel(name, tuple(frame.file for frame in frames), dark, time, light)
+    """Yield each level with a name: darks by their exposure, lit levels by number."""
+    lit_count = 0
+    for (dark, light, exposure, _), frames in groups.items():
+        lit_count += not dark
+        name = f"dark_{_time(exposure)}" if dark else f"lit_{lit_count:02d}"
+        yield FolderLevel(name, tuple(frame.file for frame in frames), dark, exposure, light)
 
 
 def _time(seconds: float) -> str:
+    """Return a time in ms as part of a name: a word of letters and digits."""
     return f"{1e3 * seconds:.6g}ms".replace(".", "p").replace("+", "")
 
 
@@ -646,18 +711,18 @@ def _numbers(
     groups: dict[_Key, list[Frame]], levels: Sequence[FolderLevel], folder: Path
 ) -> Iterator[str]:
     """Yield a problem for levels of one frame, and for too few lit levels."""
-    single = [frames[0].file for frames in groups.values() if _count(frames) < 2]
-    if single:
+    single_frames = [frames[0].file for frames in groups.values() if _count(frames) < 2]
+    if single_frames:
         yield (
-            f"{_some(single, folder)}: one frame of its level: take two or more frames of each "
-            "exposure and light, "
+            f"{_some(single_frames, folder)}: one frame of its level: take two or more frames"
+            " of each exposure and light, "
             "or give frames of one level one name with a number at its end, such as _1 and _2"
         )
-    lit = len({level.light for level in levels if not level.dark})
-    if lit < _LIT:
+    lit_count = len({level.light for level in levels if not level.dark})
+    if lit_count < _LIT:
         yield (
-            f"{folder}: {lit} lit level{'s' * (lit != 1)}: take {_LIT} or more of different light,"
-            " up to saturation"
+            f"{folder}: {lit_count} lit level{'s' * (lit_count != 1)}: take {_LIT} or more of"
+            " different light, up to saturation"
         )
 
 
@@ -667,8 +732,9 @@ def _count(frames: Sequence[Frame]) -> int:
 
 
 def _light_problems(levels: Sequence[FolderLevel], light: Light) -> Iterator[str]:
+    """Yield a problem if only exposures tell the light, and two levels have the same one."""
     if light != "exposure":
         return
-    times = [level.exposure for level in levels if not level.dark]
-    if len(set(times)) < len(times):
+    lit_exposures = [level.exposure for level in levels if not level.dark]
+    if len(set(lit_exposures)) < len(lit_exposures):
         yield f"the light of levels of one exposure is unknown: {_HOW}"

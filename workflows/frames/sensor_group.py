@@ -79,12 +79,17 @@ def frames_of_sensor(recipe: Recipe, store: Store) -> SensorFrames:
     levels: Levels = run(recipe, store, ("measured",)).values["measured"]
     largest_value = float(levels.cell_value.max()) if len(levels.cell_value) else 0.0
     brightest = max(float(levels.mean.max()), largest_value)
-    bits = next((b for b in _BITS if brightest < 2**b), header.bits)
-    dark = levels.exposure[levels.photons == 0]
-    return SensorFrames(header.shape, bits, saturation_signal(levels), float(dark.min()))
+    # the fewest bits of a common converter that hold the largest number
+    bits = next((bit_count for bit_count in _BITS if brightest < 2**bit_count), header.bits)
+    dark_exposures = levels.exposure[levels.photons == 0]
+    return SensorFrames(header.shape, bits, saturation_signal(levels), float(dark_exposures.min()))
 
 
 def _files(step: Step) -> Sequence[Path]:
+    """Return the files of frames that a step reads.
+
+    The first file of a descriptor step is the descriptor itself.
+    """
     if step.node.path == "calibrate.frames":
         return tuple(step.params["files"])
     return tuple(step.params["file"][1:]) if step.node.path == "calibrate.descriptor" else ()
@@ -122,28 +127,35 @@ def _values(
     budget: Mapping[str, Any], draws: Mapping[str, NDArray[np.float64]], frames: SensorFrames
 ) -> dict[str, _Value]:
     """Return each value of a sensor that the budget has, by its name in the group."""
-    moved = {name: _moved(draws[name], row) for name, row in budget.items() if name in draws}
+    # draws with the values and uncertainties of the budget, which has more sources than they
+    scaled_draws = {name: _moved(draws[name], row) for name, row in budget.items() if name in draws}
     values = {
-        new: _Value(budget[name]["value"], unit, moved[name])
-        for name, (new, unit) in _VALUES.items()
-        if name in moved
+        group_name: _Value(budget[name]["value"], unit, scaled_draws[name])
+        for name, (group_name, unit) in _VALUES.items()
+        if name in scaled_draws
     }
-    if "dark_signal" in moved:
-        electrons = moved["dark_signal"] / moved["gain"]
+    # offset in electrons: dark signal in DN over the gain
+    if "dark_signal" in scaled_draws:
+        offset_draws = scaled_draws["dark_signal"] / scaled_draws["gain"]
         values["offset"] = _Value(
-            budget["dark_signal"]["value"] / budget["gain"]["value"], "e-", electrons
+            budget["dark_signal"]["value"] / budget["gain"]["value"], "e-", offset_draws
         )
-    if "dark_current" in moved:
-        of = float(str(budget["dark_current"]["unit"]).removeprefix("e- in ").removesuffix(" s"))
-        ratio = frames.exposure / of
+    if "dark_current" in scaled_draws:
+        # its unit is such as ``e- in 1 s``
+        posterior_exposure = float(
+            str(budget["dark_current"]["unit"]).removeprefix("e- in ").removesuffix(" s")
+        )
+        exposure_ratio = frames.exposure / posterior_exposure
         values["dark_current"] = _Value(
-            ratio * budget["dark_current"]["value"], "e-", ratio * moved["dark_current"]
+            exposure_ratio * budget["dark_current"]["value"],
+            "e-",
+            exposure_ratio * scaled_draws["dark_current"],
         )
     if frames.full is not None:
-        normal = np.random.default_rng(_STREAM).standard_normal(len(moved["gain"]))
-        signal = frames.full.signal + frames.full.uncertainty * normal
+        normal_draws = np.random.default_rng(_STREAM).standard_normal(len(scaled_draws["gain"]))
+        signal_draws = frames.full.signal + frames.full.uncertainty * normal_draws
         values["full_well"] = _Value(
-            frames.full.signal / budget["gain"]["value"], "e-", signal / moved["gain"]
+            frames.full.signal / budget["gain"]["value"], "e-", signal_draws / scaled_draws["gain"]
         )
     return values
 
@@ -152,12 +164,18 @@ def _moved(draws: NDArray[np.float64], row: Mapping[str, Any]) -> NDArray[np.flo
     """Return draws that are shifted and scaled to the value and the combined standard
     uncertainty of a budget.
     """
-    z: NDArray[np.float64] = (draws - draws.mean()) / draws.std(ddof=1)
-    moved: NDArray[np.float64] = row["value"] + row["combined standard uncertainty"] * z
-    return moved
+    standardised: NDArray[np.float64] = (draws - draws.mean()) / draws.std(ddof=1)
+    scaled_draws: NDArray[np.float64] = (
+        row["value"] + row["combined standard uncertainty"] * standardised
+    )
+    return scaled_draws
 
 
 def _written(values: Mapping[str, _Value], frames: SensorFrames, source: str) -> str:
+    """Return the text of the file.
+
+    It has what the frames say, the values, and their joint distribution.
+    """
     return "\n".join([*_head(frames, source), *_sensor(values, frames), *_posterior(values), ""])
 
 
@@ -189,26 +207,32 @@ def _sensor(values: Mapping[str, _Value], frames: SensorFrames) -> list[str]:
 def _posterior(values: Mapping[str, _Value]) -> list[str]:
     """Return the lines of means, standard uncertainties and correlations."""
     correlation = np.atleast_2d(np.corrcoef([value.draws for value in values.values()]))
-    means = ", ".join(
+    mean_texts = ", ".join(
         f"sensor.{name}: {_text(value.mean, value.unit)}" for name, value in values.items()
     )
-    widths = ", ".join(
-        f"sensor.{name}: {_text(float(v.draws.std(ddof=1)), v.unit)}" for name, v in values.items()
+    sd_texts = ", ".join(
+        f"sensor.{name}: {_text(float(sensor_value.draws.std(ddof=1)), sensor_value.unit)}"
+        for name, sensor_value in values.items()
     )
     rows = ", ".join(map(_numbers, _symmetric(correlation)))
     return [
         "posterior:   # standard uncertainties, which `neusee study uncertainty` draws together",
-        f"  mean: {{{means}}}",
-        f"  sd: {{{widths}}}",
+        f"  mean: {{{mean_texts}}}",
+        f"  sd: {{{sd_texts}}}",
         f"  correlation: [{rows}]",
     ]
 
 
 def _numbers(row: Iterable[float]) -> str:
+    """Return a row of a matrix as a YAML list."""
     return "[" + ", ".join(f"{x:.6f}" for x in row) + "]"
 
 
 def _symmetric(correlation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a correlation rounded to six digits.
+
+    It is still symmetric, with ones on its diagonal.
+    """
     rounded = np.round((correlation + correlation.T) / 2, 6)
     np.fill_diagonal(rounded, 1.0)
     return rounded

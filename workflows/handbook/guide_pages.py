@@ -71,6 +71,7 @@ def pictures_of(text: str) -> Iterator[Picture]:
     command.
     """
     for mark in _MARK.finditer(text):
+        # the last command above the mark of the picture
         commands = _COMMAND.findall(text, 0, mark.start())
         if not commands:
             raise ValueError(
@@ -90,13 +91,13 @@ def with_pictures(text: str, paths: Mapping[Picture, str]) -> str:
         picture = next(pictures)
         if picture not in paths:
             return mark[0]
-        shown = (
+        linked = (
             # a click shows the picture at its full size
             f"[![{picture.caption}]({paths[picture]})]({paths[picture]})"
         )
         return (
             "<figure"
-            f' markdown="span">\n{shown}\n<figcaption>{picture.caption}</figcaption>\n</figure>'
+            f' markdown="span">\n{linked}\n<figcaption>{picture.caption}</figcaption>\n</figure>'
         )
 
     return _MARK.sub(figure, text)
@@ -154,8 +155,9 @@ def draw_pictures(
 def _run(words: tuple[str, ...], work: Path, results: Path) -> Path:
     """Run a command of neusee and return the folder that it wrote."""
     package = str(Path(neusee.__file__).parents[1])
+    # the same package in the process of the command, also if it is not installed
     paths = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "neusee", *words, "--out", str(results)],
         cwd=work,
         env={**os.environ, "PYTHONPATH": paths},
@@ -163,10 +165,10 @@ def _run(words: tuple[str, ...], work: Path, results: Path) -> Path:
         text=True,
     )
     folders = [path for path in results.glob("*") if path.is_dir() and not path.is_symlink()]
-    if done.returncode not in _FINE or len(folders) != 1:
+    if process.returncode not in _FINE or len(folders) != 1:
         raise NoPicture(
-            f"neusee {' '.join(words)} ended with exit code {done.returncode}:"
-            f" {done.stderr.strip()[-500:]}"
+            f"neusee {' '.join(words)} ended with exit code {process.returncode}:"
+            f" {process.stderr.strip()[-500:]}"
         )
     return folders[0]
 
@@ -183,16 +185,17 @@ def _name_latest(results: Path, work: Path) -> None:
 
 def _take(picture: Picture, results: Path, target: Path) -> str:
     """Copy a picture out of a folder of results and return its new name."""
-    matching = sorted(results.glob(picture.file))
-    if not matching:
-        written = (
+    matching_files = sorted(results.glob(picture.file))
+    if not matching_files:
+        written_text = (
             ", ".join(sorted(str(path.relative_to(results)) for path in results.rglob("*.png")))
             or "no picture"
         )
         raise NoPicture(
-            f"neusee {' '.join(picture.words)} wrote no {picture.file}; it wrote {written}"
+            f"neusee {' '.join(picture.words)} wrote no {picture.file}; it wrote {written_text}"
         )
+    # one name for each command and file, whatever the order of the pages
     digest = hashlib.sha256(" ".join([*picture.words, picture.file]).encode()).hexdigest()[:12]
-    name = f"{digest}{matching[0].suffix}"
-    shutil.copyfile(matching[0], target / name)
+    name = f"{digest}{matching_files[0].suffix}"
+    shutil.copyfile(matching_files[0], target / name)
     return name

@@ -130,11 +130,11 @@ def _defaults() -> Schema:
     A name alone is that of a recipe, or, in the file of an option, that of another option of the
     same group.
     """
-    offered = {
+    packaged_options = {
         group: {"enum": [option.name for option in options]} for group, options in groups().items()
     }
-    other: Schema = {"type": ["string", "null", "array"], "items": {"type": "string"}}
-    options = {group: {"anyOf": [names, other]} for group, names in offered.items()}
+    any_names: Schema = {"type": ["string", "null", "array"], "items": {"type": "string"}}
+    options = {group: {"anyOf": [names, any_names]} for group, names in packaged_options.items()}
     group_choice: Schema = {
         "type": "object",
         "properties": options,
@@ -148,17 +148,17 @@ def _step(nodes: Mapping[str, Node]) -> Schema:
     """Return the JSON schema of a recipe step: the keys of all steps, and the inputs and
     parameters of each node.
     """
-    collection: Schema = {
+    item_lists: Schema = {
         "type": ["string", "array", "null"],
         "items": {"type": "string"},
         "maxItems": 2,
     }
-    names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
+    node_names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
     return {
         "type": ["object", "null"],
         "properties": {
-            "node": names,
-            "each": collection,
+            "node": node_names,
+            "each": item_lists,
             "from": _ANY,
             "with": _ANY,
             "device": _DEVICE,
@@ -195,12 +195,13 @@ def _inputs(node: Node) -> Schema:
 
 
 def _expectation() -> Schema:
+    """Return the JSON schema of an expected number in the key ``expect``."""
     number: Schema = {"anyOf": [{"type": "number"}, REFERENCE]}
-    place: Schema = {
+    indices: Schema = {
         "type": ["array", "integer", "string"],
         "items": {"type": ["integer", "string"]},
     }
-    properties = {"step": {"type": "string"}, "at": place, "value": number, "rtol": number}
+    properties = {"step": {"type": "string"}, "at": indices, "value": number, "rtol": number}
     required = ["step", "value", "rtol"]
     return {
         "type": "object",
@@ -217,12 +218,12 @@ def _parameters(nodes: Mapping[str, Node]) -> Schema:
         model = node.params.model_json_schema(schema_generator=_Generator)
         for field in model.get("properties", {}).values():
             field.pop("title", None)
-        allowed = {
+        parameter_schema = {
             "type": ["object", "null"],
             "properties": model.get("properties", {}),
             "additionalProperties": False,
         }
-        schemas[name] = allowed | ({"$defs": model["$defs"]} if "$defs" in model else {})
+        schemas[name] = parameter_schema | ({"$defs": model["$defs"]} if "$defs" in model else {})
     return schemas
 
 
@@ -243,9 +244,11 @@ class _Generator(GenerateJsonSchema):
     """
 
     def generate_inner(self, schema: Any) -> JsonSchemaValue:
-        inner = super().generate_inner(schema)
-        takes_reference = schema["type"] in _REFERABLE and REFERENCE not in inner.get("anyOf", ())
-        return {"anyOf": [inner, REFERENCE]} if takes_reference else inner
+        value_schema = super().generate_inner(schema)
+        takes_reference = schema["type"] in _REFERABLE and REFERENCE not in value_schema.get(
+            "anyOf", ()
+        )
+        return {"anyOf": [value_schema, REFERENCE]} if takes_reference else value_schema
 
     def function_before_schema(
         self, schema: core_schema.BeforeValidatorFunctionSchema
@@ -253,9 +256,10 @@ class _Generator(GenerateJsonSchema):
         """Return the JSON schema of a physical quantity: a number with one of the units that the
         parameter allows.
         """
-        read = schema["function"]["function"]
+        reader = schema["function"]["function"]
         every_unit = itertools.chain.from_iterable(units._SCALE.values())
-        allowed_units = [unit for unit in every_unit if _takes(read, unit)]
+        # the reader of a quantity refuses the units of other quantities
+        allowed_units = [unit for unit in every_unit if _takes(reader, unit)]
         if not allowed_units:
             return super().function_before_schema(schema)
         lower_bound = max(schema["schema"].get(bound, -math.inf) for bound in ("gt", "ge"))
@@ -265,6 +269,7 @@ class _Generator(GenerateJsonSchema):
 
 
 def _takes(read: Any, unit: str) -> bool:
+    """Return True if the reader of a quantity accepts a number with this unit."""
     try:
         read(f"1 {unit}")
     except (ValueError, TypeError):

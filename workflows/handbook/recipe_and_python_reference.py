@@ -24,10 +24,11 @@ def escaped(text: str) -> str:
     """Return a text in which signs that Markdown would read stand for themselves, outside of
     code.
     """
-    parts = _CODE.split(text)
+    pieces = _CODE.split(text)
     return "".join(
-        piece if n % 2 else re.sub(r"([\\*_<>\[\]|])", r"\\\1", piece)
-        for n, piece in enumerate(parts)
+        # the pattern has one group, so that every second piece is code
+        piece if number % 2 else re.sub(r"([\\*_<>\[\]|])", r"\\\1", piece)
+        for number, piece in enumerate(pieces)
     )
 
 
@@ -56,8 +57,8 @@ def _sentences(paragraph: str) -> Iterator[str]:
     own.
     """
     for line in paragraph.splitlines():
-        if named := re.match(r"([A-Z]\w+): ", line):
-            yield from ("", f"**{named[1]}:** {escaped(line[named.end() :])}")
+        if label := re.match(r"([A-Z]\w+): ", line):
+            yield from ("", f"**{label[1]}:** {escaped(line[label.end() :])}")
         else:
             yield escaped(line.strip())
 
@@ -70,18 +71,20 @@ def _sentences(paragraph: str) -> Iterator[str]:
 
 def python_page() -> str:
     """Return the page on every public name of the package ``neusee``."""
-    public = {name: getattr(neusee, name) for name in neusee.__all__ if not name.startswith("_")}
+    public_names = {
+        name: getattr(neusee, name) for name in neusee.__all__ if not name.startswith("_")
+    }
     functions: list[str] = []
     classes: list[str] = []
-    raised: list[str] = []
-    for name, value in public.items():
+    errors: list[str] = []
+    for name, value in public_names.items():
         if not inspect.isclass(value):
             functions += _section(name, value)
         elif not issubclass(value, Exception):
             classes += _class(name, value)
-    for name in sorted(public):
-        if _is_error(public[name]):
-            raised += _section(name, public[name])
+    for name in sorted(public_names):
+        if _is_error(public_names[name]):
+            errors += _section(name, public_names[name])
     opening = [
         "# Public names",
         "",
@@ -104,7 +107,7 @@ def python_page() -> str:
         ["## Classes"],
         classes,
         ["## Errors"],
-        raised,
+        errors,
     ):
         lines += [*section, ""]
     return "\n".join(lines) + "\n"
@@ -126,11 +129,13 @@ def _class(name: str, value: type) -> Iterator[str]:
     """Yield the section of a class and of each public method."""
     yield from _section(name, value)
     for method, function in vars(value).items():
-        inner = function.fget if isinstance(function, property) else function
+        function_itself = function.fget if isinstance(function, property) else function
         if not method.startswith("_") and (
-            inspect.isfunction(inner) or isinstance(function, classmethod)
+            inspect.isfunction(function_itself) or isinstance(function, classmethod)
         ):
-            yield from _section(f"{name}.{method}", getattr(inner, "__func__", inner), "####")
+            yield from _section(
+                f"{name}.{method}", getattr(function_itself, "__func__", function_itself), "####"
+            )
 
 
 def _signature(value: Any) -> str:
@@ -139,7 +144,7 @@ def _signature(value: Any) -> str:
         signature = inspect.signature(value)
     except (TypeError, ValueError):
         return "()"
-    shown = str(
+    text = str(
         signature.replace(
             parameters=[
                 parameter for name, parameter in signature.parameters.items() if name != "self"
@@ -147,7 +152,8 @@ def _signature(value: Any) -> str:
         )
     )
     # no address
-    return re.sub(r"<(?:function|class) '?([\w.]*\.)?(\w+)'?(?: at 0x[0-9a-f]+)?>", r"\2", shown)
+    # a default that is a function or a class is shown by its name, without an address
+    return re.sub(r"<(?:function|class) '?([\w.]*\.)?(\w+)'?(?: at 0x[0-9a-f]+)?>", r"\2", text)
 
 
 # --- recipe reference -----------------------------------------------------------------------------
@@ -255,9 +261,13 @@ def _training(block: Mapping[str, Any], blocks: Mapping[str, Any]) -> list[str]:
 def _keys(
     block: Mapping[str, Any], blocks: Mapping[str, Any], path: str
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield each key of a block with its path and its part of the schema.
+
+    Keys of blocks in the block are among them.
+    """
     for name, entry in block["properties"].items():
-        if inner := entry.get("$ref"):
-            yield from _keys(blocks[inner.rpartition("/")[2]], blocks, f"{path}.{name}")
+        if reference := entry.get("$ref"):
+            yield from _keys(blocks[reference.rpartition("/")[2]], blocks, f"{path}.{name}")
         else:
             yield f"{path}.{name}", entry
 
@@ -267,6 +277,7 @@ def _groups() -> Iterator[str]:
     for group, options in groups().items():
         yield from (f"### `{group}`", "")
         yield from table(
-            ["option", "what it is"], [[f"`{group}={o.name}`", escaped(o.title)] for o in options]
+            ["option", "what it is"],
+            [[f"`{group}={option.name}`", escaped(option.title)] for option in options],
         )
         yield ""

@@ -81,8 +81,10 @@ def build_handbook(
     pages = {**read_pages(), **reference}
     with TemporaryDirectory(prefix="neusee_handbook_") as folder:
         docs, site = Path(folder, "docs"), Path(folder, "site")
-        drawn = _draw(pages, Path(folder), docs / "pictures", progress, strict) if pictures else {}
-        _write_docs(pages, drawn, docs)
+        drawn_pictures = (
+            _draw(pages, Path(folder), docs / "pictures", progress, strict) if pictures else {}
+        )
+        _write_docs(pages, drawn_pictures, docs)
         settings = Path(folder, "mkdocs.yml")
         settings.write_text(settings_text(pages, docs, site), encoding="utf-8")
         _run_mkdocs(settings, strict)
@@ -113,9 +115,11 @@ def complete_nav(nav: Tree, pages: Mapping[str, str]) -> Tree:
 
     An entry that ends in ``/`` stands for all pages in a folder.
     """
-    named = set(_named(nav, pages))
-    unnamed = [{title_of(text): path} for path, text in pages.items() if path not in named]
-    return _sections(nav, pages) + ([{_REST: unnamed}] if unnamed else [])
+    named_pages = set(_named(nav, pages))
+    unnamed_pages = [
+        {title_of(text): path} for path, text in pages.items() if path not in named_pages
+    ]
+    return _sections(nav, pages) + ([{_REST: unnamed_pages}] if unnamed_pages else [])
 
 
 def _sections(nav: Tree, pages: Mapping[str, str]) -> Tree:
@@ -129,6 +133,10 @@ def _sections(nav: Tree, pages: Mapping[str, str]) -> Tree:
 
 
 def _filled(entry: Any, pages: Mapping[str, str]) -> Any:
+    """Return an entry of the navigation with the pages that exist.
+
+    An entry of no page gives None or an empty list.
+    """
     if isinstance(entry, list):
         return _sections(entry, pages)
     if entry.endswith("/"):
@@ -137,17 +145,18 @@ def _filled(entry: Any, pages: Mapping[str, str]) -> Any:
 
 
 def _named(entry: Any, pages: Mapping[str, str]) -> set[str]:
+    """Return the paths of all pages that an entry of the navigation names, at any depth."""
     if isinstance(entry, str):
         return {
             path
             for path in pages
             if path == entry or (entry.endswith("/") and path.startswith(entry))
         }
-    named = set()
+    named_pages = set()
     for entries in entry:
-        for inner in entries.values():
-            named |= _named(inner, pages)
-    return named
+        for entry_below in entries.values():
+            named_pages |= _named(entry_below, pages)
+    return named_pages
 
 
 def _draw(
@@ -157,6 +166,10 @@ def _draw(
     progress: Callable[[str], None],
     strict: bool,
 ) -> dict[Picture, str]:
+    """Draw the pictures of all pages, and return the name of each file.
+
+    The commands of the pages run in the folder `work`.
+    """
     write_files(pages, work)
     pictures = list(itertools.chain.from_iterable(map(pictures_of, pages.values())))
     return draw_pictures(pictures, work, target, progress, strict)
@@ -168,32 +181,46 @@ def _write_docs(pages: Mapping[str, str], drawn: Mapping[Picture, str], docs: Pa
         GUIDE, docs, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.md", "mkdocs.yml")
     )
     for path, text in pages.items():
-        up = "../" * path.count("/")
+        path_to_root = "../" * path.count("/")
         target = docs / path
         target.parent.mkdir(parents=True, exist_ok=True)
-        names = {picture: f"{up}pictures/{name}" for picture, name in drawn.items()}
+        names = {picture: f"{path_to_root}pictures/{name}" for picture, name in drawn.items()}
         target.write_text(with_pictures(text, names), encoding="utf-8")
 
 
 def _run_mkdocs(settings: Path, strict: bool) -> None:
-    words = ["build", "--quiet", *(["--strict"] if strict else []), "--config-file", str(settings)]
+    """Build the pages with MkDocs.
+
+    Raise `HandbookError` with the end of its messages if it fails.
+    """
+    arguments = [
+        "build",
+        "--quiet",
+        *(["--strict"] if strict else []),
+        "--config-file",
+        str(settings),
+    ]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", *words], env=environment, capture_output=True, text=True
+    process = subprocess.run(
+        [sys.executable, "-m", "mkdocs", *arguments],
+        env=environment,
+        capture_output=True,
+        text=True,
     )
-    if done.returncode:
+    if process.returncode:
         raise HandbookError(
-            f"mkdocs could not build the pages: {(done.stderr or done.stdout).strip()[-2000:]}"
+            "mkdocs could not build the pages:"
+            f" {(process.stderr or process.stdout).strip()[-2000:]}"
         )
 
 
 def _replace(out: Path, site: Path) -> None:
     """Put the files of the new handbook in the place of the files of an old one."""
     out.mkdir(parents=True, exist_ok=True)
-    for old in out.iterdir():
-        if old.is_dir() and not old.is_symlink():
-            shutil.rmtree(old)
+    for old_file in out.iterdir():
+        if old_file.is_dir() and not old_file.is_symlink():
+            shutil.rmtree(old_file)
         else:
-            old.unlink()
-    for new in site.iterdir():
-        shutil.move(new, out / new.name)
+            old_file.unlink()
+    for new_file in site.iterdir():
+        shutil.move(new_file, out / new_file.name)

@@ -72,8 +72,8 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
         self.register_buffer("transfer", torch.view_as_real(blur.transfer / gain), persistent=False)
         self.register_buffer("mask", mask, persistent=False)
         self.register_buffer("matrix", matrix, persistent=False)
-        measured = mask * (frame - pattern - sensor.dark)[None] / self.frame_unit
-        self.register_buffer("frame", measured, persistent=False)
+        known_frame = mask * (frame - pattern - sensor.dark)[None] / self.frame_unit
+        self.register_buffer("frame", known_frame, persistent=False)
 
     @property
     def blur(self) -> FrameBlur:
@@ -113,10 +113,13 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
         """Return the scene without contrast that has the mean of each channel of the frame; a
         good first iterate.
         """
-        lit = self.A(self.frame.new_ones(1, *self.img_size)).sum((-2, -1), keepdim=True)
-        light = self.frame.sum((-2, -1), keepdim=True) / lit.clamp_min(torch.finfo(lit.dtype).tiny)
-        even: Tensor = light.expand(1, *self.img_size).clone()
-        return even
+        frame_of_ones = self.A(self.frame.new_ones(1, *self.img_size)).sum((-2, -1), keepdim=True)
+        # clipped pixels are 0 in both sums
+        channel_light = self.frame.sum((-2, -1), keepdim=True) / frame_of_ones.clamp_min(
+            torch.finfo(frame_of_ones.dtype).tiny
+        )
+        even_scene: Tensor = channel_light.expand(1, *self.img_size).clone()
+        return even_scene
 
     def crop(self, x: Tensor) -> Tensor:
         """Return the part of scenes that lies in the frame."""
@@ -156,8 +159,8 @@ class SensorLikelihood(DataFidelity):  # type: ignore[misc]
     ) -> None:
         super().__init__()
         self.sensor, self.unit, self.floor = sensor, unit, floor * unit
-        darkest = float(sensor.variance(torch.zeros((), dtype=torch.float64), self.floor))
-        self.scale = darkest / unit**2 if scale is None else scale
+        variance_at_floor = float(sensor.variance(torch.zeros((), dtype=torch.float64), self.floor))
+        self.scale = variance_at_floor / unit**2 if scale is None else scale
 
     def fn(self, x: Tensor, y: Tensor, physics: CameraPhysics, *_: Any, **__: Any) -> Tensor:
         """Return the scaled negative log-likelihood of each frame of a batch: (batch,)."""

@@ -52,9 +52,9 @@ def as_physics(
     without these steps or with a sensor that is not of this kind, and for a glare of another number
     of channels.
     """
-    made = _deepinv_camera()
-    needed = [*_OPTICS, *(f"{name}[{arm}]" for name in ("psf", "clipped", *_SENSOR))]
-    for name in needed:
+    physics_class = _deepinv_camera()
+    needed_steps = [*_OPTICS, *(f"{name}[{arm}]" for name in ("psf", "clipped", *_SENSOR))]
+    for name in needed_steps:
         if name not in recipe.steps:
             raise ValueError(
                 f"as_physics needs the step {name}: {unknown_step(name, recipe.steps)}"
@@ -65,7 +65,7 @@ def as_physics(
         name.partition("[")[0]: value
         for name, value in run(recipe, store, outputs, device=device).values.items()
     }
-    return made(
+    return physics_class(
         *_parts(values, sensor, glare, dtype),
         sensor.well if unit is None else unit,
         values["matrix"],

@@ -26,34 +26,41 @@ def unaffected_expectations(recipe: Recipe, written: Recipe | None) -> Recipe:
     None for ``written`` means that the recipe is not valid without the changes, so that the changes
     affect everything.
     """
-    same = _unchanged_steps(recipe, written) if written else set[str]()
-    lost = [
-        e for e in recipe.expect if (written is None or e in written.expect) and e.step not in same
+    unchanged = _unchanged_steps(recipe, written) if written else set[str]()
+    affected = [
+        expected
+        for expected in recipe.expect
+        if (written is None or expected in written.expect) and expected.step not in unchanged
     ]
-    if not lost:
+    if not affected:
         return recipe
     note = (
         "not compared, because your changes affect these numbers:"
-        f" {', '.join(e.name for e in lost)}"
+        f" {', '.join(expected.name for expected in affected)}"
     )
-    comparable = tuple(e for e in recipe.expect if e not in lost)
+    comparable = tuple(expected for expected in recipe.expect if expected not in affected)
     return replace(recipe, expect=comparable, notes=(*recipe.notes, note))
 
 
 def _unchanged_steps(recipe: Recipe, written: Recipe) -> set[str]:
     """Return the steps that are the same in two recipes, with all that they depend on."""
-    same: set[str] = set()
+    unchanged: set[str] = set()
     for name in needed(recipe, recipe.steps):
-        if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
-            same.add(name)
-    return same
+        if unchanged.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
+            unchanged.add(name)
+    return unchanged
 
 
 def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
-    step, other = recipe.steps[name], written.steps.get(name)
-    if other is None or (step.node.random and recipe.seed != written.seed):
+    """Return True if a step is the same in both recipes, apart from the steps that it reads."""
+    step, written_step = recipe.steps[name], written.steps.get(name)
+    if written_step is None or (step.node.random and recipe.seed != written.seed):
         return False
-    return (step.node, step.params, step.wires) == (other.node, other.params, other.wires)
+    return (step.node, step.params, step.wires) == (
+        written_step.node,
+        written_step.params,
+        written_step.wires,
+    )
 
 
 # --- exported files -------------------------------------------------------------------------------
@@ -94,9 +101,10 @@ def exports_of(root: Value, wiring: Wiring) -> dict[str, bool] | None:
 
 
 def _named(words: list[Value], wiring: Wiring) -> Iterator[tuple[str, bool]]:
+    """Yield each file name of the list with True for half floats; report names that no file has."""
     for word in words:
         name = str(word.data).removesuffix(HALF)
-        half = str(word.data) != name
+        is_half = str(word.data) != name
         if word.data is BROKEN:
             continue
         if name not in NAMES:
@@ -104,10 +112,10 @@ def _named(words: list[Value], wiring: Wiring) -> Iterator[tuple[str, bool]]:
                 f"no file of a run; {nearest(name, NAMES)}: write {ALL}, {NONE} or a list of names"
             )
             wiring.refuse(word, f"{KEY} = {word.data}", text)
-        elif half and not name.endswith(".exr"):
+        elif is_half and not name.endswith(".exr"):
             wiring.refuse(word, f"{KEY} = {word.data}", "only an .exr file can have half floats")
         else:
-            yield name, half
+            yield name, is_half
 
 
 # --- global settings ------------------------------------------------------------------------------
@@ -198,7 +206,8 @@ def expectations(root: Value, wiring: Wiring) -> tuple[Expectation, ...]:
 
 
 def _expectation(name: str, block: Value, wiring: Wiring) -> Expectation | None:
-    before = len(wiring.diagnostics)
+    """Return one expected number of the key ``expect``; None with diagnostics for a mistake."""
+    earlier_mistakes = len(wiring.diagnostics)
     values: dict[str, Value] = block.items if isinstance(block.data, dict) else {}
     _refuse_keys(block, values, wiring)
     _refuse_numbers(values, wiring)
@@ -206,7 +215,7 @@ def _expectation(name: str, block: Value, wiring: Wiring) -> Expectation | None:
     if len(steps) > 1:
         wiring.refuse(values["step"], values["step"].name, f"must be one step, such as {steps[0]}")
     indices = _indices(values["at"], wiring) if "at" in values else ()
-    if len(wiring.diagnostics) > before or not steps:
+    if len(wiring.diagnostics) > earlier_mistakes or not steps:
         return None
     return Expectation(
         name, steps[0], indices, float(values["value"].data), float(values["rtol"].data), block.key
@@ -236,6 +245,7 @@ def _refuse_numbers(values: Mapping[str, Value], wiring: Wiring) -> None:
 
 
 def _indices(value: Value, wiring: Wiring) -> tuple[int | str, ...]:
+    """Return the indices or field names that select one number of a result; report other values."""
     indices = value.plain if isinstance(value.data, list) else [value.plain]
     if not all(isinstance(index, int | str) and not isinstance(index, bool) for index in indices):
         wiring.refuse(value, value.name, "must be a list of indices or names of fields")

@@ -90,16 +90,18 @@ def with_cameras(
         for camera in block.items.values()
     )
     settings = dict(recipe.config.settings)
-    stated = [changes(recipe.config, camera.config, _TRAIN) for camera in cameras]
-    settings[_CAMERAS] = replace(settings[_CAMERAS], value=stated)
+    differing_values = [changes(recipe.config, camera.config, _TRAIN) for camera in cameras]
+    settings[_CAMERAS] = replace(settings[_CAMERAS], value=differing_values)
     return replace(recipe, cameras=cameras, config=Config(settings))
 
 
 def _overrides(camera: Value) -> list[Override]:
+    """Return the overrides of one camera; raise `RecipeError` for one that changes the training."""
     overrides = [_override(str(value.plain), value) for value in camera.items.values()]
-    if wrong := [o for o in overrides if o.path[0] == _TRAIN]:
+    if of_training := [override for override in overrides if override.path[0] == _TRAIN]:
         raise RecipeError(
-            Diagnostic(o.mark, camera.name, f"{o.text} is no setting of a camera") for o in wrong
+            Diagnostic(override.mark, camera.name, f"{override.text} is no setting of a camera")
+            for override in of_training
         )
     return overrides
 
@@ -127,14 +129,18 @@ def final_values(
     settings: dict[str, Setting] = {}
     spare = wiring.references.spare
     for key, block in wiring.root.items.items():
+        # values of packaged options that no step uses are left out
         if key != "steps":
-            of_block = _block_settings(block, checker, memory)
-            settings |= {name: value for name, value in of_block.items() if value.path not in spare}
+            block_settings = _block_settings(block, checker, memory)
+            settings |= {
+                name: value for name, value in block_settings.items() if value.path not in spare
+            }
             continue
         for name, step in block.items.items():
             settings |= _block_settings(step, checker, memory)
             if str(name) in wiring.steps:
                 settings |= _defaults(wiring.steps[str(name)], bound)
+    # a distribution stands as it was written, not as the number of this run
     for name, law in uncertain.laws.items() if uncertain else ():
         if name in settings:
             settings[name] = replace(settings[name], value=law.full_text)
@@ -147,13 +153,13 @@ def _block_settings(
     """Return the final values of a block by path, those of an earlier check if the block is the
     same object.
     """
-    remembered = memory.settings.get(block.path) if memory else None
-    same = remembered is not None and remembered[0] is block
-    settings = remembered[1] if remembered and same else dict(settings_of([block], checker))
+    earlier = memory.settings.get(block.path) if memory else None
+    is_same = earlier is not None and earlier[0] is block
+    settings = earlier[1] if earlier and is_same else dict(settings_of([block], checker))
     # paths of files may differ
     if any(setting.path in checker.files for setting in settings.values()):
         return dict(settings_of([block], checker))
-    if memory and not same:
+    if memory and not is_same:
         memory.settings[block.path] = block, settings
     return settings
 
@@ -170,13 +176,13 @@ def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Set
     """Yield the parameters of a step that the recipe does not set, with the default values in
     SI.
     """
-    first = bound.get(step.instances[0]) if step.instances else None
-    for name, value in (first.params if first else {}).items():
-        if first and name not in first.param_marks:
+    first_copy = bound.get(step.instances[0]) if step.instances else None
+    for name, value in (first_copy.params if first_copy else {}).items():
+        if first_copy and name not in first_copy.param_marks:
             path = (*step.value.path, "with", name)
             yield (
                 ".".join(map(str, path)),
-                Setting(value, f"default of {first.node.path}", path, True),
+                Setting(value, f"default of {first_copy.node.path}", path, True),
             )
 
 
@@ -222,18 +228,21 @@ def load(
     folder). Messages number ``overrides`` from ``first``. A note names the expected numbers that
     overrides affect, because these are not compared. Raises `RecipeError` with all mistakes.
     """
-    name, beside = os.fspath(name_or_path), Path(folder or ".").absolute()
-    changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, beside))
-    composed = compose(name, changes, beside, first)
+    name, base_folder = os.fspath(name_or_path), Path(folder or ".").absolute()
+    changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, base_folder))
+    composed = compose(name, changes, base_folder, first)
     recipe = check(composed)
     if recipe.training and recipe.training.cameras:
         recipe = with_cameras(
-            recipe, composed, lambda words: check(compose(name, [*changes, *words], beside, first))
+            recipe,
+            composed,
+            lambda words: check(compose(name, [*changes, *words], base_folder, first)),
         )
+    # numbers of a recipe that was extended hold only where nothing was changed since
     for extended in composed.extended if recipe.expect else ():
-        recipe = _without_changed_numbers(recipe, extended, beside)
+        recipe = _without_changed_numbers(recipe, extended, base_folder)
     if recipe.expect and changes:
-        recipe = unaffected_expectations(recipe, _as_written(name, beside))
+        recipe = unaffected_expectations(recipe, _as_written(name, base_folder))
     if recipe.expect and (problems := list(refuse_indices(recipe))):
         raise RecipeError(problems)
     return recipe
@@ -243,8 +252,8 @@ def _without_changed_numbers(recipe: Recipe, extended: Path, folder: Path) -> Re
     """Return a recipe without those expected numbers of a recipe that it extends which its changes
     affect. One that is no recipe by itself has no numbers of its own.
     """
-    below = _as_written(str(extended), folder)
-    return recipe if below is None else unaffected_expectations(recipe, below)
+    extended_recipe = _as_written(str(extended), folder)
+    return recipe if extended_recipe is None else unaffected_expectations(recipe, extended_recipe)
 
 
 def _as_written(name: str, folder: Path) -> Recipe | None:
@@ -296,36 +305,46 @@ def check(composed: Composed) -> Recipe:
     """
     blocks = [composed.root.items[key] for key in BLOCKS if key in composed.root.items]
     mistakes: list[Diagnostic] = []
-    own = read_own_families(composed.root, mistakes)
+    # code of the user first, because blocks and steps may name it
+    own_families = read_own_families(composed.root, mistakes)
     composed = composed.with_problems(mistakes)
-    read = _settings_blocks(composed, blocks, own.modules)
-    composed, training, lifting, evaluation, traceability = read
+    blocks_read = _settings_blocks(composed, blocks, own_families.modules)
+    composed, training, lifting, evaluation, traceability = blocks_read
+    # a number in place of each distribution
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
+    # `train` is the first of `BLOCKS`
     uncertain = _with_mismatch(composed, uncertain, blocks[0] if training else None, diagnostics)
     root = composed.root
+    # the steps, and what they read
     references = References(root, diagnostics, dict(composed.replaced))
-    checker = Checker([], own=own.modules)
-    checker.files[(KEY,)] = own.places
-    graph = cached_graph(root, own.modules)
+    checker = Checker([], own=own_families.modules)
+    checker.files[(KEY,)] = own_families.places
+    graph = cached_graph(root, own_families.modules)
     memory = graph.memory if graph else None
-    steps, absent = _declared(graph, root, references, diagnostics, own)
+    steps, absent = _declared(graph, root, references, diagnostics, own_families)
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
     bound = {step.name: step for step in _bind(wiring, checker, graph, checked)}
-    loops = _cycles(bound, steps, graph)
-    diagnostics += loops
+    cycles_found = _cycles(bound, steps, graph)
+    diagnostics += cycles_found
+    # keys of the whole recipe
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
     estimates = estimates_of(root, references, checker.diagnostics)
     outputs = outputs_of(root, wiring)
-    check_steps(checked, checker, None if loops else outputs, memory.forms if memory else None)
+    # shapes are known only along a graph without a cycle
+    check_steps(
+        checked, checker, None if cycles_found else outputs, memory.forms if memory else None
+    )
     expect, exports = expectations(root, wiring), exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
+    # after all that could use a value
     references.finish()
-    _refuse_mistakes(composed, diagnostics, checker, own)
+    _refuse_mistakes(composed, diagnostics, checker, own_families)
+    # only a recipe without mistakes comes this far
     if graph is None:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     settings = final_values(wiring, bound, checker, uncertain, memory)
-    said_before_run = (composed.notes, own.notes, checker.notes, references.notes)
+    note_lists = (composed.notes, own_families.notes, checker.notes, references.notes)
     return Recipe(
         name=composed.name,
         title=composed.title,
@@ -335,7 +354,7 @@ def check(composed: Composed) -> Recipe:
         steps=bound,
         expect=expect,
         config=Config(settings | dict(settings_of(blocks, checker))),
-        notes=(*chain.from_iterable(said_before_run), *_notes_of(uncertain)),
+        notes=(*chain.from_iterable(note_lists), *_notes_of(uncertain)),
         absent=_places_of_null(absent),
         estimates=estimates,
         uncertain=uncertain,
@@ -438,19 +457,21 @@ def _bind(
     ``graph`` has the inputs of each copy, and the copies that were checked with the same values
     before.
     """
-    known_wires, memory = (graph.wires, graph.memory) if graph else ({}, None)
+    cached_wires, memory = (graph.wires, graph.memory) if graph else ({}, None)
     for step in wiring.steps.values():
+        # no copy is made, but what the step refers to counts as used
         if not step.items:
             for key in ("from", "with", "device", "cache"):
                 wiring.references.touch(step.part(key), step.dims)
         for items in step.items:
             name = step.instance(items)
-            if memory and (same := memory.find(name, wiring.references)):
-                checked.append(same)
-                yield same.step
+            # the same values were checked before
+            if memory and (checked_before := memory.find(name, wiring.references)):
+                checked.append(checked_before)
+                yield checked_before.step
                 continue
             attempt = Attempt(wiring.references, checker)
-            bound = _bound_copy(wiring, checker, step, items, known_wires)
+            bound = _bound_copy(wiring, checker, step, items, cached_wires)
             if bound is None:
                 continue
             if bound.is_valid:
@@ -495,10 +516,12 @@ def families_of(name: str, folder: Path | None = None) -> Own:
     Raises `RecipeError` if a family cannot be read.
     """
     diagnostics: list[Diagnostic] = []
-    own = read_own_families(compose(name, (), (folder or Path.cwd()).absolute()).root, diagnostics)
+    families = read_own_families(
+        compose(name, (), (folder or Path.cwd()).absolute()).root, diagnostics
+    )
     if diagnostics:
         raise RecipeError(diagnostics)
-    return own.modules
+    return families.modules
 
 
 # --- lists of recipes and groups ------------------------------------------------------------------
@@ -533,8 +556,9 @@ _TITLE = 4096  #: bytes of the first line of a recipe, at most
 
 
 def _titled(path: Path) -> Titled:
-    first = head_of(path, _TITLE).decode("utf-8", "replace").partition("\n")[0].strip()
-    return Titled(path.stem, visible(first.lstrip("# ")) if first.startswith("#") else "")
+    """Return a recipe with its title: the first line of its file, if that is a comment."""
+    first_line = head_of(path, _TITLE).decode("utf-8", "replace").partition("\n")[0].strip()
+    return Titled(path.stem, visible(first_line.lstrip("# ")) if first_line.startswith("#") else "")
 
 
 # --- changed recipe -------------------------------------------------------------------------------
@@ -549,6 +573,7 @@ def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     """
     with TemporaryDirectory(prefix="neusee-") as folder:
         path = Path(folder) / "recipe.yaml"
+        # written out and read again, so that every override is checked
         path.write_text(recipe.config.to_yaml(), encoding="utf-8")
         loaded = load(path, overrides)
     loaded = replace(

@@ -52,8 +52,8 @@ def find_node(name: str, own: Own = _NO_OWN) -> Node:
     """
     family, _, attribute = name.partition(".")
     nodes = nodes_of(family, own) if _exists(family, own) else {}
-    if attribute not in nodes and (now := instead(name)):
-        raise LookupError(f"{name} {now}")
+    if attribute not in nodes and (renaming := instead(name)):
+        raise LookupError(f"{name} {renaming}")
     if not nodes:
         hint = _elsewhere(attribute, own) or nearest(family, families(own))
         raise LookupError(f"no family of nodes {family}; {hint}")
@@ -66,14 +66,14 @@ def find_node(name: str, own: Own = _NO_OWN) -> Node:
 def families(own: Own = _NO_OWN) -> list[str]:
     """Return the names of the families of nodes, such as ``optics``, without importing a family."""
     packages = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
-    loaded = (
+    matches = (
         re.fullmatch(rf"{neusee.nodes.__name__}\.([a-z]\w*)", module)
         for module in list(sys.modules)
     )
     return sorted(
         {
             *packages,
-            *(match[1] for match in loaded if match and _ours(match[1])),
+            *(match[1] for match in matches if match and _ours(match[1])),
             *_installed(),
             *own,
         }
@@ -209,8 +209,8 @@ def import_own(where: str, folder: Path) -> ModuleType:
         return module
     except ModuleNotFoundError as error:
         if not is_path and error.name and f"{where}.".startswith(f"{error.name}."):
-            beside = f"; write ./{where} for the folder" if path.is_dir() else ""
-            raise LookupError(f"no module {where} is installed{beside}") from None
+            hint = f"; write ./{where} for the folder" if path.is_dir() else ""
+            raise LookupError(f"no module {where} is installed{hint}") from None
         raise LookupError(_failure(where, error)) from None
     except (Exception, SystemExit) as error:
         raise LookupError(_failure(where, error)) from None
@@ -221,19 +221,23 @@ def _with_parameters(node: Node) -> Node:
     be validated.
     """
     code = inspect.unwrap(node.fn).__code__
-    place, name = f"{Path(code.co_filename).name}:{code.co_firstlineno}", node.fn.__name__
+    source_line, name = f"{Path(code.co_filename).name}:{code.co_firstlineno}", node.fn.__name__
     try:
-        if bare := unannotated(node):
+        if without_annotation := unannotated(node):
             raise LookupError(
-                f"{place}: {name} does not say what {bare[0]} is: write a type such as `{bare[0]}:"
+                f"{source_line}: {name} does not say what {without_annotation[0]} is: write a"
+                f" type such as `{without_annotation[0]}:"
                 " float`, or a unit of neusee.nodes.units"
             )
+        # made at the first use, which reads the annotations
         assert node.params
     except LookupError:
         raise
     except Exception as error:
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        raise LookupError(f"{place}: the annotations of {name} cannot be read: {text}") from None
+        raise LookupError(
+            f"{source_line}: the annotations of {name} cannot be read: {text}"
+        ) from None
     return node
 
 
@@ -249,22 +253,25 @@ def unannotated(node: Node) -> list[str]:
 
 def _failure(where: str, error: BaseException) -> str:
     """Return why the import of a module failed, with the last line of the user's code that ran."""
-    inner = _own_frames(error)
-    line = f"{Path(inner[-1].filename).name}:{inner[-1].lineno}: " if inner else ""
+    user_frames = _own_frames(error)
+    source_line = (
+        f"{Path(user_frames[-1].filename).name}:{user_frames[-1].lineno}: " if user_frames else ""
+    )
     if isinstance(error, SyntaxError) and error.filename:
-        line = f"{Path(error.filename).name}:{error.lineno}: "
-    kind = "" if type(error) is ImportError and not inner else f"{type(error).__name__}: "
+        source_line = f"{Path(error.filename).name}:{error.lineno}: "
+    # an ImportError of our own says all in its text
+    kind = "" if type(error) is ImportError and not user_frames else f"{type(error).__name__}: "
     text = error.msg if isinstance(error, SyntaxError) else str(error)
-    return f"{where} cannot be imported: {line}{kind}{text}".rstrip()
+    return f"{where} cannot be imported: {source_line}{kind}{text}".rstrip()
 
 
 def _own_frames(error: BaseException) -> list[traceback.FrameSummary]:
     """Return the lines of an error that are neither of the import nor of neusee."""
-    ours = str(Path(neusee.nodes.__file__).parents[1])
+    package_folder = str(Path(neusee.nodes.__file__).parents[1])
     return [
         frame
         for frame in traceback.extract_tb(error.__traceback__)
-        if "importlib" not in frame.filename and not frame.filename.startswith(ours)
+        if "importlib" not in frame.filename and not frame.filename.startswith(package_folder)
     ]
 
 
@@ -281,6 +288,7 @@ def _is_ours(family: str) -> bool:
 
 
 def _ours(family: str) -> dict[str, Node]:
+    """Return the nodes of a family of neusee by name."""
     module = importlib.import_module(f"{neusee.nodes.__name__}.{family}")
     return {name: value for name, value in vars(module).items() if isinstance(value, Node)}
 
@@ -307,14 +315,17 @@ def _load(family: str) -> ModuleType:
             sorted({point.dist.name if point.dist else point.value for point in points})
         )
         raise LookupError(f"{names} both install a family of nodes {family}: uninstall one")
-    module, place = points[0].value, points[0].dist.name if points[0].dist else points[0].value
+    module, distribution = (
+        points[0].value,
+        points[0].dist.name if points[0].dist else points[0].value,
+    )
     try:
         loaded = importlib.import_module(module)
         note_module(module)
         return loaded
     except (Exception, SystemExit) as error:
         raise LookupError(
-            f"{family} of the installed package {place} fails: {_failure(module, error)}"
+            f"{family} of the installed package {distribution} fails: {_failure(module, error)}"
         ) from None
 
 
@@ -350,50 +361,54 @@ def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies
 
     Importing runs the code. The variable ``NEUSEE_NO_CODE`` refuses that.
     """
-    own = OwnFamilies()
+    own_families = OwnFamilies()
     entries = root.items.get(KEY)
     if entries is None or entries.data is None:
-        return own
+        return own_families
     if not isinstance(entries.data, list):
         diagnostics.append(
             Diagnostic(
                 entries.mark, KEY, f"must be a list of files and modules, not {kind(entries)}"
             )
         )
-        own.is_whole = False
-        return own
-    before = len(diagnostics)
+        own_families.is_whole = False
+        return own_families
+    earlier_mistakes = len(diagnostics)
     for entry in entries.data:
-        pair = _pair(entry)
-        if pair is None:
+        family_and_place = _pair(entry)
+        if family_and_place is None:
             diagnostics.append(Diagnostic(entry.mark, entry.name, _FORM))
             continue
         if is_strange():
             message = f"names code, which {NO_CODE_VARIABLE} or --no-code refuses to run"
-            diagnostics.append(Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", message))
+            diagnostics.append(
+                Diagnostic(entry.mark, f"{entry.name} = {family_and_place[1].data}", message)
+            )
             continue
         try:
-            _add(own, *pair)
+            _add(own_families, *family_and_place)
         except LookupError as error:
             diagnostics.append(
-                Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", str(error.args[0]))
+                Diagnostic(
+                    entry.mark, f"{entry.name} = {family_and_place[1].data}", str(error.args[0])
+                )
             )
-    own.is_whole = len(diagnostics) == before
-    if own.modules:
+    own_families.is_whole = len(diagnostics) == earlier_mistakes
+    if own_families.modules:
         names = ", ".join(
-            str(getattr(module, "__file__", module)) for module in own.modules.values()
+            str(getattr(module, "__file__", module)) for module in own_families.modules.values()
         )
-        own.notes.append(f"reading this recipe ran code: {names}")
-    return own
+        own_families.notes.append(f"reading this recipe ran code: {names}")
+    return own_families
 
 
 def _pair(entry: Value) -> tuple[str, Value] | None:
     """Return the family, or an empty text, and the place of an entry, or None for another form."""
     if isinstance(entry.data, str):
         return "", entry
-    pair = list(entry.items.items()) if isinstance(entry.data, dict) else []
-    if len(pair) == 1 and isinstance(pair[0][1].data, str) and str(pair[0][0]).isidentifier():
-        return str(pair[0][0]), pair[0][1]
+    items = list(entry.items.items()) if isinstance(entry.data, dict) else []
+    if len(items) == 1 and isinstance(items[0][1].data, str) and str(items[0][0]).isidentifier():
+        return str(items[0][0]), items[0][1]
     return None
 
 
@@ -403,15 +418,18 @@ def _add(own: OwnFamilies, family: str, where: Value) -> None:
     """
     folder = Path(where.mark.folder)
     module = import_own(str(where.data), folder)
-    name = family or module.__name__.rpartition(".")[2]
-    if own.modules.get(name) is module:
+    family_name = family or module.__name__.rpartition(".")[2]
+    if own.modules.get(family_name) is module:
         return
-    if name in own.modules or is_known(name):
-        other = getattr(own.modules.get(name), "__file__", "neusee or an installed package")
-        text = f"a family of nodes {name} is there already, of {other}"
-        raise LookupError(f"{text}: name yours, as in `nodes: [my_{name}: {where.data}]`")
-    own_nodes(name, module)
-    own.modules[name] = module
-    full = folder / str(where.data)
-    place = os.path.abspath(full) if full.exists() else str(where.data)
-    own.places.append({family: place} if family else place)
+    if family_name in own.modules or is_known(family_name):
+        other_file = getattr(
+            own.modules.get(family_name), "__file__", "neusee or an installed package"
+        )
+        text = f"a family of nodes {family_name} is there already, of {other_file}"
+        raise LookupError(f"{text}: name yours, as in `nodes: [my_{family_name}: {where.data}]`")
+    # raises for a module without a node
+    own_nodes(family_name, module)
+    own.modules[family_name] = module
+    full_path = folder / str(where.data)
+    recorded_place = os.path.abspath(full_path) if full_path.exists() else str(where.data)
+    own.places.append({family: recorded_place} if family else recorded_place)

@@ -89,9 +89,9 @@ class Checker:
             self.diagnostics += _problems(error, node, values, block, step)
             return None
         params = {name: getattr(model, name) for name in node.params.model_fields}
-        strange = _strange_files(params, values)
-        self.diagnostics += strange
-        return None if strange else params
+        refused_files = _strange_files(params, values)
+        self.diagnostics += refused_files
+        return None if refused_files else params
 
     def preflight(
         self,
@@ -114,8 +114,11 @@ class Checker:
                 bound, functools.partial(bound.node.hooks.preflight, **bound.params, **forms)
             )
         except ParameterError as error:
-            fed, _, name = error.parameter.rpartition(".")
-            value = (source(bound.wires.get(fed)) if fed else parameters.items).get(name)
+            # the node may blame a parameter of the step that feeds one of its inputs
+            fed_input, _, name = error.parameter.rpartition(".")
+            value = (source(bound.wires.get(fed_input)) if fed_input else parameters.items).get(
+                name
+            )
             if value is None:
                 self.diagnostics.append(
                     Diagnostic(step.key, f"{step.name}.with.{error.parameter}", str(error))
@@ -135,20 +138,20 @@ class Checker:
         """Return a parameter value as plain data, with a file path relative to the folder of its
         YAML file.
         """
-        parts = value.data if isinstance(value.data, list) else [value]
+        items = value.data if isinstance(value.data, list) else [value]
         hint = node.hints.get(name)
         if (
             not is_file(hint)
-            or not all(isinstance(item.data, str) for item in parts)
+            or not all(isinstance(item.data, str) for item in items)
             or value.plain in texts_of(hint)
         ):
             return value.plain
         paths = [
             os.path.normpath(Path(item.mark.folder) / Path(item.data).expanduser())
-            for item in parts
+            for item in items
         ]
-        full = [os.path.abspath(path) for path in paths]
-        self.files[value.path] = full if isinstance(value.data, list) else full[0]
+        full_paths = [os.path.abspath(path) for path in paths]
+        self.files[value.path] = full_paths if isinstance(value.data, list) else full_paths[0]
         return paths if isinstance(value.data, list) else paths[0]
 
 
@@ -163,14 +166,14 @@ def _strange(parameter: Any, value: Value) -> str:
     text.
     """
     values = parameter if isinstance(parameter, tuple | list) else [parameter]
-    files = [path for path in values if isinstance(path, Path)]
-    if not files or not is_strange():
+    paths = [path for path in values if isinstance(path, Path)]
+    if not paths or not is_strange():
         return ""
-    if any(file.suffix == ".pt2" for file in files):
+    if any(file.suffix == ".pt2" for file in paths):
         refused = f"which {NO_CODE_VARIABLE} or --no-code refuses to run"
         return f"a file of torch.export holds code, {refused}"
     try:
-        for file in files:
+        for file in paths:
             refuse_outside(file, value.mark)
     except ValueError as error:
         return str(error)
@@ -191,27 +194,33 @@ def _problems(
 ) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each parameter of a step that is wrong, unknown or missing."""
     details = error.errors(include_url=False)
-    strangers = [str(e["loc"][0]) for e in details if _is_of_parameter(e, "extra_forbidden")]
-    wrong: dict[tuple[Location, str], list[str]] = {}
-    removed: dict[str, Diagnostic] = {}
-    for e in details:
-        name = str(e["loc"][0])
-        if _is_of_parameter(e, "extra_forbidden"):
+    unknown_names = [
+        str(detail["loc"][0]) for detail in details if _is_of_parameter(detail, "extra_forbidden")
+    ]
+    messages_by_place: dict[tuple[Location, str], list[str]] = {}
+    unknown_parameters: dict[str, Diagnostic] = {}
+    for detail in details:
+        name = str(detail["loc"][0])
+        if _is_of_parameter(detail, "extra_forbidden"):
             unknown = f"unknown to {node.path}; {nearest(name, node.params.model_fields)}"
             message = instead(f"{node.path}.{name}") or unknown
-            removed.setdefault(
+            unknown_parameters.setdefault(
                 message, Diagnostic(values[name].key, f"{block.name}.{name}", message)
             )
-        elif _is_of_parameter(e, "missing"):
-            if not _is_meant(name, strangers, node):
+        elif _is_of_parameter(detail, "missing"):
+            # a misspelt name is one mistake, not an unknown and a missing parameter
+            if not _is_meant(name, unknown_names, node):
                 yield Diagnostic(
                     step, f"{block.name}.{name}", f"missing parameter: {node.path} needs {name}"
                 )
         else:
-            value = _deepest(values[name], e["loc"][1:])
-            wrong.setdefault((value.mark, _said(value)), []).append(message_of(e, value))
-    yield from removed.values()  # parameters that moved to the same node share one message
-    for (mark, path), messages in wrong.items():
+            value = _deepest(values[name], detail["loc"][1:])
+            messages_by_place.setdefault((value.mark, _said(value)), []).append(
+                message_of(detail, value)
+            )
+    # parameters that moved to the same node share one message
+    yield from unknown_parameters.values()
+    for (mark, path), messages in messages_by_place.items():
         yield Diagnostic(mark, path, _in_one(messages))
 
 
@@ -222,19 +231,19 @@ def _is_of_parameter(error: ErrorDetails, kind_of_error: str) -> bool:
 
 def _is_meant(name: str, strangers: Iterable[str], node: Node) -> bool:
     """Return True if an unknown name is a misspelt or an old form of a parameter."""
-    meant = {nearest(stranger, node.params.model_fields) for stranger in strangers}
-    now = {new_name(f"{node.path}.{stranger}") for stranger in strangers}
-    return f"did you mean {name}?" in meant or name in now
+    suggestions = {nearest(stranger, node.params.model_fields) for stranger in strangers}
+    new_names = {new_name(f"{node.path}.{stranger}") for stranger in strangers}
+    return f"did you mean {name}?" in suggestions or name in new_names
 
 
 def _in_one(messages: Iterable[str]) -> str:
     """Return the messages on one value as one: first that a file is missing, then the others as
     alternatives.
     """
-    once = dict.fromkeys(messages)
-    absent = [message for message in once if message.startswith("no such file")]
-    others = [message for message in once if message not in absent]
-    return "; ".join([*absent, *([", or ".join(others)] if others else [])])
+    distinct = dict.fromkeys(messages)
+    missing_files = [message for message in distinct if message.startswith("no such file")]
+    alternatives = [message for message in distinct if message not in missing_files]
+    return "; ".join([*missing_files, *([", or ".join(alternatives)] if alternatives else [])])
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
@@ -306,11 +315,11 @@ def check_steps(
     """
     by_name = {candidate.step.name: candidate for candidate in checked}
     sources = {name: _sources_among(by_name, candidate.step) for name, candidate in by_name.items()}
-    computed = set(ordered(sources, [name for name in outputs or () if name in by_name]))
+    needed_names = set(ordered(sources, [name for name in outputs or () if name in by_name]))
     checks = _FormChecks(
         by_name=by_name,
         checker=checker,
-        computed=computed,
+        computed=needed_names,
         is_cycle=outputs is None,
         before={} if before is None else before,
         memory=machine_memory(),
@@ -341,45 +350,49 @@ class _FormChecks:
 
     def notes_of(self, name: str) -> Sequence[str]:
         """Check a step whose inputs were checked, and return its notes."""
-        current = self.by_name[name]
-        forms, is_computed = inputs_of(current.step, self.results), name in self.computed
-        known = self.before.get(name)
-        if known is not None and known.holds(current, forms, is_computed):
-            self.results[name] = known.form
-            return known.notes
-        inputs = dict(zip(current.step.node.inputs, forms, strict=True))
+        current_step = self.by_name[name]
+        input_forms, is_computed = inputs_of(current_step.step, self.results), name in self.computed
+        known_form = self.before.get(name)
+        # nothing has changed since an earlier check
+        if known_form is not None and known_form.holds(current_step, input_forms, is_computed):
+            self.results[name] = known_form.form
+            return known_form.notes
+        inputs = dict(zip(current_step.step.node.inputs, input_forms, strict=True))
         notes = self.checker.preflight(
-            current.step,
+            current_step.step,
             inputs,
             lambda wire: _params(self.by_name, wire),
-            current.params,
-            current.value,
+            current_step.params,
+            current_step.value,
         )
+        # the step has a mistake, which counts only if the step is needed
         if notes is None:
             is_needed = self.is_cycle or is_computed
-            return [] if is_needed else _set_aside(current.step, inputs, self.checker)
+            return [] if is_needed else _set_aside(current_step.step, inputs, self.checker)
         self._add_result(name)
         problem = is_computed and _too_large(
-            current.step, inputs, self.results.get(name), self.memory
+            current_step.step, inputs, self.results.get(name), self.memory
         )
         if problem:
             del self.results[name]
-            self.checker.diagnostics.append(_at_shape(current, problem))
+            self.checker.diagnostics.append(_at_shape(current_step, problem))
         elif name in self.results:
-            self.before[name] = KnownForm(current, forms, is_computed, notes, self.results[name])
+            self.before[name] = KnownForm(
+                current_step, input_forms, is_computed, notes, self.results[name]
+            )
         return notes
 
     def _add_result(self, name: str) -> None:
         """Add what is known of the result of a step, or a diagnostic if it cannot be."""
-        current, known = self.by_name[name], self.before.get(name)
+        current_step, known_form = self.by_name[name], self.before.get(name)
         try:
-            self.results[name] = form = _form(current.step, self.results)
-            if known is not None and alike(form, known.form):
+            self.results[name] = form = _form(current_step.step, self.results)
+            if known_form is not None and alike(form, known_form.form):
                 # the same object, so that later steps need no new check
-                self.results[name] = known.form
+                self.results[name] = known_form.form
         except (ValueError, OverflowError) as error:
             self.checker.diagnostics.append(
-                Diagnostic(current.value.key, current.value.name, str(error))
+                Diagnostic(current_step.value.key, current_step.value.name, str(error))
             )
 
 
@@ -395,6 +408,7 @@ def _set_aside(step: Step, inputs: Mapping[str, Any], checker: Checker) -> list[
     """Return the last mistake as a note if it comes from the inputs of a step that no output of
     the recipe needs.
     """
+    # the mistake is of the parameters alone, so that it stays
     if all(inputs.get(name) is None for name in step.node.preflight_inputs):
         return []
     problem = checker.diagnostics.pop()
@@ -448,15 +462,16 @@ def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float
     """
     if result is None or any(getattr(step.node, name) for name in _CHEAPER):
         return ""
-    single: list[Any] = []
+    input_results: list[Any] = []
     for value in inputs.values():
-        single += value if type(value) is list else [value]
-    needed = bytes_of(result) + max(map(bytes_of, single), default=0.0)
-    if needed <= memory:
+        input_results += value if type(value) is list else [value]
+    # at least one input is there while the result is made
+    needed_bytes = bytes_of(result) + max(map(bytes_of, input_results), default=0.0)
+    if needed_bytes <= memory:
         return ""
     sizes = " x ".join(map(str, max(tensors_of(result), key=_numbers_of).shape))
     return (
-        f"the step {step.name.partition('[')[0]} needs {needed / _GB:.4g} GB for a result of"
+        f"the step {step.name.partition('[')[0]} needs {needed_bytes / _GB:.4g} GB for a result of"
         f" {sizes} values and one input, and this machine has {memory / _GB:.3g} GB: choose a"
         " smaller shape, or fewer bands or samples"
     )
@@ -474,6 +489,7 @@ def _wrong_index(expected: Expectation, result: Any) -> str:
 
     selected, axis = result, 0
     for index in expected.at:
+        # nothing is known of the result before the run
         if selected is None:
             return ""
         if isinstance(index, str):
@@ -494,6 +510,7 @@ def _wrong_index(expected: Expectation, result: Any) -> str:
                     f"index {index} is out of range: {_described(expected.step, selected)};"
                     f" axis {axis} has 0 to {size - 1}"
                 )
+            # each number selects along one more axis of the tensor
             axis += 1
     if isinstance(selected, Tensor) and selected.shape[axis:].numel() != 1:
         return (
@@ -604,6 +621,7 @@ class Attempt:
         memory.bound[name] = BoundStep.of(checked, reads, self._references.root)
 
     def _state(self) -> tuple[int, ...]:
+        """Return the number of messages so far, in each list; it grows with a mistake or a note."""
         references, checker = self._references, self._checker
         reports: tuple[Sized, ...] = (references.diagnostics, references.lacking, references.notes)
         lists = (*reports, checker.diagnostics, checker.notes)
@@ -663,23 +681,31 @@ def cache_graph(
     """
     if any(_refers(step.value.items.get("node")) for step in steps.values()):
         return
-    fixed: list[str] = []
+    steps_with_fixed_wires: list[str] = []
     for step in steps.values():
         if not _refers(step.value.items.get("from")):
-            fixed += step.instances
-    graph = CachedGraph(steps, absent, {name: wires[name] for name in fixed})
+            steps_with_fixed_wires += step.instances
+    graph = CachedGraph(steps, absent, {name: wires[name] for name in steps_with_fixed_wires})
     key = _key(root)
+    # the oldest graph goes first
     while len(_graphs) >= _MOST:
         _graphs.pop(next(iter(_graphs), key), None)
     _graphs[key] = graph
 
 
 def _names(root: Value) -> Names:
-    blocks = ((str(key), block.data) for key, block in root.items.items() if key != "steps")
-    return tuple((key, _items(data) if isinstance(data, dict) else None) for key, data in blocks)
+    """Return the names of all blocks but the steps.
+
+    Beside each name are those of its items, or None for a block that is no list of items.
+    """
+    other_blocks = ((str(key), block.data) for key, block in root.items.items() if key != "steps")
+    return tuple(
+        (key, _items(data) if isinstance(data, dict) else None) for key, data in other_blocks
+    )
 
 
 def _items(block: dict[str | int, Value]) -> tuple[str, ...] | None:
+    """Return the names of the items of a block; None for a block with a single value."""
     return (
         tuple(map(str, block))
         if all(isinstance(item.data, dict) for item in block.values())
@@ -704,6 +730,7 @@ def _is_current(step: Declared, families: Callable[[str], Mapping[str, Node]]) -
 
 
 def _refers(value: Value | None) -> bool:
+    """Return True if a value contains a reference such as ``${sensor.gain}``, at any depth."""
     if value is None:
         return False
     return (

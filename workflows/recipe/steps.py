@@ -83,20 +83,21 @@ def declare(
     """
     written = _written_steps(root, diagnostics)
     absent = {name: value for name, value in written if value.data is None}
-    steps, total = dict[str, Declared](), 0
+    steps, step_count = dict[str, Declared](), 0
     find = functools.cache(functools.partial(find_node, own=own.modules))
     for name, value in written:
         if value.data is None:
             continue
+        # a step with mistakes stays known, so that others may name it
         steps[name] = Declared(name, value, None, (), ())
         if not _well_formed(name, value, diagnostics):
             continue
         node = _node(value, find, references, diagnostics, own)
         dims = _dims(value, root, diagnostics)
         copies = _number_of_copies(dims, root)
-        total += copies
-        if total > _MOST:
-            raise RecipeError([_too_many(value, dims or (), root, copies, total)])
+        step_count += copies
+        if step_count > _MOST:
+            raise RecipeError([_too_many(value, dims or (), root, copies, step_count)])
         steps[name] = Declared(name, value, node, dims or (), _items_of(dims, root))
     return steps, absent
 
@@ -148,6 +149,7 @@ def _too_many(
 
 
 def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool:
+    """Return True if a step has a valid name and is a mapping; report mistakes and unknown keys."""
     if not _NAME.fullmatch(name):
         diagnostics.append(
             Diagnostic(
@@ -209,7 +211,7 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
         return ()
     lists = _item_lists(root)
     dims: list[str] = []
-    before = len(diagnostics)
+    earlier_mistakes = len(diagnostics)
     for value in setting.data if isinstance(setting.data, list) else [setting]:
         block = lists.get(value.data) if isinstance(value.data, str) else None
         if block is None:
@@ -228,7 +230,7 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
         else:
             dims.append(value.data)
             diagnostics += _wrong_items(block)
-    return tuple(dims) if len(diagnostics) == before else None
+    return tuple(dims) if len(diagnostics) == earlier_mistakes else None
 
 
 def _item_lists(root: Value) -> dict[str | int, Value]:
@@ -263,9 +265,9 @@ def device_of(
             Diagnostic(setting.mark, f"{setting.name} = {setting.plain}", f"unknown device: {hint}")
         )
         return ""
-    only = step.node.device if step.node else "any"
-    if only != "any" and (only == "cpu") != (setting.data == "cpu"):
-        message = f"{step.node and step.node.path} runs only on a {only.upper()}"
+    required_device = step.node.device if step.node else "any"
+    if required_device != "any" and (required_device == "cpu") != (setting.data == "cpu"):
+        message = f"{step.node and step.node.path} runs only on a {required_device.upper()}"
         diagnostics.append(Diagnostic(setting.mark, f"{setting.name} = {setting.data}", message))
     return setting.data
 
@@ -385,9 +387,9 @@ class Wiring:
             return  # the parameters of an old recipe are reported with the step that replaces them
         if not (isinstance(sources.data, dict) and _misspelt(name, node, sources)):
             mark = sources.mark if sources.items else step.value.key
-            fix = f"write from: {{{name}: STEP}}{self._makers(needs(node, name))}"
+            advice = f"write from: {{{name}: STEP}}{self._makers(needs(node, name))}"
             self.diagnostics.append(
-                Diagnostic(mark, sources.name, f"{node.path} needs the input {name}: {fix}")
+                Diagnostic(mark, sources.name, f"{node.path} needs the input {name}: {advice}")
             )
 
     def _wire(
@@ -401,13 +403,13 @@ class Wiring:
             if not is_many and name not in node.optional:
                 self._refuse_null(node, name, value, path)
             return () if is_many else None
-        here = dict(zip(step.dims, items, strict=True))
-        names = self._producers(value, path, here, self._makers(needs(node, name)))
+        items_of_reader = dict(zip(step.dims, items, strict=True))
+        names = self._producers(value, path, items_of_reader, self._makers(needs(node, name)))
         if names is None:
             return None
         self._agree(node, name, self._named(value), value, path)
-        if not is_many and not self._is_single(value, here):
-            self._refuse_copies(node, name, value, path, here)
+        if not is_many and not self._is_single(value, items_of_reader):
+            self._refuse_copies(node, name, value, path, items_of_reader)
             return None
         return names if is_many else names[0]
 
@@ -423,15 +425,21 @@ class Wiring:
         """
         parsed, producer = _parse(value), self._named(value)
         chosen_items = parsed[1] if parsed else None
+        # each list of items is fixed by the reader, or by the brackets
         return set(producer.dims) <= set(here) or len(chosen_items or ()) == len(producer.dims)
 
     def _refuse_copies(
         self, node: Node, name: str, value: Value, path: str, here: Mapping[str, str]
     ) -> None:
+        """Report an input of one step that names several copies.
+
+        `here` has the items of the step that reads it.
+        """
         producer = self._named(value)
-        left = ", ".join(dim for dim in producer.dims if dim not in here)
+        open_lists = ", ".join(dim for dim in producer.dims if dim not in here)
         message = (
-            f"{node.path} takes one step as {name}; {producer.name} is a step for each of {left}:"
+            f"{node.path} takes one step as {name}; {producer.name} is a step for each of"
+            f" {open_lists}:"
             f" write {_example_of(producer)}"
         )
         self.refuse(value, path, message)
@@ -442,9 +450,12 @@ class Wiring:
         return value.data is None or (parsed is not None and parsed[0] in self.absent)
 
     def _refuse_null(self, node: Node, name: str, value: Value, path: str) -> None:
+        """Report an input that a node needs and that is null, or names a step that is null."""
         parsed = _parse(value)
-        null = self.absent.get(parsed[0]) if parsed else None
-        instead = f"{parsed[0]}, which is null ({null.mark})" if parsed and null else "null"
+        null_step = self.absent.get(parsed[0]) if parsed else None
+        instead = (
+            f"{parsed[0]}, which is null ({null_step.mark})" if parsed and null_step else "null"
+        )
         self.refuse(value, path, f"{node.path} needs {name}, but the input is {instead}")
 
     def _producers(
@@ -461,9 +472,13 @@ class Wiring:
         selected = {} if items is None else self._chosen(producer, items, value, path)
         if selected is None:
             return None
-        fixed = {**here, **selected}
-        choices = [[fixed[dim]] if dim in fixed else self._items(dim) for dim in producer.dims]
-        return tuple(producer.instance(items) for items in itertools.product(*choices))
+        # brackets count before the items of the reader; a list with neither gives all its items
+        item_by_list = {**here, **selected}
+        items_by_list = [
+            [item_by_list[dim]] if dim in item_by_list else self._items(dim)
+            for dim in producer.dims
+        ]
+        return tuple(producer.instance(items) for items in itertools.product(*items_by_list))
 
     def _unknown(self, value: Value, makers: str) -> str:
         """Return the error message for a value that should name a step but does not."""
@@ -474,8 +489,8 @@ class Wiring:
         name = parsed[0]
         if name in self.absent:
             return f"step {name} is null ({self.absent[name].mark})"
-        if now := new_name(f"steps.{name}"):
-            return f"step {name} is called {now.removeprefix('steps.')} now"
+        if present_name := new_name(f"steps.{name}"):
+            return f"step {name} is called {present_name.removeprefix('steps.')} now"
         hint = nearest(name, self.steps)
         return (
             f"no step {name};"
@@ -493,22 +508,26 @@ class Wiring:
         if not producer.dims:
             self.refuse(value, path, f"{producer.name} has no items: leave out the brackets")
             return None
-        left = list(producer.dims)
+        open_lists = list(producer.dims)
         selected: dict[str, str] = {}
         for item in items:
-            among = left[:1] if len(items) == len(producer.dims) else left
-            dim = next((dim for dim in among if item in self._items(dim)), None)
-            if dim is None:
-                names = [*itertools.chain.from_iterable(map(self._items, among))]
+            # with an item for every list the items stand in the order of the lists
+            candidate_lists = open_lists[:1] if len(items) == len(producer.dims) else open_lists
+            list_name = next(
+                (list_name for list_name in candidate_lists if item in self._items(list_name)), None
+            )
+            if list_name is None:
+                names = [*itertools.chain.from_iterable(map(self._items, candidate_lists))]
                 self.refuse(
                     value, path, f"{producer.name} has no item {item}; {nearest(item, names)}"
                 )
                 return None
-            selected[dim] = item
-            left.remove(dim)
+            selected[list_name] = item
+            open_lists.remove(list_name)
         return selected
 
     def _items(self, dim: str) -> list[str]:
+        """Return the names of the items in a list such as ``lasers``."""
         return [str(name) for name in self.root.items[dim].items]
 
     def _agree(self, node: Node, name: str, producer: Declared, value: Value, path: str) -> None:
@@ -575,11 +594,16 @@ def needs(node: Node, name: str) -> tuple[type, ...]:
 
 
 def _returned(step: Declared) -> list[type]:
+    """Return the classes that the result of a step may have."""
     return _kinds(step.node.hints.get("return")) if step.node else []
 
 
 def _fits(returned: Iterable[type], needed: Iterable[type]) -> bool:
-    return any(issubclass(r, n) for r, n in itertools.product(returned, needed))
+    """Return True if a returned class is one of the needed classes, or a subclass of one."""
+    return any(
+        issubclass(returned_class, needed_class)
+        for returned_class, needed_class in itertools.product(returned, needed)
+    )
 
 
 def _options(hint: Any) -> list[Any]:
@@ -592,13 +616,15 @@ def _options(hint: Any) -> list[Any]:
 
 
 def _kinds(hint: Any) -> list[type]:
+    """Return the classes in a type annotation; ``object`` says nothing and does not count."""
     return [
         option for option in _options(hint) if isinstance(option, type) and option is not object
     ]
 
 
 def _a(kinds: Sequence[type]) -> str:
-    return "a " + " or ".join(dict.fromkeys(k.__name__ for k in kinds))
+    """Return classes in words, such as ``a Psf or Tensor``."""
+    return "a " + " or ".join(dict.fromkeys(type_.__name__ for type_ in kinds))
 
 
 # --- cycles ---------------------------------------------------------------------------------------
@@ -610,24 +636,27 @@ def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator
     for loop in _loops(
         {name: [s for s in step.sources if s in steps] for name, step in steps.items()}
     ):
+        # copies of one step count as one
         names = list(dict.fromkeys(name.partition("[")[0] for name in loop))
         if frozenset(names) in reported:
             continue
         reported.add(frozenset(names))
+        # the same cycle begins at its step that stands first in the file
         start = min(range(len(names)), key=lambda n: marks[names[n]])
         names = names[start:] + names[:start]
-        few = (
+        shown_names = (
             names
             if len(names) <= _NAMED
             else [*names[: _NAMED - 1], f"({len(names) - _NAMED} more)", names[-1]]
         )
-        where = _lines_of([marks[name] for name in names[:_NAMED]])
+        lines = _lines_of([marks[name] for name in names[:_NAMED]])
         yield Diagnostic(
-            marks[names[0]], "steps", f"cycle: {' -> '.join([*few, names[0]])} ({where})"
+            marks[names[0]], "steps", f"cycle: {' -> '.join([*shown_names, names[0]])} ({lines})"
         )
 
 
 def _lines_of(marks: list[Location]) -> str:
+    """Return the lines of places in words, with their files if there are several."""
     if len({mark.file for mark in marks}) > 1:
         return ", ".join(f"{mark.file}:{mark.line}" for mark in marks)
     return f"line{'s' * (len(marks) > 1)} {', '.join(str(mark.line) for mark in marks)}"
@@ -637,17 +666,20 @@ def _loops(sources: Mapping[str, list[str]]) -> Iterator[list[str]]:
     """Yield the names of the steps in each cycle, each step before the step that reads its
     result.
     """
-    done: set[str] = set()
+    visited: set[str] = set()
     for root in sources:
-        path: dict[str, Iterator[str]] = {} if root in done else {root: iter(sources[root])}
+        path: dict[str, Iterator[str]] = {} if root in visited else {root: iter(sources[root])}
+        # depth-first search with an explicit stack: each open step with its sources still to visit
         while path:
             name = next(reversed(path))
+            # the next source of the innermost open step
             source = next(path[name], None)
             if source is None:
-                done.add(name)
+                visited.add(name)
                 path.popitem()
             elif source in path:
                 names = list(path)
+                # the open steps from the repeated one on, sources first
                 yield names[names.index(source) :][::-1]
-            elif source not in done:
+            elif source not in visited:
                 path[source] = iter(sources[source])

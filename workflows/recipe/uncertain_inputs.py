@@ -77,11 +77,13 @@ def within_allowed(uncertain: Uncertain, negligible: float) -> tuple[Uncertain, 
         allowed = _allowed_part(uncertain, name, partial(_law_value, law))
         if not allowed.reason:
             continue
-        low, high = _bound(law, allowed.low), _bound(law, allowed.high)
-        if allowed.outside > negligible or _is_single(law, low, high):
-            problems.append(_refusal(uncertain, name, law.text, allowed, _advice(law, low, high)))
+        low_bound, high_bound = _bound(law, allowed.low), _bound(law, allowed.high)
+        if allowed.outside > negligible or _is_single(law, low_bound, high_bound):
+            problems.append(
+                _refusal(uncertain, name, law.text, allowed, _advice(law, low_bound, high_bound))
+            )
             continue
-        laws[name] = law.truncated(low, high)
+        laws[name] = law.truncated(low_bound, high_bound)
         notes[name] = _statement(law, laws[name], allowed)
     joint = uncertain.joint
     if joint is not None:
@@ -96,10 +98,12 @@ def _allowed_part(uncertain: Uncertain, name: str, value: Callable[[float], floa
     """Return the allowed range of normal scores around 0, where ``value`` is the value at a
     normal score.
     """
-    reasons = {end: _reason(uncertain, name, value(end)) for end in (-_FAR, _FAR)}
-    low = _edge(uncertain, name, value, -_FAR) if reasons[-_FAR] else -math.inf
-    high = _edge(uncertain, name, value, _FAR) if reasons[_FAR] else math.inf
-    return AllowedPart(low, high, reasons[-_FAR] or reasons[_FAR])
+    reason_at = {
+        end_score: _reason(uncertain, name, value(end_score)) for end_score in (-_FAR, _FAR)
+    }
+    low_score = _edge(uncertain, name, value, -_FAR) if reason_at[-_FAR] else -math.inf
+    high_score = _edge(uncertain, name, value, _FAR) if reason_at[_FAR] else math.inf
+    return AllowedPart(low_score, high_score, reason_at[-_FAR] or reason_at[_FAR])
 
 
 def _edge(
@@ -110,11 +114,11 @@ def _edge(
     """
     allowed = 0.0
     for _ in range(_HALVINGS):
-        middle = (allowed + refused) / 2
-        if _reason(uncertain, name, value(middle)):
-            refused = middle
+        middle_score = (allowed + refused) / 2
+        if _reason(uncertain, name, value(middle_score)):
+            refused = middle_score
         else:
-            allowed = middle
+            allowed = middle_score
     return allowed
 
 
@@ -136,8 +140,8 @@ def _bound(law: Law, score: float) -> float:
     value = float(law.shape.at(np.array(score)))
     if isinstance(law.shape, Discrete):
         return value
-    step = float(law.shape.at(np.array(1.0)) - law.shape.at(np.array(-1.0))) / 2
-    return _short(value, _CLOSE * step)
+    one_sd = float(law.shape.at(np.array(1.0)) - law.shape.at(np.array(-1.0))) / 2
+    return _short(value, _CLOSE * one_sd)
 
 
 def _short(number: float, within: float) -> float:
@@ -156,11 +160,12 @@ def _is_single(law: Law, low: float, high: float) -> bool:
     """Return True if only one of several separate values is allowed."""
     if not isinstance(law.shape, Discrete):
         return False
-    inside = (law.shape.values >= low) & (law.shape.values <= high)
-    return int(inside.sum()) < 2
+    is_allowed = (law.shape.values >= low) & (law.shape.values <= high)
+    return int(is_allowed.sum()) < 2
 
 
 def _advice(law: Law, low: float, high: float) -> str:
+    """Return what to write in place of a distribution of which too much is not allowed."""
     if law.kind == "truncated":
         return "give it tighter bounds"
     if isinstance(law.shape, Discrete):
@@ -176,9 +181,11 @@ def _bound_text(bound: float, unit: str) -> str:
 def _refusal(
     uncertain: Uncertain, name: str, text: str, allowed: AllowedPart, advice: str
 ) -> Diagnostic:
-    share = f"{allowed.outside:.2g}" if allowed.outside < 1e-3 else f"{allowed.outside:.2%}"
+    """Return the diagnostic for a distribution of which too much is not allowed."""
+    share_text = f"{allowed.outside:.2g}" if allowed.outside < 1e-3 else f"{allowed.outside:.2%}"
     message = (
-        f"{share} of this distribution lies outside the allowed values ({allowed.reason}): {advice}"
+        f"{share_text} of this distribution lies outside the allowed values"
+        f" ({allowed.reason}): {advice}"
     )
     return Diagnostic(_mark(uncertain, name), f"{name} = {text}", message)
 
@@ -192,12 +199,12 @@ def _mark(uncertain: Uncertain, name: str) -> Location:
 def _statement(law: Law, cut: Law, allowed: AllowedPart) -> str:
     """Return what was cut off a distribution, and how far its mean and standard deviation moved."""
     (mean, sd), (new_mean, new_sd) = law.shape.moments(), cut.shape.moments()
-    moved = (
+    change_text = (
         f"its mean moves by {(new_mean - mean) / sd:+.2g} sd, and its sd by {new_sd / sd - 1:+.2%}"
     )
     return (
         f"{allowed.outside:.2g} of it lies outside the allowed values ({allowed.reason}) and is"
-        f" cut off; {moved}"
+        f" cut off; {change_text}"
     )
 
 
@@ -209,17 +216,18 @@ def _joint_within(
     """
     if joint.draws is None:
         return _normal_within(uncertain, joint, negligible, problems)
-    allowed = np.ones(len(joint.draws), bool)
+    row_is_allowed = np.ones(len(joint.draws), bool)
     notes = dict[str, str]()
     for i, name in enumerate(joint.names):
-        column = np.sort(joint.draws[:, i])
-        limits = _allowed_part(uncertain, name, partial(_sample, column))
+        sorted_draws = np.sort(joint.draws[:, i])
+        limits = _allowed_part(uncertain, name, partial(_sample, sorted_draws))
         if not limits.reason:
             continue
-        low, high = (_sample(column, score) for score in (limits.low, limits.high))
-        inside = (joint.draws[:, i] >= low) & (joint.draws[:, i] <= high)
-        outside = 1.0 - float(inside.mean())
+        lowest, highest = (_sample(sorted_draws, score) for score in (limits.low, limits.high))
+        is_inside = (joint.draws[:, i] >= lowest) & (joint.draws[:, i] <= highest)
+        outside = 1.0 - float(is_inside.mean())
         if outside > negligible:
+            # `_refusal` states the probability outside: all of it is put on one side
             excess = replace(limits, low=-math.inf, high=-_score(outside))
             problems.append(
                 _refusal(
@@ -227,12 +235,14 @@ def _joint_within(
                 )
             )
             continue
-        allowed &= inside
+        row_is_allowed &= is_inside
         notes[name] = (
-            f"{int((~inside).sum())} of its {len(inside)} rows lie outside the allowed values"
+            f"{int((~is_inside).sum())} of its {len(is_inside)} rows lie outside the allowed values"
             f" ({limits.reason}) and are left out"
         )
-    return (joint if allowed.all() else Joint.of_draws(joint.names, joint.draws[allowed])), notes
+    return (
+        joint if row_is_allowed.all() else Joint.of_draws(joint.names, joint.draws[row_is_allowed])
+    ), notes
 
 
 def _law_value(law: Law, score: float) -> float:
@@ -266,6 +276,10 @@ def _score(share: float) -> float:
 def _normal_within(
     uncertain: Uncertain, joint: Joint, negligible: float, problems: list[Diagnostic]
 ) -> tuple[Joint, dict[str, str]]:
+    """Return a joint normal distribution cut off at allowed values, with statements.
+
+    Add a problem for each value of which more than the share `negligible` is not allowed.
+    """
     bounds = np.array([[-math.inf, math.inf]] * len(joint.names))
     notes = dict[str, str]()
     for i, name in enumerate(joint.names):
@@ -361,8 +375,8 @@ class Inputs:
         if not with_effect:
             raise NothingDrawn(f"no output depends on {', '.join(uncertain.names)}")
         idle = tuple(name for name in uncertain.names if name not in with_effect)
-        drawn = only_values(uncertain, with_effect)
-        return cls(recipe, drawn, drawn.names, idle, readers, notes)
+        drawn_values = only_values(uncertain, with_effect)
+        return cls(recipe, drawn_values, drawn_values.names, idle, readers, notes)
 
     @property
     def labels(self) -> list[str]:
@@ -412,6 +426,7 @@ class Inputs:
         """
         columns = [law.at(z[:, i]) for i, law in enumerate(self.uncertain.laws.values())]
         joint = self.uncertain.joint
+        # the columns of the laws come first, then those of the joint distribution
         return np.stack([*columns, *(joint.at(z[:, len(columns) :]).T if joint else ())], 1)
 
     def independent(self, count: int, seed: int) -> InputDraws:
@@ -422,10 +437,14 @@ class Inputs:
         values, joint = self.at(z), self.uncertain.joint
         if joint is None or joint.draws is None:
             return InputDraws(z, values)
+        # without repetition: each row of the table at most once
+        # whole rows of the table, so that the values of a draw belong together
         rows = np.random.default_rng([seed, 2]).permutation(len(joint.draws))[:count]
-        first = len(self.uncertain.laws)
-        z = np.concatenate([z[: len(rows), :first], joint.numbers()[rows]], 1)
-        return InputDraws(z, np.concatenate([values[: len(rows), :first], joint.draws[rows]], 1))
+        joint_start = len(self.uncertain.laws)
+        z = np.concatenate([z[: len(rows), :joint_start], joint.numbers()[rows]], 1)
+        return InputDraws(
+            z, np.concatenate([values[: len(rows), :joint_start], joint.draws[rows]], 1)
+        )
 
     def sobol(self, count: int, seed: int) -> InputDraws:
         """Return input draws from `SCRAMBLES` scrambled Sobol sequences; draw i belongs to
@@ -434,14 +453,19 @@ class Inputs:
         from scipy.special import ndtri
         from scipy.stats import qmc
 
+        # rounded up
         per_sequence = -(-count // SCRAMBLES)
         streams = [np.random.default_rng([seed, 3, n]) for n in range(SCRAMBLES)]
         sequences = [
+            # Sobol sequences are balanced only at powers of 2
             qmc.Sobol(len(self.names), seed=rng).random_base2((per_sequence - 1).bit_length())
             for rng in streams
         ]
-        u = np.stack([s[:per_sequence] for s in sequences], 1).reshape(-1, len(self.names))[:count]
-        z = np.asarray(ndtri(u.clip(_EDGE, 1 - _EDGE)), np.float64)
+        # draw by draw from one sequence after the other
+        probabilities = np.stack([sequence[:per_sequence] for sequence in sequences], 1).reshape(
+            -1, len(self.names)
+        )[:count]
+        z = np.asarray(ndtri(probabilities.clip(_EDGE, 1 - _EDGE)), np.float64)
         return InputDraws(z, self.at(z))
 
     def checked(self, values: FloatArray) -> None:
@@ -453,11 +477,13 @@ class Inputs:
                 try:
                     recipe_at(self.uncertain, {name: value})
                 except RecipeError as error:
-                    drawn = [
-                        replace(d, message=f"the value is sampled, but {d.message}")
-                        for d in error.diagnostics
+                    explained = [
+                        replace(
+                            diagnostic, message=f"the value is sampled, but {diagnostic.message}"
+                        )
+                        for diagnostic in error.diagnostics
                     ]
-                    raise RecipeError(drawn) from None
+                    raise RecipeError(explained) from None
 
     def problem(self, row: FloatArray) -> Diagnostic | None:
         """Return why the recipe does not allow the values of a draw together, or None."""
@@ -498,16 +524,20 @@ def _readers(
     in the parameter.
     """
     probe = _probe(uncertain, name)
-    changed = recipe_at(uncertain, {name: probe})
-    if changed.steps.keys() != recipe.steps.keys() or changed.outputs != recipe.outputs:
+    # what changes with the value is what reads it
+    changed_recipe = recipe_at(uncertain, {name: probe})
+    if (
+        changed_recipe.steps.keys() != recipe.steps.keys()
+        or changed_recipe.outputs != recipe.outputs
+    ):
         raise ValueError(
             f"the value {name} changes the list of steps and therefore cannot be sampled"
         )
     for step in needed(recipe, outputs):
-        before, after = recipe.steps[step], changed.steps[step]
-        for param, value in after.params.items():
-            for index, new in _changed(before.params[param], value):
-                _refuse_changed(new, probe, f"{step}.{param}", name)
+        old_step, new_step = recipe.steps[step], changed_recipe.steps[step]
+        for param, value in new_step.params.items():
+            for index, new_number in _changed(old_step.params[param], value):
+                _refuse_changed(new_number, probe, f"{step}.{param}", name)
                 yield f"{step}.{param}", index
 
 
@@ -541,7 +571,9 @@ def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:
     pairs = _paired(before, after)
     if pairs is not None:
         for index, (earlier, later) in pairs.items():
-            yield from (((index, *inner), new) for inner, new in _changed(earlier, later))
+            yield from (
+                ((index, *inner), new_element) for inner, new_element in _changed(earlier, later)
+            )
     elif before != after:
         yield (), after
 
@@ -550,11 +582,11 @@ def _paired(before: Any, after: Any) -> dict[Any, tuple[Any, Any]] | None:
     """Return the elements of two lists or mappings by index, or None if they have no common
     indices.
     """
-    lists = isinstance(before, list | tuple) and isinstance(after, list | tuple)
-    if lists and len(after) == len(before):
+    are_lists = isinstance(before, list | tuple) and isinstance(after, list | tuple)
+    if are_lists and len(after) == len(before):
         return dict(enumerate(zip(before, after, strict=True)))
-    mappings = isinstance(before, Mapping) and isinstance(after, Mapping)
-    if mappings and after.keys() == before.keys():
+    are_mappings = isinstance(before, Mapping) and isinstance(after, Mapping)
+    if are_mappings and after.keys() == before.keys():
         return {key: (before[key], value) for key, value in after.items()}
     return None
 
@@ -568,11 +600,17 @@ def put_at(value: Any, index: Index, new: float) -> Any:
     if isinstance(value, Mapping):
         return {**value, index[0]: put_at(value[index[0]], index[1:], new)}
     return type(value)(
-        put_at(v, index[1:], new) if i == index[0] else v for i, v in enumerate(value)
+        put_at(element, index[1:], new) if i == index[0] else element
+        for i, element in enumerate(value)
     )
 
 
 def _label(uncertain: Uncertain, name: str) -> str:
+    """Return the label of an input: its name, or that it is drawn with others.
+
+    Correlated values are drawn one after another, so that a later one is only the rest that the
+    earlier ones leave open.
+    """
     joint = uncertain.joint
     if joint is None or name not in joint.names:
         return name

@@ -40,16 +40,21 @@ def named_frames(words: Iterable[str], folder: Path) -> list[Path]:
 
 
 def _named(path: Path) -> Iterator[Path]:
+    """Yield the frames that a path is.
+
+    A file is one, a folder stands for the frames in it, sorted by name.
+    """
     if path.is_file():
         yield path
     elif path.is_dir():
-        inside = (
+        files = (
             file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")
         )
-        yield from sorted(file for file in inside if file.suffix.lower() in FRAME_SUFFIXES)
+        yield from sorted(file for file in files if file.suffix.lower() in FRAME_SUFFIXES)
 
 
 def _absent(path: Path) -> str:
+    """Return why a path gives no frame."""
     if path.is_dir():
         return f"the folder has no frames: give files that end in {', '.join(FRAME_SUFFIXES)}"
     return "no such file or folder: give the path of a frame, or of a folder of frames"
@@ -86,13 +91,20 @@ def recipes_of(
     ``first``; ``psf`` is a folder of frames of point sources, from which the PSF is measured, or
     empty. Raises `RecipeError` with the mistakes of all frames, each mistake once.
     """
-    name, base, words = _camera(camera, folder)
-    words += _mask(mask, folder) + _psf(psf, changes, folder, first)
+    recipe_name, recipe_folder, camera_words = _camera(camera, folder)
+    camera_words += _mask(mask, folder) + _psf(psf, changes, folder, first)
     frames, recipes, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
-    own = [(n, text) for n, text in enumerate(changes, first) if not psf or text not in _WITH_PSF]
+    # the choice of a restorer for a measured PSF is among the words already
+    numbered_changes = [
+        (number, text)
+        for number, text in enumerate(changes, first)
+        if not psf or text not in _WITH_PSF
+    ]
     for frame in frames:
         try:
-            recipes.append(_one(frame, (name, base, words), own, folder))
+            recipes.append(
+                _one(frame, (recipe_name, recipe_folder, camera_words), numbered_changes, folder)
+            )
         except RecipeError as error:
             problems |= dict.fromkeys(error.diagnostics)
     if problems:
@@ -106,15 +118,26 @@ def _one(
     changes: Sequence[tuple[int, str]],
     folder: Path,
 ) -> Recipe:
-    name, base, words = camera
-    own = [
-        read_override(text, Location(f"argument {n}", folder=str(folder))) for n, text in changes
+    """Return the recipe that restores one frame.
+
+    `camera` is the name of its recipe, the folder of its paths, and the words that choose sensor,
+    mask and PSF. `changes` are the numbered words of the user.
+    """
+    recipe_name, recipe_folder, camera_words = camera
+    overrides = [
+        read_override(text, Location(f"argument {number}", folder=str(folder)))
+        for number, text in changes
     ]
     file = _said(
         "frame", f"frame.file={_quoted(frame)}", folder, shown_as=str(_near(frame, folder))
     )
-    recipe = load(name, [*_prepared(name, base, own), *words, file, *own], base)
-    title = f"The frame {frame.name}, restored with the camera {name}"
+    # the words of the user come last, so that they win
+    recipe = load(
+        recipe_name,
+        [*_prepared(recipe_name, recipe_folder, overrides), *camera_words, file, *overrides],
+        recipe_folder,
+    )
+    title = f"The frame {frame.name}, restored with the camera {recipe_name}"
     return replace(recipe, name=f"restore_{_STEM.sub('_', frame.stem)}", title=title)
 
 
@@ -146,6 +169,7 @@ def _camera(camera: str, folder: Path) -> tuple[str, Path, list[Override]]:
 
 
 def _items(path: Path) -> set[str]:
+    """Return the keys at the top of a YAML file."""
     return set(map(str, read(path, path.name).root.items))
 
 
@@ -188,8 +212,9 @@ def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Ove
         raise RecipeError(
             [replace(problem, mark=Location("--psf")) for problem in error.diagnostics]
         ) from None
-    listed = "points.files=[" + ", ".join(map(_quoted, files)) + "]"
-    words = [(f"restore={restorer}", ""), ("steps.level.from.psf=measured", ""), (listed, psf)]
+    points_text = "points.files=[" + ", ".join(map(_quoted, files)) + "]"
+    # each word, with the text that messages show in its place
+    words = [(f"restore={restorer}", ""), ("steps.level.from.psf=measured", ""), (points_text, psf)]
     return [_said("--psf", word, folder, shown_as) for word, shown_as in words]
 
 
@@ -197,15 +222,16 @@ def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
     """Return the words that turn a recipe of a camera into one that restores: no scene, no
     laser, other outputs.
     """
-    composed = compose(name, (), base)
-    root, groups = composed.root, set(composed.groups)
+    composed_recipe = compose(name, (), base)
+    root, groups = composed_recipe.root, set(composed_recipe.groups)
     overridden = {override.path[0] for override in own}
     words = _without_scene(groups)
     if not overridden & {"laser", "lasers"}:
-        words += _no_laser(groups, composed.own_blocks)
+        words += _no_laser(groups, composed_recipe.own_blocks)
     if "restore" not in overridden:
         words.append("restore=wiener_blind" if "restore" in groups else "+restore=wiener_blind")
     words += _simulated_steps(root)
+    # expected numbers are those of the simulated scene
     if "expect" in root.items.keys() - overridden:
         words.append("~expect")
     if "outputs" not in overridden:
@@ -232,6 +258,10 @@ def _no_laser(groups: Container[str], blocks: Container[str]) -> list[str]:
 
 
 def _said(where: str, text: str, folder: Path, shown_as: str = "") -> Override:
+    """Return the override of a word that the program itself adds.
+
+    Messages name `where` as its place, and `shown_as` as its text if given.
+    """
     override = read_override(text, Location(where, folder=str(folder)))
     return replace(override, text=shown_as) if shown_as else override
 
@@ -242,4 +272,5 @@ def _quoted(path: Path) -> str:
 
 
 def _near(path: Path, folder: Path) -> Path:
+    """Return a path relative to the folder, if it lies in it."""
     return path.relative_to(folder) if path.is_relative_to(folder) else path

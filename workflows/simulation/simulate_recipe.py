@@ -74,7 +74,7 @@ def simulate(
     stored.
     """
     finished: dict[str, StepRecord] = {}
-    began = timestamp()
+    start_time = timestamp()
 
     def note(event: Event) -> None:
         if event.done is not None:
@@ -82,30 +82,38 @@ def simulate(
         if watch is not None:
             watch(event)
 
-    shelf = DerivedFiles(store)
+    picture_store = DerivedFiles(store)
     with (
-        warnings.catch_warnings(record=True) as caught,
-        FilesBeside(_files, shelf, memory_limit(None) if memory is None else 0.0) as beside,
+        warnings.catch_warnings(record=True) as caught_warnings,
+        FilesBeside(
+            _files, picture_store, memory_limit(None) if memory is None else 0.0
+        ) as files_beside,
     ):
         warnings.simplefilter("default")
+        # cheaper steps, as far as the tolerance of the recipe allows
         recipe = with_substitutions(recipe, wanted(recipe))
-        explained_run, graph = explained(recipe, store, note), GraphAhead(beside, store, finished)
+        explained_run, graph_pictures = (
+            explained(recipe, store, note),
+            GraphAhead(files_beside, store, finished),
+        )
 
         def show(*result: Any) -> None:
-            beside(*result)
-            graph(*result)
+            files_beside(*result)
+            graph_pictures(*result)
 
         result = run(
             recipe, store, wanted(recipe), explained_run, device, executor, memory, show, anew=anew
         )
+        # the records of steps that were computed here have their times
         result = replace(
             result, done={name: finished.get(name, done) for name, done in result.done.items()}
         )
+        # the name of the folder follows from the keys of the results
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
         with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:
-            folder.said = {"began": began}
-            doc = _write(result, shelf, folder, command, caught, beside)
-    return Simulation(folder.path, doc, folder.taken)
+            folder.said = {"began": start_time}
+            document = _write(result, picture_store, folder, command, caught_warnings, files_beside)
+    return Simulation(folder.path, document, folder.taken)
 
 
 @contextmanager
@@ -121,6 +129,7 @@ def _watched() -> Iterator[None]:
 
 
 def _files(recipe: Recipe) -> Iterator[DerivedFile]:
+    """Yield the pictures and data files that are made beside a run while it goes on."""
     yield from figure_files()
     yield from data_files(recipe)
 
@@ -136,46 +145,56 @@ def _write(
     """Write the folder of a run: all that shows no picture while the last pictures are drawn,
     and then the page.
     """
-    bars, finish = folder.path / "figures" / "timeline.png", _last_pictures(result, folder, beside)
-    doc = run_page.document(result, command)
+    timeline_file, finish = (
+        folder.path / "figures" / "timeline.png",
+        _last_pictures(result, folder, beside),
+    )
+    document = run_page.document(result, command)
     folder.write("code.json", code_text(result))
     folder.write("recipe.yaml", recipe_text(result.recipe))
-    folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
-    folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(doc["steps"]))
+    folder.write_rows("metrics.csv", ("step", "field", "index", "value"), document["metrics"])
+    folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(document["steps"]))
     run_folder.prepare()
     finish()
-    drawn, missing = pictures(result, shelf)
-    files, refused = exports(result, shelf)
-    doc = run_page.with_pictures(
-        doc, files, missing, refused, (str(warning.message) for warning in caught)
+    picture_files, missing_files = pictures(result, shelf)
+    files, refused_files = exports(result, shelf)
+    document = run_page.with_pictures(
+        document, files, missing_files, refused_files, (str(warning.message) for warning in caught)
     )
-    folder.said |= doc
-    for name, path in drawn.items():
+    folder.said |= document
+    for name, path in picture_files.items():
         folder.take(f"figures/{name}.png", path)
     for name, path in files.items():
         folder.take(f"data/{name}", path)
-    shown = {**drawn, **({"timeline": bars} if bars.exists() else {})}
-    folder.write("provenance.json", run_folder.document_text(doc))
+    page_pictures = {
+        **picture_files,
+        **({"timeline": timeline_file} if timeline_file.exists() else {}),
+    }
+    folder.write("provenance.json", run_folder.document_text(document))
     folder.write(
         "report.html",
-        run_folder.page(doc, {name: path.read_bytes() for name, path in shown.items()}),
+        run_folder.page(
+            document, {name: path.read_bytes() for name, path in page_pictures.items()}
+        ),
     )
-    return doc
+    return document
 
 
 def _last_pictures(result: Result, folder: RunFolder, beside: FilesBeside) -> Callable[[], None]:
     """Begin the pictures that show no result of a step; return a function that waits for all
     pictures and files.
     """
-    times = timeline(result)
-    bars = folder.place("figures/timeline.png")
-    wait = beside.draw(bars, TIMELINE_DRAWING, times) if times else None
+    step_times = timeline(result)
+    timeline_file = folder.place("figures/timeline.png")
+    wait_for_timeline = (
+        beside.draw(timeline_file, TIMELINE_DRAWING, step_times) if step_times else None
+    )
     for key, arguments in graphs(result.recipe, states_of(result.done)):
         beside.add("graph", key, GRAPH_DRAWING, arguments)
 
     def finish() -> None:
-        if wait is not None:
-            wait()
+        if wait_for_timeline is not None:
+            wait_for_timeline()
         beside.finish()
 
     return finish

@@ -62,12 +62,13 @@ class CameraMismatch:
             path: difference for path, difference in mismatch.items() if path not in directions
         }
         moved, probes = _moved_and_probes(_inputs(recipe, differences))
+        # a direction is no law of the recipe itself: its two angles have one each
         for path in directions:
-            of_axes = _by_axis(path)
+            axis_paths = _by_axis(path)
             readers = _towards(recipe, mismatch, path)
-            moved |= dict.fromkeys(readers, of_axes)
+            moved |= dict.fromkeys(readers, axis_paths)
             probes |= {reader: _value(recipe, reader) for reader in readers}
-            differences |= dict.fromkeys((name for _, name in of_axes), mismatch[path])
+            differences |= dict.fromkeys((name for _, name in axis_paths), mismatch[path])
         _refuse_learnt(moved, mismatch, settings.learn)
         return cls(differences, moved, probes)
 
@@ -78,25 +79,32 @@ class CameraMismatch:
         Until they are drawn, the true values are the probes, so that no step counts as one without
         effect.
         """
-        moved = {name for name in self.moved if _has(recipe, name)}
-        if not moved:
+        changed_names = {name for name in self.moved if _has(recipe, name)}
+        if not changed_names:
             return recipe, psf
-        camera = set(needed(recipe, [FRAME]))
-        readers = knowers(recipe, [name for name in needed(recipe, outputs) if name not in camera])
-        believed = needed(recipe, [*known(recipe, readers), psf])
-        copied = dependents(recipe, {name.rpartition(".")[0] for name in moved}) & set(believed)
-        changed = with_copies(recipe, readers, copied, lambda step: step)
-        steps = dict(changed.steps)
-        for name in moved:
+        camera_steps = set(needed(recipe, [FRAME]))
+        # steps beyond the frame that are told something of the camera
+        restorer_steps = knowers(
+            recipe, [name for name in needed(recipe, outputs) if name not in camera_steps]
+        )
+        believed_steps = needed(recipe, [*known(recipe, restorer_steps), psf])
+        steps_to_copy = dependents(
+            recipe, {name.rpartition(".")[0] for name in changed_names}
+        ) & set(believed_steps)
+        copied_recipe = with_copies(recipe, restorer_steps, steps_to_copy, lambda step: step)
+        steps = dict(copied_recipe.steps)
+        for name in changed_names:
             step, _, param = name.rpartition(".")
             steps[step] = _with(steps[step], param, self.probes[name])
-        return replace(changed, steps=steps), (TOLD if psf in copied else "") + psf
+        # the copies have the prefix TOLD
+        return replace(copied_recipe, steps=steps), (TOLD if psf in steps_to_copy else "") + psf
 
     def drawn(self, seed: Sequence[int]) -> dict[str, float]:
         """Draw the differences of one picture, in SI, by path."""
         if not self.differences:
             return {}
         laws = {path: difference.law for path, difference in self.differences.items()}
+        # one draw of each law
         return {path: column[0] for path, column in draw_laws(laws, 1, [*seed, *_STREAM]).items()}
 
     def truth(self, theta: Mapping[str, Any], drawn: Mapping[str, float]) -> dict[str, Any]:
@@ -108,8 +116,8 @@ class CameraMismatch:
             if reader in theta:
                 values[reader] = theta[reader]
                 for index, path in inputs:
-                    new = self.differences[path].of(_at(theta[reader], index), drawn[path])
-                    values[reader] = put_at(values[reader], index, new)
+                    true_value = self.differences[path].of(_at(theta[reader], index), drawn[path])
+                    values[reader] = put_at(values[reader], index, true_value)
         return values
 
 
@@ -119,6 +127,7 @@ def _by_axis(path: str) -> tuple[tuple[Index, str], ...]:
 
 
 def _refuse_no_frame(recipe: Recipe, mismatch: Mapping[str, Difference]) -> None:
+    """Raise `RecipeError` at the first difference if the recipe has no frame of a camera."""
     if FRAME not in recipe.steps:
         raise _mistake(
             mismatch,
@@ -158,11 +167,12 @@ def _inputs(recipe: Recipe, mismatch: Mapping[str, Difference]) -> Inputs | None
         return None
     assert recipe.uncertain is not None
     laws = {path: difference.truth for path, difference in mismatch.items()}
-    within = replace(recipe, uncertain=replace(recipe.uncertain, laws=laws, joint=None))
+    all_laws = replace(recipe, uncertain=replace(recipe.uncertain, laws=laws, joint=None))
     for path in mismatch:
-        alone = replace(recipe.uncertain, laws={path: laws[path]}, joint=None)
+        # each law alone first, so that a mistake names its path
+        one_law = replace(recipe.uncertain, laws={path: laws[path]}, joint=None)
         try:
-            Inputs.of(replace(recipe, uncertain=alone), [FRAME], negligible=None)
+            Inputs.of(replace(recipe, uncertain=one_law), [FRAME], negligible=None)
         except ValueError as error:
             text = (
                 "no step before the frame reads it"
@@ -170,23 +180,28 @@ def _inputs(recipe: Recipe, mismatch: Mapping[str, Difference]) -> Inputs | None
                 else str(error)
             )
             raise _mistake(mismatch, path, text) from error
-    inputs = Inputs.of(within, [FRAME], negligible=None)
-    ends = [
+    inputs = Inputs.of(all_laws, [FRAME], negligible=None)
+    # rows: all values at the lower end, all at the upper end
+    extreme_values = [
         [
             difference.of(difference.own, float(difference.law.at(np.array(z))))
             for difference in mismatch.values()
         ]
         for z in (-_FAR, _FAR)
     ]
-    inputs.checked(np.array(ends))
+    inputs.checked(np.array(extreme_values))
     return inputs
 
 
 def _probes(inputs: Inputs) -> dict[str, float]:
     """Return a value of each law that differs from that of the recipe."""
     assert inputs.recipe.uncertain is not None
-    own = {path: difference.own for path, difference in inputs.recipe.uncertain.mismatch.items()}
-    return {name: inputs.uncertain.laws[name].other_than(own[name]) for name in inputs.names}
+    recipe_values = {
+        path: difference.own for path, difference in inputs.recipe.uncertain.mismatch.items()
+    }
+    return {
+        name: inputs.uncertain.laws[name].other_than(recipe_values[name]) for name in inputs.names
+    }
 
 
 def _towards(recipe: Recipe, mismatch: Mapping[str, Difference], path: str) -> list[str]:
@@ -194,15 +209,24 @@ def _towards(recipe: Recipe, mismatch: Mapping[str, Difference], path: str) -> l
     has the path.
     """
     laser = path.removeprefix("lasers.").removesuffix(f".{ANGLE}")
-    source, order = f"direction[{laser}]", needed(recipe, [FRAME])
-    turned = [name for name in order if recipe.steps[name].wires.get("direction") == source]
-    readers = [f"{name}.{ANGLE}" for name in turned if ANGLE in recipe.steps[name].params]
+    direction_input, steps_before_frame = f"direction[{laser}]", needed(recipe, [FRAME])
+    turned_steps = [
+        name
+        for name in steps_before_frame
+        if recipe.steps[name].wires.get("direction") == direction_input
+    ]
+    readers = [f"{name}.{ANGLE}" for name in turned_steps if ANGLE in recipe.steps[name].params]
     if not readers:
         raise _mistake(mismatch, path, "no step before the frame reads this direction")
     return readers
 
 
 def _mistake(mismatch: Mapping[str, Difference], path: str, message: str) -> RecipeError:
+    """Return the error for a difference of the block.
+
+    Of a path with an axis, such as ``lasers.red.angle y``, only the part before the space stands in
+    the recipe.
+    """
     path = path.rpartition(" ")[0] or path
     return RecipeError([Diagnostic(mismatch[path].mark, f"{KEY}.mismatch.{path}", message)])
 

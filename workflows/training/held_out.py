@@ -73,16 +73,22 @@ def split(recipe: Recipe, settings: Training, photographs: Photographs) -> Split
     photographs = by_content(photographs)
     if not holds_out(settings):
         return Split(photographs)
-    alike = _by_digest(photographs.paths)
-    if len(alike) < 2:
+    paths_by_digest = _by_digest(photographs.paths)
+    if len(paths_by_digest) < 2:
         raise ValueError(_too_few(recipe, settings, len(photographs.paths)))
     assert settings.held_out is not None
-    count = min(max(1, round(settings.held_out * len(alike))), len(alike) - 1)
-    groups = [alike[digest] for digest in sorted(alike)[:count]]
-    held_out = tuple(chain.from_iterable(groups))
+    # at least one is held out, and at least one is trained on
+    held_out_count = min(
+        max(1, round(settings.held_out * len(paths_by_digest))), len(paths_by_digest) - 1
+    )
+    # the order of digests is random but the same everywhere
+    held_out_groups = [
+        paths_by_digest[digest] for digest in sorted(paths_by_digest)[:held_out_count]
+    ]
+    held_out = tuple(chain.from_iterable(held_out_groups))
     trained = _without(photographs, set(held_out))
-    one_each = [paths[0] for paths in groups][: settings.held_out_pictures]
-    judged = tuple(path for path in one_each if _readable(path, trained))
+    first_of_each = [paths[0] for paths in held_out_groups][: settings.held_out_pictures]
+    judged = tuple(path for path in first_of_each if _readable(path, trained))
     return Split(trained, held_out, judged)
 
 
@@ -118,6 +124,7 @@ def _readable(path: Path, photographs: Photographs) -> bool:
     cannot.
     """
     try:
+        # decodes the whole file, whatever the size of the crop
         Photographs((path,)).crop((1, 1), 0, 0)
     except ValueError as error:
         photographs.broken[path] = str(error)
@@ -126,11 +133,13 @@ def _readable(path: Path, photographs: Photographs) -> bool:
 
 
 def _too_few(recipe: Recipe, settings: Training, count: int) -> str:
+    """Return the message for a folder with fewer than two different photographs."""
     setting = recipe.config.settings.get(f"{KEY}.photographs")
-    holding = "1 photograph" if count == 1 else f"{count} photographs, all equal"
+    folder_content = "1 photograph" if count == 1 else f"{count} photographs, all equal"
     return (
         f"{setting.source if setting else recipe.name}   {KEY}.photographs   the folder"
-        f" {settings.photographs} holds {holding}, and {KEY}.held_out: {settings.held_out} sets"
+        f" {settings.photographs} holds {folder_content}, and {KEY}.held_out:"
+        f" {settings.held_out} sets"
         f" photographs aside for the validation: add photographs, or write {KEY}.held_out=null"
     )
 
@@ -152,15 +161,19 @@ class Validation:
 
         Pictures behind a ``fixed`` mask are computed once and kept in the memory of the processor.
         """
-        trains = net.training
+        was_training = net.training
         net.eval()
         numbers: dict[str, float] = {}
         for i, sample in self._pictures(samples, shared, fixed):
             picture = sample.picture.to(self.device)
             truth = sample.truth.to(self.device)
-            for who, estimate in (("held_out", net(picture, *sample.given)), ("input", picture)):
-                numbers |= {f"{i} {who}_{name}": x for name, x in _quality(estimate, truth).items()}
-        net.train(trains)
+            for source, estimate in (("held_out", net(picture, *sample.given)), ("input", picture)):
+                # as `_by_photograph` and `summary` read it: the number of the picture, a space, the
+                # column
+                numbers |= {
+                    f"{i} {source}_{name}": x for name, x in _quality(estimate, truth).items()
+                }
+        net.train(was_training)
         repeats, count = samples.repeats, len(self.photographs)
         names = [f"{i} {name}" for i, name in product(range(count * repeats), _OF_PICTURE)]
         return summary(
@@ -170,6 +183,10 @@ class Validation:
     def _pictures(
         self, samples: Samples, shared: Shared, fixed: bool
     ) -> Iterator[tuple[int, Sample]]:
+        """Yield number and sample of each held-out picture of this process.
+
+        Behind a fixed mask they are the same every time, and are kept from the first time on.
+        """
         # empty in a process without a picture, which must not wait for others
         if fixed and self._kept is not None:
             yield from self._kept.items()
@@ -193,8 +210,8 @@ def _by_photograph(numbers: Mapping[str, float], repeats: int) -> dict[str, floa
     means: dict[str, float] = {}
     for name, value in numbers.items():
         number, _, column = name.partition(" ")
-        key = f"{int(number) // repeats} {column}"
-        means[key] = means.get(key, 0.0) + value / repeats
+        photograph_column = f"{int(number) // repeats} {column}"
+        means[photograph_column] = means.get(photograph_column, 0.0) + value / repeats
     return means
 
 
@@ -203,10 +220,11 @@ def _quality(estimate: Tensor, truth: Tensor) -> dict[str, float]:
     the pictures.
     """
     qualities = [
-        metrics.quality(e.float(), t.float()) for e, t in zip(estimate, truth, strict=True)
+        metrics.quality(estimated.float(), true.float())
+        for estimated, true in zip(estimate, truth, strict=True)
     ]
     return {
-        name: sum(float(getattr(q, name.lower())) for q in qualities) / len(qualities)
+        name: sum(float(getattr(quality, name.lower())) for quality in qualities) / len(qualities)
         for name in _METRICS
     }
 
@@ -215,15 +233,21 @@ def summary(numbers: Mapping[str, float], count: int) -> Losses:
     """Return means and intervals over ``count`` photographs from numbers named such as ``0
     held_out_PSNR``.
     """
-    columns = {name: [numbers[f"{i} {name}"] for i in range(count)] for name in _OF_PICTURE}
-    pairs = zip(columns["held_out_PSNR"], columns["input_PSNR"], strict=True)
-    columns["gain_PSNR"] = [own - other for own, other in pairs]
+    values_by_column = {
+        name: [numbers[f"{i} {name}"] for i in range(count)] for name in _OF_PICTURE
+    }
+    restored_and_given = zip(
+        values_by_column["held_out_PSNR"], values_by_column["input_PSNR"], strict=True
+    )
+    values_by_column["gain_PSNR"] = [
+        restored - input_psnr for restored, input_psnr in restored_and_given
+    ]
     result: Losses = {}
-    for name, values in columns.items():
-        mean, low, high = interval(values)
+    for name, values in values_by_column.items():
+        mean, interval_low, interval_high = interval(values)
         result[name] = mean
         if f"{name}_low" in COLUMNS and count > 1:
-            result |= {f"{name}_low": low, f"{name}_high": high}
+            result |= {f"{name}_low": interval_low, f"{name}_high": interval_high}
     return result
 
 
@@ -236,8 +260,11 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
         return float(x.mean()), math.nan, math.nan
     from scipy.stats import t
 
-    half = float(t.ppf((1 + CONFIDENCE) / 2, len(x) - 1)) * float(x.std(ddof=1)) / math.sqrt(len(x))
-    return float(x.mean()), float(x.mean()) - half, float(x.mean()) + half
+    # quantile of Student's t times the standard error of the mean
+    half_width = (
+        float(t.ppf((1 + CONFIDENCE) / 2, len(x) - 1)) * float(x.std(ddof=1)) / math.sqrt(len(x))
+    )
+    return float(x.mean()), float(x.mean()) - half_width, float(x.mean()) + half_width
 
 
 # --- the best state -------------------------------------------------------------------------------
@@ -257,6 +284,7 @@ class Best:
         best = cls()
         for row in rows:
             if row["stage"] == str(stage) and row.get(_SCORE):
+                # the table counts iterations from 0
                 best = best.after(float(row[_SCORE]), int(row["iteration"]) + 1)
         return best
 
@@ -271,15 +299,22 @@ def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None)
     """Return what `training.json` says of the held-out photographs, the best state and the end
     of stage 2.
     """
-    names = {"held_out": [str(path) for path in parts.held_out], "judged": len(parts.judged)}
+    held_out_facts = {
+        "held_out": [str(path) for path in parts.held_out],
+        "judged": len(parts.judged),
+    }
     best = Best.of(rows, 2)
     if not best.iterations:
-        return names
+        return held_out_facts
     rows_of_stage = [row for row in rows if row["stage"] == "2"]
     row = next(row for row in rows_of_stage if int(row["iteration"]) + 1 == best.iterations)
     numbers = {name: float(row[name]) for name in COLUMNS if row.get(name)}
-    early = patience is not None and best.since >= patience
-    return {**names, "best": {"iterations": best.iterations, **numbers}, "stopped_early": early}
+    stopped_early = patience is not None and best.since >= patience
+    return {
+        **held_out_facts,
+        "best": {"iterations": best.iterations, **numbers},
+        "stopped_early": stopped_early,
+    }
 
 
 def score_of(losses: Losses) -> float:
@@ -293,12 +328,12 @@ def said(losses: Losses, better: bool) -> str:
     """Return one line of text about a validation."""
 
     def shown(name: str) -> str:
-        both = (
+        interval_text = (
             f" ({losses[f'{name}_low']:.2f} to {losses[f'{name}_high']:.2f})"
             if f"{name}_low" in losses
             else ""
         )
-        return f"{losses[name]:.2f} dB{both}"
+        return f"{losses[name]:.2f} dB{interval_text}"
 
     text = (
         f"held-out PSNR {shown('held_out_PSNR')}, input {losses['input_PSNR']:.2f} dB, gain"

@@ -50,10 +50,10 @@ class Mesh:
             return
         texts: list[Any] = [None] * self.size
         dist.all_gather_object(texts, about)
-        for rank, other in enumerate(texts):
-            if other != texts[0]:
+        for rank, text in enumerate(texts):
+            if text != texts[0]:
                 raise MeshError(
-                    f"process 0 is in {texts[0]}, process {rank} is in {other}: use one shared"
+                    f"process 0 is in {texts[0]}, process {rank} is in {text}: use one shared"
                     " folder"
                 )
 
@@ -83,11 +83,11 @@ class Mesh:
         """Replace the gradient of each module parameter by its sum over all processes."""
         if self.size == 1:
             return
-        own: list[nn.Parameter] = []
+        parameters: list[nn.Parameter] = []
         for module in parts:
-            own += module.parameters()
-        for kind in dict.fromkeys(p.dtype for p in own):
-            _add([p for p in own if p.dtype == kind])
+            parameters += module.parameters()
+        for kind in dict.fromkeys(p.dtype for p in parameters):
+            _add([p for p in parameters if p.dtype == kind])
 
 
 def _add(own: Sequence[nn.Parameter]) -> None:
@@ -96,9 +96,10 @@ def _add(own: Sequence[nn.Parameter]) -> None:
     """
     has_gradient = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
     grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
-    flat = torch.cat([*(g.reshape(-1) for g in grads), has_gradient])
-    dist.all_reduce(flat)
-    *sums, counts = torch.split(flat, [*(p.numel() for p in own), len(own)])
+    # the gradients in one vector, and after them one flag for each parameter
+    all_numbers = torch.cat([*(g.reshape(-1) for g in grads), has_gradient])
+    dist.all_reduce(all_numbers)
+    *sums, counts = torch.split(all_numbers, [*(p.numel() for p in own), len(own)])
     for p, total, count in zip(own, sums, counts.tolist(), strict=True):
         p.grad = total.view_as(p).clone() if count else None
 
@@ -124,8 +125,8 @@ def device_here(device: str) -> str:
 @contextmanager
 def joined(device: str) -> Iterator[Mesh]:
     """Return a context in which this process belongs to the processes of `torchrun`."""
-    rank, world = processes()
-    if world == 1:
+    rank, process_count = processes()
+    if process_count == 1:
         yield ALONE
         return
     if device.startswith("cuda"):
@@ -133,6 +134,6 @@ def joined(device: str) -> Iterator[Mesh]:
         dist.init_process_group("nccl", device_id=torch.device(device))
     else:
         dist.init_process_group("gloo")
-    yield Mesh(world, rank)
+    yield Mesh(process_count, rank)
     # not after an error, because this process would wait for processes that have ended
     dist.destroy_process_group()

@@ -65,19 +65,21 @@ class UnchangedFiles:
         for path, content in self.contents.items():
             try:
                 stamp = file_stamps(path)[0]
+                # size and time are as at the last look, so that the file is not read again
                 if self._stamps.get(path) == stamp:
                     continue
-                same = file_digest(path) == content
+                is_same = file_digest(path) == content
             except OSError as error:
                 raise ValueError(
                     self._said(path, f"cannot be read any more ({error.strerror})")
                 ) from error
-            if not same:
+            if not is_same:
                 raise ValueError(self._said(path, "has another content now"))
             self._stamps[path] = stamp
 
     @staticmethod
     def _said(path: Path, change: str) -> str:
+        """Return the message of an error: which photograph has changed, and what to do."""
         return (
             f"the photograph {path} {change}, after this training began with it; the checkpoint"
             " before is kept: put the file back and give the command again to go on, or give the"
@@ -199,6 +201,7 @@ def train(
     _require_fitting_mesh(recipe, settings, stages, mesh)
     CameraMismatch.of(recipe, settings)  # raises its mistakes before any work
     if not mesh.first:
+        # only the first process prints
         progress, watch = (lambda line: None), None
     begun = BegunTraining.of(recipe, settings, store, runs, bool(with_pictures))
     folder = begun.folder
@@ -231,12 +234,16 @@ class BegunTraining:
         """Find the inputs of a training, and the folder of results with equal inputs, or a new
         one.
         """
-        parts = held_out.split(recipe, settings, _photographs(recipe, settings, pictures))
-        start = WarmStart.of(recipe, settings)
+        photograph_split = held_out.split(
+            recipe, settings, _photographs(recipe, settings, pictures)
+        )
+        warm_start = WarmStart.of(recipe, settings)
         code = Code(store.code_memo)
-        inputs = inputs_of(recipe, settings, parts, start, code)
+        inputs = inputs_of(recipe, settings, photograph_split, warm_start, code)
         code.save()
-        return cls(parts, start, inputs, folder_of(runs, f"{recipe.name}_train", inputs))
+        return cls(
+            photograph_split, warm_start, inputs, folder_of(runs, f"{recipe.name}_train", inputs)
+        )
 
 
 def _require_fitting_mesh(
@@ -252,6 +259,7 @@ def _require_fitting_mesh(
 
 
 def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> None:
+    """Raise `MeshError` for a batch that does not divide equally among the processes."""
     for number, stage in settings.stages.items():
         if stage.batch % mesh.size:
             path = f"{KEY}.stages.{number}.batch"
@@ -264,14 +272,18 @@ def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> Non
 
 
 def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photographs:
+    """Return the photographs of a training: its folder, or the single file of the scene step.
+
+    Without either it raises ValueError if pictures are `needed`.
+    """
     if settings.photographs is not None:
         return Photographs.under(settings.photographs)
-    file = (
+    scene_file = (
         recipe.steps[settings.scene].params.get("file") if settings.scene in recipe.steps else None
     )
-    if not isinstance(file, Path) and needed:
+    if not isinstance(scene_file, Path) and needed:
         raise ValueError("train.photographs is missing: write the path of a folder of photographs")
-    return Photographs((file,) if isinstance(file, Path) else ())
+    return Photographs((scene_file,) if isinstance(scene_file, Path) else ())
 
 
 class _TrainingLoop(ResumableLoop[Learner]):
@@ -286,9 +298,9 @@ class _TrainingLoop(ResumableLoop[Learner]):
         watch: Watch | None,
         mesh: Mesh,
     ) -> None:
-        folder, parts, start = begun.folder, begun.parts, begun.start
+        folder, photograph_split, warm_start = begun.folder, begun.parts, begun.start
         self.designed = designed(folder)
-        learner = Learner(recipe, settings, device, self.designed, mesh, start)
+        learner = Learner(recipe, settings, device, self.designed, mesh, warm_start)
         require_exports(learner.net, settings)
         super().__init__(
             folder,
@@ -301,25 +313,36 @@ class _TrainingLoop(ResumableLoop[Learner]):
             mesh.first,
             begun.inputs.digest,
         )
-        self.recipe, self.settings, self.split, self.store = recipe, settings, parts, store
-        self.photographs, self.validation = parts.trained, Validation(parts, mesh, device)
+        self.recipe, self.settings, self.split, self.store = (
+            recipe,
+            settings,
+            photograph_split,
+            store,
+        )
+        self.photographs, self.validation = (
+            photograph_split.trained,
+            Validation(photograph_split, mesh, device),
+        )
         self.mesh, self.stage, self.best = (
             mesh,
             2 if self.designed else min(settings.learnt),
             Best(),
         )
-        self.start = start
-        self.read_again = UnchangedFiles.of([*parts.trained.paths, *parts.judged])
+        self.start = warm_start
+        self.read_again = UnchangedFiles.of(
+            [*photograph_split.trained.paths, *photograph_split.judged]
+        )
         self.mask_content = ""  #: digest of the mask behind which stage 2 trains
-        progress(str(parts))
+        progress(str(photograph_split))
         if settings.augment.pooled != "none":
             progress(
                 "pooled pictures are turned with their true pictures, as behind a mask and a sensor"
                 " that turn"
             )
-        if start is not None and not self.state.path.exists():
-            progress(f"begins with the weights of {start.file}")
+        if warm_start is not None and not self.state.path.exists():
+            progress(f"begins with the weights of {warm_start.file}")
         self.resume()
+        # all processes must have read the same checkpoint
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
         self.board = (
             open_board(folder, self._iterations_of_all_stages)
@@ -349,12 +372,12 @@ class _TrainingLoop(ResumableLoop[Learner]):
                     f" {stages_left}"
                 )
             if number > self.stage:
-                first = (
+                advice = (
                     f"run the {self._length} iterations of stage {self.stage} first, or --stage"
                     " mask"
                 )
                 raise ValueError(
-                    f"stage {number} cannot begin before the end of stage {self.stage}: {first}"
+                    f"stage {number} cannot begin before the end of stage {self.stage}: {advice}"
                 )
             if number == self.stage:
                 self._run_stage()
@@ -363,32 +386,36 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
     @property
     def _iterations_of_all_stages(self) -> int:
+        """Return the number of iterations so far, those of all earlier stages included."""
         return self.iteration + sum(
             s.iterations for number, s in self.settings.stages.items() if number < self.stage
         )
 
     @property
     def _length(self) -> int:
+        """Return the number of iterations of the present stage."""
         return self.settings.stages[self.stage].iterations
 
     def _run_stage(self) -> None:
         """Train to the end of the present stage, and write the checkpoint with which the next
         stage begins.
         """
-        fixed = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
-        if fixed is not None:
+        fixed_recipe = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
+        if fixed_recipe is not None:
             self._require_same_mask()
-        parts = self.recipe, self.settings, self.photographs, self.store, self.device
-        self.samples = samples_of(*parts, fixed, self.mesh, self.split.judged)
+        pictures_of = self.recipe, self.settings, self.photographs, self.store, self.device
+        self.samples = samples_of(*pictures_of, fixed_recipe, self.mesh, self.split.judged)
         self.best = Best.of(self.rows.rows, self.stage)
         self.run(self._length, self.settings.stages[self.stage].batch)
         if counts := self.samples.pool_counts:
-            read, made = counts["from_store"], counts["simulated"]
+            read_count, simulated_count = counts["from_store"], counts["simulated"]
             self.progress(
-                f"pictures of the pool: {read} came from the cache, {made} were simulated"
+                f"pictures of the pool: {read_count} came from the cache, {simulated_count}"
+                " were simulated"
             )
         if self.writes:
             self._export()
+        # the checkpoint below is the first of the next stage
         self.stage, self.iteration = self.stage + 1, 0
         self.begin_stage()
         if self.stage == 2 and self.writes:
@@ -440,16 +467,18 @@ class _TrainingLoop(ResumableLoop[Learner]):
             iterations % self.settings.validate_every and iterations != self._length
         ):
             return {}
-        net: Any = self.learner.average.module if self.learner.average else self.learner.net
+        network: Any = self.learner.average.module if self.learner.average else self.learner.net
         losses = self.validation(
-            net, self.samples, self.learner.shared(self.samples), self.stage == 2
+            network, self.samples, self.learner.shared(self.samples), self.stage == 2
         )
         self.best = self.best.after(held_out.score_of(losses), iterations)
-        better = self.stage == 2 and self.best.iterations == iterations
-        if better and self.writes:
-            export(self.folder, "best", net.stored.state_dict(), file_metadata(self.learner.net))
+        is_best = self.stage == 2 and self.best.iterations == iterations
+        if is_best and self.writes:
+            export(
+                self.folder, "best", network.stored.state_dict(), file_metadata(self.learner.net)
+            )
         self.progress(
-            f"stage {self.stage}, iteration {iterations}: {held_out.said(losses, better)}"
+            f"stage {self.stage}, iteration {iterations}: {held_out.said(losses, is_best)}"
         )
         return losses
 
@@ -488,30 +517,39 @@ class _TrainingLoop(ResumableLoop[Learner]):
         with torch.no_grad():
             restored = self.learner.net(sample.picture[:1], *sample.given)[0].float()
         self.learner.net.train()
-        shown = strip([sample.picture[0].detach(), restored, sample.truth[0]])
+        picture_strip = strip([sample.picture[0].detach(), restored, sample.truth[0]])
         if self.board:
             self.board.add_image(
-                f"stage {self.stage}", shown, self._iterations_of_all_stages - 1, dataformats="HWC"
+                f"stage {self.stage}",
+                picture_strip,
+                self._iterations_of_all_stages - 1,
+                dataformats="HWC",
             )
-        self.write_picture(f"stage{self.stage}_{self.iteration:06d}", png(shown))
+        self.write_picture(f"stage{self.stage}_{self.iteration:06d}", png(picture_strip))
 
     def _export(self) -> None:
+        """Write the mask after stage 1, and the network.
+
+        The averaged weights count where there is an average.
+        """
         if self.stage == 1:
             with torch.no_grad():
                 height, stop = self.learner.height(), self.learner.stop
-                size = doe.size_metadata(float(stop.pitch)) if stop is not None else {}
-                export(self.folder, "mask", {"height": height}, size)
-        net: Any = self.learner.average.module if self.learner.average else self.learner.net
-        export(self.folder, "network", net.stored.state_dict(), file_metadata(self.learner.net))
+                size_facts = doe.size_metadata(float(stop.pitch)) if stop is not None else {}
+                export(self.folder, "mask", {"height": height}, size_facts)
+        network: Any = self.learner.average.module if self.learner.average else self.learner.net
+        export(self.folder, "network", network.stored.state_dict(), file_metadata(self.learner.net))
 
     @property
     def _mask_source(self) -> str:
+        """Return where the mask comes from, in words."""
         if self.settings.learn is None:
             return "the recipe's own"
         return "designed without images" if self.designed else "learnt in stage 1"
 
     def _close(self, command: Sequence[str]) -> None:
-        rows, drawn = self.rows.rows, curves(self.rows.rows)
+        """Write the exports, the page and the document of the training."""
+        rows, loss_curves = self.rows.rows, curves(self.rows.rows)
         facts: dict[str, Any] = {
             "mask": self._mask_source,
             "train": self.settings.model_dump(mode="json"),
@@ -527,8 +565,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
             "last": rows[-1],
         }
         write_exports(self.folder, self.learner.net, self.settings)
-        write_page(self.folder, self.recipe.name, rows, drawn, facts)
-        self.close(drawn, self.recipe.name, command, **facts)
+        write_page(self.folder, self.recipe.name, rows, loss_curves, facts)
+        self.close(loss_curves, self.recipe.name, command, **facts)
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
@@ -543,6 +581,7 @@ def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
             f"{file} does not exist: run --stage 1 or --stage mask first to write this file"
         )
     step = recipe.steps[settings.learn]
+    # depth and scale change nothing where the file has heights in m
     params, wires = {"file": file, "depth": 1e-6, "scale": 0.1}, {"stop": step.wires["stop"]}
     learnt = replace(step, node=doe.pixelwise, params=params, wires=wires)
     return replace(recipe, steps={**recipe.steps, settings.learn: learnt})

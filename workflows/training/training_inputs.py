@@ -82,22 +82,26 @@ def _cameras(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
 
 
 def _camera(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
-    named = (settings.picture, settings.truth, settings.psf, settings.light, settings.learn)
-    outputs = [name for name in named if name is not None and name in recipe.steps]
+    """Return what a camera contributes.
+
+    The scene step does not count, because the training itself makes the scenes; its shape does.
+    """
+    read_steps = (settings.picture, settings.truth, settings.psf, settings.light, settings.learn)
+    outputs = [name for name in read_steps if name is not None and name in recipe.steps]
     camera = CameraInputs.of(recipe, outputs, code, computed=(settings.scene,))
     scene = recipe.steps.get(settings.scene)
-    shape = list(scene.params.get("shape") or ()) if scene else []
+    scene_shape = list(scene.params.get("shape") or ()) if scene else []
     return CameraInputs(
-        {**camera.settings, f"{settings.scene}.shape": shape}, camera.steps, camera.laws
+        {**camera.settings, f"{settings.scene}.shape": scene_shape}, camera.steps, camera.laws
     )
 
 
 def _settings(settings: Training, parts: Split) -> dict[str, Any]:
     """Return the settings of the block by path, without those of files and of the mask design."""
-    without = _WITHOUT_EFFECT | _BY_CONTENT | (set() if parts.held_out else _OF_VALIDATION)
-    block = settings.model_dump(mode="json", exclude=without)
-    block["network"] = network_settings(settings.network)
-    return dict(_flat(block, KEY))
+    excluded = _WITHOUT_EFFECT | _BY_CONTENT | (set() if parts.held_out else _OF_VALIDATION)
+    train_settings = settings.model_dump(mode="json", exclude=excluded)
+    train_settings["network"] = network_settings(settings.network)
+    return dict(_flat(train_settings, KEY))
 
 
 def network_settings(network: Network) -> dict[str, Any]:
@@ -111,11 +115,17 @@ def network_settings(network: Network) -> dict[str, Any]:
 
 
 def _flat(block: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
-    flat: list[tuple[str, Any]] = []
+    """Return the single values of a nested mapping, each with its path.
+
+    An empty mapping counts as a value.
+    """
+    flat_settings: list[tuple[str, Any]] = []
     for name, value in block.items():
-        inside = f"{path}.{name}"
-        flat += _flat(value, inside) if isinstance(value, dict) and value else [(inside, value)]
-    return flat
+        inner_path = f"{path}.{name}"
+        flat_settings += (
+            _flat(value, inner_path) if isinstance(value, dict) and value else [(inner_path, value)]
+        )
+    return flat_settings
 
 
 def _code(network: Network, code: Code) -> dict[str, str]:

@@ -63,13 +63,18 @@ def together(
     if not by_shape:
         yield from (([number], sample) for number, sample in pictures)
         return
-    alike: dict[object, dict[int, Sample]] = {}
+    groups: dict[object, dict[int, Sample]] = {}
     for number, sample in pictures:
-        facts = sample.given[0] if sample.given else None
-        free = facts is None or isinstance(facts, FilterFacts)
-        shapes = tuple((name, x.shape) for name, x in sample.tensors.items()) if free else number
-        alike.setdefault(shapes, {})[number] = sample
-    for group in alike.values():
+        filter_facts = sample.given[0] if sample.given else None
+        has_free_size = filter_facts is None or isinstance(filter_facts, FilterFacts)
+        # a Wiener problem is of one picture, so that its number keeps it alone
+        group_key = (
+            tuple((name, x.shape) for name, x in sample.tensors.items())
+            if has_free_size
+            else number
+        )
+        groups.setdefault(group_key, {})[number] = sample
+    for group in groups.values():
         yield list(group), joined(list(group.values()))
 
 
@@ -77,24 +82,24 @@ def joined(samples: list[Sample]) -> Sample:
     """Return pictures of one size as one sample, whose maps beside the pictures have one axis
     more, the first.
     """
-    first = samples[0]
+    first_sample = samples[0]
     if len(samples) == 1:
-        return first
+        return first_sample
     pictures, truths = (
         torch.cat([getattr(s, name) for s in samples]) for name in ("picture", "truth")
     )
     light = torch.stack([s.light for s in samples])
-    if not first.given:
-        return Sample(pictures, truths, light, first.drawn)
-    facts = FilterFacts._make(
+    if not first_sample.given:
+        return Sample(pictures, truths, light, first_sample.drawn)
+    filter_facts = FilterFacts._make(
         map(torch.stack, zip(*(s.given[0] for s in samples if s.given), strict=True))
     )
     return Sample(
         pictures,
         truths,
         light,
-        first.drawn,
-        (facts, torch.stack([s.given[1] for s in samples if s.given])),
+        first_sample.drawn,
+        (filter_facts, torch.stack([s.given[1] for s in samples if s.given])),
     )
 
 
@@ -219,14 +224,14 @@ class Learner:
             return start_network(lambda: _network_of(network), self._rng("network")).to(
                 self.settings.dtype
             )
-        own = own_network(
+        user_network = own_network(
             network.architecture,
             network.parameters,
             network.multiple,
             stream_seed(self.seed, "train network"),
         )
-        try_network(own, self.settings.dtype, self.device)
-        return own.train()
+        try_network(user_network, self.settings.dtype, self.device)
+        return user_network.train()
 
     def _start(self, recipe: Recipe, learn: str) -> nn.Module:
         """Return the mask of the recipe step ``learn`` as a PyTorch module with trainable
@@ -254,6 +259,7 @@ class Learner:
         return height
 
     def _rng(self, *names: object) -> torch.Generator:
+        """Return a generator on this device, seeded by the seed of the recipe and the names."""
         return torch.Generator(self.device).manual_seed(
             stream_seed(self.seed, " ".join(map(str, ("train", *names))))
         )
@@ -273,8 +279,8 @@ class Learner:
             betas=self.settings.critics.betas,
         )
         self._first = [
-            [g["lr"] for g in o.param_groups]
-            for o in (self.generator_optimizer, self.critic_optimizer)
+            [group["lr"] for group in optimiser.param_groups]
+            for optimiser in (self.generator_optimizer, self.critic_optimizer)
         ]
 
     def set_rates(self, iteration: int) -> float:
@@ -282,23 +288,24 @@ class Learner:
         learning rates.
         """
         factor = self.settings.rates.share(iteration)
-        for optimiser, first in zip(
+        for optimiser, first_rates in zip(
             (self.generator_optimizer, self.critic_optimizer), self._first, strict=True
         ):
-            for group, rate in zip(optimiser.param_groups, first, strict=True):
+            for group, rate in zip(optimiser.param_groups, first_rates, strict=True):
+                # never below the least rate, but a rate that begins below it is not raised
                 group["lr"] = max(rate * factor, min(rate, self.settings.rates.least))
         return factor
 
     def parts(self) -> dict[str, Any]:
         """Return by name the objects whose state a checkpoint must contain."""
-        parts = {
+        members = {
             "mask": self.mask,
             "net": self.net,
             "critics": self.critics,
             "makers": self.generator_optimizer,
         }
         return {
-            **parts,
+            **members,
             "judges": self.critic_optimizer,
             **({"average": self.average} if self.average else {}),
         }
@@ -315,27 +322,40 @@ class Learner:
         self.generator_optimizer.zero_grad(set_to_none=True)
         self._moment = stage, iteration
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
-        sums = self._mask_suppression(shared, samples) if self.learns else {}
-        batch, record, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
-        pictures = noted(samples.batch(shared, stage, iteration * batch, batch), record)
+        loss_sums = self._mask_suppression(shared, samples) if self.learns else {}
+        batch_size, batch_samples, truth_and_estimate = (
+            self.stage.batch,
+            list[Sample](),
+            dict[int, tuple[Scales, Scales]](),
+        )
+        pictures = noted(
+            samples.batch(shared, stage, iteration * batch_size, batch_size), batch_samples
+        )
+        # each picture, or on a GPU all of one size at once, is restored and propagated back
         for numbers, sample in together(pictures, self._whole):
             terms, truth, estimate = self._restoration_terms(sample)
-            pairs |= _apart(numbers, truth, estimate)
-            share = len(numbers) / batch
-            _backward([weight * term * share for weight, term in terms.values() if weight])
-            _add_terms(sums, terms, share)
+            truth_and_estimate |= _apart(numbers, truth, estimate)
+            batch_share = len(numbers) / batch_size
+            _backward([weight * term * batch_share for weight, term in terms.values() if weight])
+            _add_terms(loss_sums, terms, batch_share)
+        # gradients of all pictures at once, through the steps that depend on the mask alone
         shared.back()
-        sums = self.mesh.numbers(sums, self._names(), self.device)
-        sums["slope"] = self._move(
-            self.generator_optimizer, sums, (self.net, self.mask) if self.learns else (self.net,)
+        # sums over all processes; each added its share of the batch
+        loss_sums = self.mesh.numbers(loss_sums, self._names(), self.device)
+        loss_sums["slope"] = self._move(
+            self.generator_optimizer,
+            loss_sums,
+            (self.net, self.mask) if self.learns else (self.net,),
         )
         if isinstance(self.net, OwnNetwork):
             self.mesh.share_buffers(self.net)
         if self.average:
             self.average.update_parameters(self.net)
         if self.stage.adversarial:
-            sums |= self._train_critics(pairs, self._rng("between", stage, iteration))
-        return sums, record
+            loss_sums |= self._train_critics(
+                truth_and_estimate, self._rng("between", stage, iteration)
+            )
+        return loss_sums, batch_samples
 
     @property
     def _whole(self) -> bool:
@@ -345,8 +365,10 @@ class Learner:
         A class of the user has random numbers of its own for each picture, and sums over pixels are
         of one picture.
         """
-        gpu = device_kind(self.device) != "cpu" and not self.learns and not self.stage.bsr
-        return gpu and self.settings.reduction == "mean" and not isinstance(self.net, OwnNetwork)
+        can_batch = device_kind(self.device) != "cpu" and not self.learns and not self.stage.bsr
+        return (
+            can_batch and self.settings.reduction == "mean" and not isinstance(self.net, OwnNetwork)
+        )
 
     @torch.no_grad()
     def shared(self, samples: Samples) -> Shared:
@@ -378,7 +400,7 @@ class Learner:
         Every process has all bands, with smaller weights, so that each band counts once.
         """
         psf: Psf = shared.values[samples.psf]
-        times = self.mesh.size
+        process_count = self.mesh.size
         with torch.no_grad():
             peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
@@ -386,10 +408,14 @@ class Learner:
                 loss = checkpoint(
                     self._suppression, psf.intensity, psf.clear_peak, band, use_reentrant=False
                 )
-                (self.stage.lsr / times * loss).backward()
-        return {"LSR": float(peaks.mean()) / times}
+                (self.stage.lsr / process_count * loss).backward()
+        return {"LSR": float(peaks.mean()) / process_count}
 
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
+        """Return the laser suppression loss of one band.
+
+        `intensity` (band, y, x) is the PSF and `clear` (band,) its peak without a mask.
+        """
         psf = Psf(intensity[band : band + 1], clear[band : band + 1])
         loss: Tensor = losses.suppression_loss(psf, log=self.settings.logarithm)
         return loss
@@ -400,18 +426,21 @@ class Learner:
         """Restore a training picture; return its weighted loss terms, true picture and detached
         restored picture.
         """
-        low = torch.autocast(
+        lower_precision = torch.autocast(
             device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16"
         )
         picture = sample.picture if self.learns else sample.picture.detach()
-        with low, self._seeded(sample):
+        with lower_precision, self._seeded(sample):
             coarse, fine = self.net.pyramid(picture, *sample.given)
         estimate = Scales(coarse.to(self.settings.dtype), fine.to(self.settings.dtype))
         y, x = sample.truth.shape[-2:]
+        # half the size, rounded up, as the network halves a picture
         truth = Scales(resize(sample.truth.detach(), -(-y // 2), -(-x // 2)), sample.truth.detach())
         zero = torch.zeros((), device=fine.device)
+        # L1 has no weight: it is written to the table alone
         terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
         if self.stage.bsr:
+            # the BSR loss: the light of the scene over what the mask keeps
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
         if self.stage.reconstruction:
             terms["reconstruction"] = (
@@ -421,7 +450,10 @@ class Learner:
         if self.stage.decibels:
             terms["decibels"] = (self.stage.decibels, losses.log_error(estimate.fine, truth.fine))
         if self.stage.adversarial:
-            scores = (-critic(e).mean() for critic, e in zip(self.critics, estimate, strict=True))
+            scores = (
+                -critic(estimate_scale).mean()
+                for critic, estimate_scale in zip(self.critics, estimate, strict=True)
+            )
             terms["adversarial"] = (self.stage.adversarial, sum(scores, zero))
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
 
@@ -440,11 +472,17 @@ class Learner:
             yield
 
     def _errors(self, estimate: Scales, truth: Scales) -> Iterator[Tensor]:
+        """Yield the reconstruction error at half and at full resolution.
+
+        Each is an error of pixels and one of frequencies.
+        """
         options = (
             {} if self.settings.reduction == "mean" else {"reduction": self.settings.reduction}
         )
-        for e, t in zip(estimate, truth, strict=True):
-            yield losses.charbonnier(e, t, **options) + losses.fft_l1(e, t, **options)
+        for estimate_scale, truth_scale in zip(estimate, truth, strict=True):
+            yield losses.charbonnier(estimate_scale, truth_scale, **options) + losses.fft_l1(
+                estimate_scale, truth_scale, **options
+            )
 
     def _train_critics(
         self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator
@@ -453,21 +491,30 @@ class Learner:
         numbers in all processes.
         """
         self.critic_optimizer.zero_grad(set_to_none=True)
-        numbers, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
+        critic_losses, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
+                    # the picture of another process takes its random numbers too
                     skip_critic_draws(rng, self.settings.patches if self.settings.patch else 1)
                 continue
-            for critic, t, e in zip(self.critics, *pairs[i], strict=True):
-                apart = (critic(e) - critic(t)).mean()
-                steep = losses.gradient_penalty(critic_slopes(critic, t, e, rng))
-                _backward([(self.stage.adversarial * apart + self.stage.penalty * steep) / batch])
-                numbers["critics"] += float(apart.detach()) / batch
-                numbers["penalty"] += float(steep.detach()) / batch
-        numbers = self.mesh.numbers(numbers, tuple(numbers), self.device)
-        self._move(self.critic_optimizer, numbers, list(self.critics))
-        return numbers
+            for critic, truth_scale, estimate_scale in zip(self.critics, *pairs[i], strict=True):
+                score_difference = (critic(estimate_scale) - critic(truth_scale)).mean()
+                penalty = losses.gradient_penalty(
+                    critic_slopes(critic, truth_scale, estimate_scale, rng)
+                )
+                # Wasserstein distance with a gradient penalty
+                _backward(
+                    [
+                        (self.stage.adversarial * score_difference + self.stage.penalty * penalty)
+                        / batch
+                    ]
+                )
+                critic_losses["critics"] += float(score_difference.detach()) / batch
+                critic_losses["penalty"] += float(penalty.detach()) / batch
+        critic_losses = self.mesh.numbers(critic_losses, tuple(critic_losses), self.device)
+        self._move(self.critic_optimizer, critic_losses, list(self.critics))
+        return critic_losses
 
     def _move(
         self,
@@ -483,9 +530,9 @@ class Learner:
         Raises `NotFinite` before the step.
         """
         self.mesh.add_gradients(parts)
-        largest = math.inf if self.settings.clip is None else self.settings.clip
+        norm_limit = math.inf if self.settings.clip is None else self.settings.clip
         norm = max(
-            float(nn.utils.clip_grad_norm_(module.parameters(), largest)) for module in parts
+            float(nn.utils.clip_grad_norm_(module.parameters(), norm_limit)) for module in parts
         )
         require_finite({**losses, "norm of the gradient": norm})
         optimiser.step()
@@ -506,19 +553,21 @@ def _apart(
     """Return the true and the restored picture of each number, of pictures that went through the
     network together.
     """
-    pictures = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
+    chunks = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
     return {
-        n: (Scales(*(x[i] for x in pictures[0])), Scales(*(x[i] for x in pictures[1])))
-        for i, n in enumerate(numbers)
+        number: (Scales(*(x[i] for x in chunks[0])), Scales(*(x[i] for x in chunks[1])))
+        for i, number in enumerate(numbers)
     }
 
 
 def _backward(terms: Sequence[Tensor]) -> None:
+    """Propagate the gradients of the sum of terms; a stage without weights has none."""
     if terms:
         sum(terms[1:], terms[0]).backward()  # type: ignore[no-untyped-call]
 
 
 def _network_of(network: Network) -> Restorer:
+    """Return the packaged network that the settings name, with random weights."""
     if network.kind == "fft_mamba":
         return FFTMamba(network.width, **network.options)
     if network.kind == "unrolled":

@@ -39,10 +39,12 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
     """
     names = [name for name in _SHOWN if any(row[name] for row in rows)]
     figure, axes = canvas(11.0, 2.4 * -(-len(names) // 2), -(-len(names) // 2), 2)
-    first = 1 + max((int(r["iteration"]) for r in rows if r["stage"] == "1"), default=-1)
+    length_of_first_stage = 1 + max(
+        (int(r["iteration"]) for r in rows if r["stage"] == "1"), default=-1
+    )
     for ax, name in zip(axes.flat, names, strict=False):
         for stage, colour in ((1, BLUE), (2, VERMILION)):
-            _draw_loss(ax, rows, name, stage, first * (stage == 2), colour)
+            _draw_loss(ax, rows, name, stage, length_of_first_stage * (stage == 2), colour)
         if name in ("LSR", "L1", "reconstruction", "rate"):
             ax.set_yscale("log", nonpositive="mask")
         ax.set_title(name)
@@ -59,9 +61,9 @@ def _draw_loss(
     """Draw a loss and its running median over the iterations of a stage that begins after
     ``first`` iterations.
     """
-    shown = [row for row in rows if row["stage"] == str(stage) and row[name]]
-    iterations = [int(row["iteration"]) + first for row in shown]
-    values = [float(row[name]) for row in shown]
+    rows_of_stage = [row for row in rows if row["stage"] == str(stage) and row[name]]
+    iterations = [int(row["iteration"]) + first for row in rows_of_stage]
+    values = [float(row[name]) for row in rows_of_stage]
     ax.plot(iterations, values, color=colour, alpha=0.25, linewidth=0.7)
     ax.plot(iterations, running_median(values), color=colour, linewidth=1.5, label=f"stage {stage}")
 
@@ -75,16 +77,16 @@ def held_out_curves(rows: Sequence[Mapping[str, str]], best: int) -> Any:
     best.
     """
     figure, axes = canvas(9.0, 6.4, 2, 1, sharex=True)
-    first = sum(row["stage"] == "1" for row in rows)
-    _draw_training(axes[0, 0], rows, first)
-    judged = [row for row in rows if row.get("held_out_PSNR")]
-    _draw_held_out(axes[1, 0], judged, first)
+    length_of_first_stage = sum(row["stage"] == "1" for row in rows)
+    _draw_training(axes[0, 0], rows, length_of_first_stage)
+    validated_rows = [row for row in rows if row.get("held_out_PSNR")]
+    _draw_held_out(axes[1, 0], validated_rows, length_of_first_stage)
     for ax in axes[:, 0]:
-        if 0 < first < len(rows):
-            ax.axvline(first, color=BLACK, linewidth=0.8, linestyle=":")
+        if 0 < length_of_first_stage < len(rows):
+            ax.axvline(length_of_first_stage, color=BLACK, linewidth=0.8, linestyle=":")
             ax.annotate(
                 "stage 2",
-                (first, 1),
+                (length_of_first_stage, 1),
                 (3, -12),
                 ("data", "axes fraction"),
                 "offset points",
@@ -92,7 +94,7 @@ def held_out_curves(rows: Sequence[Mapping[str, str]], best: int) -> Any:
             )
         if best:
             ax.axvline(
-                first + best,
+                length_of_first_stage + best,
                 color=GREEN,
                 linewidth=1.0,
                 label=f"best: after {best} iterations of stage 2",
@@ -103,6 +105,10 @@ def held_out_curves(rows: Sequence[Mapping[str, str]], best: int) -> Any:
 
 
 def _draw_training(ax: Any, rows: Sequence[Mapping[str, str]], first: int) -> None:
+    """Draw the training loss and its running median over the iterations.
+
+    `first` is the number of iterations of stage 1.
+    """
     name = "reconstruction" if any(row["reconstruction"] for row in rows) else "L1"
     loss = [(float(_at(row, first)), float(row[name])) for row in rows if row[name]]
     iterations, values = zip(*loss, strict=True)
@@ -113,23 +119,39 @@ def _draw_training(ax: Any, rows: Sequence[Mapping[str, str]], first: int) -> No
 
 
 def _draw_held_out(ax: Any, judged: Sequence[Mapping[str, str]], first: int) -> None:
+    """Draw the PSNR of the held-out pictures and of the input, with the interval of the former.
+
+    `judged` are the rows of the loss table with a validation.
+    """
     iterations = [_at(row, first) for row in judged]
-    for who, colour, text in (
+    for source, colour, curve_label in (
         ("held_out", VERMILION, "network"),
         ("input", BLACK, "input of the network"),
     ):
-        values = [float(row[f"{who}_PSNR"]) for row in judged]
-        style = "--" if who == "input" else "-"
+        values = [float(row[f"{source}_PSNR"]) for row in judged]
+        style = "--" if source == "input" else "-"
         ax.plot(
-            iterations, values, color=colour, linestyle=style, marker=".", linewidth=1.5, label=text
+            iterations,
+            values,
+            color=colour,
+            linestyle=style,
+            marker=".",
+            linewidth=1.5,
+            label=curve_label,
         )
     with_ends = [row for row in judged if row["held_out_PSNR_low"]]
-    low, high = (
-        [float(row[f"held_out_PSNR_{end}"]) for row in with_ends] for end in ("low", "high")
+    low_ends, high_ends = (
+        [float(row[f"held_out_PSNR_{interval_end}"]) for row in with_ends]
+        for interval_end in ("low", "high")
     )
-    label = "90 % interval of the mean over photographs"
+    interval_label = "90 % interval of the mean over photographs"
     ax.fill_between(
-        [_at(row, first) for row in with_ends], low, high, color=VERMILION, alpha=0.15, label=label
+        [_at(row, first) for row in with_ends],
+        low_ends,
+        high_ends,
+        color=VERMILION,
+        alpha=0.15,
+        label=interval_label,
     )
 
 
@@ -142,8 +164,11 @@ def running_median(values: Sequence[float]) -> list[float]:
     """Return the running median of a sequence of numbers, in a window of about 1/20 of the
     sequence length.
     """
-    half = max(1, len(values) // 40)
-    return [statistics.median(values[max(0, i - half) : i + half + 1]) for i in range(len(values))]
+    half_window = max(1, len(values) // 40)
+    return [
+        statistics.median(values[max(0, i - half_window) : i + half_window + 1])
+        for i in range(len(values))
+    ]
 
 
 def strip(pictures: Sequence[Tensor]) -> Any:
@@ -151,10 +176,10 @@ def strip(pictures: Sequence[Tensor]) -> Any:
     x, 3).
     """
     gap = torch.ones(3, pictures[0].shape[-2], _GAP)
-    parts = [pictures[0].detach().cpu()]
+    columns = [pictures[0].detach().cpu()]
     for picture in pictures[1:]:
-        parts += [gap, picture.detach().cpu()]
-    return (encoded(torch.cat(parts, -1)) * 255).round().astype("uint8")
+        columns += [gap, picture.detach().cpu()]
+    return (encoded(torch.cat(columns, -1)) * 255).round().astype("uint8")
 
 
 def png(codes: Any) -> bytes:
@@ -180,61 +205,69 @@ def write_page(
     folder: Path, recipe: str, rows: Sequence[Mapping[str, str]], curves: bytes, facts: Any
 ) -> None:
     """Write the page of a training, and the figure ``held_out.png`` if photographs are held out."""
-    judged = [row for row in rows if row.get("held_out_PSNR")]
+    validated_rows = [row for row in rows if row.get("held_out_PSNR")]
     sections = []
-    if judged:
+    if validated_rows:
         figure = held_out_curves(rows, int(facts.get("best", {}).get("iterations", 0)))
         write_whole(folder / "held_out.png", figure)
         sections.append(Section("Held-out pictures", _meaning(facts), picture=figure))
-        sections.append(_table(judged, facts))
+        sections.append(_table(validated_rows, facts))
     sections.append(
         Section("Losses", "Each loss, and its running median, over both stages.", picture=curves)
     )
-    if shown := sorted((folder / "pictures").glob("stage*.png")):
+    if pictures_of_stages := sorted((folder / "pictures").glob("stage*.png")):
         text = (
             "From the left: the input of the network, what the network makes of it, and the true"
             " picture."
         )
-        sections.append(Section("A training picture", text, picture=shown[-1].read_bytes()))
-    about = {
+        sections.append(
+            Section("A training picture", text, picture=pictures_of_stages[-1].read_bytes())
+        )
+    page_facts = {
         name: facts[name]
         for name in ("mask", "photographs", "iterations", "mesh", "broken")
         if facts.get(name)
     }
     write_whole(
-        folder / PAGE, page(f"Training: {recipe}", _lead(judged, facts), sections, about).encode()
+        folder / PAGE,
+        page(f"Training: {recipe}", _lead(validated_rows, facts), sections, page_facts).encode(),
     )
 
 
 def _lead(judged: Sequence[Mapping[str, str]], facts: Any) -> str:
+    """Return the opening of the page: the PSNR of the best network, and its gain over the input."""
     if not judged:
         return (
             "No photograph is held out, so that nothing here says how the network restores pictures"
             " it never saw."
         )
-    row, gain = judged[-1], facts.get("best")
-    if gain is None:
+    row, best = judged[-1], facts.get("best")
+    if best is None:
         return (
             "After the last iteration the held-out pictures have a PSNR of"
             f" {float(row['held_out_PSNR']):.2f} dB."
         )
     text = (
-        f"The best network, after {gain['iterations']} iterations of stage 2, restores held-out"
-        f" pictures with a PSNR of {gain['held_out_PSNR']:.2f} dB, {gain['gain_PSNR']:+.2f} dB over"
+        f"The best network, after {best['iterations']} iterations of stage 2, restores held-out"
+        f" pictures with a PSNR of {best['held_out_PSNR']:.2f} dB, {best['gain_PSNR']:+.2f} dB over"
         " its input"
     )
-    if "gain_PSNR_low" not in gain:
+    if "gain_PSNR_low" not in best:
         return f"{text}. One photograph is held out, which gives no interval."
-    low, high = gain["gain_PSNR_low"], gain["gain_PSNR_high"]
-    sure = (
+    gain_low, gain_high = best["gain_PSNR_low"], best["gain_PSNR_high"]
+    conclusion = (
         "The interval excludes zero."
-        if low > 0 or high < 0
+        if gain_low > 0 or gain_high < 0
         else "The interval includes zero: this is no gain."
     )
-    return f"{text} (90 % interval over photographs: {low:+.2f} to {high:+.2f} dB). {sure}"
+    return (
+        f"{text} (90 % interval over photographs: {gain_low:+.2f} to {gain_high:+.2f} dB)."
+        f" {conclusion}"
+    )
 
 
 def _meaning(facts: Any) -> str:
+    """Return what the curves of held-out pictures show and do not show."""
     text = (
         f"{len(facts['held_out'])} photographs are held out; {facts['judged']} of them are"
         " restored, each with the same scene, laser and noise at every validation. The input is"
@@ -243,8 +276,8 @@ def _meaning(facts: Any) -> str:
         " is a little too high for other pictures: judge it by `neusee evaluate` on photographs of"
         " their own."
     )
-    early = " Stage 2 ended early, because `train.patience` validations had no better PSNR."
-    return text + early if facts.get("stopped_early") else text
+    ending = " Stage 2 ended early, because `train.patience` validations had no better PSNR."
+    return text + ending if facts.get("stopped_early") else text
 
 
 def _table(judged: Sequence[Mapping[str, str]], facts: Any) -> Section:
@@ -256,11 +289,23 @@ def _table(judged: Sequence[Mapping[str, str]], facts: Any) -> Section:
     rows = []
     for name, numbers in states:
         for metric, text in _NAMES.items():
-            own = [float(numbers[key]) for key in (f"held_out_{metric}", f"input_{metric}")]
-            low, high = (
-                _four_digits(numbers.get(f"held_out_{metric}_{end}")) for end in ("low", "high")
+            network_and_input = [
+                float(numbers[key]) for key in (f"held_out_{metric}", f"input_{metric}")
+            ]
+            interval_low, interval_high = (
+                _four_digits(numbers.get(f"held_out_{metric}_{interval_end}"))
+                for interval_end in ("low", "high")
             )
-            rows.append((name, text, f"{own[0]:.4g}", low, high, f"{own[1]:.4g}"))
+            rows.append(
+                (
+                    name,
+                    text,
+                    f"{network_and_input[0]:.4g}",
+                    interval_low,
+                    interval_high,
+                    f"{network_and_input[1]:.4g}",
+                )
+            )
     columns = ("state", "metric", "network", "from", "to", "input")
     return Section("Numbers", "Means over photographs, and their 90 % intervals.", columns, rows)
 

@@ -116,16 +116,19 @@ class PosedPictures:
         kind = settings.network.kind
         if settings.network.architecture is not None or kind not in POSED:
             return None
-        shown = recipe.steps[settings.picture]
-        channels, matrix = (str(shown.wires.get(name)) for name in ("channels", "matrix"))
-        if shown.node.path != "restore.colour" or recipe.steps[channels].node.path not in _FILTERS:
+        picture_step = recipe.steps[settings.picture]
+        channels, matrix = (str(picture_step.wires.get(name)) for name in ("channels", "matrix"))
+        if (
+            picture_step.node.path != "restore.colour"
+            or recipe.steps[channels].node.path not in _FILTERS
+        ):
             setting = recipe.config.settings.get(f"{KEY}.picture")
-            text = (
-                f"{settings.picture} is {shown.node.path}, and the network {kind} starts from the"
-                f" Wiener filter: use restore: wiener and {KEY}.picture: restored"
+            problem = (
+                f"{settings.picture} is {picture_step.node.path}, and the network {kind}"
+                f" starts from the Wiener filter: use restore: wiener and {KEY}.picture: restored"
             )
             raise ValueError(
-                f"{setting.source if setting else recipe.name}   {KEY}.picture   {text}"
+                f"{setting.source if setting else recipe.name}   {KEY}.picture   {problem}"
             )
         return cls(channels, matrix, kind)
 
@@ -138,8 +141,8 @@ class PosedPictures:
         """Return the recipe whose filter poses the problem and solves it."""
         step = recipe.steps[self.filter]
         params = {name: value for name, value in step.params.items() if name in _PARAMETERS}
-        posed = replace(step, node=_KNOWN[self.kind], params=params)
-        return replace(recipe, steps={**recipe.steps, self.filter: posed})
+        posing_step = replace(step, node=_KNOWN[self.kind], params=params)
+        return replace(recipe, steps={**recipe.steps, self.filter: posing_step})
 
     def read(self, values: Mapping[str, Any], dtype: torch.dtype) -> tuple[Tensor, Given]:
         """Return the picture of the filter (3, y, x), and what the network needs beside it in the
@@ -176,11 +179,14 @@ def turned(beside: Given, seed: tuple[int, ...]) -> Given:
     """Turn the maps that a network sees beside a picture, as `scene.symmetry` turns the picture
     with the same seed.
     """
-    facts = beside[0] if beside else None
-    if not beside or not isinstance(facts, FilterFacts):
+    filter_facts = beside[0] if beside else None
+    if not beside or not isinstance(filter_facts, FilterFacts):
         return beside
-    maps = {name: symmetry(getattr(facts, name), seed) for name in ("answer", "deviation", "maps")}
-    return facts._replace(**maps), beside[1]
+    maps = {
+        name: symmetry(getattr(filter_facts, name), seed)
+        for name in ("answer", "deviation", "maps")
+    }
+    return filter_facts._replace(**maps), beside[1]
 
 
 # --- stored pool ----------------------------------------------------------------------------------
@@ -233,34 +239,50 @@ class StoredPool:
             if is_private(key)
             else compute_once(self.store, key, dict, simulated, _ABOUT)
         )
+        # `compute_once` calls the function only if the store lacks the key
         self.computed, self.read = self.computed + bool(computed), self.read + (not computed)
         return {name: x.to(self.device) for name, x in tensors.items()}
 
     def _key(self, scene: Tensor, changed: Mapping[str, Any], noise: int) -> str:
+        """Return the key of a picture, from all that decides it.
+
+        That is the scene, the changed parameters, the noise seed and how the picture is cut. A step
+        that reads something private gives a private key, which is not stored.
+        """
         settings, recipe = self.settings, self.recipe
-        pixels = scene.detach().cpu().contiguous()
-        keys = {settings.scene: hashlib.sha256(pixels.numpy().tobytes()).hexdigest()}
-        drawn: dict[str, dict[str, Any]] = {}
+        scene_pixels = scene.detach().cpu().contiguous()
+        key_of_step = {settings.scene: hashlib.sha256(scene_pixels.numpy().tobytes()).hexdigest()}
+        changed_params: dict[str, dict[str, Any]] = {}
         for reader, value in changed.items():
-            reads, _, param = reader.rpartition(".")
-            drawn.setdefault(reads, {})[param] = value
+            step_name, _, param = reader.rpartition(".")
+            changed_params.setdefault(step_name, {})[param] = value
+        # the keys of all steps with the drawn parameters, as a run has them
         for name in self._order:
             step = recipe.steps[name]
-            step = replace(step, params={**step.params, **drawn.get(name, {})})
-            keys[name], _ = key_of(step, keys, recipe.seed, self._code, place(step, self.device))
-        own = [keys[name] for name in self._outputs]
-        if private := next(filter(is_private, own), None):
-            return private
-        cut = [settings.size, settings.patch, settings.patches, settings.precision, self._resize]
-        within = [
-            list(pixels.shape),
+            step = replace(step, params={**step.params, **changed_params.get(name, {})})
+            key_of_step[name], _ = key_of(
+                step, key_of_step, recipe.seed, self._code, place(step, self.device)
+            )
+        output_keys = [key_of_step[name] for name in self._outputs]
+        if private_key := next(filter(is_private, output_keys), None):
+            return private_key
+        # what is done with the picture after the camera
+        cut_settings = [
+            settings.size,
+            settings.patch,
+            settings.patches,
+            settings.precision,
+            self._resize,
+        ]
+        surroundings = [
+            list(scene_pixels.shape),
             noise,
             recipe.tolerance,
             recipe.exact,
             recipe.estimates,
             device_kind(self.device),
         ]
-        return digest("training picture", engine(*_CODE), own, cut, within)
+        return digest("training picture", engine(*_CODE), output_keys, cut_settings, surroundings)
 
 
 # --- training pictures ----------------------------------------------------------------------------
@@ -275,6 +297,7 @@ class StoredPool:
 
 #: the node of a laser, and the parameter that is 0 without a laser
 _LASER = ("optics.laser_irradiance", "strength")
+# noise seeds and picture numbers lie below this
 _SEEDS = 2**31
 #: in place of the number of a stage: the pictures of held-out photographs, the same in both stages
 HELD_OUT = 3
@@ -326,10 +349,16 @@ class Shared:
 
     def back(self) -> None:
         """Propagate the accumulated gradients from the detached copies to the mask."""
-        pairs = zip(tensors_in(dict(self.made)), tensors_in(dict(self.values)), strict=True)
-        roots = [(x, leaf.grad) for x, leaf in pairs if x.requires_grad and leaf.grad is not None]
-        if roots:
-            torch.autograd.backward([x for x, _ in roots], [grad for _, grad in roots])
+        results_and_leaves = zip(
+            tensors_in(dict(self.made)), tensors_in(dict(self.values)), strict=True
+        )
+        graph_ends = [
+            (x, leaf.grad)
+            for x, leaf in results_and_leaves
+            if x.requires_grad and leaf.grad is not None
+        ]
+        if graph_ends:
+            torch.autograd.backward([x for x, _ in graph_ends], [grad for _, grad in graph_ends])
 
 
 def _leaf(x: Tensor) -> Tensor:
@@ -356,33 +385,39 @@ class TrainingStream:
         held_out: Sequence[Path] = (),
     ) -> None:
         learn = None if frozen else settings.learn
-        learns = {learn} if learn else set[str]()
+        learnt_steps = {learn} if learn else set[str]()
         self.settings, self.photographs, self.device = settings, photographs, device
         self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
         outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
-        require_steps(recipe, "train", (*outputs, settings.scene, *learns))
+        require_steps(recipe, "train", (*outputs, settings.scene, *learnt_steps))
         self._inputs = _uncertain_inputs(recipe, outputs)
         self._mismatch = CameraMismatch.of(recipe, settings)
         self.shape = frame_of(recipe, settings.scene)
+        # what the restorer is told of the camera
         believed = in_precision(frozen or recipe, settings.dtype)
         self._posed = PosedPictures.of(recipe, settings)
         if self._posed:
             believed = self._posed.within(believed)
         self._made = self._outputs(2 if frozen else 1)
+        # the camera that takes the pictures may differ from it
         recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
         outputs = (*self._made, self.psf)
-        recipe = with_substitutions(replace(recipe, estimates=False), outputs, learns)
+        recipe = with_substitutions(replace(recipe, estimates=False), outputs, learnt_steps)
         order = needed(recipe, outputs)
         self._stored = self._stored_pool(recipe, store)
         self._lasers = _parameters_of_lasers(recipe, order)
         self._readers = self._read(believed, order)
-        noise, drawn = self._changing(recipe, order)
-        learnt = dependents(recipe, learns, order)
-        read = _sources(recipe, drawn) | {self.psf}
-        border = [name for name in order if name in (learnt - drawn) & read]
-        self._divide(recipe, learn, border, noise, store)
+        # steps that draw noise for each picture, and all steps that change with each picture
+        noise_steps, picture_steps = self._changing(recipe, order)
+        steps_behind_mask = dependents(recipe, learnt_steps, order)
+        read_by_pictures = _sources(recipe, picture_steps) | {self.psf}
+        # steps behind the mask that no picture changes but that the steps of pictures read
+        shared_outputs = [
+            name for name in order if name in (steps_behind_mask - picture_steps) & read_by_pictures
+        ]
+        self._divide(recipe, learn, shared_outputs, noise_steps, store)
 
     def _stored_pool(self, recipe: Recipe, store: Store) -> StoredPool | None:
         """Return the pictures of a pool in the store, or None if there is no pool to keep."""
@@ -395,16 +430,18 @@ class TrainingStream:
         picture.
         """
         # random effects in the PSF, such as dirt, are constant
-        fixed = set(needed(recipe, [self.psf]))
-        noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
-        read = {self.settings.scene, *(name.rpartition(".")[0] for name in self._readers)}
-        drawn = dependents(recipe, noise | read, order)
-        if self.psf in drawn:
+        psf_steps = set(needed(recipe, [self.psf]))
+        noise_steps = {
+            name for name in order if recipe.steps[name].node.random and name not in psf_steps
+        }
+        drawn_steps = {self.settings.scene, *(name.rpartition(".")[0] for name in self._readers)}
+        picture_steps = dependents(recipe, noise_steps | drawn_steps, order)
+        if self.psf in picture_steps:
             raise ValueError(
                 f"train.psf: {self.settings.psf} changes with each picture: name a step with a"
                 " constant PSF"
             )
-        return noise, drawn
+        return noise_steps, picture_steps
 
     def _outputs(self, number: int) -> tuple[str, ...]:
         """Return the steps that make a picture of a stage: what a network sees, the truth, light
@@ -412,8 +449,8 @@ class TrainingStream:
         """
         stage = self.settings.stages.get(number)
         light = (self.settings.light,) if stage is not None and stage.bsr else ()
-        shown = self._posed.steps if self._posed else (self.settings.picture,)
-        return (*shown, self.settings.truth, *light)
+        input_steps = self._posed.steps if self._posed else (self.settings.picture,)
+        return (*input_steps, self.settings.truth, *light)
 
     def _read(self, believed: Recipe, order: Sequence[str]) -> dict[str, Any]:
         """Return the parameters that change with each picture, with the values that the recipe
@@ -422,12 +459,14 @@ class TrainingStream:
         What is drawn for the camera is told to the restorer too, but for the differences of
         ``train.mismatch``.
         """
-        drawn = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
-        believed_names, steps = [TOLD + name for name in drawn], set(order)
+        drawn_names = dict.fromkeys(
+            [*(self._inputs.readers if self._inputs else ()), *self._lasers]
+        )
+        believed_names, step_names = [TOLD + name for name in drawn_names], set(order)
         changing = [
             name
-            for name in (*drawn, *believed_names, *self._mismatch.moved)
-            if name.rpartition(".")[0] in steps
+            for name in (*drawn_names, *believed_names, *self._mismatch.moved)
+            if name.rpartition(".")[0] in step_names
         ]
         return {name: _given(believed, name.removeprefix(TOLD)) for name in changing}
 
@@ -442,10 +481,12 @@ class TrainingStream:
         """Divide the recipe into steps that depend on the mask alone, up to ``border``, and
         steps for each picture.
         """
-        ways: dict[str, Any] = {"store": store, "device": self.device}
-        self.shared = as_function(recipe, learn, outputs=border, **ways) if learn else None
-        free = [*border, self.settings.scene, *self._readers]
-        self._simulate = as_function(recipe, *free, outputs=self._made, redraw=noise, **ways)
+        options: dict[str, Any] = {"store": store, "device": self.device}
+        self.shared = as_function(recipe, learn, outputs=border, **options) if learn else None
+        free_inputs = [*border, self.settings.scene, *self._readers]
+        self._simulate = as_function(
+            recipe, *free_inputs, outputs=self._made, redraw=noise, **options
+        )
 
     @property
     def pool_counts(self) -> dict[str, int]:
@@ -497,6 +538,8 @@ class TrainingStream:
         """
         if self._pool is None or stage == HELD_OUT or self.settings.augment.pooled == "none":
             return sample
+        # the last number keeps apart the random streams of a picture: 1 values, 2 patches, 3 scene,
+        # 4 turn
         seed = (self.seed, stage, number, 4)
         picture, truth = symmetry(sample.picture, seed), symmetry(sample.truth, seed)
         return replace(sample, picture=picture, truth=truth, given=turned(sample.given, seed))
@@ -520,43 +563,46 @@ class TrainingStream:
         )
 
     def _alone(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        theta, noise, drawn = self._drawn(stage, number)
+        """Return the picture with this number, from the store where it may be there."""
+        theta, noise, drawn_values = self._drawn(stage, number)
         values = {**shared, **theta}
-        free = {name: values[name] for name in self._simulate.free}
+        free_values = {name: values[name] for name in self._simulate.free}
 
         def simulated() -> Sample:
-            return self._sample(self._simulate(free, noise), drawn)
+            return self._sample(self._simulate(free_values, noise), drawn_values)
 
         if self._stored is None or stage == HELD_OUT:
             return simulated()
-        changed = {name: theta[name] for name in self._readers}
+        changed_values = {name: theta[name] for name in self._readers}
         tensors = self._stored.picture(
-            theta[self.settings.scene], changed, noise, lambda: simulated().tensors
+            theta[self.settings.scene], changed_values, noise, lambda: simulated().tensors
         )
-        return Sample.of(tensors, drawn)
+        return Sample.of(tensors, drawn_values)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
         """Sample the random inputs of a training picture; return the inputs, the noise seed, and
         all values by name.
         """
         rng = np.random.default_rng((self.seed, stage, number, 1))
-        theta, drawn = dict(self._readers), dict[str, Any]()
+        # by step and parameter, the values of the recipe to begin with; by name, what is drawn
+        theta, drawn_values = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
             values = self._inputs.at(rng.standard_normal((1, len(self._inputs.names))))[0]
-            drawn = dict(zip(self._inputs.names, map(float, values), strict=True))
-            theta |= self._inputs.theta(drawn)
+            drawn_values = dict(zip(self._inputs.names, map(float, values), strict=True))
+            theta |= self._inputs.theta(drawn_values)
+        # the restorer is told the drawn values, before the camera differs from them
         theta |= {name: theta[name.removeprefix(TOLD)] for name in theta if name.startswith(TOLD)}
         differences = self._mismatch.drawn((self.seed, stage, number))
         theta |= self._mismatch.truth(theta, differences)
-        drawn |= {f"mismatch {path}": value for path, value in differences.items()}
+        drawn_values |= {f"mismatch {path}": value for path, value in differences.items()}
         if rng.random() < self.settings.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
-            drawn["laser"] = "none"
+            drawn_values["laser"] = "none"
         theta |= {
             self.settings.scene: self._scene(stage, number).to(self.device, self.settings.dtype)
         }
-        noise = int(rng.integers(_SEEDS))
-        return theta, noise, {**drawn, "noise": noise, "number": number}
+        noise_seed = int(rng.integers(_SEEDS))
+        return theta, noise_seed, {**drawn_values, "noise": noise_seed, "number": number}
 
     def _sample(self, values: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
         """Resize a training picture and the true picture to ``train.size``, and cut both into
@@ -567,14 +613,16 @@ class TrainingStream:
         """
         light = values.get(self.settings.light, torch.zeros(0))
         dtype = self.settings.dtype
-        picture, beside = (
+        picture, network_inputs = (
             self._posed.read(values, dtype) if self._posed else (values[self.settings.picture], ())
         )
-        both = [x.to(dtype) for x in (picture, values[self.settings.truth])]
+        picture_and_truth = [x.to(dtype) for x in (picture, values[self.settings.truth])]
         if self.settings.size is not None:
-            both = [resize(picture, *self.settings.size) for picture in both]
-        picture, truth = self._patches(torch.stack(both), drawn["noise"])
-        return Sample(picture, truth, light, drawn, beside)
+            picture_and_truth = [
+                resize(picture, *self.settings.size) for picture in picture_and_truth
+            ]
+        picture, truth = self._patches(torch.stack(picture_and_truth), drawn["noise"])
+        return Sample(picture, truth, light, drawn, network_inputs)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
         """Cut patches from a training picture and the true picture at the same positions, as a
@@ -586,21 +634,23 @@ class TrainingStream:
         if self.settings.patch is None:
             return both[:, None]
         size, patch = (both.shape[-2], both.shape[-1]), self.settings.patch
-        if any(have < want for have, want in zip(size, patch, strict=True)):
+        if any(side < patch_side for side, patch_side in zip(size, patch, strict=True)):
             raise ValueError(
                 f"train.patch: {list(patch)} is larger than the picture {list(size)}: set a smaller"
                 " patch"
             )
         rng = np.random.default_rng((seed, 2))
         count = self.settings.patches
-        places = [
+        corners = [
             [int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)]
             for _ in range(count)
         ]
-        return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
+        # axis 1 counts the patches, axis 0 has picture and truth
+        return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in corners], 1)
 
 
 def _uncertain_inputs(recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
+    """Return the uncertain inputs of a recipe, or None for a recipe without any."""
     if recipe.uncertain and recipe.uncertain.names:
         return Inputs.of(recipe, outputs)
     return None
@@ -613,11 +663,13 @@ def _parameters_of_lasers(recipe: Recipe, order: Sequence[str]) -> list[str]:
 
 
 def _given(recipe: Recipe, name: str) -> Any:
+    """Return the value of a parameter, from a name such as ``psf[mask].angle``."""
     step, _, param = name.rpartition(".")
     return recipe.steps[step].params[param]
 
 
 def _sources(recipe: Recipe, readers: Iterable[str]) -> set[str]:
+    """Return the steps whose results the readers read."""
     return set(chain.from_iterable(recipe.steps[reader].sources for reader in readers))
 
 
@@ -647,12 +699,19 @@ class SeveralCameras:
     ) -> None:
         recipes = (recipe, *recipe.cameras)
         self.repeats, self._pool = len(recipes), settings.pool
-        judged: list[Path] = []
+        # each held-out photograph once for each camera
+        repeated_photographs: list[Path] = []
         for path in held_out:
-            judged += [path] * len(recipes)
+            repeated_photographs += [path] * len(recipes)
         self._streams = [
             TrainingStream(
-                camera, settings, photographs, store, device, frozen=camera, held_out=judged
+                camera,
+                settings,
+                photographs,
+                store,
+                device,
+                frozen=camera,
+                held_out=repeated_photographs,
             )
             for camera in recipes
         ]
@@ -678,8 +737,8 @@ class SeveralCameras:
         """
         for i in range(count):
             number = first + i
-            within = number % self._pool if self._pool and stage != HELD_OUT else number
-            stream = self._streams[within % self.repeats]
+            number_in_pool = number % self._pool if self._pool and stage != HELD_OUT else number
+            stream = self._streams[number_in_pool % self.repeats]
             yield i, stream.turned(stream(shared.values, stage, number), stage, number)
 
 

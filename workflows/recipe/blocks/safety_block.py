@@ -86,10 +86,15 @@ class SensorFacts(SettingsBlock):
 
     @model_validator(mode="after")
     def _leaves_room_for_light(self) -> SensorFacts:
+        """Refuse an offset that fills the pixel.
+
+        A converter without a step below the full well is refused too.
+        """
         if not self.fills > 0:
-            full = f"an offset of {self.offset:g} e- leaves no room for light"
+            problem = f"an offset of {self.offset:g} e- leaves no room for light"
             raise ValueError(
-                f"{full} in a full well of {self.full_well:g} e-, or in the range of the converter"
+                f"{problem} in a full well of {self.full_well:g} e-, or in the range of the"
+                " converter"
             )
         if self.full_well is not None and self.gain is not None and self.bits is not None:
             refuse_without_steps(self.full_well, gain=self.gain, bits=self.bits)
@@ -276,6 +281,7 @@ class EyeDazzle(SettingsBlock):
     @field_validator("angles")
     @classmethod
     def _has_an_equation(cls, angles: tuple[float, ...]) -> tuple[float, ...]:
+        """Refuse angles for which the glare equation does not hold."""
         for angle in angles:
             if not math.radians(0.1) <= angle <= math.radians(100):
                 raise ValueError(
@@ -352,6 +358,7 @@ class SafetySettings(SettingsBlock):
 
     @model_validator(mode="after")
     def _knows_saturation(self) -> SafetySettings:
+        """Refuse dazzle without the efficiency, the full well and the exposure of the sensor."""
         lacking = [name for name in SATURATION if getattr(self.sensor, name) is None]
         if self.dazzle is not None and lacking:
             names = ", ".join(lacking)
@@ -387,17 +394,23 @@ def read_safety(
     block = _settings_of(root, references, diagnostics)
     if block is None:
         return None
-    before = len(diagnostics)
+    earlier_mistakes = len(diagnostics)
     block = _located_in(block, root.mark.file)
     settings = _validated(SafetySettings, block, diagnostics)
-    item = _laser_of(root, block, references, diagnostics)
-    laser = None if item is None or broken(item) else _laser(item, diagnostics)
+    laser_value = _laser_of(root, block, references, diagnostics)
+    laser = None if laser_value is None or broken(laser_value) else _laser(laser_value, diagnostics)
     laws = _laws(block, diagnostics, files)
-    if settings is None or laser is None or item is None or len(diagnostics) > before:
+    if (
+        settings is None
+        or laser is None
+        or laser_value is None
+        or len(diagnostics) > earlier_mistakes
+    ):
         return None
     values = {dotted(path): value for path, value in _leaves(block, ())}
-    values |= {dotted(path): value for path, value in _leaves(item, ("laser",))}
-    return Safety(laser, settings, str(item.path[-1]), values, laws)
+    # the laser of the settings alone, under the name ``laser``
+    values |= {dotted(path): value for path, value in _leaves(laser_value, ("laser",))}
+    return Safety(laser, settings, str(laser_value.path[-1]), values, laws)
 
 
 def _settings_of(
@@ -405,6 +418,7 @@ def _settings_of(
 ) -> Value | None:
     """Return the block ``safety`` with its references resolved, or None for null or a mistake."""
     lasers = root.items[LASERS].items if LASERS in root.items else {}
+    # every setting of a laser may be written, whatever step reads it
     references.used |= {(LASERS, *pair) for pair in product(lasers, Laser.model_fields)}
     block = references.resolve(root.items[KEY], Scope({}, KEY))
     if broken(block) or block.data is None:
@@ -436,6 +450,7 @@ def _laws(
 
 
 def _validated(model: type[Model], block: Value, diagnostics: list[Diagnostic]) -> Model | None:
+    """Return the settings in a block, or None with a diagnostic for each mistake."""
     try:
         return model.model_validate(block.plain)
     except ValidationError as error:
@@ -450,10 +465,10 @@ def _located_in(value: Value, file: str) -> Value:
     if not isinstance(value.data, dict):
         return value
     items = {key: _located_in(item, file) for key, item in value.data.items()}
-    own = next((item.key for item in items.values() if item.key.file == file), None)
-    if own is None or value.key.file == file:
+    place_in_file = next((item.key for item in items.values() if item.key.file == file), None)
+    if place_in_file is None or value.key.file == file:
         return replace(value, data=items)
-    return replace(value, data=items, key=own, mark=own)
+    return replace(value, data=items, key=place_in_file, mark=place_in_file)
 
 
 def _laser_of(
@@ -476,9 +491,11 @@ def _laser_of(
             return None
         name = str(setting.data)
     elif len(lasers) != 1:
-        several = f"the recipe has the lasers {', '.join(lasers)}: write safety.laser=NAME"
+        message_of_several = (
+            f"the recipe has the lasers {', '.join(lasers)}: write safety.laser=NAME"
+        )
         diagnostics.append(
-            Diagnostic(block.key, KEY, several if lasers else "the recipe has no laser")
+            Diagnostic(block.key, KEY, message_of_several if lasers else "the recipe has no laser")
         )
         return None
     else:
@@ -495,13 +512,13 @@ def _laser(item: Value, diagnostics: list[Diagnostic]) -> Laser | None:
             Diagnostic(item.mark, item.name, f"must be a mapping of values, not {kind(item)}")
         )
         return None
-    own = Value(
-        {k: v for k, v in item.data.items() if k in Laser.model_fields},
+    laser_settings = Value(
+        {key: setting for key, setting in item.data.items() if key in Laser.model_fields},
         item.key,
         item.key,
         item.path,
     )
-    laser = _validated(Laser, own, diagnostics)
+    laser = _validated(Laser, laser_settings, diagnostics)
     try:
         if laser is not None:
             laser.beam()

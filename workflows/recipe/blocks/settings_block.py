@@ -58,6 +58,7 @@ def located(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
     """
     value = block
     for key in error["loc"]:
+        # keys that are no part of the recipe, such as names of types, are skipped
         value = value.child(key) or value
     text = message_of(error, value)
     if error["type"] == "extra_forbidden":
@@ -67,8 +68,8 @@ def located(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
             value.name,
             instead(value.name) or f"unknown; {nearest(error['loc'][-1], names)}",
         )
-    if now := instead(f"{value.name}={error['input']}"):
-        text = f"{error['input']} {now}"
+    if renaming := instead(f"{value.name}={error['input']}"):
+        text = f"{error['input']} {renaming}"
     elif error["type"] == "missing":
         text = f"needs {error['loc'][-1]}"
     return Diagnostic(value.mark, value.name, text)
@@ -82,6 +83,7 @@ def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
             model = next(
                 (
                     model_class
+                    # the model inside of an optional or a mapping
                     for model_class in get_args(annotation)
                     if hasattr(model_class, "model_fields")
                 ),

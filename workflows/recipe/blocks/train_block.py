@@ -102,6 +102,7 @@ class Weights(SettingsBlock):
 
     @model_validator(mode="after")
     def _some(self) -> Weights:
+        """Refuse a loss whose every weight is 0."""
         if not any(getattr(self, name) for name in type(self).model_fields):
             names = " or ".join(
                 [", ".join([*type(self).model_fields][:-1]), [*type(self).model_fields][-1]]
@@ -202,6 +203,7 @@ class MaskSettings(SettingsBlock):
 
     @model_validator(mode="after")
     def _rising(self) -> Self:
+        """Refuse settings that contradict each other: slopes, a peak limit and a learnt stop."""
         if not self.slopes[0] < self.slopes[1]:
             raise ValueError(f"slopes = {self.slopes}: give the smaller slope first")
         if self.limit is not None and not self.weights.protected:
@@ -303,12 +305,16 @@ class Network(SettingsBlock):
 
     @model_validator(mode="after")
     def _fits(self) -> Network:
-        owners = {name: "unrolled" if name == "steps" else "fft_mamba" for name in self.options}
-        wrong = {name: owner for name, owner in owners.items() if owner != self.kind}
-        if self.architecture is None and wrong:
-            owner = next(iter(wrong.values()))
+        """Refuse options that belong to another kind of network."""
+        network_of_option = {
+            name: "unrolled" if name == "steps" else "fft_mamba" for name in self.options
+        }
+        misplaced = {name: owner for name, owner in network_of_option.items() if owner != self.kind}
+        if self.architecture is None and misplaced:
+            owner = next(iter(misplaced.values()))
             raise ValueError(
-                f"{', '.join(wrong)}: only the network {owner} has such options, not {self.kind}"
+                f"{', '.join(misplaced)}: only the network {owner} has such options, not"
+                f" {self.kind}"
             )
         return self
 
@@ -439,6 +445,10 @@ class Training(SettingsBlock):
 
     @model_validator(mode="after")
     def _unrolls(self) -> Training:
+        """Refuse settings that a network behind a Wiener filter cannot have.
+
+        Such a network restores whole pictures behind a fixed mask.
+        """
         kind = self.network.kind
         if self.network.architecture is not None or kind not in POSED:
             return self
@@ -450,17 +460,20 @@ class Training(SettingsBlock):
         not_for_both = {"learn": self.learn, "size": self.size, "patch": self.patch}
         if self.augment.pooled != "none" and kind == "unrolled":
             not_for_both["augment.pooled"] = "none"
-        wrong = next((name for name, value in not_for_both.items() if value is not None), None)
-        if wrong:
+        first_wrong = next(
+            (name for name, value in not_for_both.items() if value is not None), None
+        )
+        if first_wrong:
             text = f"the network {kind} restores a whole picture behind a fixed mask"
             raise ValueError(
-                f"{wrong}: {text}: write {wrong}:"
-                f" {not_for_both[wrong] if wrong == 'augment.pooled' else 'null'}"
+                f"{first_wrong}: {text}: write {first_wrong}:"
+                f" {not_for_both[first_wrong] if first_wrong == 'augment.pooled' else 'null'}"
             )
         return self
 
     @model_validator(mode="after")
     def _mixes(self) -> Training:
+        """Refuse further cameras together with a mask that is trained."""
         if self.cameras and self.learn is not None:
             raise ValueError(
                 "cameras: pictures are of several cameras where no mask is trained: write learn:"
@@ -512,9 +525,9 @@ def read_training(
     if (
         training
         and "network" in block.items
-        and (wrong := list(_wrong_network(block.items["network"], training)))
+        and (network_mistakes := list(_wrong_network(block.items["network"], training)))
     ):
-        return composed.with_problems(wrong), None
+        return composed.with_problems(network_mistakes), None
     missing = list(_missing(block, training)) if training else []
     return (composed.with_problems(missing), None) if missing else (composed, training)
 
@@ -533,14 +546,14 @@ def _missing(block: Value, training: Training) -> Iterator[Diagnostic]:
         yield Diagnostic(
             value.mark, value.name, f"there is neither a file nor a folder {training.start}"
         )
-    for outer, path, key in (
+    for block_of_path, path, key in (
         (block, training.photographs, "photographs"),
         (block, training.start, "start"),
         (block.items.get("mask"), training.mask.start, "start"),
     ):
-        named = outer.child(key) if outer else None
-        if named is not None and path is not None:
-            yield from _outside(path, named)
+        path_value = block_of_path.child(key) if block_of_path else None
+        if path_value is not None and path is not None:
+            yield from _outside(path, path_value)
 
 
 def _outside(path: Path, value: Value) -> Iterator[Diagnostic]:
@@ -606,14 +619,14 @@ def _plain(block: Value) -> Any:
     YAML file.
     """
     plain = block.plain
-    for outer, key in (
+    for block_of_path, key in (
         (block, "photographs"),
         (block, "start"),
         (block.items.get("mask"), "start"),
     ):
-        value = outer.items.get(key) if outer else None
+        value = block_of_path.items.get(key) if block_of_path else None
         if value is not None and isinstance(value.data, str):
-            (plain if outer is block else plain["mask"])[key] = (
+            (plain if block_of_path is block else plain["mask"])[key] = (
                 Path(value.mark.folder) / Path(value.data).expanduser()
             )
     return plain
@@ -654,12 +667,13 @@ class LiftTraining(SettingsBlock):
         """Return the learning rate at an iteration: a linear warm-up, then half a cosine from
         `rate` to `min_rate`.
         """
-        lowest, rising = (
+        least_rate, warmup_share = (
             min(self.min_rate, self.rate),
             min(1.0, (iteration + 1) / max(self.warmup, 1)),
         )
-        return rising * (
-            lowest + (self.rate - lowest) * half_cosine(math.pi * iteration / self.iterations)
+        return warmup_share * (
+            least_rate
+            + (self.rate - least_rate) * half_cosine(math.pi * iteration / self.iterations)
         )
 
 

@@ -65,6 +65,8 @@ def read_columns(path: Path) -> dict[str, FloatArray]:
 
 
 def _arrays(path: Path) -> dict[str, FloatArray]:
+    """Return the arrays of an .npz file by name, each as one column."""
+    # the first bytes of every zip file
     if head_of(path, 2) != b"PK":
         raise ValueError(f"{path.name} cannot be read: the file does not have the format .npz")
     npz_needs(path, 1.0, 8.0)
@@ -73,6 +75,10 @@ def _arrays(path: Path) -> dict[str, FloatArray]:
 
 
 def _one_column(path: Path, array: FloatArray) -> FloatArray:
+    """Return the array of an .npy file as a column.
+
+    Raise ValueError unless it is a row of real numbers.
+    """
     if array.ndim != 1 or array.dtype.kind not in "fiu":
         raise ValueError(
             f"{path.name} must contain one row of real numbers, not {array.dtype} of shape"
@@ -82,8 +88,16 @@ def _one_column(path: Path, array: FloatArray) -> FloatArray:
 
 
 def _text_columns(path: Path) -> dict[str, FloatArray]:
+    """Return the columns of a .csv or .txt file by heading.
+
+    Raise ValueError for a cell without a number.
+    """
     lines = csv.reader(lines_of(path, _CELLS))
-    rows = [(n, row) for n, row in enumerate(lines, 1) if any(cell.strip() for cell in row)]
+    rows = [
+        (line_number, row)
+        for line_number, row in enumerate(lines, 1)
+        if any(cell.strip() for cell in row)
+    ]
     if not rows:
         raise ValueError(f"{path.name} is empty")
     headings, rows = _take_headings(path, rows)
@@ -152,10 +166,10 @@ def si_unit(unit: str) -> tuple[float, str]:
     with the factor 1.
     """
     try:
-        scale, si, reciprocal = read_written(f"1 {unit}".strip())
+        scale, si_text, reciprocal = read_written(f"1 {unit}".strip())
     except ValueError:
         return 1.0, unit
-    return scale, unit if reciprocal else si
+    return scale, unit if reciprocal else si_text
 
 
 def require_samples(samples: FloatArray, name: str) -> None:
@@ -247,20 +261,22 @@ class Joint:
         """Transform standard normal numbers ``z`` to draws of the joint distribution; both have
         the shape (…, name).
         """
-        score = z @ self.factor.T
+        scores = z @ self.factor.T
         if self.bounds is not None:
             columns = [
-                scores_between(score[..., i], low, high)
-                for i, (low, high) in enumerate(self.bounds)
+                scores_between(scores[..., i], lower_bound, upper_bound)
+                for i, (lower_bound, upper_bound) in enumerate(self.bounds)
             ]
-            score = np.stack(columns, -1)
+            scores = np.stack(columns, -1)
         if self.draws is None:
-            return np.asarray(self.mean + self.sd * score, np.float64)
+            return np.asarray(self.mean + self.sd * scores, np.float64)
         from scipy.special import ndtr
 
-        share = np.arange(1, len(self.draws) + 1) / (len(self.draws) + 1)
+        # rank i of n draws stands for the probability i / (n + 1), as in `_scores`
+        probabilities = np.arange(1, len(self.draws) + 1) / (len(self.draws) + 1)
         columns = [
-            np.interp(ndtr(score[..., i]), share, np.sort(x)) for i, x in enumerate(self.draws.T)
+            np.interp(ndtr(scores[..., i]), probabilities, np.sort(column))
+            for i, column in enumerate(self.draws.T)
         ]
         return np.stack(columns, -1)
 
@@ -284,8 +300,8 @@ class Joint:
         """Return the 5 % and the 95 % quantile of the quantity ``name``."""
         i = self.names.index(name)
         if self.draws is not None:
-            low, high = np.quantile(self.draws[:, i], [0.05, 0.95])
-            return float(low), float(high)
+            lower_end, upper_end = np.quantile(self.draws[:, i], [0.05, 0.95])
+            return float(lower_end), float(upper_end)
         return float(self.mean[i] - Z_90 * self.sd[i]), float(self.mean[i] + Z_90 * self.sd[i])
 
     def only(self, names: Sequence[str]) -> Joint:
@@ -295,6 +311,7 @@ class Joint:
         columns = [self.names.index(name) for name in names]
         if self.draws is not None:
             return Joint.of_draws(names, self.draws[:, columns])
+        # the bounds may have changed the covariance: it is scaled back to a correlation
         covariance = self.factor @ self.factor.T
         scale = np.sqrt(np.diag(covariance))
         joint = Joint.of_normal(
@@ -317,6 +334,7 @@ def _scores(draws: FloatArray) -> FloatArray:
 
 
 def _factor(correlation: FloatArray) -> FloatArray:
+    """Return the lower Cholesky factor of a correlation, made firm against rounding."""
     return np.asarray(
         np.linalg.cholesky(correlation + _JITTER * np.eye(len(correlation))), np.float64
     )
@@ -346,6 +364,7 @@ def read_posterior(path: Path, mark: Location | None = None) -> Posterior:
     if any(sign in str(path) for sign in "*?["):
         path = max(
             map(Path, glob(str(path))),
+            # the newest, and by name among equals
             key=lambda match: (match.stat().st_mtime, match),
             default=path,
         )
@@ -389,14 +408,16 @@ def _calibrated(doc: Mapping[str, Any], path: Path, mark: Location | None) -> Po
     _refuse_failed(doc)
     joint = read_posterior(path.with_name("draws.npz"), mark).joint
     assert joint.draws is not None
-    rows = {POSTERIOR_NAMES.get(name, name): row for name, row in doc["parameters"].items()}
+    parameter_rows = {
+        POSTERIOR_NAMES.get(name, name): row for name, row in doc["parameters"].items()
+    }
     columns = {
         POSTERIOR_NAMES.get(name, name): x
         for name, x in zip(joint.names, joint.draws.T, strict=True)
     }
-    posterior = _drawn(columns, {name: str(row["unit"]) for name, row in rows.items()})
-    untold = tuple(name for name in rows if name not in columns)
-    kinds = {name: str(row["kind"]) for name, row in rows.items()}
+    posterior = _drawn(columns, {name: str(row["unit"]) for name, row in parameter_rows.items()})
+    untold = tuple(name for name in parameter_rows if name not in columns)
+    kinds = {name: str(row["kind"]) for name, row in parameter_rows.items()}
     return replace(posterior, kinds=kinds, untold=untold)
 
 
@@ -414,8 +435,11 @@ def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Poste
     DN/e-.
     """
     with np.errstate(divide="ignore"):
-        draws = [1.0 / x if units.get(name) == "e-/DN" else x for name, x in columns.items()]
-    lengths = {len(x) for x in draws}
+        draws = [
+            1.0 / column if units.get(name) == "e-/DN" else column
+            for name, column in columns.items()
+        ]
+    lengths = {len(column) for column in draws}
     if len(lengths) != 1:
         raise ValueError(
             "the values have different numbers of draws"
@@ -439,6 +463,7 @@ def summary(moments: Mapping[str, Any]) -> Posterior:
 
 
 def _normal(moments: Mapping[str, Any]) -> Joint:
+    """Return the normal distribution with the means and the spread of a summary."""
     _refuse_other_moments(moments)
     names = [str(name) for name in moments["mean"]]
     mean = np.array([_si(x) for x in moments["mean"].values()])
@@ -454,6 +479,10 @@ def _normal(moments: Mapping[str, Any]) -> Joint:
 
 
 def _of_covariance(names: list[str], mean: FloatArray, covariance: FloatArray) -> Joint:
+    """Return the normal distribution with a covariance.
+
+    Raise ValueError for one without variances.
+    """
     sd = np.sqrt(np.diag(covariance).clip(0)) if covariance.ndim == 2 else np.zeros(0)
     if sd.shape != mean.shape or not (sd > 0).all():
         raise ValueError(
@@ -478,6 +507,7 @@ def _refuse_other_moments(moments: Mapping[str, Any]) -> None:
 
 
 def _si(text: Any) -> float:
+    """Return a number in SI from a text with a unit; raise ValueError for a gain in e-/DN."""
     number, _, reciprocal = read_written(text)
     if reciprocal:
         raise ValueError(f"{text}: write the mean and the sd of a gain in DN/e-")
@@ -485,6 +515,10 @@ def _si(text: Any) -> float:
 
 
 def _matrix(rows: Any) -> FloatArray:
+    """Return rows of numbers as an array.
+
+    Raise ValueError for rows of different lengths or other values.
+    """
     try:
         return np.array(rows, np.float64)
     except (TypeError, ValueError):

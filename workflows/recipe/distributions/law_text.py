@@ -115,6 +115,7 @@ def read_law(text: str, folder: Path = Path(), mark: Location | None = None) -> 
 
 
 def _form(kind: str) -> str:
+    """Return the message that a distribution is not well written, with its correct form."""
     form, meaning = KINDS[kind]
     return f"the distribution {kind} needs {meaning}: write {form}"
 
@@ -125,6 +126,7 @@ def _is_closed(text: str) -> bool:
     """
     depth = 0
     for sign in text:
+        # how many parentheses are open
         depth += (sign == "(") - (sign == ")")
         if depth < 0:
             return False
@@ -135,29 +137,31 @@ def _arguments(text: str) -> list[str]:
     """Return the arguments between the outer commas of a text; a comma in quotes or parentheses
     separates nothing.
     """
-    parts, depth, quote = [""], 0, ""
+    # a quote ends at the sign with which it began
+    arguments, depth, quote = [""], 0, ""
     for sign in text:
         if quote or sign in "\"'":
             quote = "" if sign == quote else quote or sign
         depth += (sign == "(") - (sign == ")")
         if sign == "," and not depth and not quote:
-            parts.append("")
+            arguments.append("")
         else:
-            parts[-1] += sign
-    return [argument.strip() for argument in parts]
+            arguments[-1] += sign
+    return [argument.strip() for argument in arguments]
 
 
 def _numbers(arguments: Sequence[str]) -> _Numbers:
     """Return numbers of one unit."""
-    read = [read_written(argument) for argument in arguments]
-    _, unit, reciprocal = read[0]
-    for argument, (_, other, also) in zip(arguments, read, strict=True):
-        if (other, also) != (unit, reciprocal):
+    written_numbers = [read_written(argument) for argument in arguments]
+    _, unit, reciprocal = written_numbers[0]
+    for argument, (_, other_unit, other_reciprocal) in zip(arguments, written_numbers, strict=True):
+        if (other_unit, other_reciprocal) != (unit, reciprocal):
             raise ValueError(f"{arguments[0]} and {argument} must have the same unit")
-    return _Numbers(tuple(number for number, _, _ in read), unit, reciprocal)
+    return _Numbers(tuple(number for number, _, _ in written_numbers), unit, reciprocal)
 
 
 def _plain(argument: str, meaning: str) -> float:
+    """Return an argument as a number; raise ValueError for one with a unit."""
     number, unit, _ = read_written(argument)
     if unit:
         raise ValueError(f"{meaning} is a number without a unit, such as 1.1, not {argument}")
@@ -165,6 +169,7 @@ def _plain(argument: str, meaning: str) -> float:
 
 
 def _law(kind: str, text: str, shape: Shape, numbers: _Numbers) -> Law:
+    """Return a distribution from its shape, with the unit of its numbers."""
     return Law(kind, text, shape, numbers.unit, numbers.reciprocal)
 
 
@@ -173,21 +178,22 @@ def _pair(kind: str, text: str, arguments: Sequence[str]) -> Law:
     if len(arguments) != 2:
         raise ValueError(_form(kind))
     numbers = _numbers(arguments)
-    first, second = numbers.values
+    first_number, second_number = numbers.values
     if kind == "normal":
-        if not second > 0:
+        if not second_number > 0:
             raise ValueError("the standard deviation must be greater than 0")
-        return _law(kind, text, Normal(first, second), numbers)
-    if not first < second:
+        return _law(kind, text, Normal(first_number, second_number), numbers)
+    if not first_number < second_number:
         raise ValueError("the first value must be smaller than the second")
     if kind == "uniform":
-        return _law(kind, text, Uniform(first, second), numbers)
-    if not first > 0:
+        return _law(kind, text, Uniform(first_number, second_number), numbers)
+    if not first_number > 0:
         raise ValueError("the least value must be greater than 0")
-    return _law(kind, text, LogUniform(first, second), numbers)
+    return _law(kind, text, LogUniform(first_number, second_number), numbers)
 
 
 def _lognormal(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    """Return a lognormal distribution from its median and the factor of one standard deviation."""
     if len(arguments) != 2:
         raise ValueError(_form(kind))
     numbers = _numbers(arguments[:1])
@@ -198,18 +204,23 @@ def _lognormal(kind: str, text: str, arguments: Sequence[str]) -> Law:
 
 
 def _triangular(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    """Return a triangular distribution from its least, most probable and largest value."""
     if len(arguments) != 3:
         raise ValueError(_form(kind))
     numbers = _numbers(arguments)
-    low, mode, high = numbers.values
-    if not (low <= mode <= high and low < high):
+    least, mode, largest = numbers.values
+    if not (least <= mode <= largest and least < largest):
         raise ValueError(
             "the least, the most probable and the largest value must stand in this order"
         )
-    return _law(kind, text, Triangular(low, mode, high), numbers)
+    return _law(kind, text, Triangular(least, mode, largest), numbers)
 
 
 def _beta(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    """Return a beta distribution.
+
+    Its arguments are two shape parameters, and perhaps the least and the largest value.
+    """
     if len(arguments) not in (2, 4):
         raise ValueError(_form(kind))
     a, b = (_plain(argument, "a shape parameter") for argument in arguments[:2])
@@ -218,13 +229,14 @@ def _beta(kind: str, text: str, arguments: Sequence[str]) -> Law:
     if len(arguments) == 2:
         return _law(kind, text, Beta(a, b), _Numbers((), "", False))
     numbers = _numbers(arguments[2:])
-    low, high = numbers.values
-    if not low < high:
+    least, largest = numbers.values
+    if not least < largest:
         raise ValueError("the least value must be smaller than the largest")
-    return _law(kind, text, Beta(a, b, low, high), numbers)
+    return _law(kind, text, Beta(a, b, least, largest), numbers)
 
 
 def _discrete(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    """Return a discrete distribution from values, each perhaps followed by its weight."""
     matches = [_WEIGHTED.fullmatch(argument) for argument in arguments]
     numbers = _numbers(
         [
@@ -262,10 +274,12 @@ def _truncated(text: str, arguments: Sequence[str], folder: Path, mark: Location
             "a truncated distribution cannot be truncated again: write one distribution with both"
             " bounds"
         )
-    low, high = (_bound(argument, law) for argument in arguments[1:])
-    if math.isinf(low) and math.isinf(high):
+    lower_bound, upper_bound = (_bound(argument, law) for argument in arguments[1:])
+    if math.isinf(lower_bound) and math.isinf(upper_bound):
         raise ValueError("a truncated distribution needs a bound: " + KINDS["truncated"][0])
-    return replace(law, kind="truncated", text=text, shape=law.shape.truncated(low, high))
+    return replace(
+        law, kind="truncated", text=text, shape=law.shape.truncated(lower_bound, upper_bound)
+    )
 
 
 def _bound(argument: str, law: Law) -> float:
@@ -292,6 +306,7 @@ def _empirical(text: str, arguments: Sequence[str], folder: Path, mark: Location
             raise ValueError(f"{path.name} gives the unit {unit} of {name}: remove the unit here")
         scale, unit = _unit(options["unit"])
         samples = samples * scale
+    # raises for a unit that no recipe has; e-/DN is none of a recipe
     if unit and unit != "e-/DN":
         _unit(unit)
     require_samples(samples, f"{path.name}, column {name}" if name else path.name)
@@ -320,6 +335,10 @@ def _options_of(arguments: Sequence[str]) -> dict[str, str]:
 
 
 def _column(path: Path, names: Sequence[str], name: str | None) -> str:
+    """Return the column that is named, or the only one.
+
+    Raise ValueError if it is not clear which.
+    """
     if name is None and len(names) == 1:
         return names[0]
     if name is None:
@@ -405,6 +424,10 @@ def read_mismatch(
 
 
 def _laws(block: Value, above: str = "") -> Iterator[tuple[str, Value]]:
+    """Yield each single value below a mapping with its dotted path.
+
+    `above` is the path of the mapping itself, with a dot at its end.
+    """
     for key, value in block.items.items():
         if isinstance(value.data, dict):
             yield from _laws(value, f"{above}{key}.")
@@ -413,13 +436,17 @@ def _laws(block: Value, above: str = "") -> Iterator[tuple[str, Value]]:
 
 
 def _difference(path: str, leaf: Value, root: Value) -> Difference:
-    own = root.below(path.split("."))
-    if own is None:
+    """Return the law of how the value at a path of the recipe differs in truth.
+
+    Lognormal and loguniform laws are factors, all others are added.
+    """
+    value_in_recipe = root.below(path.split("."))
+    if value_in_recipe is None:
         raise ValueError(
             f"the recipe has no value {path};"
             f" {nearest(path, [recipe_value.name for recipe_value in root.leaves()])}"
         )
-    value, unit = _own(path, own)
+    value, unit = _own(path, value_in_recipe)
     law = (
         read_law(leaf.data, Path(leaf.mark.folder), leaf.mark)
         if is_law(leaf.data)
@@ -462,5 +489,6 @@ def _own(path: str, own: Value) -> tuple[float, str]:
 
 
 def _single(leaf: Value) -> Law:
+    """Return a certain difference as a law: a normal distribution without width."""
     value, unit = read_any(leaf.plain)
     return Law("normal", str(leaf.data), Normal(value, 0.0), unit)

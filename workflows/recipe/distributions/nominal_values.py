@@ -114,6 +114,7 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
             diagnostics.append(Diagnostic(leaf.mark, f"{dotted(path)} = {leaf.data}", str(error)))
             root = put(root, path, BROKEN)
             continue
+        # a run without draws uses the median
         root = put(root, path, written(law.median, law.unit))
     block = root.items.get(KEY)
     if block is None and not laws and len(diagnostics) == len(composed.diagnostics):
@@ -141,6 +142,7 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
     """Yield the path and the value of every distribution in a recipe; a value with YAML aliases
     has several paths.
     """
+    # `_laws_in` takes from the end of its stack: both together keep one order
     for key, block in reversed(root.items.items()):
         if key != KEY:
             yield from (((key, *path), value) for path, value in _laws_in(block))
@@ -165,8 +167,8 @@ def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Va
     """Return a recipe in which ``data`` replaces the value at an existing path."""
     if not path:
         return replace(root, data=data, mark=mark or root.mark)
-    key = next(key for key in root.items if str(key) == str(path[0]))
-    return root.replaced(key, put(root.items[key], path[1:], data, mark))
+    block_key = next(block_key for block_key in root.items if str(block_key) == str(path[0]))
+    return root.replaced(block_key, put(root.items[block_key], path[1:], data, mark))
 
 
 class _Reader:
@@ -189,15 +191,17 @@ class _Reader:
         if block.data is None:
             return
         items = block.items if isinstance(block.data, dict) else {"file": block}
-        if strange := [v for key, v in items.items() if key not in (*_KEYS, *_SUMMARY)]:
+        if unknown_values := [v for key, v in items.items() if key not in (*_KEYS, *_SUMMARY)]:
             return self._fail(
-                strange[0].key, strange[0].name, f"unknown; {nearest(strange[0].name, _KEYS)}"
+                unknown_values[0].key,
+                unknown_values[0].name,
+                f"unknown; {nearest(unknown_values[0].name, _KEYS)}",
             )
         try:
             posterior = self._posterior(block, items)
         except ValueError as error:
-            place = items.get("covariance") or items.get("correlation") or block
-            return self._fail(place.mark, place.name, str(error))
+            faulty = items.get("covariance") or items.get("correlation") or block
+            return self._fail(faulty.mark, faulty.name, str(error))
         try:
             use = self._use(items.get("use"), posterior)
             pairs = self._pairs(items.get("values"), posterior)
@@ -206,6 +210,10 @@ class _Reader:
         self._apply(posterior, pairs, use, block.mark)
 
     def _posterior(self, block: Value, items: Mapping[Any, Value]) -> Posterior:
+        """Return the posterior that the block names.
+
+        It stands in the block itself, as means and deviations, or in a file.
+        """
         if any(key in items for key in _SUMMARY):
             self.source = f"summary at {block.mark}"
             return summary({key: _flat(v) for key, v in items.items() if key in _SUMMARY})
@@ -219,6 +227,10 @@ class _Reader:
         return read_posterior(Path(file.mark.folder) / Path(file.data).expanduser(), file.mark)
 
     def _use(self, setting: Value | None, posterior: Posterior) -> str | int:
+        """Return which value of the posterior a run uses.
+
+        It is ``mean``, ``nominal``, or the number of a draw.
+        """
         use = "mean" if setting is None else setting.data
         draws = posterior.joint.draws
         if use in ("mean", "nominal"):
@@ -239,17 +251,21 @@ class _Reader:
         """
         names = posterior.joint.names
         pairs = self._own_pairs(names) if setting is None else _stated_pairs(setting, names)
-        if wrong := [path for path in pairs if self._value(path) is None]:
-            raise ValueError(f"values: the recipe has no value at the path {wrong[0]}")
+        if paths_without_value := [path for path in pairs if self._value(path) is None]:
+            raise ValueError(
+                f"values: the recipe has no value at the path {paths_without_value[0]}"
+            )
         if not pairs:
             raise ValueError(
                 f"no value of the recipe is in the posterior, which contains {', '.join(names)}"
             )
-        own = [name for name in posterior.untold if self._value(f"{_BLOCK}.{name}") is not None]
-        if own and setting is None:
+        untold_values = [
+            name for name in posterior.untold if self._value(f"{_BLOCK}.{name}") is not None
+        ]
+        if untold_values and setting is None:
             self.notes.append(
-                f"the posterior does not tell {', '.join(own)}: the recipe's own value counts as"
-                " certain"
+                f"the posterior does not tell {', '.join(untold_values)}: the recipe's own"
+                " value counts as certain"
             )
         self._conventions(posterior, pairs)
         return pairs
@@ -260,9 +276,10 @@ class _Reader:
         """
         all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
         pairs = {path: name for path, name in all_pairs.items() if self._value(path) is not None}
-        if lost := [name for path, name in all_pairs.items() if path not in pairs]:
+        if names_without_value := [name for path, name in all_pairs.items() if path not in pairs]:
             self.notes.append(
-                f"this recipe does not have these values of the posterior: {', '.join(lost)}"
+                "this recipe does not have these values of the posterior:"
+                f" {', '.join(names_without_value)}"
             )
         return pairs
 
@@ -280,12 +297,21 @@ class _Reader:
             if is_gain and posterior.units.get(name) != GAIN_UNIT:
                 raise ValueError(f"the {name} of the posterior has no unit: {BARE_GAIN}")
         exposure = self._value(f"{_BLOCK}.exposure")
-        words = posterior.units.get("dark_current", "")
-        if "dark_current" in pairs.values() and exposure is not None and " in " in words:
-            other, own = read_any(words.partition(" in ")[2])[0], read_any(exposure.data)[0]
-            if abs(other - own) > 1e-9 * own:
+        dark_current_unit = posterior.units.get("dark_current", "")
+        if (
+            "dark_current" in pairs.values()
+            and exposure is not None
+            and " in " in dark_current_unit
+        ):
+            # a dark current has a unit such as ``e- in 1 s``
+            posterior_exposure, recipe_exposure = (
+                read_any(dark_current_unit.partition(" in ")[2])[0],
+                read_any(exposure.data)[0],
+            )
+            if abs(posterior_exposure - recipe_exposure) > 1e-9 * recipe_exposure:
                 raise ValueError(
-                    f"the dark current is for {other:g} s in the posterior and {own:g} s in the"
+                    f"the dark current is for {posterior_exposure:g} s in the posterior and"
+                    f" {recipe_exposure:g} s in the"
                     " recipe"
                 )
 
@@ -295,10 +321,15 @@ class _Reader:
     def _apply(
         self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Location
     ) -> None:
-        taken = {}
+        """Put the values of the posterior into the recipe, and compare them with those that it has.
+
+        A value that an argument sets stays; a distribution in the recipe is a mistake.
+        """
+        name_by_path = {}
         for path, name in pairs.items():
             value = self._value(path)
             assert value is not None
+            # an argument of the command has no line
             if path in self.laws or value.mark.line == 0:
                 if path in self.laws and value.mark.line:
                     self._fail(
@@ -309,19 +340,20 @@ class _Reader:
                 self.notes.append(f"{path} comes from the argument, not from the posterior")
                 continue
             try:
-                own, unit = read_any(value.data)
+                recipe_value, unit = read_any(value.data)
             except ValueError as error:
                 self._fail(value.mark, path, f"the posterior contains this value, but {error}")
                 continue
             if fault := _unit_fault(name, posterior.units.get(name, ""), unit):
                 self._fail(mark, KEY, fault)
                 continue
-            taken[path] = name
+            name_by_path[path] = name
             self.units[path] = unit
-            self._stand(posterior, path, name, own, use, mark)
-        if taken:
-            joint = posterior.joint.only(tuple(taken.values()))
-            self.joint = replace(joint, names=tuple(taken))
+            self._stand(posterior, path, name, recipe_value, use, mark)
+        if name_by_path:
+            # the values that were taken keep their correlations; their names are now paths
+            joint = posterior.joint.only(tuple(name_by_path.values()))
+            self.joint = replace(joint, names=tuple(name_by_path))
 
     def _stand(
         self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location
@@ -331,27 +363,28 @@ class _Reader:
         """
         joint, unit, kind = posterior.joint, self.units[path], posterior.kinds.get(name, "estimate")
         i = joint.names.index(name)
-        nominal, why = own, "recipe"
+        # a value that the frames do not estimate stays that of the recipe
+        used_value, origin = own, "recipe"
         if isinstance(use, int):
             assert joint.draws is not None
-            nominal, why = float(joint.draws[use, i]), f"draw {use}"
+            used_value, origin = float(joint.draws[use, i]), f"draw {use}"
         elif kind == "estimate" and use == "mean":
-            nominal, why = float(joint.mean[i]), "mean"
-        if nominal != own:
-            self.root = put(self.root, tuple(path.split(".")), written(nominal, unit), mark)
-        low, high = joint.interval(name)
+            used_value, origin = float(joint.mean[i]), "mean"
+        if used_value != own:
+            self.root = put(self.root, tuple(path.split(".")), written(used_value, unit), mark)
+        interval_low, interval_high = joint.interval(name)
         standing = Standing(
             path,
             own=_rounded(own, unit),
             kind=kind,
             mean=float(joint.mean[i]),
             sd=float(joint.sd[i]),
-            low=low,
-            high=high,
+            low=interval_low,
+            high=interval_high,
             unit=unit,
             below=joint.below(name, own),
-            used=_rounded(nominal, unit),
-            why=why,
+            used=_rounded(used_value, unit),
+            why=origin,
         )
         self.standings.append(standing)
         if standing.far:
@@ -388,14 +421,14 @@ def _stated_pairs(setting: Value, names: Sequence[str]) -> dict[str, str]:
             "values must be a mapping: write values: {path in the recipe: name in the posterior}"
         )
     pairs = {path: str(name) for path, name in _flat(setting).items()}
-    if wrong := [name for name in pairs.values() if name not in names]:
-        now = POSTERIOR_NAMES.get(wrong[0])
+    if unknown_names := [name for name in pairs.values() if name not in names]:
+        present_name = POSTERIOR_NAMES.get(unknown_names[0])
         hint = (
-            f"called {now} now"
-            if now in names
-            else f"not in the posterior; {nearest(wrong[0], names)}"
+            f"called {present_name} now"
+            if present_name in names
+            else f"not in the posterior; {nearest(unknown_names[0], names)}"
         )
-        raise ValueError(f"values: {wrong[0]} is {hint}")
+        raise ValueError(f"values: {unknown_names[0]} is {hint}")
     return pairs
 
 

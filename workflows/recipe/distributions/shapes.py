@@ -59,9 +59,9 @@ class Shape(ABC):
     def moments(self) -> tuple[float, float]:
         """Return mean and standard deviation."""
         z, weights = _normal_measure()
-        x = self.at(z)
-        mean = float(weights @ x)
-        return mean, math.sqrt(float(weights @ (x - mean) ** 2))
+        values = self.at(z)
+        mean = float(weights @ values)
+        return mean, math.sqrt(float(weights @ (values - mean) ** 2))
 
     def truncated(self, low: float, high: float) -> Shape:
         """Return the distribution under the condition that the value is between ``low`` and
@@ -168,11 +168,12 @@ class Triangular(Shape):
         from scipy.special import ndtr
 
         width = self.high - self.low
-        below, above = ndtr(z), ndtr(-z)
-        rising = self.low + np.sqrt(below * width * (self.mode - self.low))
-        falling = self.high - np.sqrt(above * width * (self.high - self.mode))
+        share_below, share_above = ndtr(z), ndtr(-z)
+        left_of_mode = self.low + np.sqrt(share_below * width * (self.mode - self.low))
+        right_of_mode = self.high - np.sqrt(share_above * width * (self.high - self.mode))
         return np.asarray(
-            np.where(below * width < self.mode - self.low, rising, falling), np.float64
+            np.where(share_below * width < self.mode - self.low, left_of_mode, right_of_mode),
+            np.float64,
         )
 
     def score(self, x: float) -> float:
@@ -197,17 +198,20 @@ class Beta(Shape):
         from scipy.special import betaincinv, ndtr
 
         width = self.high - self.low
-        lower = self.low + width * betaincinv(self.a, self.b, ndtr(np.minimum(z, 0.0)))
-        upper = self.high - width * betaincinv(self.b, self.a, ndtr(-np.maximum(z, 0.0)))
-        return np.asarray(np.where(z < 0, lower, upper), np.float64)
+        lower_half = self.low + width * betaincinv(self.a, self.b, ndtr(np.minimum(z, 0.0)))
+        # B(a, b) seen from its other end is B(b, a): both tails keep their digits
+        upper_half = self.high - width * betaincinv(self.b, self.a, ndtr(-np.maximum(z, 0.0)))
+        return np.asarray(np.where(z < 0, lower_half, upper_half), np.float64)
 
     def score(self, x: float) -> float:
         from scipy.special import betainc
 
         share = min(max((x - self.low) / (self.high - self.low), 0.0), 1.0)
-        below = float(betainc(self.a, self.b, share))
+        share_below = float(betainc(self.a, self.b, share))
         return (
-            _score(below) if below < 0.5 else -_score(float(betainc(self.b, self.a, 1.0 - share)))
+            _score(share_below)
+            if share_below < 0.5
+            else -_score(float(betainc(self.b, self.a, 1.0 - share)))
         )
 
 
@@ -222,17 +226,17 @@ class Discrete(Shape):
     @classmethod
     def of(cls, values: FloatArray, weights: FloatArray) -> Discrete:
         """Return the distribution of ``values`` with ``weights``; equal values become one value."""
-        distinct, place = np.unique(values, return_inverse=True)
-        total = np.bincount(place.reshape(-1), weights=weights)
-        total = total / total.sum()
-        identity = hashlib.sha256(distinct.tobytes() + total.tobytes()).hexdigest()
-        return cls(distinct, total, identity)
+        distinct, number_of_value = np.unique(values, return_inverse=True)
+        total_weights = np.bincount(number_of_value.reshape(-1), weights=weights)
+        total_weights = total_weights / total_weights.sum()
+        identity = hashlib.sha256(distinct.tobytes() + total_weights.tobytes()).hexdigest()
+        return cls(distinct, total_weights, identity)
 
     def at(self, z: FloatArray) -> FloatArray:
         from scipy.special import ndtr
 
-        steps = np.cumsum(self.weights)[:-1]
-        return np.asarray(self.values[np.searchsorted(steps + _ROUNDING, ndtr(z))], np.float64)
+        cumulative = np.cumsum(self.weights)[:-1]
+        return np.asarray(self.values[np.searchsorted(cumulative + _ROUNDING, ndtr(z))], np.float64)
 
     def score(self, x: float) -> float:
         return _score(float(self.weights[self.values <= x].sum()))
@@ -281,10 +285,14 @@ class Truncated(Shape):
         return np.asarray(np.clip(x, self.low, self.high), np.float64)
 
     def score(self, x: float) -> float:
-        low, high = self.scores
-        z = min(max(self.shape.score(x), low), high)
-        below, above = share_between(low, z) / self.share, share_between(z, high) / self.share
-        return _score(below) if below < above else -_score(above)
+        low_score, high_score = self.scores
+        z = min(max(self.shape.score(x), low_score), high_score)
+        # from the nearer end, so that the tails keep their digits
+        share_below, share_above = (
+            share_between(low_score, z) / self.share,
+            share_between(z, high_score) / self.share,
+        )
+        return _score(share_below) if share_below < share_above else -_score(share_above)
 
     def coordinate(self, z: FloatArray) -> FloatArray:
         return self.shape.coordinate(scores_between(z, *self.scores))
@@ -310,6 +318,7 @@ def share_between(low: float, high: float) -> float:
     """Return the probability of a standard normal number between ``low`` and ``high``."""
     from scipy.special import ndtr
 
+    # by symmetry, because 1 - ndtr has no digits left far above 0
     if low > 0:
         return float(ndtr(-low) - ndtr(-high))
     return float(ndtr(high) - ndtr(low))
@@ -324,11 +333,15 @@ def scores_between(z: FloatArray, low: float, high: float) -> FloatArray:
     from scipy.special import ndtr, ndtri
 
     share = share_between(low, high)
-    below = ndtr(low) + share * ndtr(z)
-    above = ndtr(-high) + share * ndtr(-np.asarray(z))
+    share_below = ndtr(low) + share * ndtr(z)
+    share_above = ndtr(-high) + share * ndtr(-np.asarray(z))
     with np.errstate(divide="ignore"):
-        inside = np.where(below < above, ndtri(below.clip(0.0, 1.0)), -ndtri(above.clip(0.0, 1.0)))
-    return np.asarray(np.clip(inside, low, high), np.float64)
+        score = np.where(
+            share_below < share_above,
+            ndtri(share_below.clip(0.0, 1.0)),
+            -ndtri(share_above.clip(0.0, 1.0)),
+        )
+    return np.asarray(np.clip(score, low, high), np.float64)
 
 
 def _score(probability: float) -> float:
@@ -372,9 +385,9 @@ class Law:
         """Return the values of the distribution at the cumulative probabilities of standard
         normal numbers ``z``.
         """
-        x = self.shape.at(np.asarray(z, np.float64))
+        number = self.shape.at(np.asarray(z, np.float64))
         with np.errstate(divide="ignore"):
-            return np.asarray(1.0 / x if self.reciprocal else x, np.float64)
+            return np.asarray(1.0 / number if self.reciprocal else number, np.float64)
 
     @property
     def median(self) -> float:

@@ -68,8 +68,8 @@ class Groups:
         """
         folders = self.folders
         for path in open_:
-            same = (path.parent.name, path.stem) == (option.group, option.name)
-            if same and path.parent.parent in folders:
+            is_same = (path.parent.name, path.stem) == (option.group, option.name)
+            if is_same and path.parent.parent in folders:
                 folders = folders[folders.index(path.parent.parent) + 1 :]
         return option_file(option.group, option.name, folders)
 
@@ -77,31 +77,40 @@ class Groups:
         """Return the values in the file of an option with those of the options that it extends, or
         None for a mistake.
         """
-        above = file.parent.parent
-        if is_strange() and above not in shared_folders() and not is_inside(file, above):
+        # the file of an option is FOLDER/GROUP/NAME.yaml
+        groups_folder = file.parent.parent
+        if (
+            is_strange()
+            and groups_folder not in shared_folders()
+            and not is_inside(file, groups_folder)
+        ):
             self._report(option, _is_link(file, self.folder))
             return None
-        if not open_ and above != packaged():
+        if not open_ and groups_folder != packaged():
             self._say_hidden(option.group, option.name, file)
         return self._read(file, open_)
 
     def _read(self, file: Path, open_: tuple[Path, ...]) -> Value | None:
+        """Return the values in the file of an option, with those of the options that it extends.
+
+        A mistake is reported and gives None.
+        """
         try:
             root = read(file, shown(file, self.folder)).root
         except RecipeError as error:
             self.diagnostics += error.diagnostics
             return None
-        before = len(self.diagnostics)
+        earlier_mistakes = len(self.diagnostics)
         levels: list[Value | None] = []
         for entry in entries_of(root, self.diagnostics, file.parent.name):
             if isinstance(entry, Choice):
                 levels += self.values(entry, (*open_, file))
             else:
                 levels.append(root)
-        if len(self.diagnostics) > before:
+        if len(self.diagnostics) > earlier_mistakes:
             return None
-        parts = tuple(level for level in levels if level is not None)
-        return self.merge(parts, root.mark) if len(parts) > 1 else root
+        values = tuple(level for level in levels if level is not None)
+        return self.merge(values, root.mark) if len(values) > 1 else root
 
     def _absent(self, option: Option, open_: tuple[Path, ...]) -> str:
         """Return the message for an option without a file, or with the files of all folders in
@@ -112,8 +121,8 @@ class Groups:
             return f"no group {option.group}; {nearest(option.group, options)}"
         names = options[option.group]
         if option.name in names and open_:
-            chain = " -> ".join(shown(path, self.folder) for path in (*open_, open_[0]))
-            return f"options extend each other in a circle: {chain}"
+            circle = " -> ".join(shown(path, self.folder) for path in (*open_, open_[0]))
+            return f"options extend each other in a circle: {circle}"
         if "," in option.name:
             return (
                 f"no option {option.name} in {option.group}: several options are a list,"
@@ -122,19 +131,26 @@ class Groups:
         return f"no option {option.name} in {option.group}; {nearest(option.name, names)}"
 
     def _say_hidden(self, group: str, name: str, file: Path) -> None:
+        """Note that an option hides one of the same name in a later folder."""
         later_folders = self.folders[self.folders.index(file.parent.parent) + 1 :]
         hidden = option_file(group, name, later_folders)
         if hidden is not None:
-            ours = "the packaged option" if hidden.parent.parent == packaged() else str(hidden)
-            self.notes.append(f"{group}: {name} is {shown(file, self.folder)}, which hides {ours}")
+            hidden_text = (
+                "the packaged option" if hidden.parent.parent == packaged() else str(hidden)
+            )
+            self.notes.append(
+                f"{group}: {name} is {shown(file, self.folder)}, which hides {hidden_text}"
+            )
 
     def _report(self, option: Option, message: str) -> None:
+        """Add a diagnostic, unless the same one is there already."""
         problem = Diagnostic(option.mark, option.shown, message)
         if problem not in self.diagnostics:
             self.diagnostics.append(problem)
 
 
 def _is_link(file: Path, folder: Path) -> str:
+    """Return the message for an option that is a link out of its folder."""
     return (
         f"{shown(file, folder)} is a link to another folder, which {NO_CODE_VARIABLE} or --no-code"
         " refuses"
@@ -212,32 +228,34 @@ class Composer:
         if not self._written.is_complete:  # what lacks a recipe lacks what arguments change
             overrides = []
         choices, values = _choose(self._written, overrides, self._groups(diagnostics))
+        # points of a sweep with the same options share the composed recipe
         if choices not in self._known:
             self._known[choices] = self._with_options(choices)
-        below = self._known[choices]
-        root, diagnostics = below.root, [*diagnostics, *below.diagnostics]
+        with_options = self._known[choices]
+        root, diagnostics = with_options.root, [*diagnostics, *with_options.diagnostics]
         for override in values:
-            root = apply(root, override, diagnostics, below.groups)
-        return replace(below, root=root, diagnostics=tuple(diagnostics))
+            root = apply(root, override, diagnostics, with_options.groups)
+        return replace(with_options, root=root, diagnostics=tuple(diagnostics))
 
     def _groups(self, diagnostics: list[Diagnostic]) -> Groups:
+        """Return the groups of the recipe; mistakes in their options go to `diagnostics`."""
         folders = search_folders(self._path, self._written.extended, self._folder)
         return Groups(folders, self._folder, _merged, diagnostics)
 
     def _with_options(self, choices: tuple[Choice, ...]) -> Composed:
         """Return the recipe with the chosen option of each group."""
         written, groups = self._written, self._groups([])
-        levels: list[Value | None] = []
+        layer_values: list[Value | None] = []
         for layer in written.layers_with(choices):
-            levels += groups.values(layer) if isinstance(layer, Choice) else [layer]
-        parts = tuple(level for level in levels if level is not None)
+            layer_values += groups.values(layer) if isinstance(layer, Choice) else [layer]
+        values = tuple(level for level in layer_values if level is not None)
         replaced = tuple(_replaced(written, choices, groups))
         return Composed(
             name=self._path.stem,
             title=written.title,
-            root=_merged(parts, written.root.mark),
+            root=_merged(values, written.root.mark),
             diagnostics=(*written.diagnostics, *groups.diagnostics),
-            whole=written.is_complete and None not in levels,
+            whole=written.is_complete and None not in layer_values,
             replaced=replaced,
             notes=(*self._hides, *written.notes, *groups.notes),
             groups=tuple(entry.group for entry in choices),
@@ -253,9 +271,9 @@ def merge(below: Value, above: Value) -> Value:
     ``below``. The lists ``nodes`` are joined, because each file names the code of its own steps.
     """
     if above.path == ("nodes",) and isinstance(below.data, list) and isinstance(above.data, list):
-        joined = [*below.data, *above.data]
+        entries = [*below.data, *above.data]
         return replace(
-            above, data=[replace(entry, path=("nodes", i)) for i, entry in enumerate(joined)]
+            above, data=[replace(entry, path=("nodes", i)) for i, entry in enumerate(entries)]
         )
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
@@ -276,6 +294,7 @@ def _merged(parts: tuple[Value, ...], mark: Location) -> Value:
 
 
 def _new_step(value: Value) -> bool:
+    """Return True for a step with a node, which replaces a step of the same name as a whole."""
     return len(value.path) == 2 and value.path[0] == "steps" and "node" in value.items
 
 
@@ -292,6 +311,7 @@ def _choose(
     names, value_overrides = functools.cache(groups.names), []
     for override in overrides:
         group = override.path[0]
+        # a name that is no group, or is a block of values that the recipe writes itself
         is_other = group not in choices and (group in written.own_blocks or group not in names())
         if is_other or not _names_options(override):
             value_overrides.append(override)
@@ -321,17 +341,21 @@ def _replaced(
     that extends it, replaces or removes.
     """
     final_choices = {entry.group: entry for entry in choices}
-    silent = replace(groups, diagnostics=[], notes=[])
-    for former in (*written.replaced, *written.choices.values()):
-        now = final_choices.get(former.group)
-        if now and now.names == former.names:
+    silent_groups = replace(groups, diagnostics=[], notes=[])
+    for former_choice in (*written.replaced, *written.choices.values()):
+        present_choice = final_choices.get(former_choice.group)
+        if present_choice and present_choice.names == former_choice.names:
             continue
-        text = now.shown if now else f"~{former.group}"
-        for option in silent.values(former):
+        text = present_choice.shown if present_choice else f"~{former_choice.group}"
+        for option in silent_groups.values(former_choice):
             yield from ((leaf.path, text) for leaf in (option.leaves() if option else ()))
 
 
 def _group_fault(o: Override, choices: Mapping[str, Choice]) -> str:
+    """Return what is wrong with an override of a group, or an empty text.
+
+    A ``+`` adds a group that is not there, a ``~`` removes one that is there.
+    """
     group = o.path[0]
     if group in choices:
         names = choices[group].names or ["null"]

@@ -91,9 +91,10 @@ def choice(
 
 
 def _listed(block: Value, diagnostics: list[Diagnostic], group: str) -> list[Entry]:
+    """Return the entries of a list ``defaults``; report wrong and repeated ones."""
     if not isinstance(block.data, list):
-        form = "options of this group, such as `[small]`" if group else "`group: option`"
-        message = f"must be a list of {form}, not {kind(block)}"
+        expected_form = "options of this group, such as `[small]`" if group else "`group: option`"
+        message = f"must be a list of {expected_form}, not {kind(block)}"
         diagnostics.append(Diagnostic(block.mark, "defaults", message))
         return []
     entries: list[Entry] = []
@@ -128,6 +129,7 @@ def _entry(value: Value, group: str) -> Entry | Diagnostic:
     if value.data == SELF:
         return OwnValues(value.mark)
     if isinstance(value.data, str):
+        # in the file of an option a name alone is another option of its group
         if group:
             return _choice(group, value, f"{group}: {value.data}")
         return Extended(value.data, value.mark)
@@ -135,11 +137,11 @@ def _entry(value: Value, group: str) -> Entry | Diagnostic:
     if len(pairs) != 1 or isinstance(pairs[0][1].data, dict):
         return Diagnostic(value.mark, value.name, _INNER if group else _FORM)
     name, options = str(pairs[0][0]), pairs[0][1]
-    shown = f"{name}: {_text(options)}"
+    entry_text = f"{name}: {_text(options)}"
     if advice := advice_on_group(name, _text(options)):
-        return Diagnostic(value.mark, shown, advice)
+        return Diagnostic(value.mark, entry_text, advice)
     is_optional = name.startswith(_OPTIONAL)
-    return _choice(name.removeprefix(_OPTIONAL).strip(), options, shown, is_optional)
+    return _choice(name.removeprefix(_OPTIONAL).strip(), options, entry_text, is_optional)
 
 
 def _choice(

@@ -75,8 +75,8 @@ class Written:
                 layers.append(layer)
             elif layer.group in chosen_groups:
                 layers.append(chosen_groups.pop(layer.group))
-        place = len(layers) - 1 if isinstance(layers[-1], Value) else len(layers)
-        return [*layers[:place], *chosen_groups.values(), *layers[place:]]
+        position = len(layers) - 1 if isinstance(layers[-1], Value) else len(layers)
+        return [*layers[:position], *chosen_groups.values(), *layers[position:]]
 
 
 class Extension:
@@ -118,15 +118,17 @@ class Extension:
 
     def _add_choice(self, entry: Choice, layers: list[Layer]) -> None:
         """Add a choice to the layers, in the place of that which an extended recipe has."""
-        for place, layer in enumerate(layers):
+        for position, layer in enumerate(layers):
             if isinstance(layer, Choice) and layer.group == entry.group:
                 if entry.is_optional:
-                    fix = entry.shown.removeprefix("optional ")
-                    message = f"takes the place of {layer.shown} ({layer.mark}): write `{fix}`"
+                    correct_form = entry.shown.removeprefix("optional ")
+                    message = (
+                        f"takes the place of {layer.shown} ({layer.mark}): write `{correct_form}`"
+                    )
                     self._refuse(entry.mark, entry.shown, message)
                     return
                 self.replaced.append(layer)
-                layers[place] = entry
+                layers[position] = entry
                 return
         layers.append(entry)
 
@@ -190,9 +192,10 @@ class Extension:
 
     def _refuse_again(self, file: Path, entry: Extended, open_: tuple[Path, ...]) -> None:
         """Raise ValueError for a file that is being read, or was read already."""
-        real = os.path.realpath(file)
-        if any(os.path.realpath(path) == real for path in open_):
+        real_path = os.path.realpath(file)
+        if any(os.path.realpath(path) == real_path for path in open_):
             raise ValueError(self._circle((*open_, file)))
+        # two entries for one recipe would merge it twice
         if file in self.extended:
             raise ValueError(f"is extended already, by {self.extended[file]}: remove this entry")
         if len(open_) > _MOST_FILES_DEEP:
@@ -201,8 +204,9 @@ class Extension:
             )
 
     def _circle(self, files: Sequence[Path]) -> str:
-        chain = " -> ".join(shown(path, self.folder) for path in files)
-        return f"recipes extend each other in a circle: {chain}"
+        """Return the message for recipes that extend each other in a circle."""
+        circle = " -> ".join(shown(path, self.folder) for path in files)
+        return f"recipes extend each other in a circle: {circle}"
 
     def _refuse(self, mark: Location, name: str, message: str) -> None:
         self.diagnostics.append(Diagnostic(mark, name, message))
@@ -221,7 +225,9 @@ def _absent(name: str, folders: tuple[Path, ...]) -> str:
 def _refuse_strange(file: Path, entry: Extended) -> None:
     """Raise ValueError for a file outside of the folder of a stranger's recipe that extends it."""
     shared, folder = shared_folders(), Path(entry.mark.folder)
-    is_own = file.parent in shared or any(folder.is_relative_to(own) for own in shared)
+    is_own = file.parent in shared or any(
+        folder.is_relative_to(shared_folder) for shared_folder in shared
+    )
     if is_strange() and not is_own and not is_inside(file, folder):
         raise ValueError(
             f"is not in the folder of {Path(entry.mark.file).name}, which {NO_CODE_VARIABLE} or"
@@ -235,14 +241,17 @@ def _chosen_before(entry: Extended, layers: Sequence[Layer], before: Sequence[La
     """
     groups = {layer.group for layer in choices_in(layers)}
     earlier = [layer for layer in choices_in(before) if layer.group in groups]
-    ours = [layer for layer in earlier if layer.mark.file == entry.mark.file]
-    if ours:
-        return f"has the group {ours[0].group} too: write `{ours[0].shown}` after {entry.name}"
+    of_same_file = [layer for layer in earlier if layer.mark.file == entry.mark.file]
+    if of_same_file:
+        return (
+            f"has the group {of_same_file[0].group} too: write `{of_same_file[0].shown}`"
+            f" after {entry.name}"
+        )
     if not earlier:
         return ""
     names = ", ".join(layer.group for layer in earlier[:6])
-    more = f" and {len(earlier) - 6} more" if len(earlier) > 6 else ""
-    return f"has the groups of an earlier recipe ({names}{more}): extend only one of the two"
+    further = f" and {len(earlier) - 6} more" if len(earlier) > 6 else ""
+    return f"has the groups of an earlier recipe ({names}{further}): extend only one of the two"
 
 
 def choices_in(layers: Iterable[Layer]) -> list[Choice]:

@@ -29,6 +29,7 @@ def message_of(error: ErrorDetails, value: Value) -> str:
     if error["type"] == "extra_forbidden":
         return "has no meaning here"
     if error["type"] == "missing":
+        # a list that is too short lacks its value at this index
         return f"must have at least {int(error['loc'][-1]) + 1} values"
     if limit := _limit_in_unit(error, value):
         return limit
@@ -71,12 +72,13 @@ def _limit_in_unit(error: ErrorDetails, value: Value) -> str:
     if not isinstance(value.data, str):
         return f"must be {_LIMITS[name]} {limit:g}" if abs(limit) > _LONG else ""
     try:
-        _, si, _ = read_written(value.data)
+        _, unit, _ = read_written(value.data)
     except ValueError:
         return ""
+    # a tiny least value stands for a number above 0
     if name == "ge" and limit > 0 and _is_at_most_zero(error["input"]):
         return "must be greater than 0"
-    return f"must be {_LIMITS[name]} {in_words(limit, si)}" if si and limit else ""
+    return f"must be {_LIMITS[name]} {in_words(limit, unit)}" if unit and limit else ""
 
 
 def _limit_name(error: ErrorDetails) -> str | None:

@@ -112,16 +112,17 @@ def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]
     not exist.
     """
     trail: Trail = []
-    here = root
-    for n, name in enumerate(path):
-        items = here.items
+    value = root
+    for position, name in enumerate(path):
+        items = value.items
+        # the items of a mapping may have whole numbers as keys
         key: str | int = (
             int(name) if name not in items and name.isdecimal() and int(name) in items else name
         )
         if key not in items:
-            return [*trail, (here, name)], path[n:]
-        trail.append((here, key))
-        here = items[key]
+            return [*trail, (value, name)], path[position:]
+        trail.append((value, key))
+        value = items[key]
     return trail, ()
 
 
@@ -129,16 +130,17 @@ def _fault(
     root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]
 ) -> str | None:
     """Return the message for an invalid override of a recipe, or None for a valid override."""
-    here, is_added = trail[-1][0], o.sign == "+"
+    parent, is_added = trail[-1][0], o.sign == "+"
     if not missing:
         return "exists already: remove the + to change the value" if is_added else None
     if advice := advice_on_argument(o.text, ".".join(o.path)):
         return advice
-    if isinstance(here.data, list):
-        return _index_fault(here, missing, is_added)
+    if isinstance(parent.data, list):
+        return _index_fault(parent, missing, is_added)
+    # a new value needs a mapping as its parent
     if is_added or (not o.sign and _implied(root, o.path)):
-        is_open = isinstance(here.data, dict | None)
-        return None if is_open else f"{here.name} is a single value, not a mapping"
+        is_open = isinstance(parent.data, dict | None)
+        return None if is_open else f"{parent.name} is a single value, not a mapping"
     return instead(".".join(o.path)) or f"unknown; {_suggest(root, o.path, groups)}"
 
 
@@ -163,29 +165,32 @@ def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
     """Return a hint with the most similar path in the recipe, because an unknown path is often a
     typing error.
     """
-    here, similar = _followed_similar(root, path, groups)
+    last_value, similar = _followed_similar(root, path, groups)
     if len(similar) == len(path):
         return f"did you mean {'.'.join(similar)}?"
-    if same := _paths_ending_alike(root, path[-1]):
-        return f"did you mean {' or '.join(sorted(same)[:3])}?"
-    return f"{here.name or 'the recipe'} has {', '.join(map(str, here.items)) or 'no such value'}"
+    if alike_paths := _paths_ending_alike(root, path[-1]):
+        return f"did you mean {' or '.join(sorted(alike_paths)[:3])}?"
+    return (
+        f"{last_value.name or 'the recipe'} has"
+        f" {', '.join(map(str, last_value.items)) or 'no such value'}"
+    )
 
 
 def _followed_similar(
     root: Value, path: tuple[str, ...], groups: Iterable[str]
 ) -> tuple[Value, list[str]]:
     """Return the value at which a path of similar names ends, with these names."""
-    here, similar = root, list[str]()
+    value, similar = root, list[str]()
     for name in path:
-        names = set(map(str, here.items))
-        if here is root:
+        names = set(map(str, value.items))
+        if value is root:
             names |= {*RESERVED, *groups}
-        close = difflib.get_close_matches(name, names, 1)
-        if not close:
+        matches = difflib.get_close_matches(name, names, 1)
+        if not matches:
             break
-        similar += close
-        here = here.child(close[0]) or Value(None, here.mark, here.key, ())
-    return here, similar
+        similar += matches
+        value = value.child(matches[0]) or Value(None, value.mark, value.key, ())
+    return value, similar
 
 
 def _paths_ending_alike(root: Value, name: str) -> set[str]:
@@ -206,17 +211,22 @@ def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
     innermost value outwards.
     """
     value = _parsed_again(trail, missing, o)
-    for n in range(len(missing) - 1, 0, -1):
+    # mappings that do not exist yet, from the inside outwards
+    for position in range(len(missing) - 1, 0, -1):
         assert value is not None
         value = Value(
-            {_key(missing[n]): value}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n]
+            {_key(missing[position]): value},
+            o.mark,
+            o.mark,
+            o.path[: len(o.path) - len(missing) + position],
         )
-    for here, key in reversed(trail):
-        key = _key(key) if missing and here is trail[-1][0] else key
+    # then the values that exist, each with its new child
+    for parent, key in reversed(trail):
+        key = _key(key) if missing and parent is trail[-1][0] else key
         value = (
-            Value({key: value}, o.mark, here.key, here.path)
-            if here.data is None
-            else here.replaced(key, value)
+            Value({key: value}, o.mark, parent.key, parent.path)
+            if parent.data is None
+            else parent.replaced(key, value)
         )
     assert value is not None
     return value
@@ -236,6 +246,7 @@ def _parsed_again(trail: Trail, missing: tuple[str, ...], o: Override) -> Value 
 
 
 def _key(name: str | int) -> str | int:
+    """Return a name of decimal digits as a whole number, and any other key as it is."""
     return int(name) if isinstance(name, str) and name.isdecimal() else name
 
 
@@ -283,20 +294,20 @@ def _read(key: str, argument: Any, mark: Location) -> Iterator[Override]:
     """Yield the overrides that one keyword argument contains: one override for each value in a
     mapping.
     """
-    named = _named(key, argument, mark)
-    if named.sign:
-        yield named if named.sign == "~" else _override(named, named.path, argument)
+    override = _named(key, argument, mark)
+    if override.sign:
+        yield override if override.sign == "~" else _override(override, override.path, argument)
         return
-    stack = [(named.path, argument)]
+    stack = [(override.path, argument)]
     while stack:
         path, value = stack.pop()
         if isinstance(value, Mapping) and value and not _whole_step(path, value):
             stack += [
-                ((*path, str(_python_key(name, mark, path))), below)
-                for name, below in reversed(list(value.items()))
+                ((*path, str(_python_key(name, mark, path))), inner)
+                for name, inner in reversed(list(value.items()))
             ]
         else:
-            yield _override(named, path, value)
+            yield _override(override, path, value)
 
 
 def _named(key: str, argument: Any, mark: Location) -> Override:
@@ -316,16 +327,18 @@ def _named(key: str, argument: Any, mark: Location) -> Override:
 
 
 def _whole_step(path: tuple[str, ...], value: Mapping[Any, Any]) -> bool:
+    """Return True for a mapping that is a step with its node, which is set as a whole."""
     return len(path) == 2 and path[0] == "steps" and "node" in value
 
 
 def _override(named: Override, path: tuple[str, ...], argument: Any) -> Override:
+    """Return the override of one value at a path, with the argument shown as a text."""
     name = ".".join(path)
     mark = named.mark if path == named.path else replace(named.mark, file=f"argument {name}")
     value = _value(argument, mark, path)
-    shown = flow(value.plain)
-    shown = shown if len(shown) <= _LONGEST else shown[: _LONGEST - 1] + "…"
-    return Override(f"{named.sign}{name}={shown}", named.sign, path, value, mark)
+    value_text = flow(value.plain)
+    value_text = value_text if len(value_text) <= _LONGEST else value_text[: _LONGEST - 1] + "…"
+    return Override(f"{named.sign}{name}={value_text}", named.sign, path, value, mark)
 
 
 def _value(argument: Any, mark: Location, path: Where) -> Value:
@@ -347,14 +360,15 @@ def _value(argument: Any, mark: Location, path: Where) -> Value:
     if argument is None or isinstance(argument, bool | int | float | str):
         return Value(argument, mark, mark, path)
     # a number or an array of numpy or torch
-    listed = argument.tolist() if hasattr(argument, "tolist") else argument
-    if not isinstance(listed, bool | int | float | str | list):
+    plain = argument.tolist() if hasattr(argument, "tolist") else argument
+    if not isinstance(plain, bool | int | float | str | list):
         message = f"a recipe cannot contain a value of type {type(argument).__name__}: {_ALLOWED}"
         raise RecipeError([Diagnostic(mark, dotted(path), message)])
-    return _value(listed, mark, path)
+    return _value(plain, mark, path)
 
 
 def _python_key(key: Any, mark: Location, path: Where) -> str | int:
+    """Return a key of a Python mapping; raise `RecipeError` unless it is a name or an integer."""
     if isinstance(key, str | int) and not isinstance(key, bool) and key != "":
         return key
     raise RecipeError(

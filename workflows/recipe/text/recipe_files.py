@@ -67,30 +67,30 @@ def shared_folders() -> tuple[Path, ...]:
     """Return the folders that every recipe searches: those of ``NEUSEE_RECIPES``, of the user,
     and the packaged one.
     """
-    named = (
+    named_folders = (
         Path(name).expanduser().absolute()
         for name in os.environ.get(RECIPES_VARIABLE, "").split(os.pathsep)
         if name
     )
-    return tuple(dict.fromkeys((*named, user_folder(), packaged())))
+    return tuple(dict.fromkeys((*named_folders, user_folder(), packaged())))
 
 
 def search_folders(recipe: Path, extended: Iterable[Path], folder: Path) -> tuple[Path, ...]:
     """Return the folders in which the groups of a recipe are searched: beside it, beside the
     recipes that it extends, and those of all recipes. Beside a packaged recipe is ``folder``.
     """
-    beside = folder if recipe.parent == packaged() else recipe.parent
-    below = [file.parent for file in extended if file.parent != packaged()]
-    return tuple(dict.fromkeys((beside, *below, *shared_folders())))
+    first_folder = folder if recipe.parent == packaged() else recipe.parent
+    extended_folders = [file.parent for file in extended if file.parent != packaged()]
+    return tuple(dict.fromkeys((first_folder, *extended_folders, *shared_folders())))
 
 
 def shown(path: Path, folder: Path) -> str:
     """Return the path of a file relative to the packaged recipes or to ``folder``, or else the
     full path.
     """
-    for above in (packaged(), folder):
-        if path.is_relative_to(above):
-            return path.relative_to(above).as_posix()
+    for base_folder in (packaged(), folder):
+        if path.is_relative_to(base_folder):
+            return path.relative_to(base_folder).as_posix()
     return str(path)
 
 
@@ -110,7 +110,7 @@ def option_file(group: str, option: str, folders: tuple[Path, ...]) -> Path | No
     if not NAME.fullmatch(group) or not NAME.fullmatch(option):
         return None
     return next(
-        (path for above in folders if (path := above / group / f"{option}.yaml").is_file()), None
+        (path for folder in folders if (path := folder / group / f"{option}.yaml").is_file()), None
     )
 
 
@@ -128,9 +128,9 @@ def locate(recipe: str | Path, folder: Path) -> Path:
             return path
         message = f"no such file; {similar_file(str(recipe), path, folder)}"
     else:
-        named = next(files_named(str(recipe), shared), None)
-        if named is not None:
-            return named
+        file = next(files_named(str(recipe), shared), None)
+        if file is not None:
+            return file
         message = f"no such recipe; {nearest(str(recipe), names_in(shared))}"
     raise RecipeError([Diagnostic(Location("recipe"), str(recipe), message)])
 
@@ -152,7 +152,9 @@ def names_in(folders: Iterable[Path]) -> list[str]:
 def similar_file(name: str, path: Path, folder: Path) -> str:
     """Return a hint with the recipe files in the folder of a ``path`` that does not exist."""
     similar = path.parent.glob("*.yaml")
-    return nearest(name, [str(p.relative_to(folder)) for p in similar if p.is_relative_to(folder)])
+    return nearest(
+        name, [str(file.relative_to(folder)) for file in similar if file.is_relative_to(folder)]
+    )
 
 
 def hiding_notes(path: Path, recipe: str | Path) -> list[str]:
@@ -183,7 +185,9 @@ def refuse_outside(path: Path, mark: Location) -> None:
     if not is_strange() or _is_argument(mark):
         return
     folder = Path(mark.folder)
-    if is_inside(path, folder) or any(folder.is_relative_to(own) for own in shared_folders()):
+    if is_inside(path, folder) or any(
+        folder.is_relative_to(shared_folder) for shared_folder in shared_folders()
+    ):
         return
     raise ValueError(
         f"is not in the folder of {Path(mark.file).name.partition(':')[0]}, and with "

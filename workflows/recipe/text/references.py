@@ -43,15 +43,20 @@ class Scope:
 
         If no item fits, return None, an empty path and a message.
         """
-        dims = list(self.items)
-        if parts[0] == "item" and len(dims) == 1:
-            return self.items[dims[0]], parts[1:], ""
-        if parts[0] == "each" and len(parts) > 1 and parts[1] in dims:
+        list_names = list(self.items)
+        # `item` is clear only for a step with one list of items
+        if parts[0] == "item" and len(list_names) == 1:
+            return self.items[list_names[0]], parts[1:], ""
+        if parts[0] == "each" and len(parts) > 1 and parts[1] in list_names:
             return self.items[parts[1]], parts[2:], ""
-        if not dims:
+        if not list_names:
             return None, [], f"${{{'.'.join(parts)}}} needs `each` in steps.{self.step}"
-        below = "".join(f".{name}" for name in _below_item(parts))
-        return None, [], f"write {' or '.join(f'${{each.{dim}{below}}}' for dim in dims)}"
+        inner_path = "".join(f".{name}" for name in _below_item(parts))
+        return (
+            None,
+            [],
+            f"write {' or '.join(f'${{each.{dim}{inner_path}}}' for dim in list_names)}",
+        )
 
 
 def _below_item(parts: list[str]) -> list[str]:
@@ -116,6 +121,7 @@ class References:
             target = self._target(match[1], value, scope)
             if target is None:
                 return replace(value, data=BROKEN)
+            # the reference is the whole value, which keeps its type
             if match[0] == text:
                 return target
             if target.data is ABSENT:
@@ -140,24 +146,28 @@ class References:
         return replace(value, data=text)
 
     def _target(self, text: str, origin: Value, scope: Scope) -> Value | None:
+        """Return the value to which a reference refers, or None after a report of the mistake.
+
+        An optional reference to nothing gives a value with the data `ABSENT`.
+        """
         if advice := advice_on_reference(text.strip()):
             self._fail(origin, advice)
             return None
-        optional = text.rstrip().endswith("?")
-        parts, start = text.strip().removesuffix("?").split("."), self.root
-        if parts[0] in ("item", "each") and parts[0] not in self.root.items:
-            item, parts, fault = scope.find(parts)
+        is_optional = text.rstrip().endswith("?")
+        keys, start = text.strip().removesuffix("?").split("."), self.root
+        if keys[0] in ("item", "each") and keys[0] not in self.root.items:
+            item, keys, fault = scope.find(keys)
             if item is None:
                 self._fail(origin, fault)
                 return None
             start = item
-        target = start.below(parts)
-        self.trace.append(((*start.path, *parts), target))
-        if target is None and optional:
-            self.offered.add((*start.path, *parts))
+        target = start.below(keys)
+        self.trace.append(((*start.path, *keys), target))
+        if target is None and is_optional:
+            self.offered.add((*start.path, *keys))
             return replace(origin, data=ABSENT)
         if target is None:
-            self._missing(start, parts, origin, scope)
+            self._missing(start, keys, origin, scope)
             return None
         self.used.add(target.path)
         return self._followed(target, scope, origin)
@@ -173,7 +183,8 @@ class References:
             self._fail(origin, fault)
             return None
         self.open.append(target.path)
-        first = len(self.trace)
+        first_trace = len(self.trace)
+        # a value of a step may refer to its items, any other value may not
         value = self.resolve(
             target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path))
         )
@@ -186,17 +197,18 @@ class References:
             value = replace(value, data=BROKEN)
         if target.path[0] != "steps":
             # each once: nested lists would grow it
-            self.trace[first:] = dict(self.trace[first:]).items()
-            self.known[target.path], self._traces[target.path] = value, self.trace[first:]
+            self.trace[first_trace:] = dict(self.trace[first_trace:]).items()
+            self.known[target.path], self._traces[target.path] = value, self.trace[first_trace:]
         return value
 
     def _chain_fault(self, target: Value) -> str:
         """Return what is wrong with one more reference behind those that are being resolved."""
         if target.path in self.open:
-            loop = [*self.open[self.open.index(target.path) :], target.path]
-            return f"the value refers to itself: {' -> '.join(map(dotted, loop))}"
+            cycle = [*self.open[self.open.index(target.path) :], target.path]
+            return f"the value refers to itself: {' -> '.join(map(dotted, cycle))}"
         if len(self.open) > _DEEPEST:
             return f"the value begins a chain of more than {_DEEPEST} references"
+        # counted anew where no value is being resolved
         self.followed = self.followed + 1 if self.open else 0
         if self.followed > _MOST_VALUES:
             return f"references expand this value to more than {_MOST_VALUES} values"
@@ -221,19 +233,22 @@ class References:
         path = (*start.path, *parts)
         name = dotted(path)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
-        if any(other.below(parts) for other in siblings):
+        if any(sibling.below(parts) for sibling in siblings):
             message = f"has no {'.'.join(parts)}; steps.{scope.step} needs this value"
             self.lacking.append((path, Diagnostic(start.key, start.name, message)))
             return
-        near = _nearest(
+        nearest_path = _nearest(
             path, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED}
         )
-        hint = f" is unknown; did you mean {dotted(near)}?" if near else " is unknown"
-        if now := instead(name):
-            hint = f": {now}" if new_name(name) is None else f" {now}"
+        hint = (
+            f" is unknown; did you mean {dotted(nearest_path)}?" if nearest_path else " is unknown"
+        )
+        if advice := instead(name):
+            hint = f": {advice}" if new_name(name) is None else f" {advice}"
         self.lacking.append((path, Diagnostic(origin.mark, origin.name, f"${{{name}}}{hint}")))
 
     def _fail(self, origin: Value, message: str) -> Value:
+        """Report a mistake, unless it was the last one reported; return the value as `BROKEN`."""
         problem = Diagnostic(origin.mark, origin.name, message)
         if problem not in self.diagnostics[-1:]:
             self.diagnostics.append(problem)
@@ -245,13 +260,13 @@ class References:
         """
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
-                parts = match[1].strip().removesuffix("?").split(".")
-                if parts[0] not in ("item", "each"):
+                keys = match[1].strip().removesuffix("?").split(".")
+                if keys[0] not in ("item", "each"):
                     self._target(match[1], text, Scope({}, ""))
                     continue
-                below = _below_item(parts)
+                inner_path = _below_item(keys)
                 for dim in dims or self.root.items:
-                    self.used |= {(dim, name, *below) for name in self.root.items[dim].items}
+                    self.used |= {(dim, name, *inner_path) for name in self.root.items[dim].items}
 
     def finish(self) -> None:
         """Report values of the recipe that no step uses, and references to values that do not
@@ -263,12 +278,12 @@ class References:
         targets = dict(self.lacking)
         misspelt = set[Where]()
         for leaf in self._unused():
-            meant = self._meant(leaf) or ()
-            if meant not in targets and self._may_be_unused(leaf):
+            meant_path = self._meant(leaf) or ()
+            if meant_path not in targets and self._may_be_unused(leaf):
                 self.spare.add(leaf.path)
                 continue
-            misspelt.add(meant)
-            self.diagnostics.append(_unknown(leaf, meant, targets.get(meant)))
+            misspelt.add(meant_path)
+            self.diagnostics.append(_unknown(leaf, meant_path, targets.get(meant_path)))
         self._report_lacking(misspelt)
 
     def _report_lacking(self, misspelt: Container[Where]) -> None:
@@ -302,20 +317,21 @@ class References:
                 yield key, Diagnostic(block.key, str(key), message)
 
     def _unused(self) -> list[Value]:
+        """Return the values that no step uses; reserved blocks and empty mappings do not count."""
         blocks = (block for key, block in self.root.items.items() if key not in RESERVED)
         leaves = chain.from_iterable(block.leaves() for block in blocks)
         return [leaf for leaf in leaves if leaf.data != {} and not self._is_used(leaf)]
 
     def _is_used(self, leaf: Value) -> bool:
         """Return True if a step uses a value, or a block that has the value."""
-        return any(leaf.path[:n] in self.used for n in range(1, len(leaf.path) + 1))
+        return any(leaf.path[:depth] in self.used for depth in range(1, len(leaf.path) + 1))
 
     def _meant(self, leaf: Value) -> Where | None:
         """Return the path that a user probably meant by an unused path: its new name, or a
         similar path in use.
         """
-        if now := new_name(leaf.name):
-            return tuple(now.split("."))
+        if present_name := new_name(leaf.name):
+            return tuple(present_name.split("."))
         candidates = {*self.used, *self.offered, *(path for path, _ in self.lacking)}
         candidates |= (
             {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
@@ -329,24 +345,27 @@ def _lacking_message(block: Value, paths: Iterable[Where]) -> str:
     """
     if not block.mark.line or not isinstance(block.data, dict):
         return ""
-    names, place = sorted(dotted(path[1:]) for path in paths), _place(block)
-    if place == "packaged" or len(names) < (3 if place == "recipe" else 1):
+    names, origin = sorted(dotted(path[1:]) for path in paths), _place(block)
+    # a recipe that lacks one or two values: each step says it better
+    if origin == "packaged" or len(names) < (3 if origin == "recipe" else 1):
         return ""
-    listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-    advice = _ADVICE_IN_RECIPE if place == "recipe" else _ADVICE_IN_OPTION
-    return f"lacks {listed}, which steps need: {advice}"
+    listed_names = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    advice = _ADVICE_IN_RECIPE if origin == "recipe" else _ADVICE_IN_OPTION
+    return f"lacks {listed_names}, which steps need: {advice}"
 
 
 def _unknown(leaf: Value, meant: Where, needed: Diagnostic | None) -> Diagnostic:
     """Return the diagnostic for a value that no step uses; ``needed`` is the one of a missing value
     that the user probably ``meant``.
     """
-    if now := instead(leaf.name):
-        return Diagnostic(leaf.key, leaf.name, now)
-    shown = dotted(meant[-1:] if meant[:-1] == leaf.path[:-1] else meant)
-    hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
-    user = f" (needed at {needed.mark})" if needed else ""
-    return Diagnostic(leaf.key, leaf.name, f"unknown{hint}{user}", "" if shown else UNREAD)
+    if advice := instead(leaf.name):
+        return Diagnostic(leaf.key, leaf.name, advice)
+    meant_text = dotted(meant[-1:] if meant[:-1] == leaf.path[:-1] else meant)
+    hint = f"; did you mean {meant_text}?" if meant_text else ": no step refers to this value"
+    needed_text = f" (needed at {needed.mark})" if needed else ""
+    return Diagnostic(
+        leaf.key, leaf.name, f"unknown{hint}{needed_text}", "" if meant_text else UNREAD
+    )
 
 
 def _place(block: Value) -> Literal["packaged", "option", "recipe"]:
@@ -370,12 +389,14 @@ def _nearest(path: Where, candidates: set[Where]) -> Where | None:
     """Return the path in ``candidates`` with the last name most similar to that of ``path``, if
     possible in its block.
     """
-    paths_by_name = {str(other[-1]): other for other in sorted(candidates, key=str)}
-    beside = {str(other[-1]): other for other in candidates if other[:-1] == path[:-1]}
-    for paths in (beside, paths_by_name):
-        close = difflib.get_close_matches(str(path[-1]), paths, 1, 0.75)
-        if close:
-            return paths[close[0]]
+    paths_by_name = {str(candidate[-1]): candidate for candidate in sorted(candidates, key=str)}
+    paths_beside = {
+        str(candidate[-1]): candidate for candidate in candidates if candidate[:-1] == path[:-1]
+    }
+    for paths in (paths_beside, paths_by_name):
+        matches = difflib.get_close_matches(str(path[-1]), paths, 1, 0.75)
+        if matches:
+            return paths[matches[0]]
     return None
 
 
@@ -397,10 +418,12 @@ def broken(value: Value) -> bool:
 
 
 def _pasted(data: Any) -> str:
+    """Return a value as YAML writes it in a text."""
     return str(data).lower() if isinstance(data, bool) else "null" if data is None else str(data)
 
 
 def _texts(value: Value) -> Iterator[Value]:
+    """Yield all strings in a value."""
     if isinstance(value.data, str):
         yield value
     for child in value.items.values():

@@ -27,10 +27,10 @@ POSTERIOR_NAMES: dict[str, str] = _TABLE["posterior"]
 
 def new_name(old: str) -> str | None:
     """Return the present name of an old recipe path, or None for a path that was never renamed."""
-    parts = old.split(".")
-    for n in range(len(parts), 0, -1):
-        if now := _CALLED.get(".".join(parts[:n])):
-            return ".".join([now, *parts[n:]])
+    keys = old.split(".")
+    for length in range(len(keys), 0, -1):
+        if present_name := _CALLED.get(".".join(keys[:length])):
+            return ".".join([present_name, *keys[length:]])
     return None
 
 
@@ -38,8 +38,8 @@ def instead(old: str) -> str:
     """Return a message that says what to write instead of an old recipe path, or an empty text
     for any other path.
     """
-    if now := new_name(old):
-        return f"is called {now} now"
+    if present_name := new_name(old):
+        return f"is called {present_name} now"
     return _REMOVED.get(old, "")
 
 

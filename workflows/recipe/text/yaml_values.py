@@ -62,12 +62,12 @@ def directive_mistake(text: str) -> YamlMistake | None:
                 number, 0, f"the directive {name} has no meaning in a recipe: remove this line"
             )
         if version[1] != "1.2":
-            fix = (
+            advice = (
                 "remove this line, and see that the file means the same in YAML 1.2 (on is a word,"
                 " 010 is ten)"
             )
             return YamlMistake(
-                number, version.start(1), f"recipes are YAML 1.2, not {version[1]}: {fix}"
+                number, version.start(1), f"recipes are YAML 1.2, not {version[1]}: {advice}"
             )
     return None
 
@@ -76,17 +76,21 @@ def explained(error: Exception, text: str) -> YamlMistake:
     """Return the mistake for an error that the YAML parser raised for a text."""
     if not isinstance(error, MarkedYAMLError) or not error.problem:
         return YamlMistake(*_first_control_character(text), "is not YAML: an invalid character")
-    places = (_open_quote, _missing_space, _text_goes_on, _open_bracket)
-    for mistake in (place(error, text) for place in places):
+    explanations = (_open_quote, _missing_space, _text_goes_on, _open_bracket)
+    for mistake in (explanation(error, text) for explanation in explanations):
         if mistake is not None:
             return mistake
     line, column = _problem_place(error, text)
     lines = text.splitlines() or [""]
-    here = lines[min(line, len(lines) - 1)]
-    return YamlMistake(line, column, _sentence(error.problem, here, column))
+    line_text = lines[min(line, len(lines) - 1)]
+    return YamlMistake(line, column, _sentence(error.problem, line_text, column))
 
 
 def _problem_place(error: MarkedYAMLError, text: str) -> tuple[int, int]:
+    """Return line and column of the problem, from 0.
+
+    If the parser gives none, they are those of the first control character.
+    """
     mark = error.problem_mark
     return (mark.line, mark.column) if mark else _first_control_character(text)
 
@@ -103,17 +107,18 @@ def _open_quote(error: MarkedYAMLError, text: str) -> YamlMistake | None:
             error.context_mark.column,
             "a quote opens here and never closes",
         )
-    stop = _problem_place(error, text)[0]
-    long = [
+    problem_line = _problem_place(error, text)[0]
+    quotes_over_lines = [
         token
         for token in _tokens(text)
-        if _is_quoted_over_lines(token) and token.end_mark.line <= stop
+        if _is_quoted_over_lines(token) and token.end_mark.line <= problem_line
     ]
-    if not long or long[-1].end_mark.line != stop:
+    if not quotes_over_lines or quotes_over_lines[-1].end_mark.line != problem_line:
         return None
-    start = long[-1].start_mark
+    start = quotes_over_lines[-1].start_mark
     message = (
-        f"the quote that opens here closes only in line {long[-1].end_mark.line + 1}: close it in"
+        "the quote that opens here closes only in line"
+        f" {quotes_over_lines[-1].end_mark.line + 1}: close it in"
         " its line"
     )
     return YamlMistake(start.line, start.column, message)
@@ -143,11 +148,11 @@ def _missing_space(error: MarkedYAMLError, text: str) -> YamlMistake | None:
 
 def _unfinished_key(text: str, line: int, column: int) -> YamlMistake:
     """Return the mistake of a key at a place that no colon with a space follows."""
-    written = (text.splitlines() or [""])[line][column:].split(" #")[0].strip()
-    key, colon, value = written.partition(":")
-    fix = f"write `{key}: {value}`" if colon and value else "write `key: value`"
+    key_and_value = (text.splitlines() or [""])[line][column:].split(" #")[0].strip()
+    key, colon, value = key_and_value.partition(":")
+    advice = f"write `{key}: {value}`" if colon and value else "write `key: value`"
     reason = "needs a space after the colon" if colon and value else "has no colon"
-    return YamlMistake(line, column, f"{_short(written)} {reason}: {fix}")
+    return YamlMistake(line, column, f"{_short(key_and_value)} {reason}: {advice}")
 
 
 def _text_goes_on(error: MarkedYAMLError, text: str) -> YamlMistake | None:
@@ -160,16 +165,19 @@ def _text_goes_on(error: MarkedYAMLError, text: str) -> YamlMistake | None:
     if "mapping values are not allowed" not in str(error.problem):
         return None
     line, column = _problem_place(error, text)
-    before = "\n".join([*text.splitlines()[:line], text.splitlines()[line][:column]])
-    scalars = [token for token in _tokens(before) if isinstance(token, ScalarToken)]
+    text_before = "\n".join([*text.splitlines()[:line], text.splitlines()[line][:column]])
+    scalars = [token for token in _tokens(text_before) if isinstance(token, ScalarToken)]
     if not scalars or scalars[-1].start_mark.line == line:
         return None
-    start = scalars[-1].start_mark
-    if not text.splitlines()[start.line][: start.column].strip(" -"):
-        return _unfinished_key(text, start.line, start.column)
+    value_start = scalars[-1].start_mark
+    # nothing but list dashes before it: the value begins its line, so that it is a key without its
+    # space
+    if not text.splitlines()[value_start.line][: value_start.column].strip(" -"):
+        return _unfinished_key(text, value_start.line, value_start.column)
     indent = column - len(text.splitlines()[line][:column].lstrip())
     message = (
-        f"a wrong indent: as it stands, this line is more of the value in line {start.line + 1}"
+        "a wrong indent: as it stands, this line is more of the value in line"
+        f" {value_start.line + 1}"
     )
     return YamlMistake(line, indent, message)
 
@@ -240,14 +248,15 @@ def _wrong_indent(problem: str, here: str) -> str:
 
 
 def _short(text: str) -> str:
+    """Return a text with at most 40 characters, an ellipsis included."""
     return text if len(text) <= 40 else f"{text[:39]}…"
 
 
 def _first_control_character(text: str) -> tuple[int, int]:
     """Return the line and column of the first control character in a text."""
     match = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
-    before = text[: match.start()] if match else ""
-    return before.count("\n"), len(before.rpartition("\n")[2])
+    text_before = text[: match.start()] if match else ""
+    return text_before.count("\n"), len(text_before.rpartition("\n")[2])
 
 
 # --- yaml values ----------------------------------------------------------------------------------
@@ -310,7 +319,7 @@ class Value:
         return (
             items[name]
             if name in items
-            else next((v for key, v in items.items() if str(key) == str(name)), None)
+            else next((value for key, value in items.items() if str(key) == str(name)), None)
         )
 
     def below(self, path: Iterable[str | int]) -> Value | None:
@@ -326,12 +335,19 @@ class Value:
         """Return a copy of a mapping or a list with ``child`` at a key, or without the key if
         ``child`` is None.
         """
-        items = {k: v for k, v in self.items.items() if child is not None or k != key}
+        items = {
+            item_key: value
+            for item_key, value in self.items.items()
+            if child is not None or item_key != key
+        }
         if child is not None:
             items[key] = child
         if isinstance(self.data, list):
             return replace(
-                self, data=[replace(v, path=(*self.path, i)) for i, v in enumerate(items.values())]
+                self,
+                data=[
+                    replace(value, path=(*self.path, i)) for i, value in enumerate(items.values())
+                ],
             )
         return replace(self, data=items)
 
@@ -380,8 +396,8 @@ def read(path: Path, shown: str) -> Document:
     except NotRegular as error:
         raise RecipeError([Diagnostic(Location(shown), "", str(error))]) from None
     except UnicodeDecodeError as error:
-        before = error.object[: error.start].decode("utf-8", "replace")
-        mark = Location(shown, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
+        valid_text = error.object[: error.start].decode("utf-8", "replace")
+        mark = Location(shown, valid_text.count("\n") + 1, len(valid_text.rpartition("\n")[2]) + 1)
         raise RecipeError(
             [Diagnostic(mark, "", f"the byte 0x{error.object[error.start]:02x} is not UTF-8")]
         ) from None
@@ -394,6 +410,7 @@ def read(path: Path, shown: str) -> Document:
 
 @lru_cache(maxsize=256)
 def _document(text: str, shown: str, folder: str) -> Document:
+    """Return the mapping and the title in the text of a file; the result is cached."""
     root = parse(text, Location(shown, 1, 1, folder))
     if not isinstance(root.data, dict):
         problem = "the file is empty" if root.data is None else f"the file contains {kind(root)}"
@@ -403,8 +420,8 @@ def _document(text: str, shown: str, folder: str) -> Document:
     line = package_line(text)
     if line is not None:
         raise RecipeError([Diagnostic(Location(shown, line + 1, 1), "", ADVICE_ON_HEADER)])
-    first = text.lstrip().partition("\n")[0].strip()
-    return Document(root, visible(first.lstrip("# ")) if first.startswith("#") else "")
+    first_line = text.lstrip().partition("\n")[0].strip()
+    return Document(root, visible(first_line.lstrip("# ")) if first_line.startswith("#") else "")
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
@@ -473,6 +490,7 @@ class _Builder:
         mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
         if tag not in _KNOWN:
             return self._refuse(mark, path, f"unknown YAML tag {tag}: remove the tag")
+        # an alias is the same node again
         if id(node) in self.built:
             self.aliased += self.size[id(node)]
             self._refuse_many(self.aliased, _MOST_ALIASED, mark, path)
@@ -504,8 +522,8 @@ class _Builder:
 
     def _column(self, node: Node) -> int:
         """Return the column of a block; -1, as of the top, where an anchor or a tag hides it."""
-        hidden = self.text[node.start_mark.index] in "&!"
-        return -1 if hidden else int(node.start_mark.column)
+        is_hidden = self.text[node.start_mark.index] in "&!"
+        return -1 if is_hidden else int(node.start_mark.column)
 
     def _fault(self, node: Node, tag: str) -> str:
         """Return what is wrong with a value that the parser reads otherwise than YAML 1.2 has it,
@@ -516,11 +534,13 @@ class _Builder:
 
     def _tag_fault(self, node: Node, tag: str) -> str:
         """Return what is wrong with the tag that a text writes before a value."""
-        words = _PROPERTIES.match(self.text, node.start_mark.index)
-        written = [word for word in (words[0].split() if words else ()) if word.startswith("!")]
-        if not written:
+        properties = _PROPERTIES.match(self.text, node.start_mark.index)
+        tags = [
+            word for word in (properties[0].split() if properties else ()) if word.startswith("!")
+        ]
+        if not tags:
             return ""
-        if written == ["!"]:
+        if tags == ["!"]:
             return "a ! alone: remove it, and quote a text that looks like a number"
         return "" if _fits(node, tag) else f"the tag {tag} does not fit this value: remove the tag"
 
@@ -530,22 +550,24 @@ class _Builder:
         """
         if not _is_enclosed(node):
             return ""
-        end = node.end_mark.index
-        if self.text[end : end + 1] == "#":
+        end_index = node.end_mark.index
+        if self.text[end_index : end_index + 1] == "#":
             return "a comment needs a space before its #, after this value"
         if self.column is None:  # the brackets around it have been looked at, with all their lines
             return ""
         # many write a closing bracket, or a comment, under the key
-        free_starts = "]}#" if isinstance(node, CollectionNode) else ""
-        lines = self.text[node.start_mark.index : end].split("\n")
+        exempt_starts = "]}#" if isinstance(node, CollectionNode) else ""
+        lines = self.text[node.start_mark.index : end_index].split("\n")
+        # lines count from 1, and the first line of the value is left out
         for number, line in enumerate(lines[1:], node.start_mark.line + 2):
             text = line.strip()
             indent = len(line) - len(line.lstrip(" "))
-            if text and indent <= self.column and text[0] not in free_starts:
+            if text and indent <= self.column and text[0] not in exempt_starts:
                 return f"indent line {number}, which is part of this value, with more spaces"
         return ""
 
     def _mapping(self, node: MappingNode, path: Where) -> dict[str | int, Value]:
+        """Return the values of a mapping by key; report wrong, repeated and misspelt keys."""
         data: dict[str | int, Value] = {}
         is_advised = False  # one message for the keys of one object
         for key_node, value_node in node.value:
@@ -596,6 +618,7 @@ class _Builder:
         self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
 
     def _refuse_many(self, count: int, limit: int, mark: Location, path: Where) -> None:
+        """Raise `RecipeError` if a value has more values than a limit."""
         if count > limit:
             raise RecipeError(
                 [
@@ -606,6 +629,10 @@ class _Builder:
             )
 
     def _mark(self, node: Node) -> Location:
+        """Return the place of a node: its line and column in a file.
+
+        A text that is an argument has one place for all of it.
+        """
         if not self.start.line:
             return self.start
         return Location(
@@ -613,6 +640,7 @@ class _Builder:
         )
 
     def _refuse(self, mark: Location, path: Where, message: str) -> Value:
+        """Report a mistake and return an empty value in place of the wrong one."""
         self.diagnostics.append(Diagnostic(mark, dotted(path), message))
         return Value(None, mark, mark, path)
 
@@ -637,14 +665,18 @@ def _fault(text: str) -> str:
     """Return what is wrong with the text of a scalar that would harm a reader or the program, or
     an empty text.
     """
-    if control := CONTROL.search(text):
-        return f"has the control character {visible(control[0])}: remove it"
+    if control_character := CONTROL.search(text):
+        return f"has the control character {visible(control_character[0])}: remove it"
     if len(text) > _DIGITS and _INT.fullmatch(text):
         return f"has {len(text)} digits, more than the limit of {_DIGITS}"
     return ""
 
 
 def _scalar(node: ScalarNode) -> Any:
+    """Return the data of a scalar: null, a boolean, a number or a text.
+
+    A quoted scalar is always a text.
+    """
     text, tag = str(node.value), (node.tag or "").removeprefix(_TAG)
     if tag == "null" and node.style is None:
         return None
@@ -664,13 +696,13 @@ def _fits(node: Node, tag: str) -> bool:
 
 def _has_type(text: str, tag: str) -> bool:
     """Return True if an unquoted text has the type of a tag."""
-    types = {
+    has_type_of_tag = {
         "!!int": lambda: _INT.fullmatch(text) is not None,
         "!!float": lambda: not isinstance(number(text), str),
         "!!bool": lambda: text in _BOOLEANS,
         "!!null": lambda: text in _NULLS,
     }
-    return tag in types and types[tag]()
+    return tag in has_type_of_tag and has_type_of_tag[tag]()
 
 
 def number(text: str) -> int | float | str:
@@ -681,9 +713,9 @@ def number(text: str) -> int | float | str:
         return int(text, 0 if text[:2] in ("0o", "0x") else 10)
     if _FLOAT.fullmatch(text):
         return float(text)
-    bare = text.lstrip("+-").lower()
-    if bare in (".inf", ".nan"):
-        return -math.inf if text[0] == "-" and bare == ".inf" else float(bare[1:])
+    unsigned = text.lstrip("+-").lower()
+    if unsigned in (".inf", ".nan"):
+        return -math.inf if text[0] == "-" and unsigned == ".inf" else float(unsigned[1:])
     return text
 
 

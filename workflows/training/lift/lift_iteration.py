@@ -45,8 +45,10 @@ class Pairs:
                 " step"
             )
         self._names, self._seed = (settings.picture, settings.cube), recipe.seed
-        random = {name for name in needed(recipe, self._names) if recipe.steps[name].node.random}
-        if not random:
+        random_steps = {
+            name for name in needed(recipe, self._names) if recipe.steps[name].node.random
+        }
+        if not random_steps:
             raise ValueError(
                 f"train_lift: step {settings.picture} gives no random pictures: use a"
                 " spectra.leaves step"
@@ -56,7 +58,7 @@ class Pairs:
         self.measured: Tensor = results[settings.measured]
         need_mst_plus_plus_bands(self.bands)
         self._draw = as_function(
-            recipe, outputs=self._names, store=store, device=device, redraw=random
+            recipe, outputs=self._names, store=store, device=device, redraw=random_steps
         )
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
@@ -96,8 +98,8 @@ class LiftLearner:
 
     def parts(self) -> dict[str, Any]:
         """Return by name the objects whose state a checkpoint must contain."""
-        parts = {"net": self.net, "optimiser": self.optimiser, "average": self.average}
-        return {name: member for name, member in parts.items() if member}
+        members = {"net": self.net, "optimiser": self.optimiser, "average": self.average}
+        return {name: member for name, member in members.items() if member}
 
     def iterate(self, iteration: int) -> Losses:
         """Train the network on one batch of pictures, and return the losses.
@@ -108,31 +110,32 @@ class LiftLearner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
+        # each iteration has new pictures, numbered on and on
         picture, cube = self.pairs.batch(range(iteration * batch, (iteration + 1) * batch))
         estimate = lift_pictures(self.net, picture)
         loss = losses.mrae(estimate, cube, floor=self.settings.floor)
         loss.backward()
-        largest = math.inf if self.settings.clip is None else self.settings.clip
-        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), largest))
-        errors = {
+        norm_limit = math.inf if self.settings.clip is None else self.settings.clip
+        gradient_norm = float(nn.utils.clip_grad_norm_(self.net.parameters(), norm_limit))
+        numbers = {
             "MRAE": float(loss.detach()),
             "RMSE": _rmse(estimate.detach(), cube),
-            "slope": slope,
+            "slope": gradient_norm,
             "rate": rate,
         }
-        require_finite(errors)
+        require_finite(numbers)
         self.optimiser.step()
         if self.average:
             self.average.update_parameters(self.net)
-        return errors
+        return numbers
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
         """Return the mean errors of the network and of a linear estimate, for pictures that are
         not in the training.
         """
-        sums, count = dict[str, Losses](), self.settings.validation_batches
-        for number in range(count):
+        means, picture_count = dict[str, Losses](), self.settings.validation_batches
+        for number in range(picture_count):
             picture, cube = self.pairs("judge", number)
             for name, estimate in self.estimates(picture).items():
                 errors = {
@@ -140,10 +143,11 @@ class LiftLearner:
                     "RMSE": _rmse(estimate, cube),
                     "colour": _rmse(render(estimate, self.pairs.bands), picture),
                 }
-                sums[name] = {
-                    key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in errors.items()
+                means[name] = {
+                    key: means.get(name, {}).get(key, 0.0) + x / picture_count
+                    for key, x in errors.items()
                 }
-        return sums
+        return means
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
         """Estimate the spectra of an RGB picture twice: with the network, and with a linear

@@ -76,9 +76,11 @@ def lifted_spectra(
     """
     figure, axes = canvas(13.0, 2.6, 1, 6)
     y, x = shown.shape[-2:]
+    # five pixels at the heights 1/10, 3/10 ... 9/10, at widths in another order
     pixels = [(y * (2 * i + 1) // 10, x * (2 * ((3 * i) % 5) + 1) // 10) for i in range(5)]
     picture(axes[0, 0], encoded(shown), "picture")
     axes[0, 0].plot(
+        # a picture has its columns along x
         [c for _, c in pixels],
         [r for r, _ in pixels],
         "o",
@@ -86,12 +88,22 @@ def lifted_spectra(
         markerfacecolor="white",
         markersize=5,
     )
-    nm = (centres * 1e9).cpu().numpy()
+    wavelengths_nm = (centres * 1e9).cpu().numpy()
     for number, (ax, (row, column)) in enumerate(zip(axes[0, 1:], pixels, strict=True), 1):
-        ax.plot(nm, truth[:, row, column].cpu().numpy(), color=BLACK, linewidth=1.5, label="truth")
+        ax.plot(
+            wavelengths_nm,
+            truth[:, row, column].cpu().numpy(),
+            color=BLACK,
+            linewidth=1.5,
+            label="truth",
+        )
         for name, cube in estimates.items():
             ax.plot(
-                nm, cube[:, row, column].cpu().numpy(), linewidth=1.2, label=name, **_LOOKS[name]
+                wavelengths_nm,
+                cube[:, row, column].cpu().numpy(),
+                linewidth=1.2,
+                label=name,
+                **_LOOKS[name],
             )
         ax.set_title(f"pixel {number}")
         ax.set_ylim(bottom=0)
@@ -157,22 +169,25 @@ def train_lift(
 def lift_inputs(recipe: Recipe, settings: LiftTraining, code: Code) -> RecordedInputs:
     """Return everything that can change the trained weights."""
     camera = CameraInputs.of(recipe, [settings.measured, settings.picture, settings.cube], code)
-    block = settings.model_dump(mode="json", exclude={"keep", "show", "validation_batches"})
-    nodes = {
+    lift_settings = settings.model_dump(mode="json", exclude={"keep", "show", "validation_batches"})
+    node_digests = {
         f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}")
         for name in ("losses", "spectra")
     }
-    program = {name: Path(file).read_bytes() for name, file in _PROGRAM.items()}
+    program_files = {name: Path(file).read_bytes() for name, file in _PROGRAM.items()}
     return RecordedInputs(
         kind="lift",
         recipe=recipe.name,
         settings={
             **camera.settings,
-            **{f"train_lift.{name}": value for name, value in block.items()},
+            **{f"train_lift.{name}": value for name, value in lift_settings.items()},
         },
         steps=camera.steps,
         laws=camera.laws,
-        code={**nodes, **{name: outline(source).digest for name, source in program.items()}},
+        code={
+            **node_digests,
+            **{name: outline(source).digest for name, source in program_files.items()},
+        },
     )
 
 

@@ -101,30 +101,32 @@ class RecordedInputs:
         them.
         """
         try:
-            written = json.loads(text_of(folder / FILE))
-            if written.pop("format") != _FORMAT:
+            content = json.loads(text_of(folder / FILE))
+            if content.pop("format") != _FORMAT:
                 return None
-            stated = written.pop("digest")
+            stated_digest = content.pop("digest")
             for name in ("photographs", "held_out"):
-                written[name] = tuple(RecordedFile(**recorded) for recorded in written[name])
-            written["files"] = {
-                setting: RecordedFile(**recorded) for setting, recorded in written["files"].items()
+                content[name] = tuple(RecordedFile(**recorded) for recorded in content[name])
+            content["files"] = {
+                setting: RecordedFile(**recorded) for setting, recorded in content["files"].items()
             }
-            record = cls(**written)
+            record = cls(**content)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
-        return record if record.digest == stated else None
+        return record if record.digest == stated_digest else None
 
 
 def folder_of(runs: Path, stem: str, inputs: RecordedInputs) -> Path:
     """Return the folder of a training: one with equal inputs, whatever its recipe was called, or
     a new one.
     """
-    own = runs / f"{stem}_{inputs.key}"
-    if own.exists():
-        return own
-    equal = (file.parent for file in sorted(runs.glob(f"*_{inputs.key}/{FILE}")))
-    return next((folder for folder in equal if _digest_in(folder) == inputs.digest), own)
+    own_folder = runs / f"{stem}_{inputs.key}"
+    if own_folder.exists():
+        return own_folder
+    equal_folders = (file.parent for file in sorted(runs.glob(f"*_{inputs.key}/{FILE}")))
+    return next(
+        (folder for folder in equal_folders if _digest_in(folder) == inputs.digest), own_folder
+    )
 
 
 def _digest_in(folder: Path) -> str:
@@ -183,8 +185,8 @@ def _origin(step: Step, seed: int, code: Code) -> dict[str, Any]:
         "params": {name: plain(value) for name, value in step.params.items()},
         "inputs": [plain(step.wires.get(name)) for name in step.node.inputs],
     }
-    if said := written(step):
-        origin["written"] = said
+    if written_result := written(step):
+        origin["written"] = written_result
     return {**origin, "stream": [seed, step.name, _ANY_DEVICE]} if step.node.random else origin
 
 
@@ -252,14 +254,14 @@ class EarlierTraining:
     changes: Sequence[str]
 
     def __str__(self) -> str:
-        listed = [f"  {change}" for change in self.changes[:_SHOWN]]
-        hidden = len(self.changes) - _SHOWN
-        ending = [f"  and {hidden} more"] if hidden > 0 else []
-        head = (
+        change_lines = [f"  {change}" for change in self.changes[:_SHOWN]]
+        hidden_count = len(self.changes) - _SHOWN
+        last_line = [f"  and {hidden_count} more"] if hidden_count > 0 else []
+        first_line = (
             f"begins anew, because its inputs are not those of {self.folder.name}, which stays as"
             " it is:"
         )
-        return "\n".join([head, *listed, *ending])
+        return "\n".join([first_line, *change_lines, *last_line])
 
 
 def prepare_folder(
@@ -292,25 +294,32 @@ def why_anew(
     An earlier training without inputs, as earlier versions wrote it, gives a line of text.
     """
     runs, stem = folder.parent, folder.name.rpartition("_")[0]
-    earlier = list(_earlier(runs, stem, inputs, recipe, store))
-    if earlier:
-        return min(earlier, key=lambda training: (len(training.changes), -_began(training.folder)))
-    silent = next((path.parent for path in sorted(runs.glob(f"{stem}_*/state.pt"))), None)
-    if silent is None:
+    trainings = list(_earlier(runs, stem, inputs, recipe, store))
+    if trainings:
+        # fewest changes; among equals the youngest
+        return min(
+            trainings, key=lambda training: (len(training.changes), -_began(training.folder))
+        )
+    without_inputs = next((path.parent for path in sorted(runs.glob(f"{stem}_*/state.pt"))), None)
+    if without_inputs is None:
         return None
     text = (
         "an earlier version of neusee wrote it without its inputs, so that nobody can say whether"
         " they are these"
     )
-    return f"begins anew, and does not go on with {silent.name}: {text}"
+    return f"begins anew, and does not go on with {without_inputs.name}: {text}"
 
 
 def _earlier(
     runs: Path, stem: str, inputs: RecordedInputs, recipe: Recipe, store: Store
 ) -> Iterator[EarlierTraining]:
+    """Yield the earlier trainings of the same kind with other inputs.
+
+    One with another name counts only if few inputs differ.
+    """
     for file in sorted(runs.glob(f"*/{FILE}")):
-        begun = any((file.parent / name).is_file() for name in _CHECKPOINTS)
-        record = RecordedInputs.read(file.parent) if begun else None
+        has_begun = any((file.parent / name).is_file() for name in _CHECKPOINTS)
+        record = RecordedInputs.read(file.parent) if has_begun else None
         if record is None or record.kind != inputs.kind or record.digest == inputs.digest:
             continue
         changes = changes_since(record, inputs, recipe, store)
@@ -326,7 +335,7 @@ def changes_since(
     old: RecordedInputs, new: RecordedInputs, recipe: Recipe, store: Store
 ) -> list[str]:
     """Return a clause for each input that differs between two trainings."""
-    words = [
+    clauses = [
         *_values(old.settings, new.settings),
         *_changed_laws(old.laws, new.laws),
         *_files(old.files, new.files),
@@ -334,14 +343,16 @@ def changes_since(
         *_steps(old.steps, new.steps, recipe, store),
         *_code(old.code, new.code, store),
     ]
-    return list(dict.fromkeys(words))
+    return list(dict.fromkeys(clauses))
 
 
 def _differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the names at which two mappings differ; those of `new` come first."""
     return (name for name in dict.fromkeys([*new, *old]) if old.get(name) != new.get(name))
 
 
 def _values(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a clause for each setting that was set, removed or changed."""
     for name in _differing(old, new):
         if name not in old or name not in new:
             yield f"{name} is {'set now' if name in new else 'no longer set'}"
@@ -356,12 +367,20 @@ def _shown(value: Any) -> str:
 
 
 def _changed_laws(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a clause for each law with other draws, and one for another order of the laws.
+
+    The order counts, because each law draws from its own column.
+    """
     if old.keys() == new.keys() and list(old) != list(new):
         yield f"the laws stand in another order: {', '.join(new)}"
     for path in _differing(_draws(old), _draws(new)):
-        before, after = (laws[path]["text"] if path in laws else "no law" for laws in (old, new))
+        text_before, text_after = (
+            laws[path]["text"] if path in laws else "no law" for laws in (old, new)
+        )
         yield (
-            f"{path}: other draws of {after}" if before == after else f"{path} {before} -> {after}"
+            f"{path}: other draws of {text_after}"
+            if text_before == text_after
+            else f"{path} {text_before} -> {text_after}"
         )
 
 
@@ -370,6 +389,7 @@ def _draws(laws: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _files(old: Mapping[str, RecordedFile], new: Mapping[str, RecordedFile]) -> Iterator[str]:
+    """Yield a clause for each file that was added, removed or has another content."""
     for setting in _differing(_contents(old), _contents(new)):
         if setting not in old or setting not in new:
             yield f"{setting} is {'given now' if setting in new else 'no longer given'}"
@@ -385,11 +405,11 @@ def _photographs(old: RecordedInputs, new: RecordedInputs) -> Iterator[str]:
     """Yield a clause for each photograph that came, went or changed; a new name of an equal file
     is no change.
     """
-    before, after = [*old.photographs, *old.held_out], [*new.photographs, *new.held_out]
-    came = [photograph.name for photograph in _beyond(after, before)]
-    went = [photograph.name for photograph in _beyond(before, after)]
-    yield from _came_and_went(came, went)
-    same_files = not came and not went
+    files_before, files_after = [*old.photographs, *old.held_out], [*new.photographs, *new.held_out]
+    new_names = [photograph.name for photograph in _beyond(files_after, files_before)]
+    gone_names = [photograph.name for photograph in _beyond(files_before, files_after)]
+    yield from _came_and_went(new_names, gone_names)
+    same_files = not new_names and not gone_names
     if same_files and _beyond(new.held_out, old.held_out):
         yield "other photographs are held out"
 
@@ -406,13 +426,13 @@ def _beyond(files: Sequence[RecordedFile], others: Sequence[RecordedFile]) -> li
     """Return the files whose content the others do not have, each as often as it is missing
     there.
     """
-    unmatched = Counter(file.content for file in others)
-    beyond = []
+    counts = Counter(file.content for file in others)
+    unmatched_files = []
     for file in files:
-        unmatched[file.content] -= 1
-        if unmatched[file.content] < 0:
-            beyond.append(file)
-    return beyond
+        counts[file.content] -= 1
+        if counts[file.content] < 0:
+            unmatched_files.append(file)
+    return unmatched_files
 
 
 def _steps(
@@ -421,17 +441,22 @@ def _steps(
     recipe: Recipe,
     store: Store,
 ) -> Iterator[str]:
+    """Yield clauses for each step that was added, removed or changed.
+
+    A label has the camera in front of the step, if it is not the first camera.
+    """
     for label in _differing(old, new):
         camera, step = _camera_of(label)
-        before = f"{camera}: " if camera else ""
+        prefix = f"{camera}: " if camera else ""
         if label not in old or label not in new:
-            yield f"{before}step {step} is {'new' if label in new else 'gone'}"
+            yield f"{prefix}step {step} is {'new' if label in new else 'gone'}"
             continue
         comparison = Comparison(store, _recipe_of(camera, recipe))
         clauses = comparison.own(step, old[label], new[label])
+        # the step itself is the same, so that it reads other results
         if not clauses:
             clauses = [f"step {step} reads {_read(new[label])}, not {_read(old[label])}"]
-        yield from (f"{before}{clause}" for clause in clauses)
+        yield from (f"{prefix}{clause}" for clause in clauses)
 
 
 def _camera_of(label: str) -> tuple[str, str]:
@@ -443,13 +468,19 @@ def _camera_of(label: str) -> tuple[str, str]:
 
 
 def _recipe_of(camera: str, recipe: Recipe) -> Recipe:
+    """Return the recipe of a camera such as ``camera 2``; the first camera has no name.
+
+    Any other name belongs to the recipe itself.
+    """
     number = camera.removeprefix(CAMERA)
     if camera.startswith(CAMERA) and number.isdigit() and int(number) - 2 < len(recipe.cameras):
+        # further cameras are numbered from 2
         return recipe.cameras[int(number) - 2]
     return recipe
 
 
 def _read(origin: Mapping[str, Any]) -> str:
+    """Return the names of the results that a step reads, as text."""
     names: list[str] = []
     for source in origin["inputs"]:
         names += [source] if isinstance(source, str) else source or []
@@ -457,6 +488,10 @@ def _read(origin: Mapping[str, Any]) -> str:
 
 
 def _code(old: Mapping[str, str], new: Mapping[str, str], store: Store) -> Iterator[str]:
+    """Yield a clause for each edit of a module.
+
+    A module whose old code is not stored has one clause in all.
+    """
     for module in _differing(old, new):
         changes = edits(store.root, old.get(module, ""), new.get(module, ""))
         yield from changes or [f"the code of {module} changed"]

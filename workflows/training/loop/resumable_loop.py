@@ -276,6 +276,7 @@ class ResumableLoop(ABC, Generic[L]):
             )
             raise ValueError(f"{self.state.path} {text}: remove the folder to start again")
         self.stage, self.iteration = state.get("stage", self.stage), state.get("iteration", 0)
+        # first, because it makes the optimisers that the checkpoint fills
         self.begin_stage()
         if state:
             self.recall(state)
@@ -296,10 +297,10 @@ class ResumableLoop(ABC, Generic[L]):
             remove_crate(self.folder)
         while self.iteration < iterations and not self.stops_early:
             losses = self._next_row()
-            ended = self.iteration == iterations or self.stops_early
-            self._show_at_intervals(ended)
+            has_ended = self.iteration == iterations or self.stops_early
+            self._show_at_intervals(has_ended)
             self.note(losses)
-            if not ended and self.iteration % self.keep_every == 0:
+            if not has_ended and self.iteration % self.keep_every == 0:
                 self.keep()
 
     def _show_at_intervals(self, ended: bool) -> None:
@@ -346,40 +347,48 @@ class ResumableLoop(ABC, Generic[L]):
         remove_crate(self.folder)
         write_whole(self.folder / "curves.png", curves)
         seconds = sum(float(row["seconds"]) for row in self.rows.rows)
-        about = {
+        document = {
             "command": list(command),
             "recipe": recipe,
             **facts,
             "seconds": seconds,
             "versions": versions(),
         }
-        text = json.dumps(about, indent=1, ensure_ascii=False) + "\n"
+        text = json.dumps(document, indent=1, ensure_ascii=False) + "\n"
         write_whole(self.folder / DOCUMENT, text.encode())
-        write_crate(self.folder, self.folder.name, about | {"began": self.began})
+        write_crate(self.folder, self.folder.name, document | {"began": self.began})
 
     def _packed(self, **about: Any) -> dict[str, Any]:
-        parts = {name: member.state_dict() for name, member in self.learner.parts().items()}
+        """Return the content of a checkpoint, with `about` in addition.
+
+        It has stage, iteration, inputs, facts, and by name the state of each part of the learner.
+        """
+        member_states = {name: member.state_dict() for name, member in self.learner.parts().items()}
         return {
             "stage": self.stage,
             "iteration": self.iteration,
             "inputs": self.inputs,
             **self.facts(),
             **about,
-            "parts": parts,
+            "parts": member_states,
         }
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
         """Write the weights and the picture numbers that led to a NaN or infinite loss, and
         return the error.
         """
-        place = [self.stage, self.iteration] if self.stage else [self.iteration]
-        dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, place))}.pt")
-        first, count = self.iteration * self.batch, self.batch
+        stage_and_iteration = [self.stage, self.iteration] if self.stage else [self.iteration]
+        dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, stage_and_iteration))}.pt")
+        first_picture, count = self.iteration * self.batch, self.batch
         if self.writes:
-            dump.write(self._packed(pictures=list(range(first, first + count))))
+            dump.write(self._packed(pictures=list(range(first_picture, first_picture + count))))
             self.rows.keep()
         stage = f"stage {self.stage}, " if self.stage else ""
-        pictures = f"pictures {first} to {first + count - 1}" if count > 1 else f"picture {first}"
+        pictures = (
+            f"pictures {first_picture} to {first_picture + count - 1}"
+            if count > 1
+            else f"picture {first_picture}"
+        )
         text = (
             f"{stage}iteration {self.iteration}, {pictures}: {error}; the weights are in"
             f" {dump.path}"
@@ -391,14 +400,14 @@ def require_finite(numbers: Mapping[str, float]) -> None:
     """Raise `NotFinite` if a loss or another named number is NaN or infinite; the message gives
     its name.
     """
-    wrong = [name for name, x in numbers.items() if not abs(x) < float("inf")]
-    if wrong:
-        raise NotFinite(f"these numbers are NaN or infinite: {', '.join(wrong)}")
+    wrong_names = [name for name, x in numbers.items() if not abs(x) < float("inf")]
+    if wrong_names:
+        raise NotFinite(f"these numbers are NaN or infinite: {', '.join(wrong_names)}")
 
 
 def averaged(net: nn.Module, decay: float) -> AveragedModel | None:
     """Return an exponential moving average of the weights of a network, or None if ``decay`` is
     0.
     """
-    mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-    return AveragedModel(net, multi_avg_fn=mean) if decay else None
+    average_function = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
+    return AveragedModel(net, multi_avg_fn=average_function) if decay else None

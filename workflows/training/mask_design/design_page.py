@@ -32,6 +32,7 @@ from neusee.workflows.training.mask_design.mask_optimisers import LearntMask
 
 
 _LIGHTS = (10.0, 30.0, 100.0, 300.0, 1000.0)  #: e- in a pixel, beside that of the design
+# the figures are natural logarithms of ratios of powers
 _DECIBELS = 10 / math.log(10)
 _COLUMNS = (
     "light (e-)",
@@ -56,36 +57,44 @@ def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
         return {}
     with torch.no_grad():
         psf, exposure = terms.psf(height), terms.exposure()
+        # the first state is the nominal one
         peaks = [
             float(metrics.lsr(terms.psf(height, None, state)).max())
             for state, _ in terms.laws.points()
         ]
-        limit, worst = exposure["limit"], max(peaks)
-        own = {**terms.passed(), "limit": None if limit is None else limit * peaks[0] / worst}
+        peak_limit, highest_peak = exposure["limit"], max(peaks)
+        # lowered so that the limit holds in the worst state too
+        mask_exposure = {
+            **terms.passed(),
+            "limit": None if peak_limit is None else peak_limit * peaks[0] / highest_peak,
+        }
         lights = sorted({*_LIGHTS, exposure["light"]})
-        rows = [_row(terms, psf, {**exposure, "light": light}, own) for light in lights]
+        rows = [_row(terms, psf, {**exposure, "light": light}, mask_exposure) for light in lights]
+    # a pupil without a shade has no stop of its own
     stop = 1.0 if terms.shade is None else terms.recipe.steps[terms.shade.step].params["diameter"]
     return {
-        "limit": limit,
-        "lsr": worst,
+        "limit": peak_limit,
+        "lsr": highest_peak,
         "stop": stop,
-        "filter": 1.0 if limit is None else min(1.0, limit / worst),
+        "filter": 1.0 if peak_limit is None else min(1.0, peak_limit / highest_peak),
         "rows": rows,
     }
 
 
 def _row(terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]) -> dict[str, float]:
-    """Return error and information of a mask, whose own limit is lower by what is uncertain, and
-    of the best stop.
+    """Return error and information of a mask, and of the best stop, at one light of the scene.
+
+    `own` has the parameters of the mask: its transmittance, and a limit lowered by what is
+    uncertain.
     """
-    sight, row = terms.seen(), {"light": exposure["light"]}
+    light_and_responses, row = terms.seen(), {"light": exposure["light"]}
     for name in ("filtered_error", "information"):
-        row[name] = float(getattr(losses, name)(psf, *sight, **{**exposure, **own}))
-        row[f"{name} of the stop"], width, passed = losses.best_stop(
-            terms.plain(), *sight, **exposure, measure=name
+        row[name] = float(getattr(losses, name)(psf, *light_and_responses, **{**exposure, **own}))
+        row[f"{name} of the stop"], stop_diameter, filter_transmittance = losses.best_stop(
+            terms.plain(), *light_and_responses, **exposure, measure=name
         )
         if name == "filtered_error":
-            row |= {"stop": width, "filter of the stop": passed}
+            row |= {"stop": stop_diameter, "filter of the stop": filter_transmittance}
     return row
 
 
@@ -104,18 +113,21 @@ def section(facts: dict[str, Any]) -> Section:
         and a grey filter of {facts["filter"]:.3g}. The rival is the round stop, as a share of the
         aperture, with the grey filter that has the least error at the same limit. A gain above 0 is
         in favour of the mask. Unknown glare and clipping are neglected."""
-    listed = []
+    table_rows = []
     for row in facts["rows"]:
-        mask, stop = (
+        mask_decibels, stop_decibels = (
             _DECIBELS * row["filtered_error"],
             _DECIBELS * row["filtered_error of the stop"],
         )
-        bits, stop_bits = -row["information"], -row["information of the stop"]
-        gain = Marked(stop - mask, "pass" if mask < stop else "fail")
-        more_bits = Marked(bits - stop_bits, "pass" if bits > stop_bits else "fail")
-        own = (row["stop"], row["filter of the stop"], bits, stop_bits, more_bits)
-        listed.append((row["light"], mask, stop, gain, *own))
-    return Section("Behind a peak limit", text, _COLUMNS, listed)
+        # `losses.information` is a loss: the negative of the bits
+        mask_bits, stop_bits = -row["information"], -row["information of the stop"]
+        gain = Marked(
+            stop_decibels - mask_decibels, "pass" if mask_decibels < stop_decibels else "fail"
+        )
+        more_bits = Marked(mask_bits - stop_bits, "pass" if mask_bits > stop_bits else "fail")
+        last_cells = (row["stop"], row["filter of the stop"], mask_bits, stop_bits, more_bits)
+        table_rows.append((row["light"], mask_decibels, stop_decibels, gain, *last_cells))
+    return Section("Behind a peak limit", text, _COLUMNS, table_rows)
 
 
 def line(facts: dict[str, Any]) -> str:
@@ -183,11 +195,13 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
     names = [name for name in columns if name not in ("start", "iteration")]
     figure, axes = canvas(3.6 * max(len(names), 2), 3.2, 1, len(names))
     starts = sorted({row["start"] for row in rows})
-    looks = dict(zip(starts, itertools.cycle(itertools.product(_STYLES, _COLOURS)), strict=False))
+    line_styles = dict(
+        zip(starts, itertools.cycle(itertools.product(_STYLES, _COLOURS)), strict=False)
+    )
     for ax, name in zip(axes[0], names, strict=True):
         for start in starts:
-            own = [row for row in rows if row["start"] == start]
-            _draw_term(ax, own, name, looks[start], f"{start:g}")
+            rows_of_start = [row for row in rows if row["start"] == start]
+            _draw_term(ax, rows_of_start, name, line_styles[start], f"{start:g}")
         ax.set_title(name)
         ax.set_xlabel("iteration")
         ax.ticklabel_format(axis="y", useOffset=False)
@@ -227,7 +241,7 @@ def sections(
         " a low peak leaves little contrast: no PSF with this peak has more contrast than `at"
         " most`."
     )
-    parts = [
+    page_sections = [
         Section(
             "Mask",
             "The height map, and the phase at three wavelengths.",
@@ -243,12 +257,12 @@ def sections(
         Section("By wavelength", bounds, _DESIGN_COLUMNS, list(zip(*columns, strict=True))),
     ]
     if figures["protected"]:
-        parts.insert(1, section(figures["protected"]))
+        page_sections.insert(1, section(figures["protected"]))
     if "history" in shown:
         text = (
             "The loss is the weighted sum of its terms. Each term is a mean over the bands of an"
             " iteration and has no unit. The term `lsr` is a natural logarithm, and so negative,"
             " unless the recipe sets `log: false`."
         )
-        parts.append(Section("Learning", text, picture=shown["history"]))
-    return parts
+        page_sections.append(Section("Learning", text, picture=shown["history"]))
+    return page_sections

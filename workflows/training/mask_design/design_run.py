@@ -169,20 +169,21 @@ class DesignedMask:
         """Optimise a mask, or continue from the checkpoint ``state``, and compute the figures of
         merit of the mask.
         """
-        learning = Terms(_at(recipe, settings), settings, store, device)
+        design_terms = Terms(_at(recipe, settings), settings, store, device)
         progress(f"fabrication: {Fabrication.of(recipe, settings)}")
-        optimise = evolve if learning.settings.kind == "five_half_rings" else descend
-        learnt = optimise(learning, state, progress)
-        full = _full(learning, learnt, recipe, settings, store, device)
+        optimise = evolve if design_terms.settings.kind == "five_half_rings" else descend
+        learnt = optimise(design_terms, state, progress)
+        full_terms = _full(design_terms, learnt, recipe, settings, store, device)
         with torch.no_grad():
-            height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
-            figures = mask_figures(full, height.to(full.device))
+            # on the pupil grid of the recipe itself, not on that of the design
+            height = learnt.height(full_terms.stop).detach().to("cpu", torch.float32).contiguous()
+            figures = mask_figures(full_terms, height.to(full_terms.device))
         progress(summary_line(figures))
         if learnt.diameter is not None:
             progress(f"learnt stop: {learnt.diameter:.3g} of the diameter of the lens")
         if figures["protected"]:
             progress(line(figures["protected"]))
-        return cls(full, learnt, height, figures)
+        return cls(full_terms, learnt, height, figures)
 
     def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
         """Write the files of a designed mask; the last file, ``mask.json``, marks a complete
@@ -213,6 +214,10 @@ class DesignedMask:
         folder.write("mask.json", json.dumps(document, indent=1))
 
     def _report(self, shown: Sequence[str]) -> StudyReport:
+        """Return page, pictures, tables and files of a designed mask.
+
+        `shown` are the keys of the provenance that the page shows.
+        """
         from safetensors.torch import save
 
         terms, history = self.terms, self.learnt.history
@@ -226,11 +231,11 @@ class DesignedMask:
             f"{terms.recipe.name}: a mask designed without images",
             summary_line(self.figures),
         )
-        parts = sections(self.figures, terms.fabrication, drawings)
-        size = size_metadata(float(terms.stop.pitch))
-        files = {"mask.safetensors": save({"height": self.height}, size)}
+        page_sections = sections(self.figures, terms.fabrication, drawings)
+        size_facts = size_metadata(float(terms.stop.pitch))
+        files = {"mask.safetensors": save({"height": self.height}, size_facts)}
         return StudyReport(
-            title, f"{terms.settings.kind}: {lead}.", parts, drawings, tables, files, shown
+            title, f"{terms.settings.kind}: {lead}.", page_sections, drawings, tables, files, shown
         )
 
 
@@ -270,18 +275,19 @@ def design_inputs(recipe: Recipe, settings: MaskTraining, code: Code) -> Recorde
     """Return everything that can change a designed mask: steps with their files and code,
     settings and own code.
     """
-    coloured = (settings.illuminant, settings.responses) if settings.weights.coloured else ()
-    named = (settings.psf, settings.plain, settings.height, *coloured)
-    outputs = [name for name in named if name in recipe.steps]
+    colour_steps = (settings.illuminant, settings.responses) if settings.weights.coloured else ()
+    read_steps = (settings.psf, settings.plain, settings.height, *colour_steps)
+    outputs = [name for name in read_steps if name in recipe.steps]
     camera = CameraInputs.of(recipe, outputs, code)
     if settings.at:
+        # values under `at` give the design a second recipe
         camera = camera.joined(
             CameraInputs.of(_at(recipe, settings), outputs, code).named("in the design: ")
         )
-    block = settings.model_dump(mode="json", exclude={"save_every", "start", "at"})
-    nodes = {module: code.digest(module) for module in sorted(_LEARNT_WITH)}
+    design_settings = settings.model_dump(mode="json", exclude={"save_every", "start", "at"})
+    node_digests = {module: code.digest(module) for module in sorted(_LEARNT_WITH)}
     folder = Path(__file__).parent
-    own = {
+    program_files = {
         f"neusee/workflows/training/mask_design/{name}.py": folder / f"{name}.py"
         for name in _OPTIMISES
     }
@@ -290,11 +296,14 @@ def design_inputs(recipe: Recipe, settings: MaskTraining, code: Code) -> Recorde
         recipe=recipe.name,
         settings={
             **camera.settings,
-            **{f"train.mask.{name}": value for name, value in block.items()},
+            **{f"train.mask.{name}": value for name, value in design_settings.items()},
         },
         steps=camera.steps,
         laws=camera.laws,
-        code={**nodes, **{name: outline(file.read_bytes()).digest for name, file in own.items()}},
+        code={
+            **node_digests,
+            **{name: outline(file.read_bytes()).digest for name, file in program_files.items()},
+        },
         files=(
             {} if settings.start is None else {"train.mask.start": RecordedFile.of(settings.start)}
         ),

@@ -24,6 +24,7 @@ from neusee.workflows.store.result_store import Store
 # they are drawn.
 
 
+# a prime above any number of iterations keeps the seeds of all draws apart
 _PRIME = 1_000_003
 _FAR = 3**0.5  #: standard deviations at which the outer points of a law lie
 
@@ -82,10 +83,17 @@ class CameraLaws:
 
     def values(self, state: State) -> dict[str, Any]:
         """Return the parameters of the recipe in a state."""
-        defocus, _, *turns = (spread * x for spread, x in zip(self.spreads, state, strict=True))
-        params: dict[str, Any] = {name: nominal + defocus for name, nominal in self.defocus.items()}
+        # the second number moves the bands (`moved`)
+        defocus_change, _, *angle_changes = (
+            spread * x for spread, x in zip(self.spreads, state, strict=True)
+        )
+        params: dict[str, Any] = {
+            name: nominal + defocus_change for name, nominal in self.defocus.items()
+        }
         return params | {
-            name: tuple(a + b for a, b in zip(nominal, turns, strict=True))
+            name: tuple(
+                angle + change for angle, change in zip(nominal, angle_changes, strict=True)
+            )
             for name, nominal in self.angle.items()
         }
 
@@ -95,6 +103,7 @@ class CameraLaws:
 
     def drawn(self, number: int) -> State:
         """Draw the state of the iteration ``number``."""
+        # counts down, so that no seed is one of the bands (`Terms.drawn`)
         rng = torch.Generator().manual_seed(self.seed * _PRIME - number - 1)
         defocus, wavelength, y, x = torch.randn(4, generator=rng, dtype=torch.float64).tolist()
         return defocus, wavelength, y, x
@@ -105,12 +114,13 @@ class CameraLaws:
 
         For d = 1 these are the points of Gauss-Hermite quadrature.
         """
-        unknown = [place for place, spread in enumerate(self.spreads) if spread]
-        points = [(NOMINAL, 1 - len(unknown) / 3)]
-        for place in unknown:
-            for far in (-_FAR, _FAR):
+        uncertain = [position for position, spread in enumerate(self.spreads) if spread]
+        # unscented points: the centre, and sqrt(3) standard deviations up and down each axis
+        points = [(NOMINAL, 1 - len(uncertain) / 3)]
+        for position in uncertain:
+            for distance in (-_FAR, _FAR):
                 state = [0.0] * len(self.spreads)
-                state[place] = far
+                state[position] = distance
                 points.append(((state[0], state[1], state[2], state[3]), 1 / 6))
         return points
 
@@ -150,9 +160,9 @@ class LearntShade:
                 )
                 raise DesignError(f"learn_stop: {text}, or remove learn_stop")
             return None
-        wide = run(stopped(recipe, name, 1.0), store, [name], device=device)[name]
-        own = run(recipe, store, [name], device=device)[name]
-        return cls(name, own, wide, settings.learn_stop)
+        open_shade = run(stopped(recipe, name, 1.0), store, [name], device=device)[name]
+        own_shade = run(recipe, store, [name], device=device)[name]
+        return cls(name, own_shade, open_shade, settings.learn_stop)
 
     def behind(self, stop: Tensor | None) -> Shade:
         """Return the shade with the amplitude of a stop in place of its own stop, or as it is
@@ -164,8 +174,9 @@ class LearntShade:
 
     def passed(self, stop: Tensor | None) -> Tensor:
         """Return the share of the light that the shade lets through, away from its notches."""
-        light = self.behind(stop).amplitude.double().square().sum()
-        return light / torch.count_nonzero(self.wide.amplitude)
+        passed_light = self.behind(stop).amplitude.double().square().sum()
+        # over the number of samples in the fully open shade
+        return passed_light / torch.count_nonzero(self.wide.amplitude)
 
 
 def stopped(recipe: Recipe, shade: str, diameter: float) -> Recipe:
@@ -202,7 +213,7 @@ class Fabrication:
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the name and the value of each fabrication limit of a mask as text."""
-        words = {
+        labels = {
             "levels": "levels",
             "max_height": "greatest height",
             "wrap_at": "wrapped at one wave of",
@@ -213,7 +224,7 @@ class Fabrication:
         }
         if (levels := self.values["levels"]) is not None:
             texts["levels"] = str(levels)
-        return [(words[name], text) for name, text in texts.items()]
+        return [(labels[name], text) for name, text in texts.items()]
 
     def __str__(self) -> str:
         return (
@@ -239,18 +250,25 @@ class Terms:
         self.laws = CameraLaws.of(self.recipe, settings)
         self.shade = LearntShade.of(self.recipe, settings, store, device)
         self._learnt = [self.shade.step] if self.shade and self.shade.learnt else []
-        free = [settings.height, self._bands, *self._learnt, *self.laws.free]
+        free_inputs = [settings.height, self._bands, *self._learnt, *self.laws.free]
         self._function = as_function(
-            self.recipe, *free, outputs=[settings.psf], store=store, device=device
+            self.recipe, *free_inputs, outputs=[settings.psf], store=store, device=device
         )
-        sight = [settings.illuminant, settings.responses] if settings.weights.coloured else []
+        colour_steps = (
+            [settings.illuminant, settings.responses] if settings.weights.coloured else []
+        )
         stop = self.mask_step.wires.get("stop")
-        stops = [stop] if isinstance(stop, str) else []
-        done = run(self.recipe, store, [self._bands, settings.plain, *sight, *stops], device=device)
-        self._seen: list[Tensor] = [done[name] for name in sight]
-        self.bands: Bands = done[self._bands]
-        self._plain: Psf = done[settings.plain]
-        self._stop: Stop | None = done[stops[0]] if stops else None
+        stop_steps = [stop] if isinstance(stop, str) else []
+        results = run(
+            self.recipe,
+            store,
+            [self._bands, settings.plain, *colour_steps, *stop_steps],
+            device=device,
+        )
+        self._seen: list[Tensor] = [results[name] for name in colour_steps]
+        self.bands: Bands = results[self._bands]
+        self._plain: Psf = results[settings.plain]
+        self._stop: Stop | None = results[stop_steps[0]] if stop_steps else None
         self.device = self._plain.intensity.device
 
     @property
@@ -329,28 +347,34 @@ class Terms:
         points = self.laws.points() if number is None else [(self.laws.drawn(number), 1.0)]
         if self.laws.certain:
             points = [(NOMINAL, 1.0)]
-        by_state = [(self._parts(height, indices, state, stop), share) for state, share in points]
+        weighted_terms = [
+            (self._parts(height, indices, state, stop), share) for state, share in points
+        ]
         return {
-            name: torch.stack([share * terms[name] for terms, share in by_state]).sum()
-            for name in by_state[0][0]
+            name: torch.stack([share * terms[name] for terms, share in weighted_terms]).sum()
+            for name in weighted_terms[0][0]
         }
 
     def _parts(
         self, height: Tensor, indices: Sequence[int] | None, state: State, stop: Tensor | None
     ) -> dict[str, Tensor]:
+        """Return the terms that have a weight above 0, by name, in one state.
+
+        Each is a mean over the bands.
+        """
         settings, weights, psf = (
             self.settings,
             self.settings.weights,
             self.psf(height, indices, state, stop),
         )
-        sums = {}
+        band_sums = {}
         if weights.lsr:
-            sums["lsr"] = self._suppression(psf)
+            band_sums["lsr"] = self._suppression(psf)
         if weights.bsr:
-            sums["bsr"] = losses.background_loss(psf)
+            band_sums["bsr"] = losses.background_loss(psf)
         if weights.contrast:
-            sums["contrast"] = losses.contrast(psf, floor=settings.floor, up_to=settings.up_to)
-        terms = {name: term / len(psf.intensity) for name, term in sums.items()}
+            band_sums["contrast"] = losses.contrast(psf, floor=settings.floor, up_to=settings.up_to)
+        terms = {name: term / len(psf.intensity) for name, term in band_sums.items()}
         if weights.wiener:  # not a sum over bands, because each channel depends on all bands
             terms["wiener"] = losses.wiener(
                 psf,
@@ -361,6 +385,7 @@ class Terms:
             )
         for name in ("filtered_error", "information"):
             if getattr(weights, name):
+                # parameters of both losses
                 shared = {**self.exposure(), **self.passed(stop), "power": settings.power}
                 terms[name] = getattr(losses, name)(psf, *self.seen(indices), **shared)
         return terms
@@ -375,14 +400,14 @@ class Terms:
         """Return the parameters that `losses.filtered_error`, `losses.information` and
         `losses.best_stop` share.
         """
-        s = self.settings
+        settings = self.settings
         return {
-            "light": s.light,
-            "read_noise": s.read_noise,
-            "veil": s.veil,
-            "limit": s.limit,
-            "contrast": s.contrast_variance,
-            "up_to": s.up_to,
+            "light": settings.light,
+            "read_noise": settings.read_noise,
+            "veil": settings.veil,
+            "limit": settings.limit,
+            "contrast": settings.contrast_variance,
+            "up_to": settings.up_to,
         }
 
     def seen(self, indices: Sequence[int] | None = None) -> tuple[Tensor, Tensor, Bands]:
@@ -418,8 +443,11 @@ class Terms:
         if count is None or count >= all_bands:
             return None
         rng = torch.Generator().manual_seed(self.settings.seed * _PRIME + number)
-        positions = (torch.arange(count) + torch.rand(count, generator=rng)) * (all_bands / count)
-        return [min(int(position), all_bands - 1) for position in positions]
+        # one random place in each of `count` equal parts
+        band_positions = (torch.arange(count) + torch.rand(count, generator=rng)) * (
+            all_bands / count
+        )
+        return [min(int(position), all_bands - 1) for position in band_positions]
 
     def even(self) -> list[int] | None:
         """Return the indices of evenly spaced spectral bands, or None for all bands."""
@@ -430,6 +458,7 @@ class Terms:
 
 
 def _bands_step(recipe: Recipe, psf: str) -> str:
+    """Return the name of the only step of bands on which the PSF depends."""
     names = [
         name for name in needed(recipe, [psf]) if recipe.steps[name].node.path == "spectra.bands"
     ]
@@ -448,8 +477,11 @@ def _some(value: Any, indices: Sequence[int] | None) -> Any:
     """
     if indices is None:
         return value
-    rows = torch.tensor(list(indices))
-    changed = {name: getattr(value, name) for name in band_names(value)}
+    band_numbers = torch.tensor(list(indices))
+    spectral_fields = {name: getattr(value, name) for name in band_names(value)}
     return value._replace(
-        **{name: x.index_select(0, rows.to(x.device)) for name, x in changed.items()}
+        **{
+            name: x.index_select(0, band_numbers.to(x.device))
+            for name, x in spectral_fields.items()
+        }
     )

@@ -81,6 +81,7 @@ class Stopped(nn.Module):
 
 
 def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
+    """Return a trainable mask of the kind of the settings, with random initial parameters."""
     settings, step = terms.settings, terms.mask_step
     if settings.kind == "recipe_mask":
         if step.node.path not in PARAMETRISATIONS:
@@ -92,11 +93,11 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
         return Pixels(settings.grid, settings.max_height, settings.scale, rng, _start(settings))
     if settings.kind == "zernike":
         return Modes(settings.modes, settings.waves, settings.wavelength, settings.material, rng)
-    few = (settings.degree, settings.waves, settings.wavelength, settings.material, rng)
+    shape_arguments = (settings.degree, settings.waves, settings.wavelength, settings.material, rng)
     if settings.kind == "polynomial":
-        return Polynomials(*few)
+        return Polynomials(*shape_arguments)
     if settings.kind == "streak":
-        return Streak(*few)
+        return Streak(*shape_arguments)
     if settings.kind == "rings":
         return Rings(
             settings.rings,
@@ -115,6 +116,7 @@ def _start(settings: MaskTraining) -> Tensor | None:
     """
     if settings.start is None:
         return None
+    # a file in grey levels is scaled to max_height; one in metres may still be deeper
     height = read_height_map(settings.start, settings.max_height)
     if (deepest := float(height.max())) > settings.max_height:
         raise DesignError(
@@ -126,13 +128,16 @@ def _start(settings: MaskTraining) -> Tensor | None:
 
 def rate(settings: MaskTraining, number: int) -> float:
     """Return the learning rate of a mask optimisation at iteration ``number``, counted from 0."""
-    done = number / settings.iterations
+    progress_share = number / settings.iterations
     if settings.schedule == "step":
-        return settings.rate * 0.5 ** math.floor(5 * done)
-    return settings.rate * half_cosine(math.pi * done)
+        # halved at each fifth of the iterations
+        return settings.rate * 0.5 ** math.floor(5 * progress_share)
+    return settings.rate * half_cosine(math.pi * progress_share)
 
 
 def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
+    # the checkpoint: number of the present start, history, best mask so far
+    # Optimise a mask by gradient descent from several starts; the best on all bands counts.
     state, settings = (
         file.read(strict=False) or {"start": 0, "history": [], "best": None},
         terms.settings,
@@ -141,6 +146,7 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
         progress(
             f"continues from start {state['start'] + 1}, iteration {state.get('iteration', 0)}"
         )
+    # each start from other random parameters; the best on all bands counts
     for start in range(state["start"], settings.starts):
         shape = shape_of(terms, start).to(terms.device)
         _one_start(terms, shape, start, state, file, progress)
@@ -154,6 +160,7 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
             )
         if state["best"] is None or loss < state["best"]["loss"]:
             state["best"] = {"loss": loss, "start": start, "shape": deepcopy(shape.state_dict())}
+        # what belongs to this start alone
         for name in ("shape", "adam", "iteration"):
             state.pop(name, None)
         state["start"] = start + 1
@@ -177,6 +184,7 @@ def _one_start(
     """
     settings = terms.settings
     adam = torch.optim.Adam(shape.parameters(), lr=settings.rate)
+    # an interrupted start goes on
     if "shape" in state:
         shape.load_state_dict(state["shape"])
         adam.load_state_dict(state["adam"])
@@ -198,11 +206,12 @@ def _one_start(
 def _step(
     terms: Terms, shape: nn.Module, adam: torch.optim.Adam, start: int, number: int
 ) -> dict[str, float]:
+    """Compute the loss of one iteration and move the mask; return the row of the history."""
     adam.zero_grad()
-    parts = _parts(terms, shape, terms.drawn(number), number)
-    loss = terms.total(parts)
+    terms_by_name = _parts(terms, shape, terms.drawn(number), number)
+    loss = terms.total(terms_by_name)
     row = {"start": start, "iteration": number, "loss": float(loss.detach())}
-    row |= {name: float(term.detach()) for name, term in parts.items()}
+    row |= {name: float(term.detach()) for name, term in terms_by_name.items()}
     if not math.isfinite(row["loss"]):
         raise DesignError(
             f"start {start + 1}, iteration {number}: the loss is NaN or infinite"
@@ -235,10 +244,10 @@ def _few(shape: nn.Module) -> dict[str, Any]:
     """Return the parameters of a mask as lists by name, without matrices and vectors of more
     than 1000 numbers.
     """
-    inner: Any = shape
-    while isinstance(inner, (Stopped, Written)):
-        inner = inner.shape
-    state = {} if isinstance(inner, Drawn) else inner.state_dict()
+    innermost: Any = shape
+    while isinstance(innermost, (Stopped, Written)):
+        innermost = innermost.shape
+    state = {} if isinstance(innermost, Drawn) else innermost.state_dict()
     return {name: x.tolist() for name, x in state.items() if x.numel() <= 1000 and x.dim() == 1}
 
 
@@ -256,14 +265,15 @@ def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Ten
     """Return a function that computes the height map of a mask of half-rings from a vector of
     its parameters.
     """
-    *slopes, side, turn = (float(gene) for gene in genes)
-    numbers = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
+    *slopes, side, orientation = (float(gene) for gene in genes)
+    # a continuous gene stands for a choice of two
+    ring_parameters = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": orientation}
 
     def height(stop: Stop) -> Tensor:
-        made: Tensor = half_rings(
-            stop, **numbers, wavelength=settings.wavelength, material=settings.material
+        height_map: Tensor = half_rings(
+            stop, **ring_parameters, wavelength=settings.wavelength, material=settings.material
         )
-        return made
+        return height_map
 
     return height if settings.feature is None else Written(height, settings.feature)
 
@@ -282,6 +292,7 @@ class _LossOfGenes:
             progress(f"continues after {len(self.known)} masks")
 
     def __call__(self, genes: Any) -> float:
+        # the optimiser asks again for what an interrupted run has computed
         if self.asked == len(self.known):
             with torch.no_grad():
                 height = half_ring_height(genes, self.terms.settings)(self.terms.stop)
@@ -301,9 +312,12 @@ class _LossOfGenes:
 
 
 def evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
+    # Optimise a mask of five half-rings by differential evolution; loss and parameters of the best
+    # start count.
     import numpy as np
 
     settings = terms.settings
+    # steeper slopes would alias on the grid of the pupil
     if (steepest := _steepest(terms)) < settings.slopes[1]:
         progress(
             f"slopes above {steepest:.3g} waves are too steep for the samples of the pupil: use"
@@ -311,17 +325,20 @@ def evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
         )
     loss, history = _LossOfGenes(terms, state, progress), list[dict[str, float]]()
     populations: list[tuple[float, Any]] = []
+    # five slopes, the choice of a side, the orientation
     bounds = np.array([settings.slopes] * 5 + [(0.0, 1.0), (0.0, math.pi)])
     for start in range(settings.starts):
-        lowest, genes = _population(loss, bounds, start, history, progress)
-        slopes = [round(float(x), 2) for x in genes[:5]]
-        progress(f"start {start + 1} of {settings.starts}: {lowest:.5g}, slopes {slopes}")
-        populations.append((lowest, genes))
+        lowest_loss, best_genes = _population(loss, bounds, start, history, progress)
+        shown_slopes = [round(float(x), 2) for x in best_genes[:5]]
+        progress(
+            f"start {start + 1} of {settings.starts}: {lowest_loss:.5g}, slopes {shown_slopes}"
+        )
+        populations.append((lowest_loss, best_genes))
     state.write({"values": loss.known})
-    lowest, genes = min(populations, key=lambda pair: pair[0])
-    *waves, side, turn = (float(x) for x in genes)
-    numbers = {"waves": waves, "alternate": side >= 0.5, "orientation": turn}
-    return LearntMask(half_ring_height(genes, settings), lowest, numbers, history)
+    lowest_loss, best_genes = min(populations, key=lambda pair: pair[0])
+    *waves, side, orientation = (float(x) for x in best_genes)
+    ring_parameters = {"waves": waves, "alternate": side >= 0.5, "orientation": orientation}
+    return LearntMask(half_ring_height(best_genes, settings), lowest_loss, ring_parameters, history)
 
 
 def _population(
@@ -336,27 +353,35 @@ def _population(
     from scipy.optimize import differential_evolution, minimize
 
     settings = loss.terms.settings
-    rng, first, loss.chosen = (
+    rng, first_loss, loss.chosen = (
         np.random.default_rng((settings.seed, start)),
         loss.asked,
         loss.terms.even(),
     )
-    low, high = bounds.T
+    low_bounds, high_bounds = bounds.T
 
     def note_generation(genes: Any, convergence: float) -> None:
-        number = sum(row["start"] == start for row in history)
+        generation = sum(row["start"] == start for row in history)
         history.append(
-            {"start": start, "iteration": number, "loss": min(loss.known[first : loss.asked])}
+            {
+                "start": start,
+                "iteration": generation,
+                "loss": min(loss.known[first_loss : loss.asked]),
+            }
         )
-        if (number + 1) % settings.save_every == 0:
-            progress(f"generation {number + 1} of {settings.iterations}: {history[-1]['loss']:.5g}")
+        if (generation + 1) % settings.save_every == 0:
+            progress(
+                f"generation {generation + 1} of {settings.iterations}: {history[-1]['loss']:.5g}"
+            )
 
     try:
         optimum = differential_evolution(
             loss,
             bounds,
             maxiter=settings.iterations,
-            init=low + rng.random((settings.population, len(low))) * (high - low),
+            # uniform within the bounds
+            init=low_bounds
+            + rng.random((settings.population, len(low_bounds))) * (high_bounds - low_bounds),
             seed=rng,
             polish=False,
             tol=0.0,
@@ -365,11 +390,17 @@ def _population(
         )
         if settings.polish:  # on all bands, because a tenth of a wave changes the peak
             loss.chosen = None
+            # the optimum, and from it a hundredth of the range along each axis
             simplex = optimum.x + np.concatenate(
-                [np.zeros((1, len(low))), 0.01 * np.diag(high - low)]
+                [np.zeros((1, len(low_bounds))), 0.01 * np.diag(high_bounds - low_bounds)]
             )
-            fine = {"maxfev": settings.polish, "initial_simplex": np.clip(simplex, low, high)}
-            optimum = minimize(loss, optimum.x, method="Nelder-Mead", bounds=bounds, options=fine)
+            options = {
+                "maxfev": settings.polish,
+                "initial_simplex": np.clip(simplex, low_bounds, high_bounds),
+            }
+            optimum = minimize(
+                loss, optimum.x, method="Nelder-Mead", bounds=bounds, options=options
+            )
     except RuntimeError as error:  # scipy raises this for any error of the loss
         raise error.__cause__ if isinstance(error.__cause__, DesignError) else error from None
     return float(optimum.fun), optimum.x
@@ -380,10 +411,11 @@ def _steepest(terms: Terms) -> float:
     the rim.
     """
     material, wavelength = terms.settings.material, terms.settings.wavelength
-    turned = wave_height(material, wavelength) / wave_height(
+    phase_ratio = wave_height(material, wavelength) / wave_height(
         material, float(terms.bands.centres.min())
     )
-    return float(terms.stop.diameter / (4 * terms.stop.pitch * turned))
+    # at most half a wave from sample to sample, for the shortest wavelength
+    return float(terms.stop.diameter / (4 * terms.stop.pitch * phase_ratio))
 
 
 def _holds_usual(settings: MaskTraining) -> bool:
