@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import platform
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -42,13 +43,14 @@ def version_of(package: str) -> str:
     """Return the version of an installed package, or an empty string if it or its description is
     not there.
     """
-    try:
-        return version(package) or ""
-    except (
-        PackageNotFoundError,
-        FileNotFoundError,
-    ):  # the second comes from the package importlib_metadata
-        return ""
+    # FileNotFoundError comes from the package importlib_metadata; a description without a version
+    # is a warning in Python 3.13, and will be a KeyError
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        try:
+            return version(package) or ""
+        except (PackageNotFoundError, FileNotFoundError, KeyError):
+            return ""
 
 
 def machine() -> Sequence[str]:

@@ -616,7 +616,11 @@ def _named(does: Does, path: str) -> Callable[[Watch, tuple[Any, ...]], None]:
 
 
 def _command(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a program that is started."""
+    """Take note of a program that is started, but for one that the program itself starts: since
+    Python 3.13 `subprocess` says so by the event of ``os.posix_spawn`` too.
+    """
+    if _called_by_program():
+        return
     watch.records.append(Record("exec", os.fsdecode(arguments[0])))
 
 

@@ -127,6 +127,7 @@ _ACCESS = os.O_RDONLY | os.O_WRONLY | os.O_RDWR
 _PATH = getattr(os, "O_PATH", 0)
 _TMPFILE = getattr(os, "O_TMPFILE", 0)
 _GRND_NONBLOCK, _GRND_INSECURE = 1, 4
+_NO_FILE = "<unknown>"  #: of code that `ast.parse` was given as a text
 
 
 class Judgement:
@@ -330,8 +331,10 @@ class Judgement:
 
     def _is_covered(self, path: str) -> bool:
         """Return True for a path that the key covers, source of followed modules included."""
-        if "\n" in path and not os.path.lexists(path):
-            # a text of several lines, of which a library asks whether it is the name of a file
+        # a text of several lines, of which a library asks whether it is the name of a file, or the
+        # name that Python gives to code without a file, whose source a traceback looks for
+        no_name = "\n" in path or os.path.basename(path) == _NO_FILE
+        if no_name and not os.path.lexists(path):
             return True
         return self._is_covered_as_a_whole(path) or self._is_source(path)
 
