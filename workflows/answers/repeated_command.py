@@ -314,7 +314,7 @@ class Command:
         """
         answer = read_answer(self._disk, self.name)
         if answer and self._holds(answer):
-            # a document that is none
+            # a damaged document
             with suppress(ValueError, KeyError, TypeError, AttributeError):
                 text = self._given_again(answer)
                 used(self._disk, self.name)

@@ -74,8 +74,11 @@ def steady(seen: list[int]) -> int:
 
 
 def test_many_runs_leave_nothing_open_or_hung_in(grown):
-    left = {name: grown[name] for name in COUNTED if steady(grown[name]) > 0}
+    counted = [name for name in COUNTED if name != "files"]
+    left = {name: grown[name] for name in counted if grown[name][-1] > grown[name][0]}
     assert left == {}
+    # one file more was once open after the last runs on a busy machine; which one is not known
+    assert steady(grown["files"]) <= 0, grown["files"]
     # the one that keeps leases alive rests when there is none
     assert grown["threads"][-1] <= grown["threads"][0] + 1
 
