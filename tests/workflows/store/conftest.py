@@ -29,7 +29,9 @@ def users():
     folder = tempfile.mkdtemp(prefix="neusee-users-")
     os.chmod(folder, 0o755)
     forks = forks_of_users(folder)
-    code = "import neusee, os\nos.listdir(next(iter(neusee.__path__)))"
+    code = (
+        "import neusee, os, torch, PIL\n[os.listdir(m.__path__[0]) for m in (neusee, torch, PIL)]"
+    )
     try:
         tried = forks(cwd="/", env=os.environ, code=code, user=who(STRANGER, ()))
         assert tried.returncode == 0, tried.stderr[-200:]

@@ -39,8 +39,27 @@ def opened(place):
                 f"mount --bind {top} {known[top]}",
                 f"mount -t tmpfs -o mode=755 none {top}",
             ]
+        lines += shown_again(path, top, known[top])
+    return lines
+
+
+def shown_again(path, top, real):
+    """Lines that show ``path`` below the empty folder ``top``, whose own content is at ``real``.
+
+    A bound folder keeps its mode: where it is ``path`` itself that others may not enter, as a
+    folder of `mktemp` is, what it holds is bound entry by entry.
+    """
+    if path != top:
         inside = os.path.relpath(path, top)
-        lines += [f"mkdir -p {path}", f"mount --bind {known[top]}/{inside} {path}"]
+        return [f"mkdir -p {path}", f"mount --bind {real}/{inside} {path}"]
+    lines = []
+    for name in os.listdir(top):
+        entry = f"{top}/{name}"
+        if os.path.islink(entry):
+            lines.append(f"ln -s {os.readlink(entry)} {entry}")
+            continue
+        make = "mkdir" if os.path.isdir(entry) else "touch"
+        lines += [f"{make} {entry}", f"mount --bind {real}/{name} {entry}"]
     return lines
 
 
