@@ -434,8 +434,9 @@ def test_an_interrupted_training_with_renamed_photographs_goes_on_to_the_same_we
     whole, _ = trained("whole")
     with pytest.raises(KeyboardInterrupt):
         trained("parts", stopped)
-    for path in sorted(lab.path("photographs").iterdir()):
-        path.rename(path.with_name(f"z_{path.name[::-1].partition('.')[2]}{path.suffix}"))
+    photographs = sorted(lab.path("photographs").iterdir())
+    for place, path in enumerate(photographs):  # the last by name becomes the first
+        path.rename(path.with_name(f"z_{len(photographs) - place}{path.suffix}"))
     again, lines = trained("parts")
     assert "continues in stage 2 after 1 iterations" in lines
     assert again.name == whole.name
