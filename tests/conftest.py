@@ -24,7 +24,7 @@ settings.load_profile("same")
 #: files of minutes, which come first: at the end no worker waits for the other
 LONG_FILES = (
     "tests/test_guide_commands.py",
-    "tests/workflows/studies/calibration/test_calibration_study.py",
+    "tests/workflows/studies/test_calibration_study.py",
     "tests/workflows/calibration/test_real_cameras.py",
     "tests/workflows/cli/test_cache_faults.py",
     "tests/workflows/contract/test_node_contract.py",

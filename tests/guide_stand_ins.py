@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 from neusee.workflows.calibration.emva_figures import PICTURES
 from neusee.workflows.evaluation.pipelines import CASES as LASERS
 from neusee.workflows.evaluation.pipelines import NONE
-from neusee.workflows.studies.leave_out.left_out_steps import omissions
-from neusee.workflows.studies.stability import stability_study
-from neusee.workflows.studies.stability.extreme_cases import CASES
+from neusee.workflows.studies import stability_study
+from neusee.workflows.studies.extreme_cases import CASES
+from neusee.workflows.studies.left_out_steps import omissions
 from tests.drawn_chains import drawn_chains
 from tests.guide_commands import ROOT
 
@@ -121,7 +121,7 @@ def without_walk(problem: Any, mode: Any, seed: int, *_: Any, **how: Any) -> Any
     """Draw from the posterior of a sensor by weights, which takes a hundredth of the time of a
     walk.
     """
-    from tests.workflows.studies.calibration.test_calibration_study import resampled
+    from tests.workflows.studies.test_calibration_study import resampled
 
     return resampled(problem, mode, seed)
 
@@ -186,11 +186,11 @@ TWO_OF_SIX = {
 }
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {
-    "studies.accuracy.accuracy_study:_FEWER": (1e-1,),
-    "studies.accuracy.accuracy_study:TIMES": 1,
-    "studies.accuracy.recipe_knobs:_FEWER": (1 / 3,),
-    "studies.accuracy.recipe_knobs:_FEWER_SCALES": (0.75,),
-    "studies.accuracy.single_steps:_TIMES": 1,
+    "studies.accuracy_study:_FEWER": (1e-1,),
+    "studies.accuracy_study:TIMES": 1,
+    "studies.recipe_knobs:_FEWER": (1 / 3,),
+    "studies.recipe_knobs:_FEWER_SCALES": (0.75,),
+    "studies.work_precision:_CALLS": 1,
 }
 FEW_STOPS = {
     "protection.protection_result:_RATIO": 0.5,
@@ -272,7 +272,7 @@ STAND_INS = {
     "study accuracy first_light --quick": StandIn("minutes", more=(
         "laser=none", "outputs=[raw,lsr]", "--seeds", "1"), constants=FEW_POINTS),
     "study stability first_light": StandIn("minutes: the first two of the extreme cases", constants={
-        "studies.stability.stability_study:study": partial(stability_study.study, cases=CASES[:2])}),
+        "studies.stability_study:study": partial(stability_study.study, cases=CASES[:2])}),
     "study uncertainty my/uncertain.yaml --error 0.1 --points sobol": StandIn(
         "a thousand draws", instead={"0.1": "0.9"}, more=("--most", "64", "outputs=[restored_quality]")),
     'study uncertainty first_light sensor.read_noise="normal(10.5 e-, 0.5 e-)"': StandIn(
@@ -280,13 +280,13 @@ STAND_INS = {
             "--error", "0.5", "--most", "64", "outputs=[restored_quality]")),
     "study leave-out first_light": StandIn(
         "minutes: three omissions, and what simpler scenes cost is not measured", more=("outputs=[raw,lsr]",),
-        constants={"studies.leave_out.leave_out_study:measure_scenes": lambda *_: [],
-            "studies.leave_out.left_out_steps:omissions": three_omissions}),
+        constants={"studies.leave_out_study:measure_scenes": lambda *_: [],
+            "studies.left_out_steps:omissions": three_omissions}),
     "study calibration calibrate --simulations 100": StandIn(
         "minutes: 20 sensors of 32 x 32 pixels, and draws without a walk", more=("flats.shape=[32,32]",
             "sensor.gain=0.37 DN/e-"), instead={"100": "20"},
-        constants={"studies.calibration.calibration_study:PIXELS": 32,
-                   "studies.calibration.calibration_study:walk_draws": without_walk}),
+        constants={"studies.calibration_study:PIXELS": 32,
+                   "studies.calibration_study:walk_draws": without_walk}),
     **{f"sheet {words}": StandIn("seconds for each plot", constants=ONE_PLOT) for words in (
         'my/set/EMVA1288_descriptor.txt --state "wavelength=525 nm" --state "temperature=25 °C"',
         "my/frames.yaml --relative")},

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neusee.nodes.units import read_written
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_shapes import tensors_of
 from neusee.workflows.recipe.loading import load, recipes

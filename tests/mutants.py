@@ -42,66 +42,66 @@ def within(room: str, *tests: str) -> str:
 #: File, old text, new text, and the test file of `tests/nodes/laser` that must fail: the eye and
 #: what helps.
 EYE_FAULTS = (
-    ("_eye_limits", "5e-6 if wavelength < 1050e-9 else 13e-6", "13e-6", "eye_trains"),
-    ("_eye_limits", "5e-6 if wavelength < 1050e-9 else 13e-6", "5e-6", "eye_trains"),
-    ("_eye_limits", "_COUNTED = 10.0", "_COUNTED = 100.0", "eye_trains"),
-    ("_eye_limits", "_FEW = 600", "_FEW = 1200", "eye_trains"),
-    ("_eye_limits", "_LEAST_C5 = 0.4", "_LEAST_C5 = 0.2", "eye_trains"),
-    ("_eye_limits", "_BRIEF = 0.25", "_BRIEF = 0.30", "eye_trains"),
-    ("_eye_limits", "5 * math.pow(groups, -0.25)", "math.pow(groups, -0.25)", "eye_trains"),
-    ("_eye_limits", "5 * math.pow(groups, -0.25)", "5 * math.pow(groups, -0.5)", "eye_trains"),
-    ("_eye_limits", "group_limit / pulses_in_group * factor", "group_limit * factor", "eye_trains"),
-    ("_eye_limits", "else math.pow(groups, -0.25)", "else math.pow(groups, -0.5)", "eye_trains"),
-    ("_eye_limits", "min(self.single, self.mean, self.repeated)", "min(self.single, self.repeated)", "eye_trains"),
-    ("_eye_limits", "18, c_a, duration, 0.75", "18, c_a, duration, 0.7", "eye_limits"),
-    ("_eye_limits", "90, c_c, duration, 0.75", "80, c_c, duration, 0.75", "eye_trains"),
+    ("_eye", "5e-6 if wavelength < 1050e-9 else 13e-6", "13e-6", "eye_trains"),
+    ("_eye", "5e-6 if wavelength < 1050e-9 else 13e-6", "5e-6", "eye_trains"),
+    ("_eye", "_COUNTED = 10.0", "_COUNTED = 100.0", "eye_trains"),
+    ("_eye", "_FEW = 600", "_FEW = 1200", "eye_trains"),
+    ("_eye", "_LEAST_C5 = 0.4", "_LEAST_C5 = 0.2", "eye_trains"),
+    ("_eye", "_BRIEF = 0.25", "_BRIEF = 0.30", "eye_trains"),
+    ("_eye", "5 * math.pow(groups, -0.25)", "math.pow(groups, -0.25)", "eye_trains"),
+    ("_eye", "5 * math.pow(groups, -0.25)", "5 * math.pow(groups, -0.5)", "eye_trains"),
+    ("_eye", "group_limit / pulses_in_group * factor", "group_limit * factor", "eye_trains"),
+    ("_eye", "else math.pow(groups, -0.25)", "else math.pow(groups, -0.5)", "eye_trains"),
+    ("_eye", "min(self.single, self.mean, self.repeated)", "min(self.single, self.repeated)", "eye_trains"),
+    ("_eye", "18, c_a, duration, 0.75", "18, c_a, duration, 0.7", "eye_limits"),
+    ("_eye", "90, c_c, duration, 0.75", "80, c_c, duration, 0.75", "eye_trains"),
     (
-        "_eye_limits",
+        "_eye",
         "if duration <= 13e-6",
         "if duration <= 5e-6",
         "eye_trains",
     ),
     (
-        "_eye_limits",
+        "_eye",
         "if duration <= 5e-6",
         "if duration <= 18e-6",
         "eye_trains",
     ),
-    ("_eye_limits", "0.02 * max(0.0, nm - 450)", "0.02 * max(0.0, nm - 440)", "eye_limits"),
-    ("_eye_limits", "max(100.0, duration)", "max(10.0, duration)", "eye_limits"),
-    ("_eye_limits", "8 + math.pow(10, 0.04 * (nm - 1250))", "8 + math.pow(10, 0.04 * (nm - 1200))", "eye_trains"),
-    ("_eye_limits", "0.018 * (nm - 1150)", "0.0018 * (nm - 1150)", "eye_limits"),
-    ("_eye_limits", "1.1e4, c_a, duration, 0.25", "1.1e5, c_a, duration, 0.25", "eye_trains"),
-    ("_eye_limits", "2000, c_a, duration, 1", "4000, c_a, duration, 1", "eye_limits"),
-    ("_eye_limits", "5600, 1, duration, 0.25", "5600, 1, duration, 0.3", "eye_limits"),
-    ("_eye_limits", "squared = -(aperture**2) / 2 /", "squared = -(aperture**2) /", "eye_limits"),
-    ("_eye_limits", "1.5 * math.pow(duration, 0.375)", "1.0 * math.pow(duration, 0.375)", "eye_limits"),
-    ("_eye_limits", "the edition of 2007\"", "the edition of 2014\"", "eye_trains"),
-    ("_eye_dazzle", "LUMENS_PER_WATT = 683.0", "LUMENS_PER_WATT = 673.0", "eye_dazzle"),
-    ("_eye_dazzle", "10 / angle**3", "10 / angle**2", "eye_dazzle"),
-    ("_eye_dazzle", "(age / 62.5) ** 4", "(age / 70) ** 4", "eye_dazzle"),
-    ("_eye_dazzle", "0.1 * pigmentation / angle", "0.2 * pigmentation / angle", "eye_dazzle"),
-    ("_eye_dazzle", "+ 0.0025 * pigmentation", "", "eye_dazzle"),
-    ("_eye_dazzle", "_GLARE = (0.1, 100.0)", "_GLARE = (0.01, 100.0)", "eye_dazzle"),
-    ("_eye_dazzle", "STEADY = 100.0", "STEADY = 20.0", "eye_dazzle"),
-    ("_eye_dazzle", "math.pow(background, 0.466)", "math.pow(background, 0.5)", "eye_dazzle"),
-    ("_eye_dazzle", "task.margin * threshold_luminance", "threshold_luminance", "eye_dazzle"),
-    ("_eye_dazzle", "total_luminance = task.background * (1 + veil)", "total_luminance = task.background", "eye_dazzle"),
-    ("_eye_dazzle", "seen_veil * task.background / veil_of_lux", "seen_veil * task.background * veil_of_lux", "eye_dazzle"),
-    ("_eye_dazzle", "(age - 19) ** 2 / 2160", "(age - 19) ** 2 / 2610", "eye_dazzle"),
-    ("_protection", "math.log10(factor) if", "math.log(factor) if", "protection"),
-    ("_protection", "(math.sin(angle) / index) ** 2", "math.sin(angle) ** 2 / index", "protection"),
-    ("_protection", "longest / notch_wavelength(1.0, angle, index)", "longest", "protection"),
-    ("_protection", "wavelengths)[0] * wavelengths\n", "wavelengths)[0]\n", "protection"),
-    ("_protection", "EDGE = 0.01", "EDGE = 0.001", "protection"),
-    ("_protection", "min(1.0, stopped / diameter) ** 2", "min(1.0, stopped / diameter)", "protection"),
+    ("_eye", "0.02 * max(0.0, nm - 450)", "0.02 * max(0.0, nm - 440)", "eye_limits"),
+    ("_eye", "max(100.0, duration)", "max(10.0, duration)", "eye_limits"),
+    ("_eye", "8 + math.pow(10, 0.04 * (nm - 1250))", "8 + math.pow(10, 0.04 * (nm - 1200))", "eye_trains"),
+    ("_eye", "0.018 * (nm - 1150)", "0.0018 * (nm - 1150)", "eye_limits"),
+    ("_eye", "1.1e4, c_a, duration, 0.25", "1.1e5, c_a, duration, 0.25", "eye_trains"),
+    ("_eye", "2000, c_a, duration, 1", "4000, c_a, duration, 1", "eye_limits"),
+    ("_eye", "5600, 1, duration, 0.25", "5600, 1, duration, 0.3", "eye_limits"),
+    ("_eye", "squared = -(aperture**2) / 2 /", "squared = -(aperture**2) /", "eye_limits"),
+    ("_eye", "1.5 * math.pow(duration, 0.375)", "1.0 * math.pow(duration, 0.375)", "eye_limits"),
+    ("_eye", "the edition of 2007\"", "the edition of 2014\"", "eye_trains"),
+    ("_eye", "LUMENS_PER_WATT = 683.0", "LUMENS_PER_WATT = 673.0", "eye_dazzle"),
+    ("_eye", "10 / angle**3", "10 / angle**2", "eye_dazzle"),
+    ("_eye", "(age / 62.5) ** 4", "(age / 70) ** 4", "eye_dazzle"),
+    ("_eye", "0.1 * pigmentation / angle", "0.2 * pigmentation / angle", "eye_dazzle"),
+    ("_eye", "+ 0.0025 * pigmentation", "", "eye_dazzle"),
+    ("_eye", "_GLARE = (0.1, 100.0)", "_GLARE = (0.01, 100.0)", "eye_dazzle"),
+    ("_eye", "STEADY = 100.0", "STEADY = 20.0", "eye_dazzle"),
+    ("_eye", "math.pow(background, 0.466)", "math.pow(background, 0.5)", "eye_dazzle"),
+    ("_eye", "task.margin * threshold_luminance", "threshold_luminance", "eye_dazzle"),
+    ("_eye", "total_luminance = task.background * (1 + veil)", "total_luminance = task.background", "eye_dazzle"),
+    ("_eye", "seen_veil * task.background / veil_of_lux", "seen_veil * task.background * veil_of_lux", "eye_dazzle"),
+    ("_eye", "(age - 19) ** 2 / 2160", "(age - 19) ** 2 / 2610", "eye_dazzle"),
+    ("_light", "math.log10(factor) if", "math.log(factor) if", "protection"),
+    ("_light", "(math.sin(angle) / index) ** 2", "math.sin(angle) ** 2 / index", "protection"),
+    ("_light", "longest / notch_wavelength(1.0, angle, index)", "longest", "protection"),
+    ("_light", "wavelengths)[0] * wavelengths\n", "wavelengths)[0]\n", "protection"),
+    ("_light", "EDGE = 0.01", "EDGE = 0.001", "protection"),
+    ("_light", "min(1.0, stopped / diameter) ** 2", "min(1.0, stopped / diameter)", "protection"),
     (
-        "_protection",
+        "_light",
         "pixel_pitch * diameter / (wavelength * focal_length)",
         "pixel_pitch * focal_length / (wavelength * diameter)",
         "protection",
     ),
-    ("_protection", "background + veil + read_noise**2", "background + read_noise**2", "protection"),
+    ("_light", "background + veil + read_noise**2", "background + read_noise**2", "protection"),
 )  # fmt: skip
 
 
@@ -154,7 +154,7 @@ MUTANTS = (
         ),
     ),
     *faults(
-        "workflows/recipe/text/defaults_list.py",
+        "workflows/recipe/text/extended_recipes.py",
         within(
             "workflows/recipe/text",
             "extended_recipes.py::test_a_recipe_is_composed_of_what_its_defaults_say",
@@ -215,11 +215,11 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "workflows/studies/uncertainty/output_draws.py",
+        "workflows/studies/output_draws.py",
         "/ (count - 2)",
         "/ (count - 1)",
         within(
-            "workflows/studies/uncertainty",
+            "workflows/studies",
             "uncertainty_study.py::test_the_error_of_a_deviation_is_that_of_leaving_out_one_draw_after_another",
         ),
     ),
@@ -351,7 +351,7 @@ MUTANTS = (
         within("nodes", "double_precision.py::test_the_error_in_float64"),
     ),
     Mutant(
-        "nodes/metrics/_suppression_ratios.py",
+        "nodes/metrics/_suppression.py",
         "1.0 - light_in_window / passed_share.where(~is_dark, 1.0)",
         "1.0 - light_in_window",
         within(
@@ -375,13 +375,13 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "nodes/scene/_exr_picture.py",
+        "nodes/scene/_exr.py",
         '(["R", "G", "B"], ["X", "Y", "Z"], ["Y"])',
         '(["R", "G", "B"], ["Y"])',
         within("nodes/scene", "exr_picture.py::test_channels_x_y_and_z_are_cie_xyz"),
     ),
     Mutant(
-        "nodes/scene/_exr_picture.py",
+        "nodes/scene/_exr.py",
         "opened_file.channels(number)",
         "opened_file.channels(0)",
         within(
@@ -417,16 +417,16 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "workflows/training/lift/lift_iteration.py",
+        "workflows/training/lift_training.py",
         "norm_limit = math.inf if self.settings.clip is None else self.settings.clip",
         "norm_limit = 10.0",
         within(
-            "workflows/training/lift",
+            "workflows/training",
             "lift_run.py::test_the_gradient_of_all_weights_has_at_most_the_norm_clip",
         ),
     ),
     Mutant(
-        "workflows/training/loop/recorded_inputs.py",
+        "workflows/training/recorded_inputs.py",
         "return cls(path.name, file_digest(path))",
         "return cls(path.name, path.name)",
         within(
@@ -434,7 +434,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "workflows/training/loop/recorded_inputs.py",
+        "workflows/training/recorded_inputs.py",
         '"code": code_digest,',
         '"code": "",',
         within(
@@ -528,7 +528,7 @@ MUTANTS = (
         within("nodes/flare", "dirt.py::test_soft_kinds_have_the_asked_strength"),
     ),
     Mutant(
-        "nodes/calibrate/_emva_fit.py",
+        "nodes/calibrate/_emva_sheet.py",
         "_QUANTIZATION = 1.0 / 12.0",
         "_QUANTIZATION = 0.0",
         within("nodes/calibrate", "emva_fit.py::test_exact_levels_give_the_exact_camera"),
@@ -625,7 +625,7 @@ MUTANTS = (
         within("workflows/cli", "limits.py::test_arrays_and_tables_at_the_shipped_limits"),
     ),
     Mutant(
-        "nodes/scene/_picture_scaling.py",
+        "nodes/scene/_picture_changes.py",
         "(old / new) - 0.5)",
         "(old / new))",
         within(
@@ -2262,20 +2262,20 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "workflows/studies/accuracy/work_precision_points.py",
+        "workflows/studies/work_precision.py",
         "point.most < front",
         "point.most > front",
         within(
-            "workflows/studies/accuracy",
+            "workflows/studies",
             "accuracy_study.py::test_the_pareto_line_has_what_no_other_point_beats",
         ),
     ),
     Mutant(
-        "workflows/studies/calibration/posterior_tests.py",
+        "workflows/studies/posterior_tests.py",
         "_CHANCE / parameters",
         "_CHANCE",
         within(
-            "workflows/studies/calibration",
+            "workflows/studies",
             "calibration_study.py::test_many_parameters_together_raise_no_more_false_alarms_than_one",
         ),
     ),
@@ -2286,7 +2286,7 @@ MUTANTS = (
         within("workflows/sweeps", "axes.py::test_values_as_they_are_written"),
     ),
     Mutant(
-        "workflows/sweeps/point_order.py",
+        "workflows/sweeps/sweep_points.py",
         "if row_number % 2 == 0",
         "if row_number % 2 == 2",
         within("workflows/sweeps", "point_order.py::test_no_order_of_a_small_sweep_needs_less"),
@@ -2350,7 +2350,7 @@ MUTANTS = (
     ),
     # Protection, contrast, digitisation, eviction and what helps.
     *faults(
-        "nodes/laser/_protection.py",
+        "nodes/laser/_light.py",
         within(
             "nodes/laser",
             "protection.py::test_a_density_is_a_decimal_logarithm_and_never_below_zero",
@@ -2359,13 +2359,13 @@ MUTANTS = (
         ("math.pow(10, -density)", "math.exp(-density)"),
     ),
     *faults(
-        "nodes/laser/_protection.py",
+        "nodes/laser/_light.py",
         within("nodes/laser", "protection.py::test_a_filter_that_no_glass_can_make_is_refused"),
         ("abs(angle) < math.pi / 2", "abs(angle) <= math.pi / 2"),
         ("abs(angle) < math.pi / 2", "angle < math.pi / 2"),
     ),
     *faults(
-        "nodes/laser/_protection.py",
+        "nodes/laser/_light.py",
         within(
             "nodes/laser",
             "protection.py::test_the_band_covers_the_laser_from_every_angle_of_the_field",
@@ -2376,7 +2376,7 @@ MUTANTS = (
         ),
     ),
     *faults(
-        "nodes/laser/_protection.py",
+        "nodes/laser/_light.py",
         within(
             "nodes/laser",
             "protection.py::test_the_share_of_white_light_is_a_share_of_the_photons_of_daylight",
@@ -2386,13 +2386,13 @@ MUTANTS = (
         ("low * (1 - edge)", "low * (1 + edge)"),
     ),
     *faults(
-        "nodes/laser/_protection.py",
+        "nodes/laser/_light.py",
         within("nodes/laser", "protection.py::test_the_field_reaches_to_the_corner_of_the_sensor"),
         ("pixel_pitch / 2 / focal_length", "pixel_pitch / focal_length"),
         ("math.hypot(*shape)", "max(shape)"),
     ),
     *faults(
-        "nodes/laser/_protection.py",
+        "nodes/laser/_light.py",
         within(
             "nodes/laser",
             "protection.py::test_a_stop_passes_the_square_of_its_diameter_and_never_more_than_the_lens",
@@ -2400,7 +2400,7 @@ MUTANTS = (
         ("min(1.0, stopped / diameter) ** 2", "(stopped / diameter) ** 2"),
     ),
     *faults(
-        "nodes/laser/_protection.py",
+        "nodes/laser/_light.py",
         within(
             "nodes/laser",
             "protection.py::test_the_feature_is_at_its_threshold_under_the_veil_that_veil_limit_names",
@@ -2408,7 +2408,7 @@ MUTANTS = (
         ("background * feature / math.sqrt", "background * feature**2 / math.sqrt"),
     ),
     *faults(
-        "nodes/laser/_protection.py",
+        "nodes/laser/_light.py",
         within("nodes/laser", "protection.py::test_a_joule_of_one_micrometre_has_5e18_photons"),
         ("wavelength / (PLANCK * SPEED_OF_LIGHT)", "PLANCK * SPEED_OF_LIGHT / wavelength"),
     ),

@@ -115,29 +115,29 @@ import h5py
 from neusee.nodes import calibrate, scene
 from neusee.nodes.file_headers import hdf5_needs
 from neusee.nodes.calibrate import frame_header
-from neusee.nodes.calibrate._emva_descriptor import _parsed as descriptor
+from neusee.nodes.calibrate._measurement_files import _parsed as descriptor
 from neusee.nodes.doe._height_map_files import map_header
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.network_weights import fits
 from neusee.nodes.restore._networks._network_files import exported_network
 from neusee.nodes.scene._hyperspectral import size_and_type, wrong_values
-from neusee.nodes.scene._exr_picture import picture_size
+from neusee.nodes.scene._exr import picture_size
 from neusee.nodes.scene._photograph import read_header
 from neusee.nodes.scene._photograph import list_photographs
 from neusee.nodes.sensor._frame_file import read_frame
-from neusee.nodes.spectra._measured_reflectances import _read as reflectances
-from neusee.nodes.spectra._mst_plus_plus import _read as lift_weights
+from neusee.nodes.spectra._plausible_spectra import _read as reflectances
+from neusee.nodes.spectra._lift import _read as lift_weights
 from neusee.nodes.units import _existing as existing
 from neusee.workflows import load
 from neusee.workflows.calibration.emcee_sampler import _read as chain
 from neusee.workflows.comparison.run_record import _json as record
 from neusee.workflows.engine.machine_resources import process_memory
-from neusee.workflows.engine.memory_limits import limited
+from neusee.workflows.engine.machine_resources import limited
 from neusee.workflows.keys.module_digest import read_memo, read_parts
 from neusee.workflows.recipe.distributions.joint_distribution import read_posterior
 from neusee.workflows.recipe.distributions.joint_distribution import read_columns
 from neusee.workflows.store.lease import _look as look
-from neusee.workflows.training.loop.resumable_loop import StateFile
+from neusee.workflows.training.resumable_loop import StateFile
 import PIL.Image, astropy.io.fits, kornia_rs, scipy.io, torch, torch.export
 
 

@@ -22,9 +22,8 @@ from PIL import Image
 
 from neusee.workflows.cli import app
 from neusee.workflows.cli.handbook_reference import reference_pages
-from neusee.workflows.handbook import guide_pages as command_pictures
-from neusee.workflows.handbook.guide_pages import pictures_of, read_pages
-from neusee.workflows.handbook.site_build import build_handbook
+from neusee.workflows.handbook import site_build as command_pictures
+from neusee.workflows.handbook.site_build import build_handbook, pictures_of, read_pages
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe import node_families
 from neusee.workflows.report import files_beside as graph_ahead

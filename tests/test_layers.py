@@ -29,11 +29,8 @@ FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "log
 ROOMS = (
     "graph", "keys", "observation", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store",
     "placement", "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison",
-    "safety", "restoration", "protection", "priors", "sweeps", "training.loop",
-    "training.mask_design", "training", "training.lift", "evaluation", "frames", "calibration",
-    "studies", "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty",
-    "studies.calibration", "studies.protection", "api",
-    "handbook", "answers", "cli",
+    "safety", "restoration", "protection", "priors", "sweeps", "training", "evaluation", "frames", "calibration",
+    "studies", "api", "handbook", "answers", "cli",
 )  # fmt: skip
 DOOR = ""  #: neusee.workflows itself, which offers names of all rooms: no room imports it
 
@@ -70,6 +67,17 @@ ACROSS = {
     ): "the study of calibration judges the posterior that this room computes",
 }
 
+#: Files of each kind of study: they share `run_study`, and import nothing of another kind.
+STUDIES = {
+    "accuracy": ("accuracy_study", "accuracy_page", "recipe_knobs", "work_precision"),
+    "stability": ("stability_study", "extreme_cases", "case_result"),
+    "leave_out": ("leave_out_study", "left_out_steps"),
+    "calibration": ("calibration_study", "posterior_tests"),
+    "uncertainty": ("uncertainty_study", "uncertainty_page", "sobol_indices", "output_draws"),
+    "protection": ("protection_study",),
+}
+KIND_OF_STUDY = {name: kind for kind, names in STUDIES.items() for name in names}
+
 #: Calls that import a module by a name that is only known when they run.
 DYNAMIC = {
     "__init__.py": "the names that workflows offers are imported when they are first used",
@@ -90,7 +98,7 @@ DYNAMIC = {
 #: Files that may use pi.
 PI = {
     "recipe/blocks/train_block.py": "half a cosine, along which the rate of training falls",
-    "training/mask_design/mask_optimisers.py": "half a cosine, along which a rate falls, and the bound of an angle",
+    "training/mask_optimisers.py": "half a cosine, along which a rate falls, and the bound of an angle",
 }
 #: files that fork a process and end it
 FORKS = {
@@ -254,8 +262,16 @@ def siblings(files):
         one, other = outer(source), outer(target)
         if one != other and {one, other} <= set(COMMANDS) and (one, other) not in ACROSS:
             yield f"{where}: {one} imports {other}"
-        if one == other == "studies" and "." in source and "." in target:
-            yield f"{where}: {source} imports {target}"
+    for file, tree in files.items():
+        kind = KIND_OF_STUDY.get(Path(file).stem)
+        if home(file) != "studies" or kind is None:
+            continue
+        for each in imports(tree):
+            other = KIND_OF_STUDY.get(
+                each.full.removeprefix("neusee.workflows.studies.").partition(".")[0]
+            )
+            if each.full.startswith("neusee.workflows.studies.") and other not in (None, kind):
+                yield f"{file}:{each.line}: the study {kind} imports {each.full}"
 
 
 def pure(files):
@@ -295,7 +311,7 @@ def exits(files):
 def terminal(files):
     """Words to a terminal outside cli, and the console and the live table of report."""
     for file, tree in files.items():
-        if home(file) == "cli" or file in ("report/console.py", "report/live_table.py", *FORKS):
+        if home(file) == "cli" or file in ("report/console.py", *FORKS):
             continue
         names = [
             e
@@ -601,8 +617,8 @@ OFFENCES = [
     (siblings, "calibration/emcee_sampler.py", "from neusee.workflows.sweeps import axes"),
     (
         siblings,
-        "studies/leave_out/leave_out_study.py",
-        "from neusee.workflows.studies.accuracy import recipe_knobs",
+        "studies/leave_out_study.py",
+        "from neusee.workflows.studies import recipe_knobs",
     ),
     (exits, "engine/runner.py", "sys.exit(1)"),
     (exits, "store/lease.py", "raise SystemExit"),
@@ -612,11 +628,11 @@ OFFENCES = [
     (terminal, "engine/runner.py", "sys.stderr.write('x')"),
     (terminal, "engine/runner.py", "from sys import stdout"),
     (terminal, "report/run_page.py", "from rich.console import Console"),
-    (samplers, "studies/calibration/calibration_study.py", "def _():\n    import emcee"),
+    (samplers, "studies/calibration_study.py", "def _():\n    import emcee"),
     (
         private,
         "report/data_exports.py",
-        "def _():\n    from neusee.nodes.scene._spectral_exr import write_spectral",
+        "def _():\n    from neusee.nodes.scene._exr import write_spectral",
     ),
     (private, "training/run_training.py", "import neusee.nodes._node"),
     (private, "engine/runner.py", "from neusee.nodes.doe import _refractive_index"),
@@ -632,12 +648,12 @@ OFFENCES = [
         "training/training_iteration.py",
         "x = psf.intensity.amax((-2, -1)).double() / psf.clear_peak.cpu()",
     ),
-    (formulas, "report/result_numbers.py", "x = float((line.centres * line.weights).sum())"),
-    (formulas, "report/result_numbers.py", "x = height / pupil.wavelengths[band]"),
+    (formulas, "report/run_summary.py", "x = float((line.centres * line.weights).sum())"),
+    (formulas, "report/run_summary.py", "x = height / pupil.wavelengths[band]"),
     (classes, "store/lease.py", "class Store:\n    pass"),
     (classes, "recipe/text/overrides.py", "class Uncertain:\n    pass"),
     (names, "store/lease.py", "def result_store():\n    pass"),
-    (names, "studies/run_study.py", "def accuracy():\n    pass"),
+    (names, "studies/run_study.py", "def accuracy_study():\n    pass"),
     (places, "helpers.py", "x = 1"),
     (places, "engine/loops/__init__.py", "x = 1"),
     (offers, "graph/__init__.py", "import torch"),

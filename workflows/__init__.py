@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from neusee.workflows.engine.differentiable_function import as_function
     from neusee.workflows.engine.runner import Result, run
     from neusee.workflows.engine.step_job import Executor
-    from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+    from neusee.workflows.graph.errors import Diagnostic, RecipeError, RunError
     from neusee.workflows.graph.recipe_graph import Event, Recipe, Step, StepRecord
-    from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.placement.tasks_and_devices import Schedule
     from neusee.workflows.priors.recipe_physics import as_physics
     from neusee.workflows.recipe.loading import load, recipes
@@ -29,9 +28,9 @@ _HOME = {
     "as_physics": "priors.recipe_physics",
     "Recipe": "graph.recipe_graph",
     "Step": "graph.recipe_graph",
-    "Diagnostic": "graph.diagnostics",
-    "RecipeError": "graph.diagnostics",
-    "RunError": "graph.run_error",
+    "Diagnostic": "graph.errors",
+    "RecipeError": "graph.errors",
+    "RunError": "graph.errors",
     "StepRecord": "graph.recipe_graph",
     "Event": "graph.recipe_graph",
     "load": "recipe.loading",

@@ -4,16 +4,14 @@ flat light.
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.calibrate._camera_likelihood import camera, expected_levels
-from neusee.nodes.calibrate._emva_descriptor import (
-    descriptor,
-    descriptor_frames,
-    descriptor_release,
-    descriptor_series,
-    refuse_descriptor,
-)
-from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._emva_quantities import Quantity
-from neusee.nodes.calibrate._emva_sheet import EmvaSheet, emva_sheet, general_model
+from neusee.nodes.calibrate._emva_sheet import (
+    EmvaSheet,
+    LeastSquares,
+    emva_sheet,
+    general_model,
+    least_squares,
+)
 from neusee.nodes.calibrate._frame_files import (
     FrameHeader,
     frame_divisor,
@@ -21,16 +19,24 @@ from neusee.nodes.calibrate._frame_files import (
     frame_means,
 )
 from neusee.nodes.calibrate._frame_pairs import CLEAN_PAIRS, FrameTest, Hidden, Stack, open_errors
-from neusee.nodes.calibrate._frame_statistics import (
+from neusee.nodes.calibrate._inspection import coarse, inspect_frames
+from neusee.nodes.calibrate._light_levels import (
     SaturationSignal,
+    expose,
+    frames,
+    hot_pixels,
     levels,
     reduce,
     saturation_signal,
 )
-from neusee.nodes.calibrate._inspection import inspect_frames
-from neusee.nodes.calibrate._laboratory import Laboratory, Traceability, laboratory_contributions
-from neusee.nodes.calibrate._level_frames import expose, frames, hot_pixels
-from neusee.nodes.calibrate._moment_table import table
+from neusee.nodes.calibrate._measurement_files import (
+    descriptor,
+    descriptor_frames,
+    descriptor_release,
+    descriptor_series,
+    refuse_descriptor,
+    table,
+)
 from neusee.nodes.calibrate._nonuniformity import (
     DefectHistogram,
     Nonuniformity,
@@ -43,7 +49,6 @@ from neusee.nodes.calibrate._nonuniformity import (
     spectrogram,
     without_trend,
 )
-from neusee.nodes.calibrate._number_tests import coarse
 from neusee.nodes.calibrate._priors import (
     CAMERA_NAMES,
     NAMES,
@@ -56,13 +61,15 @@ from neusee.nodes.calibrate._priors import (
     guess_camera,
     prior,
 )
-from neusee.nodes.calibrate._scatter_likelihood import (
+from neusee.nodes.calibrate._scatter import (
+    SCATTER_NAMES,
     Rings,
+    ScatterCoordinates,
     guess_scatter,
     point_source,
     stray_light,
+    stray_prior,
 )
-from neusee.nodes.calibrate._scatter_prior import SCATTER_NAMES, ScatterCoordinates, stray_prior
 from neusee.nodes.calibrate._sensor_likelihood import Likelihood, Sufficient, density, sufficient
 from neusee.nodes.calibrate._sheet_budget import (
     MODEL,
@@ -78,6 +85,9 @@ from neusee.nodes.calibrate._uncertainty_budget import (
     NOT_STATED,
     Budget,
     Contribution,
+    Laboratory,
+    Traceability,
+    laboratory_contributions,
 )
 
 __all__ = [

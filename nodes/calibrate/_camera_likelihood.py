@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.calibrate._emva_fit import Share, without_histograms
+from neusee.nodes.calibrate._emva_sheet import Share, without_histograms
 from neusee.nodes.calibrate._sensor_likelihood import ROUNDED, Likelihood, without_details
 from neusee.nodes.sensor._digitization import Rounding
 from neusee.nodes.units import Efficiency, Electrons, Exposure, Gain, Real

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from neusee.nodes import ParameterError
 from neusee.nodes.file_headers import exr_needs, fits_needs, npy_needs, pages_need, refuse_packed
 from neusee.nodes.input_files import VALUES, head_of, once_per_version, refuse_other_than_file
-from neusee.nodes.scene._spectral_exr import exr_header
+from neusee.nodes.scene._exr import exr_header
 
 # --- image files ----------------------------------------------------------------------------------
 

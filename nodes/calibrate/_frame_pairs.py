@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.calibrate._frame_statistics import Scatter, histogram
+from neusee.nodes.calibrate._light_levels import Scatter, histogram
 
 # --- hidden faults --------------------------------------------------------------------------------
 

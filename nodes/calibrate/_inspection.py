@@ -1,13 +1,236 @@
-"""All tests of the frames of a calibration, before any likelihood."""
+"""All tests of the frames of a calibration, before any likelihood.
+
+The tests of digital numbers are here: missing, piled-up and too coarse numbers. Those of noise and
+of patterns have files of their own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator, Sequence
 
-from neusee.nodes.calibrate._frame_pairs import FrameTest, Stack, fitted_levels, prepared
+import torch
+from torch import Tensor
+
+from neusee.nodes.calibrate._frame_pairs import (
+    FrameTest,
+    Level,
+    Stack,
+    fitted_levels,
+    prepared,
+    saturated,
+)
 from neusee.nodes.calibrate._noise_tests import noise_tests
-from neusee.nodes.calibrate._number_tests import codes, number_tests
 from neusee.nodes.calibrate._pattern_tests import mosaic, pattern_tests
+
+_REACH = 8  #: numbers on either side of a number, which say how often it should occur
+#: least expected count of a number that is missing; chance leaves it out once in 1e11
+_EXPECTED = 25.0
+_CLIFF = 50.0  #: least count of each of three numbers beside a block of missing numbers
+_SIMILAR = 3.0  #: largest ratio of the counts of these three numbers
+_TAIL = 0.005  #: share of the pixels of a level at either end, where numbers need not occur
+_QUIET = 0.24  #: DN2, least dark variance of EMVA 1288: a standard deviation of 0.49 DN
+
+
+def number_tests(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
+    """Test digital numbers for missing codes, for a pile at either end, and for noise that the
+    numbers resolve.
+
+    ``exact`` says that the likelihood uses the probability of each number, as `density` does, so
+    that the limits of the converter and rounding are modelled.
+
+    Shapes: a list of levels -> a list of tests.
+    Units:  counts of codes and levels; DN for the dark noise.
+    Error:  a code of 25 expected pixels is missing by chance once in 1e11; an end piles up by
+            chance at 5 sigma.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 6.5 (bit depth, saturation) and 6.6
+            (variance >= 0.24).
+    """
+    fitted = [level for level in levels if level.fitted]
+    return [codes(fitted), _black(fitted, exact), _white(levels, exact), *_coarse(fitted, exact)]
+
+
+def codes(levels: Sequence[Level]) -> FrameTest:
+    code_count = max(int(level.value[-1]) for level in levels) + 1
+    lowest = min(int(level.value[0]) for level in levels)
+    level_counts = [
+        torch.zeros(code_count, dtype=torch.float64).index_add(0, x.value, x.pixels.double())
+        for x in levels
+    ]
+    total = sum(level_counts, torch.zeros(code_count, dtype=torch.float64))
+    expected = sum(
+        (_expected(count) for count in level_counts), torch.zeros(code_count, dtype=torch.float64)
+    )
+    is_missing = (total == 0) & ((expected >= _EXPECTED) | _beside_cliff(total))
+    # numbers up to the lowest one of all need not occur
+    is_missing[: lowest + 1] = False
+    missing_count, expected_count = (
+        int(is_missing.sum()),
+        int(((expected >= _EXPECTED) | (total >= _EXPECTED)).sum()),
+    )
+    if not missing_count:
+        return FrameTest(
+            "no missing codes",
+            0.0,
+            0.0,
+            "passed",
+            f"each of {expected_count} expected codes occurs",
+        )
+    present_codes = (total > 0).nonzero().squeeze(1)
+    step = math.gcd(*(present_codes - present_codes[0]).tolist())
+    text = (
+        f"{missing_count} of {expected_count} expected codes never occur, such as"
+        f" {int(is_missing.nonzero()[0])}"
+    )
+    if step > 1:
+        text += (
+            f": all numbers are {int(present_codes[0])} plus a multiple of {step}: a bit is stuck,"
+            " or shifted"
+        )
+        if int(present_codes[0]) % step == 0:
+            text += (
+                "; where the numbers are shifted, give the step of `calibrate.frames` the divisor"
+                f" {step}"
+            )
+    else:
+        text += ": a bit is stuck, or the numbers were stretched or compressed"
+    text += "; take the numbers as the converter gives them"
+    return FrameTest(
+        "no missing codes", float(missing_count), 0.0, "refused", text, explains_all=step > 1
+    )
+
+
+def _expected(count: Tensor) -> Tensor:
+    """Return the count (code,) that the neighbours on both sides predict for each number of one
+    level; 0 in the tails, where numbers need not occur.
+
+    ``count`` has the counts of all numbers from 0 on. The smaller of the means of `_REACH` numbers
+    on each side is taken.
+    """
+    cumulated_share = count.cumsum(0) / count.sum()
+    in_middle = ((cumulated_share > _TAIL) & (cumulated_share < 1 - _TAIL)).double()
+    # means over a window are differences of cumulated sums
+    cumulated_counts, cumulated_numbers = (
+        (x * in_middle).cumsum(0) for x in (count, torch.ones_like(count))
+    )
+    index = torch.arange(len(count))
+    before_window, end_of_window = (
+        (index - _REACH - 1).clamp_min(0),
+        (index + _REACH).clamp_max(len(count) - 1),
+    )
+    mean_below = (cumulated_counts[(index - 1).clamp_min(0)] - cumulated_counts[before_window]) / (
+        cumulated_numbers[(index - 1).clamp_min(0)] - cumulated_numbers[before_window]
+    ).clamp_min(1)
+    mean_above = (cumulated_counts[end_of_window] - cumulated_counts) / (
+        cumulated_numbers[end_of_window] - cumulated_numbers
+    ).clamp_min(1)
+    return torch.minimum(mean_below, mean_above) * in_middle
+
+
+def _beside_cliff(total: Tensor) -> Tensor:
+    """Return a mask of the numbers beside three numbers that occur often and about equally
+    often.
+    """
+    # the three numbers below each number, and the three above
+    neighbours = (
+        [torch.roll(total, i) for i in (1, 2, 3)],
+        [torch.roll(total, -i) for i in (1, 2, 3)],
+    )
+    cliffs = torch.zeros_like(total, dtype=torch.bool)
+    for three_counts in neighbours:
+        stacked = torch.stack(three_counts)
+        least, greatest = stacked.amin(0), stacked.amax(0)
+        cliffs |= (least >= _CLIFF) & (greatest <= _SIMILAR * least)
+    # `roll` wraps around at both ends
+    cliffs[:3], cliffs[-3:] = False, False
+    return cliffs
+
+
+def _black(levels: Sequence[Level], exact: bool) -> FrameTest:
+    """Test if numbers pile up at the lowest number; `exact` likelihoods model a pile at 0."""
+    clipped_levels = [level for level in levels if level.low]
+    name, count = "no pile at the lowest number", float(len(clipped_levels))
+    if not clipped_levels:
+        return FrameTest(name, 0.0, 0.0, "passed", "no level is clipped at the lowest number")
+    names = ", ".join(level.name for level in clipped_levels)
+    text = (
+        f"numbers pile up at {int(min(level.value[0] for level in clipped_levels))} DN in {names}"
+    )
+    if exact and all(int(level.value[0]) == 0 for level in clipped_levels):
+        return FrameTest(
+            name, count, 0.0, "modelled", f"{text}: the likelihood counts the pixels at 0"
+        )
+    return FrameTest(
+        name, count, 0.0, "refused", f"{text}: the black is clipped; raise the offset of the camera"
+    )
+
+
+def _white(levels: Sequence[Level], exact: bool) -> FrameTest:
+    """Tell which levels are saturated; a dark one refuses the frames unless the likelihood is
+    ``exact``.
+    """
+    full_levels = saturated(levels)
+    name, count = "saturated levels are told", float(len(full_levels))
+    if not full_levels:
+        return FrameTest(name, 0.0, 0.0, "passed", "no level is saturated")
+    consequence = (
+        "the likelihood counts its numbers" if exact else "such levels only bound the saturation"
+    )
+    text = f"{'; '.join(_kinds_of_saturation(full_levels))}: {consequence}"
+    dark_names = [level.name for level in full_levels if level.dark]
+    if dark_names and not exact:
+        return FrameTest(name, count, 0.0, "refused", f"{text}; {', '.join(dark_names)} is dark")
+    return FrameTest(name, count, 0.0, "modelled", text)
+
+
+def _kinds_of_saturation(full: Sequence[Level]) -> Iterator[str]:
+    """Yield a clause for levels that pile up at an end, and one for levels of unequal wells."""
+    if piled_names := [level.name for level in full if level.high]:
+        yield f"numbers pile up at the highest number in {', '.join(piled_names)}"
+    if flat_levels := [level for level in full if not level.high]:
+        names = ", ".join(level.name for level in flat_levels)
+        yield (
+            f"the variance has fallen in {names}, full at about"
+            f" {max(level.mean for level in flat_levels):.0f} DN"
+        )
+
+
+def _coarse(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
+    """Return the test of the least dark variance, or no test without paired dark levels."""
+    darks = [level.variance for level in levels if level.dark and level.paired]
+    return [coarse(min(darks), exact)] if darks else []
+
+
+def coarse(variance: float, exact: bool) -> FrameTest:
+    """Return the test of the least variance of dark levels, DN2, against the limit of EMVA 1288."""
+    deviation, least_deviation = (math.sqrt(max(x, 0.0)) for x in (variance, _QUIET))
+    name = "the dark noise exceeds rounding"
+    text = f"the dark noise is {deviation:.2f} DN; the standard asks for {least_deviation:.2f} DN"
+    if variance >= _QUIET:
+        # a smaller deviation is worse: both numbers are negative
+        return FrameTest(name, -deviation, -least_deviation, "passed", text)
+    if exact:
+        return FrameTest(
+            name,
+            -deviation,
+            -least_deviation,
+            "modelled",
+            f"{text}: the likelihood counts each number",
+        )
+    reason = (
+        "below it rounding is not independent noise, and the dark noise and the gain have only"
+        " limits"
+    )
+    return FrameTest(
+        name,
+        -deviation,
+        -least_deviation,
+        "refused",
+        f"{text}: {reason}; raise the gain of the camera",
+    )
+
+
+# --- all tests ------------------------------------------------------------------------------------
 
 
 def inspect_frames(

@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.calibrate._emva_fit import least_squares, without_histograms
+from neusee.nodes.calibrate._emva_sheet import least_squares, without_histograms
 from neusee.nodes.calibrate._sensor_likelihood import ROUNDED, Sufficient
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Efficiency, Electrons, Gain, Real

@@ -6,8 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
-from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
-from neusee.nodes.calibrate._level_frames import expose
+from neusee.nodes.calibrate._emva_sheet import LeastSquares, least_squares
+from neusee.nodes.calibrate._light_levels import expose
 from neusee.nodes.shape_rules import blank, scalars
 
 least_squares.shape(scalars(LeastSquares))

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.special import log_ndtr, ndtr
 
 from neusee.nodes import Check, node
-from neusee.nodes.calibrate._emva_fit import Share
+from neusee.nodes.calibrate._emva_sheet import Share
 from neusee.nodes.sensor._digitization import Bits, Rounding
 from neusee.nodes.sensor._noise import Distribution, Spread
 from neusee.nodes.sensor._saturation import Well

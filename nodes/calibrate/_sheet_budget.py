@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes.calibrate._camera_likelihood import CAMERA_PARAMETERS, _Camera, _signal, _used
-from neusee.nodes.calibrate._emva_fit import without_histograms
 from neusee.nodes.calibrate._emva_quantities import SENSITIVITY, Quantity
-from neusee.nodes.calibrate._emva_sheet import EmvaSheet, emva_sheet
-from neusee.nodes.calibrate._laboratory import Laboratory, laboratory_contributions
+from neusee.nodes.calibrate._emva_sheet import EmvaSheet, emva_sheet, without_histograms
 from neusee.nodes.calibrate._nonuniformity import chance_of_variances
 from neusee.nodes.calibrate._uncertainty_budget import (
     NOT_INVOLVED,
     NOT_STATED,
     Budget,
     Contribution,
+    Laboratory,
+    laboratory_contributions,
     welch_satterthwaite,
 )
 from neusee.nodes.values import Levels

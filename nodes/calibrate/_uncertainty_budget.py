@@ -1,11 +1,20 @@
-"""The uncertainty budget of one quantity: its sources, combined and expanded."""
+"""The uncertainty budget of one quantity: its sources, combined and expanded.
+
+Some sources are what a laboratory states of its light and its temperature.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from neusee.nodes.parameters import ParameterModel
+from neusee.nodes.units import Linewidth, Wavelength, read_quantity
 
 COVERAGE = 0.95  #: probability with which the expanded uncertainty holds the value
 NOT_STATED, NOT_INVOLVED = "not stated", "does not enter"
@@ -112,3 +121,196 @@ def coverage_factor(freedom: float, probability: float = COVERAGE) -> float:
 
 def _shares(contributions: Iterable[Contribution]) -> list[float]:
     return [c.share for c in contributions if c.share is not None]
+
+
+# --- traceability ---------------------------------------------------------------------------------
+
+# What a laboratory states of its light and of its temperature, so that its values can be traced to
+# a standard.
+
+
+_CELSIUS = re.compile(r"([-+]?\d+(?:\.\d+)?)\s*(°C|C|degC)?")
+_ZERO = 273.15  #: K
+
+Relative = Annotated[float, Field(gt=0, lt=1)]  #: a standard uncertainty over its value
+Finite = Annotated[float, Field(ge=-100, le=100)]
+Text = Annotated[str, BeforeValidator(lambda value: str(value).strip()), Field(min_length=1)]
+
+
+def _temperature(value: Any) -> float:
+    """Return a temperature such as ``25 °C`` or ``298 K`` in kelvin."""
+    match = _CELSIUS.fullmatch(str(value).strip())
+    # a number without a unit
+    if match and not match[2]:
+        raise ValueError(f"needs a unit: write {value} °C or {value} K")
+    kelvin = float(match[1]) + _ZERO if match else read_quantity(value, "K")
+    if not 0 < kelvin < math.inf:
+        raise ValueError(f"{value} is not a temperature: write it as 25 °C or 298 K")
+    return kelvin
+
+
+class Statement(ParameterModel):
+    """Base class of what a laboratory states; an unknown key is a mistake."""
+
+
+class Photometry(Statement):
+    """Calibration of the light: what is known of the numbers of photons, and who says so."""
+
+    #: relative: up to a factor, so that no efficiency is told
+    known: Literal["absolute", "relative"] = "absolute"
+    #: standard uncertainty of the photons over their number
+    relative_uncertainty: Relative | None = None
+    distribution: Literal["normal", "rectangular"] = "normal"
+    degrees_of_freedom: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True)] = math.inf
+    certificate: Text | None = None  #: its number
+    date: Text | None = None
+    laboratory: Text | None = None
+    instrument: Text | None = None
+
+
+class Lamp(Statement):
+    """The lamp: its spectrum, and how far its light may have drifted since it was calibrated."""
+
+    spectrum: Text | None = None  #: in words, or the name of a file
+    centroid: Wavelength | None = None
+    centroid_uncertainty: Linewidth | None = None  #: standard uncertainty
+    fwhm: Linewidth | None = None
+    efficiency_per_nm: Finite | None = None  #: relative change of the efficiency
+    #: relative standard uncertainty, from the calibration of the light to the frames
+    drift: Relative | None = None
+
+
+class SensorTemperature(Statement):
+    """The temperature of the sensor, and the relative change of its parameters per kelvin."""
+
+    value: (
+        Annotated[
+            float, Field(gt=0, le=1e4), BeforeValidator(_temperature, json_schema_input_type=str)
+        ]
+        | None
+    ) = None  #: K
+    uncertainty: (
+        Annotated[float, Field(gt=0, le=1e6), BeforeValidator(lambda x: read_quantity(x, "K"))]
+        | None
+    ) = None
+    coefficients: Mapping[str, Finite] = Field(default_factory=dict)  #: 1/K, by parameter
+
+    @property
+    def text(self) -> str | None:
+        """Return the temperature as text, such as ``25 °C``, or None."""
+        return None if self.value is None else f"{self.value - _ZERO:.4g} °C"
+
+
+class Traceability(Statement):
+    """What a laboratory states of its photons, its lamp and its temperature: the recipe key
+    ``traceability``.
+    """
+
+    photons: Photometry = Photometry()
+    lamp: Lamp = Lamp()
+    temperature: SensorTemperature = SensorTemperature()
+
+
+# --- laboratory -----------------------------------------------------------------------------------
+
+# What a laboratory states of its light and its temperature, as contributions to the uncertainty of
+# a quantity.
+
+
+PHOTOMETRY = "photometric calibration of the light"
+LAMP_DRIFT = "drift of the lamp since its calibration"
+WAVELENGTH = "centroid wavelength of the lamp"
+TEMPERATURE = "temperature"
+
+
+@dataclass(frozen=True)
+class Laboratory:
+    """Relative standard uncertainties of the light, and the uncertain temperature; None for what
+    is not stated.
+    """
+
+    photons: float | None = None  #: relative, of the number of photons
+    photons_distribution: str = "normal"
+    photons_freedom: float = math.inf
+    drift: float | None = None  #: relative, of the lamp between its calibration and the frames
+    wavelength: float | None = None  #: nm, standard uncertainty of the centroid
+    slope: float | None = None  #: relative change of the quantum efficiency per nm
+    temperature: float | None = None  #: K, standard uncertainty
+    #: relative change per K, by quantity
+    coefficients: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def light(self) -> list[tuple[str, float]]:
+        """Return distribution and relative standard uncertainty of each stated source of the
+        quantum efficiency.
+        """
+        sources = [(self.photons_distribution, self.photons), ("normal", self.drift)]
+        if self.wavelength is not None and self.slope is not None:
+            sources.append(("normal", abs(self.slope) * self.wavelength))
+        return [(law, u) for law, u in sources if u]
+
+
+def laboratory_contributions(
+    name: str, value: float, photons: float, laboratory: Laboratory
+) -> Iterator[Contribution]:
+    """Yield what light and temperature add to the uncertainty of the quantity ``name``.
+
+    ``photons`` is dy/ds for a common relative change s of the numbers of photons, 0 where the light
+    does not enter. A change of the quantum efficiency with the wavelength acts as the opposite
+    change of the photons.
+
+    Shapes: scalars.
+    Units:  ``value`` and ``photons`` those of the quantity.
+    Source: JCGM 100:2008 (GUM), sections 4.3 and 5.1.
+    """
+    yield _of_light(
+        PHOTOMETRY,
+        laboratory.photons,
+        photons,
+        laboratory.photons_distribution,
+        laboratory.photons_freedom,
+    )
+    yield _of_light(LAMP_DRIFT, laboratory.drift, photons)
+    slope = laboratory.slope
+    if not photons:
+        yield Contribution(WAVELENGTH, "B", reason=NOT_INVOLVED)
+    elif laboratory.wavelength is None or slope is None:
+        lacking = "" if laboratory.wavelength is None else ": no change of the efficiency per nm"
+        yield Contribution(WAVELENGTH, "B", reason=NOT_STATED + lacking)
+    else:
+        yield Contribution(WAVELENGTH, "B", "normal", laboratory.wavelength, "nm", -slope * photons)
+    yield _of_temperature(name, value, laboratory)
+
+
+def _of_light(
+    source: str,
+    stated: float | None,
+    sensitivity: float,
+    law: str = "normal",
+    freedom: float = math.inf,
+) -> Contribution:
+    """Return the contribution of a source of light whose relative standard uncertainty is
+    ``stated`` (None if it is not), with the ``sensitivity`` dy/ds of the quantity to a relative
+    change s of the light.
+    """
+    if not sensitivity:
+        return Contribution(source, "B", reason=NOT_INVOLVED)
+    if stated is None:
+        return Contribution(source, "B", reason=NOT_STATED)
+    return Contribution(source, "B", law, stated, "relative", sensitivity, freedom)
+
+
+def _of_temperature(name: str, value: float, laboratory: Laboratory) -> Contribution:
+    """Return the contribution of the uncertain temperature to the quantity ``name``, by its
+    coefficient in 1/K.
+    """
+    coefficient = laboratory.coefficients.get(name)
+    if laboratory.temperature is None:
+        return Contribution(TEMPERATURE, "B", reason=NOT_STATED)
+    if coefficient is None:
+        return Contribution(
+            TEMPERATURE, "B", reason=f"{NOT_STATED}: no coefficient of this quantity"
+        )
+    return Contribution(
+        TEMPERATURE, "B", "normal", laboratory.temperature, "K", coefficient * value
+    )

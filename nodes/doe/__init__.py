@@ -11,7 +11,6 @@ from neusee.nodes.doe._analytic_masks import (
     zernike,
 )
 from neusee.nodes.doe._fabrication import fabricate, height_error, smooth
-from neusee.nodes.doe._glass_table import index_rows
 from neusee.nodes.doe._height_map_files import read_height_map, size_metadata
 from neusee.nodes.doe._parametrisations import (
     PARAMETRISATIONS,
@@ -23,11 +22,18 @@ from neusee.nodes.doe._parametrisations import (
     Rings,
     Streak,
     Written,
+    unet,
 )
-from neusee.nodes.doe._refractive_index import Glass, Material, index_curve, material, wave_height
+from neusee.nodes.doe._refractive_index import (
+    Glass,
+    Material,
+    index_curve,
+    index_rows,
+    material,
+    wave_height,
+)
 from neusee.nodes.doe._sampled_height_map import height_map, pixelwise
 from neusee.nodes.doe._shade import equal_filter, shade
-from neusee.nodes.doe._unet_height_map import unet
 
 __all__ = [
     "PARAMETRISATIONS",

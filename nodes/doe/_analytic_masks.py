@@ -18,8 +18,8 @@ from neusee.nodes.doe._refractive_index import (
     height_from_phase,
     refuse_material,
 )
+from neusee.nodes.optics._pupil import surface
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, polar
-from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Angle, Charge, Count, Height, Slope, Wavelength
 from neusee.nodes.values import Stop
 

@@ -16,8 +16,8 @@ from neusee.nodes.doe._refractive_index import (
     refuse_material,
     wave_height,
 )
+from neusee.nodes.optics._pupil import factors
 from neusee.nodes.optics._pupil_grid import grid_of, refuse_other_grid, stripes
-from neusee.nodes.optics._zernike import factors
 from neusee.nodes.precision import refuse_half
 from neusee.nodes.units import Depth, Length, PupilPitch, Wavelength
 from neusee.nodes.values import Stop

@@ -22,7 +22,7 @@ from neusee.nodes.input_files import (
     refuse_large_array,
     refuse_other_than_file,
 )
-from neusee.nodes.scene._spectral_exr import exr_header, exr_parts
+from neusee.nodes.scene._exr import exr_header, exr_parts
 from neusee.nodes.units import read_quantity
 
 if TYPE_CHECKING:

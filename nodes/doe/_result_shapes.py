@@ -14,10 +14,10 @@ from neusee.nodes.doe._analytic_masks import (
     zernike,
 )
 from neusee.nodes.doe._fabrication import fabricate, height_error, smooth
+from neusee.nodes.doe._parametrisations import unet
 from neusee.nodes.doe._refractive_index import material
 from neusee.nodes.doe._sampled_height_map import pixelwise
 from neusee.nodes.doe._shade import equal_filter, shade
-from neusee.nodes.doe._unet_height_map import unet
 from neusee.nodes.shape_rules import blank, double, like_first
 from neusee.nodes.values import Bands, Shade, Stop
 

@@ -3,12 +3,12 @@
 from neusee.nodes.flare import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.flare._dirt import dirt
 from neusee.nodes.flare._ghosts import ghosts
-from neusee.nodes.flare._harvey_shack import surface_of
 from neusee.nodes.flare._stray_light import (
     StrayShares,
     Surfaces,
     stray_light,
     stray_shares,
+    surface_of,
     veil_at,
 )
 

@@ -9,8 +9,8 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, TensorStats, node
+from neusee.nodes.optics._pupil import factors, surface
 from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside, stripes
-from neusee.nodes.optics._zernike import factors, surface
 from neusee.nodes.units import Fraction, Waves
 from neusee.nodes.values import Dirt, Stop
 

@@ -85,22 +85,14 @@ from neusee.nodes.laser._dazzle import (
     pixel_share,
     veil_limit,
 )
-from neusee.nodes.laser._eye_dazzle import (
+from neusee.nodes.laser._eye import (
     LUMENS_PER_WATT,
     STEADY,
-    DazzleTask,
-    dazzle_illuminance,
-    luminous_efficiency,
-    maximum_dazzle_exposure,
-    nominal_ocular_dazzle_distance,
-    threshold_luminance,
-    unsteady,
-    veil_per_lux,
-)
-from neusee.nodes.laser._eye_limits import (
     TRAIN_RULES,
+    DazzleTask,
     TrainLimit,
     TrainRule,
+    dazzle_illuminance,
     eye_aperture,
     eye_limit,
     eye_limit_source,
@@ -109,21 +101,29 @@ from neusee.nodes.laser._eye_limits import (
     eye_mpe_train,
     eye_share,
     hazard_distance,
+    luminous_efficiency,
+    maximum_dazzle_exposure,
+    nominal_ocular_dazzle_distance,
     nominal_ocular_hazard_distance,
+    threshold_luminance,
     train_limit,
+    unsteady,
+    veil_per_lux,
 )
-from neusee.nodes.laser._light import light, pulses_within, wavefront
-from neusee.nodes.laser._protection import (
+from neusee.nodes.laser._light import (
     EDGE,
     diffraction_cutoff,
     feature_snr,
     field_angle,
+    light,
     notch_band,
     notch_wavelength,
     optical_density,
     passing,
     photons_in_joule,
+    pulses_within,
     stopped_share,
+    wavefront,
     white_share,
 )
 from neusee.nodes.laser._round_spot import defocused_peak, round_spot, spot_peak

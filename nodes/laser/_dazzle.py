@@ -13,10 +13,9 @@ from torch.nn.functional import avg_pool2d
 
 from neusee.nodes import Check, node
 from neusee.nodes.optics._lens import cut_off
-from neusee.nodes.precision import refuse_not_finite
+from neusee.nodes.precision import refuse_not_finite, transformed
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.sensor._saturation import Well, refuse_without_room
-from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Count, Efficiency, Electrons, Ratio, Shape
 from neusee.nodes.values import Bands, Psf
 

@@ -3,9 +3,12 @@
 from neusee.nodes.losses._mask_losses import (
     ContrastFloor,
     HighestFrequency,
+    NoiseVariance,
+    OneBandShare,
     background_loss,
     contrast,
     suppression_loss,
+    wiener,
 )
 from neusee.nodes.losses._protected_losses import (
     ContrastVariance,
@@ -22,7 +25,6 @@ from neusee.nodes.losses._restoration_losses import (
     log_error,
     mrae,
 )
-from neusee.nodes.losses._wiener_loss import NoiseVariance, OneBandShare, wiener
 
 __all__ = [
     "ContrastFloor",

@@ -1,18 +1,13 @@
 """Metrics: figures of merit of a mask, a picture and a laser spot."""
 
 from neusee.nodes.metrics import _result_shapes  # noqa: F401  attaches the shape rules
-from neusee.nodes.metrics._detail_targets import (
-    TARGETS,
-    detail_energy,
-    detail_targets,
-    detection_snr,
-)
-from neusee.nodes.metrics._filtered_picture import (
+from neusee.nodes.metrics._picture_quality import (
     Attacked,
     Filtered,
     GlareLevels,
     PictureSpectrum,
     PixelNoise,
+    Quality,
     attacked_picture,
     channel_psf,
     decibels,
@@ -22,18 +17,16 @@ from neusee.nodes.metrics._filtered_picture import (
     mean_log_neq,
     noise_variance,
     picture_spectrum,
+    quality,
     radial_contrast,
     remaining_error,
 )
-from neusee.nodes.metrics._picture_quality import Quality, quality
-from neusee.nodes.metrics._protection_bounds import (
-    ProtectionBounds,
-    largest_glare,
-    protection_bounds,
-    stop_diameter,
-)
 from neusee.nodes.metrics._psf_quality import (
+    TARGETS,
     Mtf,
+    detail_energy,
+    detail_targets,
+    detection_snr,
     encircled,
     encircled_curve,
     mtf,
@@ -47,9 +40,11 @@ from neusee.nodes.metrics._sensor_load import (
     peak_irradiance,
     saturated,
 )
-from neusee.nodes.metrics._suppression_ratios import (
+from neusee.nodes.metrics._suppression import (
     Limits,
+    ProtectionBounds,
     bsr,
+    largest_glare,
     least_lsr,
     light_outside,
     limits,
@@ -57,6 +52,8 @@ from neusee.nodes.metrics._suppression_ratios import (
     most_contrast,
     most_unsuppressed,
     peak_bsr,
+    protection_bounds,
+    stop_diameter,
 )
 
 __all__ = [

@@ -1,7 +1,9 @@
-"""Quality of a restored picture, measured by comparison with the true picture."""
+"""Quality of a picture: compared with the true picture, and expected from its error and information
+after a Wiener filter, also under attack.
+"""
 
 import math
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from pydantic import Field
@@ -9,6 +11,9 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.precision import exact_convolutions, single
+from neusee.nodes.restore._inverse._masked_blur import grey_shares
+from neusee.nodes.units import Electrons, Fraction
+from neusee.nodes.values import Bands, Psf
 
 _WINDOW = 11  #: width in pixels of the Gaussian window of SSIM
 _STRIPE = 118  #: rows that are compared at a time: 128 with the margin of the window
@@ -132,3 +137,473 @@ def _ssim(p: Tensor, q: Tensor) -> Tensor:
     with exact_convolutions(p):
         similarity: Tensor = ssim(*pictures, _WINDOW, eps=0.0, padding="valid")
     return similarity
+
+
+# --- filtered picture -----------------------------------------------------------------------------
+
+# The error and the information of a picture after a Wiener filter, from its noise equivalent quanta
+# (NEQ).
+
+
+Light = Annotated[Electrons, Field(gt=0)]  #: electrons a pixel
+_LEAST = 1e-30  #: NEQ below which a frequency counts as lost
+#: cycles per pixel; 0.71 is the corner of the spectrum
+HighestFrequency = Annotated[float, Field(gt=0, le=0.71)]
+#: of the contrast of a scene, relative to its squared mean
+Variance = Annotated[float, Field(gt=0, le=10)]
+
+
+class Filtered(NamedTuple):
+    """What a Wiener filter makes of a noisy picture of a natural scene, by channel of the
+    sensor.
+    """
+
+    #: (channel,) float64, error variance after the filter over the variance of the scene
+    error: Tensor
+    information: Tensor  #: (channel,) float64, bits a pixel
+    log_neq: Tensor  #: (channel,) float64, mean of the natural logarithm of the NEQ up to `up_to`
+    light: Tensor  #: (channel,) float64, share of the scene's light that reaches the sensor
+
+
+@node(rtol=1e-6)
+def filtered_picture(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    electrons: Light,
+    read_noise: Electrons,
+    glare: Electrons = 0.0,
+    prnu: Fraction = 0.0,
+    residual_glare: Fraction = 0.0,
+    variance: Variance = 0.1,
+    up_to: HighestFrequency = 0.12,
+) -> Filtered:
+    """Compute the error, the information and the NEQ of a natural scene behind a lens, after the
+    best linear filter.
+
+    The scene has a mean of ``electrons`` behind the plain lens and a contrast whose power S falls
+    with the square of the frequency. NEQ = (electrons |OTF|)**2 / noise. The error is the mean of S
+    / (1 + NEQ S) over that of S, the information the mean of log2(1 + NEQ S) / 2, both over all
+    sampled frequencies. The noise of a pixel is that of `noise_variance`. A shade lowers the OTF at
+    frequency 0, so that its loss of light counts.
+
+    Shapes: psf.intensity (band, y, x), illuminant (band,), responses (channel, band) -> four of
+            (channel,) float64.
+    Units:  electrons, read_noise and glare e- a pixel; prnu and residual_glare shares; up_to cycles
+            per pixel.
+    Error:  1e-6 in float32. The scene is grey: one spectrum everywhere. Edges and clipped pixels
+            are left out.
+    Raises: ValueError where PSF, illuminant and responses differ in the number of bands.
+    Source: Barrett and Myers, Foundations of Image Science, section 13.2 (NEQ); Goodman,
+        Introduction to Fourier Optics, 4th ed., ch. 8 (Wiener filter).
+    """
+    otf = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands))
+    light = otf[:, 0, 0].real
+    noise_variances = noise_variance(electrons * light, glare, read_noise, prnu, residual_glare)
+    neq = (electrons * otf.abs()).square() / noise_variances[:, None, None]
+    power, counted = _on(
+        neq, natural_power(tuple(neq.shape[-2:]), variance), low_frequencies(neq.shape[-2:], up_to)
+    )
+    # the Wiener filter leaves S / (1 + NEQ S) of the scene's power S
+    error = (power / (1 + neq * power)).sum((-2, -1)) / power.sum()
+    information = 0.5 * torch.log2(1 + neq * power).mean((-2, -1))
+    logs = neq[:, counted].clamp_min(_LEAST).log().mean(-1)
+    return Filtered(error, information, logs, light)
+
+
+@filtered_picture.reference
+def _(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    electrons: float,
+    read_noise: float,
+    glare: float = 0.0,
+    prnu: float = 0.0,
+    residual_glare: float = 0.0,
+    variance: float = 0.1,
+    up_to: float = 0.12,
+) -> Filtered:
+    """Sum the same means over half of the spectrum in rows, with the PSF of each channel summed
+    band by band.
+    """
+    y, x = psf.intensity.shape[-2:]
+    photons = illuminant.double() * bands.centres
+    rows = []
+    for response in responses.double():
+        band_shares = response * photons / (response * photons).sum()
+        otf = sum(
+            band_share * torch.fft.fft2(band_psf.double())
+            for band_share, band_psf in zip(band_shares, psf.intensity, strict=True)
+        )
+        light_share = float(abs(otf[0, 0]))
+        noise = (
+            electrons * light_share
+            + glare
+            + read_noise**2
+            + (prnu * (electrons * light_share + glare)) ** 2
+        )
+        noise += (residual_glare * glare) ** 2
+        fy, fx = (
+            torch.fft.fftfreq(y, dtype=torch.float64),
+            torch.fft.fftfreq(x, dtype=torch.float64),
+        )
+        squared_frequency = fy[:, None] ** 2 + fx**2
+        power = torch.where(squared_frequency > 0, 1 / squared_frequency, 0.0)
+        power = power * (variance / power.mean())
+        neq = electrons**2 * abs(otf) ** 2 / noise
+        counted = (squared_frequency > 0) & (squared_frequency <= up_to**2)
+        rows.append(
+            (
+                float((power / (1 + neq * power)).sum() / power.sum()),
+                float(torch.log2(1 + neq * power).mean() / 2),
+                float(torch.log(neq[counted].clamp_min(_LEAST)).mean()),
+                light_share,
+            )
+        )
+    return Filtered(*torch.tensor(rows, dtype=torch.float64).T)
+
+
+@filtered_picture.check
+def _(result: Filtered, *inputs: Any, electrons: float, **params: Any) -> list[Check]:
+    error, bits = float(result.error.mean()), float(result.information.mean())
+    ok = bool(((result.error >= 0) & (result.error <= 1 + 1e-6)).all())
+    text = (
+        f"{electrons:.4g} e- a pixel: error after the filter {error:.3g} of the scene, {bits:.3g}"
+        " bits a pixel"
+    )
+    return [Check(text, ok)]
+
+
+def _on(like: Tensor, *tensors: Tensor) -> list[Tensor]:
+    """Return tensors on the device of the first one."""
+    return [x.to(like.device) for x in tensors]
+
+
+def channel_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
+    """Return the PSF of each channel for a grey scene in float64, (channel, y, x); its sum is
+    the light that passes.
+    """
+    lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
+    if len(lengths) > 1:
+        raise ValueError(
+            f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands`"
+            " step"
+        )
+    shares = grey_shares(illuminant, responses, bands).to(psf.intensity.device)
+    kernels: Tensor = torch.tensordot(shares, psf.intensity.double(), 1)
+    return kernels
+
+
+def noise_variance(
+    light: Any, glare: Any, read_noise: float, prnu: float = 0.0, residual_glare: float = 0.0
+) -> Any:
+    """Return the noise variance of a pixel in e-**2: shot noise, read noise, PRNU, and wrongly
+    subtracted glare.
+
+    light + glare + read_noise**2 + (prnu (light + glare))**2 + (residual_glare glare)**2, with
+    light and glare in e-.
+    """
+    signal = light + glare
+    return signal + read_noise**2 + (prnu * signal) ** 2 + (residual_glare * glare) ** 2
+
+
+def natural_power(shape: tuple[int, ...], variance: float) -> Tensor:
+    """Return the power of the contrast of natural scenes at each frequency of an FFT: (y, x)
+    float64.
+
+    The power falls with the square of the frequency, is 0 at frequency 0, and its mean over all
+    frequencies is ``variance``.
+    """
+    squared_frequency = _square_frequency(shape)
+    power = torch.where(
+        squared_frequency > 0, 1.0 / squared_frequency.where(squared_frequency > 0, 1.0), 0.0
+    )
+    scaled: Tensor = power * (variance / power.mean())
+    return scaled
+
+
+def low_frequencies(shape: tuple[int, ...], up_to: float) -> Tensor:
+    """Return True at the frequencies above 0 and up to ``up_to`` cycles per pixel, in the layout
+    of an FFT: (y, x).
+    """
+    squared_frequency = _square_frequency(shape)
+    low: Tensor = (squared_frequency > 0) & (squared_frequency <= up_to**2)
+    return low
+
+
+def _square_frequency(shape: tuple[int, ...]) -> Tensor:
+    """Return the squared frequencies (y, x) of an FFT, in cycles per pixel."""
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in shape)
+    squared: Tensor = fy[:, None].square() + fx.square()
+    return squared
+
+
+def decibels(ratio: float) -> float:
+    """Return a ratio of variances or of powers in dB, 10 log10."""
+    return 10.0 * math.log10(ratio)
+
+
+# --- picture spectrum -----------------------------------------------------------------------------
+
+# The spectrum of a picture as a histogram, from which errors at any light, filter and noise follow
+# in microseconds.
+#
+# A grey filter scales the whole spectrum, and the light scales the scene: no PSF is computed again
+# for another transmittance, another scene light or another glare.
+
+
+#: decades of the bins, and bins a decade, which give an error of 1e-4
+_LEAST_FREQUENCY, _MOST, _EACH = -20, 8, 40
+
+
+class PictureSpectrum(NamedTuple):
+    """Sums over the frequencies of a picture with like power p, by channel of the sensor.
+
+    The Wiener filter knows the OTF ``known``, and p is the power of the scene times |known|**2. The
+    picture has the OTF ``true``. Both OTFs are equal without mismatch.
+    """
+
+    power: Tensor  #: (channel, bin) mean of p
+    signal: Tensor  #: (channel, bin) share of the scene's variance
+    real: Tensor  #: (channel, bin) the same, times the real part of true / known
+    square: Tensor  #: (channel, bin) the same, times the square of |true / known|
+    strength: Tensor  #: (channel, bin) mean of scene power times |true OTF|**2
+    rate: Tensor  #: (channel, bin) share of the frequencies with this strength
+    contrast: Tensor  #: (channel,) mean of log(|true OTF|**2) up to a highest frequency
+    light: Tensor  #: (channel,) share of the scene's light in the picture
+
+
+def picture_spectrum(
+    true: Psf,
+    assumed: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    variance: float = 0.1,
+    up_to: float = 0.12,
+) -> PictureSpectrum:
+    """Sort the frequencies of a picture by their power; ``assumed`` is the PSF that the filter
+    takes for the true one.
+    """
+    otf, assumed_otf = (
+        torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)) for psf in (true, assumed)
+    )
+    scene = natural_power(tuple(otf.shape[-2:]), variance)
+    is_low = low_frequencies(tuple(otf.shape[-2:]), up_to)
+    share = scene / scene.sum()
+    channel_rows = []
+    for channel_otf, assumed_channel_otf in zip(otf, assumed_otf, strict=True):
+        assumed_power = assumed_channel_otf.abs().square()
+        # true over assumed OTF, by which the filter's answer is off
+        ratio = torch.where(
+            assumed_power > 0,
+            channel_otf * assumed_channel_otf.conj() / assumed_power.clamp_min(1e-300),
+            0.0,
+        )
+        weights = (share, share * ratio.real, share * ratio.abs().square())
+        power, *sums = _binned(scene * assumed_power, *weights)
+        strength, count = _binned(
+            scene * channel_otf.abs().square(), torch.full_like(scene, 1.0 / scene.numel())
+        )
+        contrast = channel_otf.abs().square()[is_low].clamp_min(1e-30).log().mean()
+        channel_rows.append((power, *sums, strength, count, contrast, channel_otf[0, 0].real))
+    return PictureSpectrum(*(torch.stack(column) for column in zip(*channel_rows, strict=True)))
+
+
+def _binned(value: Tensor, *weights: Tensor) -> list[Tensor]:
+    """Return the mean of ``value`` in each bin, weighted by the first of ``weights``, and the
+    sums of all weights.
+    """
+    bin_index = (
+        ((value.clamp_min(1e-300).log10() - _LEAST_FREQUENCY) * _EACH)
+        .long()
+        .clamp(0, (_MOST - _LEAST_FREQUENCY) * _EACH - 1)
+        .flatten()
+    )
+    zero_bins = torch.zeros((_MOST - _LEAST_FREQUENCY) * _EACH, dtype=torch.float64)
+    weight_sums = [zero_bins.index_add(0, bin_index, weight.flatten()) for weight in weights]
+    weighted_sum = zero_bins.index_add(0, bin_index, (value * weights[0]).flatten())
+    return [
+        torch.where(weight_sums[0] > 0, weighted_sum / weight_sums[0].clamp_min(1e-300), 0.0),
+        *weight_sums,
+    ]
+
+
+def remaining_error(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
+    """Return the error after the filter over the variance of the scene, (noise, channel).
+
+    ``amplitude`` is the scene light in e- times the transmittance of a filter; ``noise`` (noise,
+    channel) the variance of a pixel in e-**2. With u = a**2 p / (a**2 p + noise) at amplitude a,
+    the filter passes u ratio of the scene; the ratio is true / known. The error is the sum of
+    signal |1 - u ratio|**2 and of the filtered noise, signal u (1 - u).
+    """
+    signal_power = amplitude**2 * spectrum.power
+    wiener_gain = signal_power / (signal_power + noise[:, :, None])
+    # |1 - u ratio|^2 for the scene, and u (1 - u) for the noise, by bin
+    error = (
+        spectrum.signal
+        - 2 * wiener_gain * spectrum.real
+        + wiener_gain.square() * spectrum.square
+        + wiener_gain * (1 - wiener_gain) * spectrum.signal
+    )
+    return error.sum(-1)
+
+
+def information_bits(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
+    """Return the bits a pixel, mean of log2(1 + NEQ S) / 2 over all frequencies, (noise,
+    channel).
+    """
+    signal_to_noise = amplitude**2 * spectrum.strength / noise[:, :, None]
+    return (spectrum.rate * torch.log2(1 + signal_to_noise)).sum(-1) / 2
+
+
+def mean_log_neq(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
+    """Return the mean of log(NEQ) over low frequencies, (noise, channel)."""
+    return spectrum.contrast + torch.log(amplitude**2 / noise)
+
+
+def radial_contrast(
+    psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, rings: int = 40
+) -> tuple[Tensor, Tensor]:
+    """Return frequencies up to 1/2 cycle per pixel, and the mean of |OTF|**2 in a ring about each:
+    (ring,) each.
+
+    The mean is over directions and channels, and the square of the light that passes is included.
+    """
+    mean_square_otf = (
+        torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)).abs().square().mean(0)
+    )
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in mean_square_otf.shape)
+    radius = torch.hypot(fy[:, None], fx)
+    in_rings = (radius > 0) & (radius < 0.5)
+    ring_number = (radius[in_rings] * 2 * rings).long()
+    zero_rings = torch.zeros(rings, dtype=torch.float64)
+    ring_count = zero_rings.index_add(0, ring_number, torch.ones_like(radius[in_rings])).clamp_min(
+        1
+    )
+    middle = (torch.arange(rings, dtype=torch.float64) + 0.5) / (2 * rings)
+    return middle, zero_rings.index_add(0, ring_number, mean_square_otf[in_rings]) / ring_count
+
+
+# --- attacked picture -----------------------------------------------------------------------------
+
+# A picture under attack: the glare of a laser by its level, and what a filter recovers of the
+# pixels that are left.
+
+
+_LEAST_ATTACK, _MOST_ATTACK, _ATTACKS_EACH = (
+    -16,
+    1,
+    20,
+)  #: decades of the glare, and bins a decade
+_NOISES = 48  #: noises for which the error is computed; others are interpolated, to 1e-4
+
+
+class GlareLevels(NamedTuple):
+    """The light of a laser over the pixels of a field as a histogram, relative to the peak of
+    the clear lens.
+    """
+
+    level: Tensor  #: (bin,) mean of the light in a bin
+    share: Tensor  #: (bin,) share of the pixels
+
+
+class PixelNoise(NamedTuple):
+    """The noise of a pixel and its well."""
+
+    read_noise: float  #: e-
+    full_well: float  #: e-
+    prnu: float  #: relative spread of the sensitivity of pixels
+    residual_glare: float  #: share of the glare that is subtracted wrongly
+
+
+class Attacked(NamedTuple):
+    """What is left of a picture under attack, averaged over pixels and channels."""
+
+    #: () error after the filter over the variance of the scene; a full pixel counts as 1
+    error: Tensor
+    information: Tensor  #: () bits a pixel; a full pixel counts as 0
+    seen: Tensor  #: () share of the pixels that are not full
+
+
+def glare_levels(light: Tensor, clear_peak: float) -> GlareLevels:
+    """Sort the pixels of a field by the light (y, x) that a laser sends to each pixel."""
+    relative = light.double().flatten() / clear_peak
+    bin_index = (
+        ((relative.clamp_min(1e-300).log10() - _LEAST_ATTACK) * _ATTACKS_EACH)
+        .long()
+        .clamp(0, (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH - 1)
+    )
+    zero_bins = torch.zeros(
+        (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH,
+        dtype=torch.float64,
+    )
+    count = zero_bins.index_add(0, bin_index, torch.ones_like(relative))
+    mean = zero_bins.index_add(0, bin_index, relative) / count.clamp_min(1)
+    has_pixels = count > 0
+    return GlareLevels(mean[has_pixels], count[has_pixels] / len(relative))
+
+
+def attacked_picture(
+    spectrum: PictureSpectrum,
+    glare: GlareLevels,
+    noise: PixelNoise,
+    *,
+    electrons: float,
+    transmittance: float,
+    strengths: Tensor,
+    colour: Tensor,
+) -> Attacked:
+    """Return error, information and share of seen pixels at each strength of a laser: (strength,)
+    each.
+
+    A strength of 1 fills one pixel behind the clear lens in the channel that responds most;
+    ``colour`` (channel,) is the response of each channel relative to that one. A grey filter of
+    ``transmittance`` dims scene and laser alike. The Wiener filter knows the noise of each pixel,
+    and a pixel is lost where scene and glare fill it.
+    """
+    amplitude = electrons * transmittance
+    light = amplitude * spectrum.light
+    # strengths count in full wells at the peak of the clear lens
+    peak_light = noise.full_well * strengths[:, None, None] * transmittance
+    laser_light = peak_light * glare.level[:, None] * colour  # (strength, bin, channel)
+    not_full = (laser_light + light) < noise.full_well
+    noise_without_glare = noise_variance(
+        light, 0.0, noise.read_noise, noise.prnu, noise.residual_glare
+    )
+    noise_at_full_well = noise_variance(
+        light, noise.full_well, noise.read_noise, noise.prnu, noise.residual_glare
+    )
+    noise_steps = torch.linspace(0, 1, _NOISES, dtype=torch.float64)[:, None]
+    # the error depends on the noise alone: a table over its logarithm, (noise, channel)
+    log_noise_table = (
+        noise_without_glare.log() + noise_steps * (noise_at_full_well / noise_without_glare).log()
+    )
+    log_noise = noise_variance(
+        light, laser_light, noise.read_noise, noise.prnu, noise.residual_glare
+    ).log()
+    table_place = (
+        (log_noise - noise_without_glare.log())
+        / (noise_at_full_well / noise_without_glare).log()
+        * (_NOISES - 1)
+    ).clamp(0, _NOISES - 1 - 1e-9)
+    error, bits = (
+        _between(f(spectrum, amplitude, log_noise_table.exp()), table_place)
+        for f in (remaining_error, information_bits)
+    )
+    weights = glare.share[:, None]
+    means = (torch.where(not_full, error, 1.0), torch.where(not_full, bits, 0.0), not_full.double())
+    return Attacked(*((weights * mean).sum(1).mean(-1) for mean in means))
+
+
+def _between(table: Tensor, place: Tensor) -> Tensor:
+    """Interpolate a table (noise, channel) at real rows ``place`` (strength, bin, channel)."""
+    row_below = place.floor().long()
+    channel = torch.arange(table.shape[1])
+    below, above = table[row_below, channel], table[row_below + 1, channel]
+    return below + (place - row_below) * (above - below)

@@ -4,9 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
-from neusee.nodes.metrics._filtered_picture import Filtered, filtered_picture
-from neusee.nodes.metrics._picture_quality import Quality, quality
-from neusee.nodes.metrics._protection_bounds import ProtectionBounds, protection_bounds
+from neusee.nodes.metrics._picture_quality import Filtered, Quality, filtered_picture, quality
 from neusee.nodes.metrics._psf_quality import _SAMPLES, _SIDE, Mtf, encircled, mtf, spectral_error
 from neusee.nodes.metrics._sensor_load import (
     Peak,
@@ -15,13 +13,15 @@ from neusee.nodes.metrics._sensor_load import (
     peak_irradiance,
     saturated,
 )
-from neusee.nodes.metrics._suppression_ratios import (
+from neusee.nodes.metrics._suppression import (
     Limits,
+    ProtectionBounds,
     bsr,
     light_outside,
     limits,
     lsr,
     peak_bsr,
+    protection_bounds,
 )
 from neusee.nodes.shape_rules import double, scalars
 from neusee.nodes.values import Bands, Psf, Pupil

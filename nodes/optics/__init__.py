@@ -5,11 +5,10 @@ from neusee.nodes.optics._band_image import image
 from neusee.nodes.optics._channel_image import image_channels
 from neusee.nodes.optics._few_bands import few_bands, few_bands_checked, pupil_of_bands
 from neusee.nodes.optics._laser_spot import direction, field_of_view, laser_irradiance
-from neusee.nodes.optics._lens import refuse_impossible_f_number
+from neusee.nodes.optics._lens import refuse_impossible_f_number, white_irradiance
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import mask_turns, pupil, pupil_has_large_steps
 from neusee.nodes.optics._pupil_grid import stop
-from neusee.nodes.optics._white_irradiance import white_irradiance
 
 __all__ = [
     "direction",

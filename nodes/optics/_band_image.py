@@ -9,7 +9,7 @@ from torch.nn.functional import conv2d, pad
 
 from neusee.nodes import Check, node
 from neusee.nodes.optics._transform._fft_transforms import smooth
-from neusee.nodes.torch_func import one_by_one
+from neusee.nodes.precision import one_by_one
 from neusee.nodes.values import Psf
 
 # --- band image -----------------------------------------------------------------------------------

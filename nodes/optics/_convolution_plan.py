@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.optics._transform._fft_transforms import smooth
-from neusee.nodes.torch_func import one_by_one
+from neusee.nodes.precision import one_by_one
 
 # --- psf energy -----------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred
 from neusee.nodes.optics._transform._scaled_transform import Method
-from neusee.nodes.torch_func import one_by_one, plain
+from neusee.nodes.precision import one_by_one, plain
 from neusee.nodes.values import Pupil
 
 # --- pixel filter ---------------------------------------------------------------------------------

@@ -9,13 +9,13 @@ from neusee.nodes.optics._band_image import image
 from neusee.nodes.optics._channel_image import image_channels
 from neusee.nodes.optics._few_bands import few_bands, few_bands_checked, pupil_of_bands
 from neusee.nodes.optics._laser_spot import direction, laser_irradiance
+from neusee.nodes.optics._lens import white_irradiance
 from neusee.nodes.optics._pixel_average import FINE_SAMPLES, fine_axes
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import pupil
 from neusee.nodes.optics._pupil_grid import clear_diameter
 from neusee.nodes.optics._transform._fused import expected_seconds
 from neusee.nodes.optics._transform._sample_axis import Axis
-from neusee.nodes.optics._white_irradiance import white_irradiance
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
 from neusee.nodes.values import Bands, Channels, FewBands, LowRankCube, Psf, Pupil, Stop, Wavefront
 

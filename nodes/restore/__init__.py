@@ -15,7 +15,15 @@ from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import filter_facts, wiener, wiener_problem
 from neusee.nodes.restore._lasers._find_lasers import find_lasers, found_glare, found_nearby
 from neusee.nodes.restore._measured_psf import measured_psf
-from neusee.nodes.restore._networks._critic import critic_slopes, critics, skip_critic_draws
+from neusee.nodes.restore._networks._convolutional_networks import (
+    NAFNet,
+    UNet,
+    critic_slopes,
+    critics,
+    nafnet,
+    skip_critic_draws,
+    unet,
+)
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba, fft_mamba
 from neusee.nodes.restore._networks._network_files import (
     export_network,
@@ -24,7 +32,6 @@ from neusee.nodes.restore._networks._network_files import (
 )
 from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network, try_network
 from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
-from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet, UNet, nafnet, unet
 from neusee.nodes.restore._networks._wiener_networks import Informed, Unrolled, informed, unrolled
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
 from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field

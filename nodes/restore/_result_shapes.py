@@ -34,10 +34,10 @@ from neusee.nodes.restore._inverse._wiener import (
 )
 from neusee.nodes.restore._lasers._find_lasers import find_lasers, found_glare, found_nearby
 from neusee.nodes.restore._measured_psf import measured_psf
+from neusee.nodes.restore._networks._convolutional_networks import nafnet, unet
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
 from neusee.nodes.restore._networks._network_files import network
 from neusee.nodes.restore._networks._own_network import tried
-from neusee.nodes.restore._networks._unet_and_nafnet import nafnet, unet
 from neusee.nodes.restore._networks._wiener_networks import informed, unrolled
 from neusee.nodes.restore._point_frames import points_in
 from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field

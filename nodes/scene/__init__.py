@@ -1,9 +1,7 @@
 """Scenes: photographs, OpenEXR pictures, spectral cubes and test targets."""
 
 from neusee.nodes.scene import _result_shapes  # noqa: F401  attaches the shape rules
-from neusee.nodes.scene._augmentation import Change, symmetry
-from neusee.nodes.scene._exr_picture import exr
-from neusee.nodes.scene._grey import grey
+from neusee.nodes.scene._exr import exr, write_spectral
 from neusee.nodes.scene._hyperspectral import hyperspectral
 from neusee.nodes.scene._photograph import (
     Photographs,
@@ -12,7 +10,7 @@ from neusee.nodes.scene._photograph import (
     list_photographs,
     photograph,
 )
-from neusee.nodes.scene._spectral_exr import write_spectral
+from neusee.nodes.scene._picture_changes import Change, grey, symmetry
 from neusee.nodes.scene._test_targets import targets
 
 __all__ = [

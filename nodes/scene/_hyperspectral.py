@@ -11,8 +11,8 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.file_headers import mat_needs, npy_needs
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_array
-from neusee.nodes.scene._picture_scaling import enlarged, framed
-from neusee.nodes.scene._spectral_exr import exr_header, read_spectral, spectral_channels
+from neusee.nodes.scene._exr import exr_header, read_spectral, spectral_channels
+from neusee.nodes.scene._picture_changes import enlarged, framed
 from neusee.nodes.spectra._cie_tables import Table, require_range
 from neusee.nodes.units import DataFile, Shape, Wavelength
 from neusee.nodes.values import Bands

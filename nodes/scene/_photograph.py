@@ -24,7 +24,7 @@ from neusee.nodes.input_files import (
     refuse_large_picture,
     refuse_other_than_file,
 )
-from neusee.nodes.scene._picture_scaling import (
+from neusee.nodes.scene._picture_changes import (
     Codes,
     DrawnCrop,
     drawn_crop,

@@ -5,11 +5,10 @@ from typing import Any
 
 from torch import Tensor
 
-from neusee.nodes.scene._exr_picture import exr, picture_size
-from neusee.nodes.scene._grey import grey
+from neusee.nodes.scene._exr import exr, picture_size
 from neusee.nodes.scene._hyperspectral import Layout, hyperspectral, rows_and_columns
 from neusee.nodes.scene._photograph import photograph, read_header
-from neusee.nodes.scene._picture_scaling import is_large
+from neusee.nodes.scene._picture_changes import grey, is_large
 from neusee.nodes.scene._test_targets import targets
 from neusee.nodes.shape_rules import blank, like_first
 from neusee.nodes.values import Bands

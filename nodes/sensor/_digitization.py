@@ -11,10 +11,9 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
-from neusee.nodes.precision import single
+from neusee.nodes.precision import single, transformed
 from neusee.nodes.sensor._noise import rare_events
 from neusee.nodes.sensor._saturation import Well, refuse_below_one_electron
-from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor", "truncation"]

@@ -11,9 +11,8 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
-from neusee.nodes.precision import single
+from neusee.nodes.precision import single, transformed
 from neusee.nodes.sensor._saturation import Well, refuse_without_room
-from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import (
     DarkCurrent,
     Efficiency,

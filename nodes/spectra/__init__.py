@@ -11,26 +11,22 @@ from neusee.nodes.spectra._bands import (
     line_table,
     mean_wavelength,
 )
-from neusee.nodes.spectra._camera_colour import grain, render
 from neusee.nodes.spectra._channel_responses import camera_curves, responses, rows
-from neusee.nodes.spectra._dead_leaves import leaves
 from neusee.nodes.spectra._illuminant import illuminant, illuminate, light_curve
-from neusee.nodes.spectra._linear_lift import (
+from neusee.nodes.spectra._lift import (
     lift_lmmse,
     lift_lmmse_mixture,
     lift_mallett,
     lift_mallett_mixture,
     lift_matrix,
-)
-from neusee.nodes.spectra._low_rank_cube import compress
-from neusee.nodes.spectra._measured_reflectances import reflectances
-from neusee.nodes.spectra._metamers import metamers
-from neusee.nodes.spectra._mst_plus_plus import (
     lift_mst_plus_plus,
     lift_pictures,
     need_mst_plus_plus_bands,
     start_mst_plus_plus,
 )
+from neusee.nodes.spectra._low_rank_cube import compress
+from neusee.nodes.spectra._plausible_spectra import metamers, reflectances
+from neusee.nodes.spectra._synthetic_pictures import grain, leaves, render
 
 __all__ = [
     "bands",

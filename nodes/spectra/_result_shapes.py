@@ -7,19 +7,18 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, like_first
-from neusee.nodes.spectra._camera_colour import grain, render
 from neusee.nodes.spectra._channel_responses import channel_count, responses, rows, seen_range
-from neusee.nodes.spectra._dead_leaves import _FINE, leaves
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
-from neusee.nodes.spectra._linear_lift import (
+from neusee.nodes.spectra._lift import (
     lift_lmmse,
     lift_lmmse_mixture,
     lift_mallett,
     lift_mallett_mixture,
+    lift_mst_plus_plus,
 )
 from neusee.nodes.spectra._low_rank_cube import compress
-from neusee.nodes.spectra._metamers import metamers
-from neusee.nodes.spectra._mst_plus_plus import lift_mst_plus_plus
+from neusee.nodes.spectra._plausible_spectra import metamers
+from neusee.nodes.spectra._synthetic_pictures import _FINE, grain, leaves, render
 from neusee.nodes.values import Bands, LowRankCube
 
 _FEW = 20  #: bands of a laser line, at most

@@ -23,7 +23,7 @@ from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
 from neusee.nodes.values import Psf, Pupil
 from neusee.workflows.engine.node_call import call, call_by_band, plain_of
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.store import serialization
 from neusee.workflows.store.band_files import Blobs, Stacked

@@ -26,7 +26,7 @@ from neusee.nodes.optics import _channel_image
 from neusee.workflows import load
 from neusee.workflows.engine import execution, resolve_keys, runner
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.cold_run import cold
+from neusee.workflows.studies.run_study import cold
 from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 ENGINE = (

@@ -29,8 +29,8 @@ from neusee.nodes import doe, losses, metrics
 from neusee.nodes.values import Stop
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design.design_run import MaskTraining, design, mask_figures
-from neusee.workflows.training.mask_design.design_terms import Terms
+from neusee.workflows.training.design_run import MaskTraining, design, mask_figures
+from neusee.workflows.training.design_terms import Terms
 
 AT = {"optics.samples": 270, "optics.pitch": "29.92 um", "optics.window": [504, 504]}
 # at 400 nm 72 waves (of 550 nm) are its Nyquist limit

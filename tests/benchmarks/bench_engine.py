@@ -20,7 +20,7 @@ from neusee import recipes
 from neusee.nodes import node
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.keys.code_digest import Code

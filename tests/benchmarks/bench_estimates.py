@@ -31,7 +31,7 @@ from neusee.nodes.optics import _few_bands
 from neusee.nodes.optics import _few_bands as _band_thumbnail
 from neusee.workflows.engine.runner import run
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.cold_run import cold
+from neusee.workflows.studies.run_study import cold
 from neusee.workflows.tolerance.error_norm import error_of
 
 ENDS = (1e-4, 1e-3, 1e-2, 3e-2)

@@ -30,7 +30,7 @@ from neusee.nodes.spectra import (
     reflectances,
     render,
 )
-from neusee.nodes.spectra._linear_lift import lift_matrix
+from neusee.nodes.spectra._lift import lift_matrix
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 PICTURES, SIZE, LEAST = 32, (64, 64), 1e-2

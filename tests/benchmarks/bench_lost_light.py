@@ -37,11 +37,11 @@ from neusee.nodes.restore._lasers._components import (  # noqa: E402
     Laser,
     lamp_light,
 )
-from neusee.nodes.restore._lasers._greedy_search import Known, _data  # noqa: E402
-from neusee.nodes.restore._lasers._joint_fit import (  # noqa: E402
+from neusee.nodes.restore._lasers._frame_likelihood import (  # noqa: E402
     fitted,
     spreads,
 )
+from neusee.nodes.restore._lasers._greedy_search import Known, _data  # noqa: E402
 from neusee.nodes.restore._lasers._line_pattern import Lens, line_pattern  # noqa: E402
 from tests.benchmarks import bench_restored_frames as masks  # noqa: E402
 from tests.nodes.restore.lasers import own_camera as own  # noqa: E402

@@ -265,7 +265,7 @@ from pathlib import Path
 neusee.nodes.__path__ = [*neusee.nodes.__path__, folder]
 from neusee.nodes import peer_case as case
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.engine.runner import run
 from neusee.workflows.store.result_store import Store
 for key, value in given.items():

@@ -26,7 +26,7 @@ from neusee.workflows.calibration.importance_sampling import draw_guide
 from neusee.workflows.calibration.log_posterior import SensorPosterior, search_mode
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration.posterior_tests import (
+from neusee.workflows.studies.posterior_tests import (
     DRAWS,
     PosteriorDraws,
     rank_tests,

@@ -24,8 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import RecipeError, RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_norm import error_of
 

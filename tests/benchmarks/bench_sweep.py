@@ -33,7 +33,7 @@ from neusee.workflows import load
 from neusee.workflows.engine import node_call, step_job
 from neusee.workflows.recipe.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.uncertainty.output_draws import OutputDraws
+from neusee.workflows.studies.output_draws import OutputDraws
 from neusee.workflows.sweeps.axes import read_axes, read_words
 from neusee.workflows.sweeps.sweep_points import outcomes
 from neusee.workflows.sweeps.sweep_run import Sweeping

@@ -27,12 +27,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import RecipeError, RunError
 from neusee.workflows.recipe.loading import changed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.recipe_knobs import knobs
-from neusee.workflows.studies.cold_run import cold
+from neusee.workflows.studies.recipe_knobs import knobs
+from neusee.workflows.studies.run_study import cold
 from neusee.workflows.tolerance.error_norm import error_of
 
 OUTPUTS = ("raw[plain]", "raw[mask]")

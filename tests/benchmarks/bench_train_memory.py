@@ -29,7 +29,7 @@ from live_bytes import LiveBytes
 
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
-from neusee.workflows.training.loop.resumable_loop import export
+from neusee.workflows.training.resumable_loop import export
 from neusee.workflows.training.run_training import frozen
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream

@@ -20,7 +20,7 @@ from pathlib import Path
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.cold_run import cold
+from neusee.workflows.studies.run_study import cold
 from neusee.workflows.tolerance.error_norm import error_of
 
 RECIPES = ("first_light", "six_lasers", "dirty_windshield", "paper_table1")

@@ -25,7 +25,7 @@ from typing import Any
 
 from stored_results import store, stored
 
-from neusee.workflows.graph.diagnostics import Location, RecipeError
+from neusee.workflows.graph.errors import Location, RecipeError
 from neusee.workflows.recipe.text.yaml_values import parse, read
 
 DOCUMENT = "yaml_suite"  #: in `results/`

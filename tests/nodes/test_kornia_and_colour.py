@@ -22,8 +22,8 @@ from neusee.nodes.losses import charbonnier
 from neusee.nodes.metrics import quality
 from neusee.nodes.resampling import enlarge, resize
 from neusee.nodes.scene import Photographs
-from neusee.nodes.scene._picture_scaling import framed
-from neusee.nodes.scene._spectral_exr import _PREFIX, spectral_channels
+from neusee.nodes.scene._exr import _PREFIX, spectral_channels
+from neusee.nodes.scene._picture_changes import framed
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, lift_mallett, render
 from neusee.nodes.spectra._cie_tables import light, paints
@@ -192,7 +192,7 @@ def test_names_of_spectral_channels_are_read_as_by_colour_science():
 
 
 def test_names_are_read_without_the_import_of_colour_science():
-    code = "from neusee.nodes.scene._spectral_exr import spectral_channels as s; s(['T.550,0nm'])"
+    code = "from neusee.nodes.scene._exr import spectral_channels as s; s(['T.550,0nm'])"
     done = subprocess.run(
         [sys.executable, "-c", f"import sys; {code}; print('colour' in sys.modules)"],
         capture_output=True,

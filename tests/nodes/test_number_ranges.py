@@ -17,12 +17,12 @@ from neusee.nodes.units import (
     in_words,
     number_ranges,
 )
-from neusee.workflows.recipe.blocks import evaluate_block, safety_block, train_block
+from neusee.workflows.recipe.blocks import safety_block, settings_block, train_block
 from neusee.workflows.recipe.blocks import train_block as train_lift_block
 from neusee.workflows.recipe.node_families import all_nodes
 
 # imported, so that models exist
-BLOCKS = (evaluate_block, safety_block, train_block, train_lift_block, Traceability)
+BLOCKS = (settings_block, safety_block, train_block, train_lift_block, Traceability)
 
 
 def models(base=ParameterModel):

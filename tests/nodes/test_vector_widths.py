@@ -22,8 +22,8 @@ from neusee.nodes.optics._transform._fused import fused_axis
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred, last_type
-from neusee.nodes.restore._scan import _cpp_scan
-from neusee.nodes.restore._scan._selective_scan import selective_scan
+from neusee.nodes.restore._networks import _selective_scan
+from neusee.nodes.restore._networks._selective_scan import selective_scan
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")]
 
@@ -158,7 +158,7 @@ def bound(factors, views):
 def test_a_vector_is_as_wide_as_the_registers(compiled, level):
     compiled(level)
     assert _fused.operators().neusee_psf_vector_bytes() == LEVELS[level][0]
-    assert _cpp_scan.operators().neusee_scan_vector_bytes() == LEVELS[level][0]
+    assert _selective_scan.operators().neusee_scan_vector_bytes() == LEVELS[level][0]
 
 
 @pytest.mark.parametrize("level", LEVELS)

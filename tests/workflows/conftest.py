@@ -42,7 +42,7 @@ def mistakes(read):
     """What a recipe of toy nodes is refused with: one line each, with single spaces between the
     columns.
     """
-    from neusee.workflows.graph.diagnostics import RecipeError
+    from neusee.workflows.graph.errors import RecipeError
 
     def mistakes(text, *arguments):
         with pytest.raises(RecipeError) as caught:

@@ -133,7 +133,7 @@ def once(job: dict[str, Any]) -> dict[str, Any]:
 
     import neusee.nodes
     from neusee.workflows.engine.runner import run
-    from neusee.workflows.graph.diagnostics import Location
+    from neusee.workflows.graph.errors import Location
     from neusee.workflows.graph.recipe_graph import Recipe, Step
     from neusee.workflows.store.result_store import Store
 

@@ -22,13 +22,13 @@ from neusee.workflows.report.figures import optics
 from neusee.workflows.report.figures import verification as numerics
 from neusee.workflows.report.figures import verification as photon_transfer
 from neusee.workflows.report.figures.style import canvas
-from neusee.workflows.studies.accuracy import accuracy_page as accuracy_figures
-from neusee.workflows.studies.leave_out import leave_out_study
-from neusee.workflows.studies.leave_out.leave_out_study import SceneCost
-from neusee.workflows.studies.stability.case_result import Cell
-from neusee.workflows.studies.stability.stability_study import grid_picture
-from neusee.workflows.studies.uncertainty import uncertainty_page as uncertainty_figures
-from neusee.workflows.training.mask_design import design_page
+from neusee.workflows.studies import accuracy_page as accuracy_figures
+from neusee.workflows.studies import leave_out_study
+from neusee.workflows.studies import uncertainty_page as uncertainty_figures
+from neusee.workflows.studies.case_result import Cell
+from neusee.workflows.studies.leave_out_study import SceneCost
+from neusee.workflows.studies.stability_study import grid_picture
+from neusee.workflows.training import design_run
 
 # a function that is called as it is writes the picture: the check of all figures then reads it
 
@@ -137,7 +137,7 @@ def test_twelve_masks_and_twelve_starts_look_different():
     plane = evaluation_figures.plane.__wrapped__({f"mask {i}": mask for i in range(12)}).axes[0]
     assert len(looks(line for line in plane.lines if line.get_label().startswith("mask"))) == 12
     rows = [{"start": i, "iteration": 0, "loss": 1.0} for i in range(12)]
-    assert len(looks(design_page.history.__wrapped__(rows).axes[0].lines)) == 12
+    assert len(looks(design_run.history.__wrapped__(rows).axes[0].lines)) == 12
 
 
 def test_numbers_of_panels_above_each_other_are_apart():

@@ -12,20 +12,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neusee.workflows.answers.results_folder import (
-    kept_files,
-    printed,
-    said_again,
-    write_again,
-    write_run_again,
-)
 from neusee.workflows.answers.stored_answer import (
     RUN,
     Answer,
+    kept_files,
     make_room,
+    printed,
     read_answer,
+    said_again,
     used,
+    write_again,
     write_answer,
+    write_run_again,
 )
 from neusee.workflows.answers.witnesses import (
     Folders,
@@ -46,9 +44,9 @@ from neusee.workflows.store.cache_settings import budget_bytes, default_root
 from neusee.workflows.store.shared_folder import Disk
 
 if TYPE_CHECKING:
-    from neusee.workflows.answers.results_folder import RunResults
+    from neusee.workflows.answers.stored_answer import RunResults
     from neusee.workflows.graph.recipe_graph import Recipe
-    from neusee.workflows.report.study_folder import StudyReport
+    from neusee.workflows.report.study_report import StudyReport
     from neusee.workflows.store.result_store import Store
 
 
@@ -361,7 +359,7 @@ class Command:
         """Keep the answer of a command that has ended well; do so only if nothing that it rests on
         is in doubt.
 
-        Args: text: of the terminal, with `results_folder.PAGE` for the path of the page. recipe:
+        Args: text: of the terminal, with `stored_answer.PAGE` for the path of the page. recipe:
                 that of the command.
         results: what the command has written, or what it has taken from a store. A command that
         writes nothing makes no cache either.

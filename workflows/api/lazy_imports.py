@@ -14,13 +14,12 @@ if TYPE_CHECKING:
     from neusee.workflows.evaluation import run_evaluation as run_evaluation
     from neusee.workflows.training import process_mesh as process_mesh
     from neusee.workflows.training import run_training as run_training
-    from neusee.workflows.training.lift import lift_run as lift_run
 
 #: modules below neusee
 _MODULES = (
     "workflows.calibration.run_calibration",
     "workflows.evaluation.run_evaluation",
-    "workflows.training.lift.lift_run",
+    "workflows.training.lift_training",
     "workflows.training.process_mesh",
     "workflows.training.run_training",
 )

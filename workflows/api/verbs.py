@@ -22,7 +22,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override, overrides_of
 from neusee.workflows.report.run_folder import writable_folder
-from neusee.workflows.report.study_folder import Progress, silent
+from neusee.workflows.report.study_report import Progress, silent
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.studies import run_study
 from neusee.workflows.sweeps.sweep_run import Sweep
@@ -120,7 +120,9 @@ def train(
     """
     recipe, folder, store = _read(recipe, changes), writable_folder(out), store or open_store()
     if recipe.lifting is not None:
-        return lazy.lift_run.train_lift(recipe, store, folder, command, progress, device, watch)
+        return lazy.lift_training.train_lift(
+            recipe, store, folder, command, progress, device, watch
+        )
     numbers = stages if stages is not None else recipe.training.learnt if recipe.training else ()
     return lazy.run_training.train(
         recipe,

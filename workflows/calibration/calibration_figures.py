@@ -13,7 +13,7 @@ from neusee.nodes.values import Levels
 from neusee.workflows.calibration.identifiability import words_of
 from neusee.workflows.calibration.posterior_checks import is_camera
 from neusee.workflows.report.figures.style import BLACK, BLUE, ORANGE, VERMILION, canvas, drawn
-from neusee.workflows.report.study_page import Section
+from neusee.workflows.report.study_report import Section
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -25,11 +25,15 @@ from neusee.workflows.calibration.calibration_figures import (
 )
 from neusee.workflows.calibration.frame_validity import IntervalEstimate, ModelSpread, frame_section
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability, words_of
-from neusee.workflows.calibration.laboratory import RELATIVE, stated
 from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
 from neusee.workflows.calibration.posterior_checks import Check, Mark, count_failures, is_camera
-from neusee.workflows.calibration.uncertainty_budget import budget_picture, budget_sections
-from neusee.workflows.report.study_page import Marked, Section, with_uncertainty
+from neusee.workflows.calibration.uncertainty_budget import (
+    RELATIVE,
+    budget_picture,
+    budget_sections,
+    stated,
+)
+from neusee.workflows.report.study_report import Marked, Section, with_uncertainty
 
 if TYPE_CHECKING:
     from neusee.nodes.values import Levels

@@ -17,7 +17,7 @@ from neusee.nodes.input_files import bytes_of
 from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
 from neusee.workflows.calibration.posterior_mixture import Density
 from neusee.workflows.keys.sealed_files import seal_file, unseal_file
-from neusee.workflows.report.study_folder import Progress, silent
+from neusee.workflows.report.study_report import Progress, silent
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.importance_sampling import Guide

@@ -44,8 +44,7 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.frames.folder_recipe import quoted
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report.study_folder import CsvTable
-from neusee.workflows.report.study_page import Mark, Marked, Section
+from neusee.workflows.report.study_report import CsvTable, Mark, Marked, Section
 from neusee.workflows.store.result_store import Store
 
 T = TypeVar("T")

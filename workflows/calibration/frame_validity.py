@@ -33,7 +33,7 @@ from neusee.workflows.calibration.posterior_mixture import normalised
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.distributions.joint_distribution import Z_90
-from neusee.workflows.report.study_page import Mark, Marked, Section
+from neusee.workflows.report.study_report import Mark, Marked, Section
 from neusee.workflows.store.result_store import Store
 
 if TYPE_CHECKING:

@@ -40,14 +40,6 @@ from neusee.workflows.calibration.frame_validity import (
     widened_models,
 )
 from neusee.workflows.calibration.identifiability import identify, identify_from_draws
-from neusee.workflows.calibration.laboratory import (
-    is_relative,
-    laboratory_of,
-    stated,
-    with_laboratory,
-    with_laboratory_models,
-    without_efficiency,
-)
 from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior, search_mode
 from neusee.workflows.calibration.posterior_checks import (
     Check,
@@ -62,11 +54,17 @@ from neusee.workflows.calibration.uncertainty_budget import (
     budget_document,
     budget_rows,
     budgets,
+    is_relative,
+    laboratory_of,
+    stated,
+    with_laboratory,
+    with_laboratory_models,
+    without_efficiency,
 )
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import engine
-from neusee.workflows.report.study_folder import (
+from neusee.workflows.report.study_report import (
     Content,
     CsvTable,
     Progress,

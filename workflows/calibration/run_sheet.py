@@ -25,7 +25,6 @@ from neusee.workflows.calibration.emva_sheet import (
     temporal_variance,
 )
 from neusee.workflows.calibration.frame_validity import as_rows
-from neusee.workflows.calibration.laboratory import is_relative, laboratory_of, stated
 from neusee.workflows.calibration.uncertainty_budget import (
     BUDGETED,
     COLUMNS,
@@ -33,10 +32,13 @@ from neusee.workflows.calibration.uncertainty_budget import (
     budget_picture,
     budget_rows,
     budget_sections,
+    is_relative,
+    laboratory_of,
+    stated,
 )
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
+from neusee.workflows.report.study_report import StudyReport, StudyRun, as_json
 from neusee.workflows.store.result_store import Store
 
 _PLUS = (

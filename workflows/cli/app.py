@@ -24,7 +24,6 @@ from neusee.workflows.cli.commands_and_exit_codes import (
 )
 from neusee.workflows.cli.interrupt_signal import Interrupts, said, say_stopped
 from neusee.workflows.engine.machine_resources import free_processors
-from neusee.workflows.recipe.text.hydra_habits import ADVICE_ON_MULTIRUN
 
 if TYPE_CHECKING:
     import typer
@@ -73,6 +72,9 @@ def settle_threads(command: str, environ: MutableMapping[str, str] = os.environ)
 # The entry point of the command line: ``neusee --help`` works without typer, and an error is
 # printed as one line.
 
+
+#: for a user of Hydra, whose option for several values is ``-m`` or ``--multirun``
+ADVICE_ON_MULTIRUN = "several values are a sweep: write `neusee sweep RECIPE doe=flat,axicon`"
 
 #: the program with the options of all commands, built when a caller first reads the name
 app: typer.Typer
@@ -171,5 +173,5 @@ def _explained(error: Exception) -> int:
     text = (
         str(error) if error_class in ("RunError", "UnfollowedCode") else f"{error_class}: {error}"
     )
-    print(lazy.diagnostics.visible(f"{text}   (--debug shows where)"), file=sys.stderr)
+    print(lazy.errors.visible(f"{text}   (--debug shows where)"), file=sys.stderr)
     return BAD if error_class == "UnfollowedCode" else FAILED

@@ -12,10 +12,17 @@ import typer
 
 from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import (
+    AsJson,
+    Debug,
+    FewLines,
+    Out,
+    Quiet,
+    Words,
     fail,
     failing,
     kept_in,
     load,
+    option_words,
     refusing,
     resumable,
     say,
@@ -23,15 +30,6 @@ from neusee.workflows.cli.command_frame import (
     say_line,
     split,
     the_store,
-)
-from neusee.workflows.cli.command_options import (
-    AsJson,
-    Debug,
-    FewLines,
-    Out,
-    Quiet,
-    Words,
-    option_words,
 )
 from neusee.workflows.cli.commands_and_exit_codes import FAILED, MISSED
 from neusee.workflows.keys.sealed_files import text_of
@@ -92,7 +90,7 @@ def calibrate(
         fail("--sensor needs a folder of frames, such as `neusee calibrate lab --sensor mine`")
     with (
         resumable(lambda: kept_in(store, "the draws up to the last line above are")),
-        failing(lazy.run_error.RunError, ValueError, ImportError, code=FAILED),
+        failing(lazy.errors.RunError, ValueError, ImportError, code=FAILED),
         failing(
             lazy.run_calibration.CalibrationRefused,
             code=FAILED,
@@ -151,7 +149,7 @@ def _loaded(words: list[str] | None, store: Store, quiet: bool) -> tuple[Recipe,
         return *load(words, "calibrate"), False
 
     with failing(ValueError, before="nothing was drawn: "), refusing():
-        report = lazy.study_folder.silent if quiet else say_line
+        report = lazy.study_report.silent if quiet else say_line
         recipe = lazy.folder_recipe.recipe_of_folder(Path(name), store, changes, report)
         return recipe, ["neusee", "calibrate", name, *changes], True
 
@@ -244,7 +242,7 @@ def sheet(
     command += option_words({"release": edition, "relative": relative})
     for fact in stated_facts:
         command += ["--state", fact]
-    with failing(lazy.run_error.RunError, code=FAILED), failing(ValueError):
+    with failing(lazy.errors.RunError, code=FAILED), failing(ValueError):
         folder = lazy.run_sheet.write_sheet(
             recipe,
             the_store(),
@@ -282,7 +280,7 @@ def _loaded_camera(words: list[str] | None, quiet: bool) -> tuple[Recipe, list[s
 
     with failing(ValueError, before="nothing was computed: "), refusing():
         if Path(name).is_dir() and not lazy.folder_recipe.descriptors_in(Path(name)):
-            report = lazy.study_folder.silent if quiet else say_line
+            report = lazy.study_report.silent if quiet else say_line
             recipe = lazy.folder_recipe.recipe_of_folder(
                 Path(name), the_store(), changes, report, every_pixel=True
             )

@@ -14,9 +14,8 @@ import typer
 
 import neusee.recipes
 from neusee.workflows.cli import lazy_imports as lazy
-from neusee.workflows.cli.command_frame import failing, refusing, say
-from neusee.workflows.cli.command_options import Debug
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.cli.command_frame import Debug, failing, refusing, say
+from neusee.workflows.graph.errors import nearest
 from neusee.workflows.report.paper_readings import READINGS, SETTLED
 from neusee.workflows.report.terminal_text import columns
 

@@ -11,11 +11,10 @@ from typing import Annotated
 import typer
 
 from neusee.workflows.cli import lazy_imports as lazy
-from neusee.workflows.cli.command_frame import failing, say
-from neusee.workflows.cli.command_options import Debug, Quiet, progress_lines
+from neusee.workflows.cli.command_frame import Debug, Quiet, failing, progress_lines, say
 from neusee.workflows.cli.commands_and_exit_codes import FAILED
-from neusee.workflows.handbook import guide_pages, site_build
-from neusee.workflows.handbook.guide_pages import NoPicture
+from neusee.workflows.handbook import site_build
+from neusee.workflows.handbook.site_build import NoPicture
 
 
 def handbook(
@@ -47,7 +46,7 @@ def handbook(
     with failing(
         site_build.HandbookError, NoPicture, OSError, code=FAILED, before="neusee handbook: "
     ):
-        reference = lazy.handbook_reference.reference_pages(guide_pages.GUIDE.parent)
+        reference = lazy.handbook_reference.reference_pages(site_build.GUIDE.parent)
         page = site_build.build_handbook(out, reference, pictures, progress_lines(quiet))
     say([str(page)])
     if opens and not (_has_display() and webbrowser.open(page.absolute().as_uri())) and not quiet:

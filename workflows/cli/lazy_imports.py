@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from neusee.workflows.contract import node_contract as node_contract
     from neusee.workflows.engine import dask_cluster as dask_cluster
     from neusee.workflows.engine import local_executor as local_executor
-    from neusee.workflows.engine import memory_limits as memory_limits
     from neusee.workflows.engine import wanted_steps as wanted_steps
     from neusee.workflows.evaluation import pipelines as pipelines
     from neusee.workflows.explain import run_forecast as run_forecast
@@ -40,14 +39,13 @@ if TYPE_CHECKING:
     from neusee.workflows.explain import why_rerun as why_rerun
     from neusee.workflows.frames import folder_recipe as folder_recipe
     from neusee.workflows.frames import sensor_group as sensor_group
-    from neusee.workflows.graph import diagnostics as diagnostics
+    from neusee.workflows.graph import errors as errors
     from neusee.workflows.graph import recipe_graph as recipe_graph
-    from neusee.workflows.graph import run_error as run_error
     from neusee.workflows.handbook import json_schema as json_schema
     from neusee.workflows.recipe import loading as loading
     from neusee.workflows.recipe import node_families as node_families
     from neusee.workflows.report import console as console
-    from neusee.workflows.report import study_folder as study_folder
+    from neusee.workflows.report import study_report as study_report
     from neusee.workflows.restoration import frame_recipes as frame_recipes
     from neusee.workflows.safety import run_safety as run_safety
     from neusee.workflows.safety import safety_text as safety_text
@@ -55,7 +53,7 @@ if TYPE_CHECKING:
     from neusee.workflows.studies import run_study as run_study
     from neusee.workflows.tolerance import cheaper_steps as cheaper_steps
     from neusee.workflows.training import process_mesh as process_mesh
-    from neusee.workflows.training.loop import resumable_loop as resumable_loop
+    from neusee.workflows.training import resumable_loop as resumable_loop
 
 #: modules below neusee
 _MODULES = (
@@ -77,7 +75,7 @@ _MODULES = (
     "workflows.contract.node_contract",
     "workflows.engine.dask_cluster",
     "workflows.engine.local_executor",
-    "workflows.engine.memory_limits",
+    "workflows.engine.machine_resources",
     "workflows.engine.wanted_steps",
     "workflows.evaluation.pipelines",
     "workflows.explain.run_forecast",
@@ -85,21 +83,20 @@ _MODULES = (
     "workflows.explain.why_rerun",
     "workflows.frames.folder_recipe",
     "workflows.frames.sensor_group",
-    "workflows.graph.diagnostics",
+    "workflows.graph.errors",
     "workflows.graph.recipe_graph",
-    "workflows.graph.run_error",
     "workflows.handbook.json_schema",
     "workflows.recipe.loading",
     "workflows.recipe.node_families",
     "workflows.report.console",
-    "workflows.report.study_folder",
+    "workflows.report.study_report",
     "workflows.restoration.frame_recipes",
     "workflows.safety.run_safety",
     "workflows.safety.safety_text",
     "workflows.simulation.simulate_recipe",
     "workflows.studies.run_study",
     "workflows.tolerance.cheaper_steps",
-    "workflows.training.loop.resumable_loop",
+    "workflows.training.resumable_loop",
     "workflows.training.process_mesh",
 )
 _BY_NAME = {module.rpartition(".")[2]: module for module in _MODULES}

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from neusee.workflows.cli import lazy_imports as lazy
-from neusee.workflows.cli.command_frame import fail, failing, say
-from neusee.workflows.cli.command_options import AsJson, Debug
+from neusee.workflows.cli.command_frame import AsJson, Debug, fail, failing, say
 from neusee.workflows.cli.commands_and_exit_codes import DONE, MISSED
 from neusee.workflows.contract.surroundings import elsewhere
 

@@ -12,22 +12,6 @@ import typer
 
 from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import (
-    fail,
-    failing,
-    kept_in,
-    load,
-    print_warning,
-    refusing,
-    resumable,
-    say,
-    say_json,
-    say_line,
-    search_for_garbage,
-    split,
-    split_frames,
-    the_store,
-)
-from neusee.workflows.cli.command_options import (
     AsJson,
     Debug,
     Device,
@@ -39,12 +23,26 @@ from neusee.workflows.cli.command_options import (
     check_device,
     check_executor,
     executor_of,
+    fail,
+    failing,
+    kept_in,
+    load,
     option_words,
+    print_warning,
+    refusing,
+    resumable,
+    say,
+    say_json,
+    say_line,
+    search_for_garbage,
+    split,
+    split_frames,
+    the_store,
     within_memory,
 )
 from neusee.workflows.cli.commands_and_exit_codes import FAILED, MISSED, TYPED
 from neusee.workflows.cli.repetition import keep_answer, keep_run, say_and_keep
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.report.run_folder import find_run, rebuild
 from neusee.workflows.report.terminal_text import commands_to_try, json_line
 
@@ -391,7 +389,7 @@ def safety(
     recipe, command = load(words, "safety")
     store = the_store()
 
-    with refusing(), failing(lazy.run_error.RunError, code=FAILED):
+    with refusing(), failing(lazy.errors.RunError, code=FAILED):
         folder, assessment = lazy.run_safety.assess(recipe, store, out, command)
 
     def text(page: str) -> str:
@@ -529,7 +527,7 @@ def restore(
 
     with (
         resumable(lambda: kept_in(store, "finished steps are")),
-        failing(lazy.run_error.RunError, code=FAILED),
+        failing(lazy.errors.RunError, code=FAILED),
     ):
         for file, recipe in zip(files, recipes, strict=True):
             command = ["neusee", "restore", str(file), *changes, *options]

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 from neusee.workflows.answers import repeated_command
 from neusee.workflows.answers.repeated_command import Said
-from neusee.workflows.answers.results_folder import FOLDER, PAGE, TOOK, RunResults
+from neusee.workflows.answers.stored_answer import FOLDER_MARK, PAGE, SECONDS_MARK, RunResults
 from neusee.workflows.cli import lazy_imports as lazy
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
-    from neusee.workflows.report.study_folder import StudyReport
+    from neusee.workflows.report.study_report import StudyReport
     from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
 
@@ -86,7 +86,7 @@ def keep_run(
     """
     for command in repeated_command.running:
         results = RunResults(done.folder, out, done.document, done.taken, store)
-        command.keep(text(FOLDER, TOOK), as_json, recipe, results)
+        command.keep(text(FOLDER_MARK, SECONDS_MARK), as_json, recipe, results)
 
 
 def doubt_answer() -> None:

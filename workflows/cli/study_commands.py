@@ -10,17 +10,6 @@ import typer
 
 from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import (
-    fail,
-    failing,
-    kept_in,
-    load,
-    refusing,
-    resumable,
-    say_folder,
-    split,
-    the_store,
-)
-from neusee.workflows.cli.command_options import (
     AsJson,
     Debug,
     OneDevice,
@@ -28,11 +17,20 @@ from neusee.workflows.cli.command_options import (
     Quiet,
     Words,
     check_device,
+    fail,
+    failing,
+    kept_in,
+    load,
     option_words,
     progress_lines,
+    refusing,
+    resumable,
+    say_folder,
+    split,
+    the_store,
 )
 from neusee.workflows.cli.commands_and_exit_codes import BAD, FAILED
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import nearest
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -310,7 +308,7 @@ def _run(
     when_stopped = resumable(lambda: kept_in(store, "the parts that are finished are"))
     with (
         when_stopped,
-        failing(lazy.run_error.RunError, ImportError, code=FAILED),
+        failing(lazy.errors.RunError, ImportError, code=FAILED),
         failing(ValueError, code=BAD),
         refusing(),
     ):
@@ -426,7 +424,7 @@ def _evaluate(name: str, **options: Any) -> Path:
     with (
         when_stopped,
         failing(lazy.pipelines.EvaluationRefused),
-        failing(lazy.run_error.RunError, code=FAILED),
+        failing(lazy.errors.RunError, code=FAILED),
         refusing(),
     ):
         return lazy.verbs.evaluate(name, store=store, **options)

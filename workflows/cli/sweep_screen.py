@@ -12,8 +12,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.cli.command_frame import say_json, say_line
-from neusee.workflows.cli.command_options import option_words
+from neusee.workflows.cli.command_frame import option_words, say_json, say_line
 from neusee.workflows.cli.commands_and_exit_codes import DONE, FAILED, INTERRUPTED
 from neusee.workflows.report.console import Mode, ProgressTable, mode_for
 from neusee.workflows.report.terminal_text import lasts
@@ -21,13 +20,17 @@ from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import read_words
 from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, outcomes
-from neusee.workflows.sweeps.sweep_run import Sweep, Sweeping, SweepState, counted, write_sweep
-from neusee.workflows.sweeps.sweep_table import (
+from neusee.workflows.sweeps.sweep_run import (
     AxisColumn,
+    Sweep,
+    Sweeping,
+    SweepState,
     cell_text,
+    counted,
     headline,
     point_cells,
     require_xarray,
+    write_sweep,
 )
 
 if TYPE_CHECKING:

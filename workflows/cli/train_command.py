@@ -14,17 +14,6 @@ import typer
 
 from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import (
-    fail,
-    failing,
-    kept_training,
-    load,
-    refusing,
-    resumable,
-    say,
-    say_json,
-    the_store,
-)
-from neusee.workflows.cli.command_options import (
     AsJson,
     Debug,
     Out,
@@ -32,7 +21,16 @@ from neusee.workflows.cli.command_options import (
     Quiet,
     Words,
     check_device,
+    fail,
+    failing,
+    kept_training,
+    load,
     progress_lines,
+    refusing,
+    resumable,
+    say,
+    say_json,
+    the_store,
 )
 from neusee.workflows.cli.commands_and_exit_codes import FAILED
 from neusee.workflows.keys.sealed_files import text_of
@@ -97,7 +95,7 @@ def train(
     lengths = _lengths(recipe, stages)
     with (
         resumable(lambda: kept_training(out, recipe.name)),
-        failing(lazy.run_error.RunError, ValueError, ArithmeticError, code=FAILED, before=prefix),
+        failing(lazy.errors.RunError, ValueError, ArithmeticError, code=FAILED, before=prefix),
         failing(lazy.process_mesh.MeshError, before=prefix),
         refusing(),
         lazy.process_mesh.joined(device) as processes_here,
@@ -149,7 +147,7 @@ def _lift(
     lengths, silent = {0: recipe.lifting.iterations}, quiet or as_json
     with (
         resumable(lambda: kept_training(out, recipe.name)),
-        failing(lazy.run_error.RunError, ValueError, ArithmeticError, code=FAILED),
+        failing(lazy.errors.RunError, ValueError, ArithmeticError, code=FAILED),
         refusing(),
         _loss_bar(silent, lengths) as watch,
     ):

@@ -20,8 +20,7 @@ from neusee.workflows.comparison.run_record import RunRecord
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import new_run
-from neusee.workflows.report.study_folder import StudyReport
-from neusee.workflows.report.study_page import Section
+from neusee.workflows.report.study_report import Section, StudyReport
 from neusee.workflows.report.terminal_text import columns
 
 # --- comparison page ------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.keys.sealed_files import NotRegular, text_of
 from neusee.workflows.recipe.text.yaml_values import read

@@ -15,7 +15,7 @@ from multiprocessing.connection import Pipe
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neusee.workflows.observation.known_variables import OF_LANGUAGES, OF_THREADS, is_known
+from neusee.workflows.observation.environment_variables import OF_LANGUAGES, OF_THREADS, is_known
 
 if TYPE_CHECKING:
     from neusee.workflows.contract.elsewhere_rule import Asked

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import torch
 
 from neusee.workflows.engine.dask_executor import ClusterLost, Dask, connected, silence_logs
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import nearest
 from neusee.workflows.store.cache_settings import parse_size
 from neusee.workflows.store.result_store import Store
 

@@ -30,7 +30,7 @@ from neusee.workflows.engine.step_job import (
     carry_out,
     keys_in,
 )
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.keys.cache_key import Key, code_of, is_private
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.module_digest import imported

@@ -16,9 +16,8 @@ from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.step_job import gathered
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import RunError, nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order, needed, unknown_step
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import settle
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions

@@ -12,7 +12,6 @@ from neusee.nodes import TensorStats
 from neusee.workflows.engine.cost_model import Costs, Estimate, sizes_of
 from neusee.workflows.engine.dispatch import Loop, chains_of
 from neusee.workflows.engine.local_executor import Local
-from neusee.workflows.engine.missing_values import Upstream, uses_of
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import (
     Prepared,
@@ -32,6 +31,8 @@ from neusee.workflows.engine.step_job import (
     StepJob,
     WriteBehind,
 )
+from neusee.workflows.engine.wanted_steps import Upstream, uses_of
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import (
     Event,
     Recipe,
@@ -43,7 +44,6 @@ from neusee.workflows.graph.recipe_graph import (
     needed,
     nodes_of,
 )
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, is_private
 from neusee.workflows.keys.code_digest import Code, KnownKeys
 from neusee.workflows.keys.module_digest import say_once

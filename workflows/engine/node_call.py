@@ -13,8 +13,8 @@ from torch import Tensor
 
 from neusee.nodes import Check, Node
 from neusee.nodes.values import BAND_FIELDS, band_names
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import Step
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import device_kind, digest, plain, stream_seed, written
 from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
 from neusee.workflows.store.serialization import (

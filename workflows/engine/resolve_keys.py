@@ -8,8 +8,8 @@ from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import place
 from neusee.workflows.engine.provenance import facts_in
 from neusee.workflows.engine.resolved_keys import Resolved
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store

@@ -13,8 +13,7 @@ import torch
 from neusee.workflows.engine.cost_model import sizes_of
 from neusee.workflows.engine.execution import Execution, RunSeries, TaintedRun
 from neusee.workflows.engine.local_executor import check_devices, memory_limit
-from neusee.workflows.engine.machine_resources import give_back, process_peak
-from neusee.workflows.engine.memory_limits import limited
+from neusee.workflows.engine.machine_resources import give_back, limited, process_peak
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.placement_inputs import past_costs, running_peak
 from neusee.workflows.engine.provenance import state_counts

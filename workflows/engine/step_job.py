@@ -17,13 +17,12 @@ import torch
 
 from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.cost_model import measured_size
-from neusee.workflows.engine.machine_resources import PeakMemory
-from neusee.workflows.engine.memory_limits import guarded, refusing_allocations
+from neusee.workflows.engine.machine_resources import PeakMemory, guarded, refusing_allocations
 from neusee.workflows.engine.node_call import call, call_by_band, examine, plain_of
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork, may_fork
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, device_kind, file_stamps, is_private, plain
 from neusee.workflows.keys.user_code import OwnCode, hold_back, may_be_stored
 from neusee.workflows.observation.observed_call import (

@@ -22,10 +22,15 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 
-from neusee.workflows.engine.machine_resources import resident
-from neusee.workflows.engine.memory_limits import guarded, limit_now, limited, refusing_allocations
+from neusee.workflows.engine.machine_resources import (
+    guarded,
+    limit_now,
+    limited,
+    refusing_allocations,
+    resident,
+)
 from neusee.workflows.engine.worker_processes import deaf_fork, end_with, ignore_interrupts
-from neusee.workflows.observation.hidden_variables import Asked, hide_for_good
+from neusee.workflows.observation.environment_variables import Asked, hide_for_good
 from neusee.workflows.observation.observed_call import one_at_a_time, watched_in_fork
 from neusee.workflows.observation.step_thread import is_alone
 

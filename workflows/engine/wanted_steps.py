@@ -1,15 +1,20 @@
-"""Steps whose results a run must give: its outputs, the numbers that the recipe expects, the
-spectral errors, the rival of a mask, and what the result table reads.
+"""Steps whose results a run must give, and the values that it must therefore compute.
 
-The names of the steps of the camera graph stand here and in ``report/contents.toml`` alone.
+A run gives its outputs, the numbers that the recipe expects, the spectral errors, the rival of a
+mask, and what the result table reads. The names of the steps of the camera graph stand here and in
+``report/contents.toml`` alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from neusee.workflows.graph.recipe_graph import Expectation, Recipe, needed
+from neusee.workflows.graph.recipe_graph import Expectation, Recipe, in_order, needed
+from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+# --- wanted steps ---------------------------------------------------------------------------------
 
 
 def _row(arm: str) -> dict[str, str]:
@@ -107,3 +112,53 @@ def steps_of(recipe: Recipe) -> list[str]:
     order.
     """
     return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))
+
+
+# --- missing values -------------------------------------------------------------------------------
+
+# The values that a run must compute, since the store has no copy of them. A stored value that is
+# asked for is loaded. What a missing value needs is loaded if it is stored, and else computed in
+# the same way.
+
+
+class Upstream(dict[Key, list[Key]]):
+    """Dictionary from the key of a value to the keys of its inputs; the list is empty if the
+    value is known.
+    """
+
+    def __init__(
+        self, is_known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
+    ) -> None:
+        self._known, self._sources = is_known, sources
+        self.missing = set[Key]()
+
+    def __missing__(self, key: Key) -> list[Key]:
+        if self._known(key):
+            self[key] = []
+        else:
+            self.missing.add(key)
+            self[key] = self._sources(key)
+        return self[key]
+
+    def knows(self, key: Key) -> bool:
+        """Return True if a value is known; a value that was asked for before is not asked for
+        again.
+        """
+        return key not in self.missing if key in self else self._known(key)
+
+
+def uses_of(
+    plan: Iterable[Key],
+    targets: Sequence[Key],
+    is_known: Callable[[Key], bool],
+    sources: Callable[[Key], list[Key]],
+) -> Counter[Key]:
+    """Return how often each value is read while the values with the keys ``plan`` and
+    ``targets`` are computed.
+    """
+    upstream, uses = Upstream(is_known, sources), Counter(targets)
+    # the walk notes the missing values
+    in_order(upstream, targets)
+    for key in upstream.missing.union(plan):
+        uses.update(sources(key))
+    return uses

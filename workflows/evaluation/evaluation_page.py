@@ -21,9 +21,8 @@ from neusee.workflows.evaluation.confidence_intervals import (
     gains_by_strength,
     mean,
 )
-from neusee.workflows.evaluation.equal_protection import protection_section
 from neusee.workflows.evaluation.evaluation_points import shown_commands
-from neusee.workflows.evaluation.pipelines import CASES, DRAWN
+from neusee.workflows.evaluation.pipelines import CASES, DRAWN, protection_section
 from neusee.workflows.report.figures.camera_pictures import high
 from neusee.workflows.report.figures.style import (
     BLACK,
@@ -36,7 +35,7 @@ from neusee.workflows.report.figures.style import (
     encoded,
     picture,
 )
-from neusee.workflows.report.study_page import Marked, Section
+from neusee.workflows.report.study_report import Marked, Section
 
 if TYPE_CHECKING:
     from neusee.workflows.evaluation.evaluation_result import (

@@ -26,7 +26,7 @@ from neusee.workflows.evaluation.pipelines import (
     PipelineRecipes,
     laser_line,
 )
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.recipe_graph import (
     FRAME,
     TOLD,
@@ -40,7 +40,7 @@ from neusee.workflows.graph.recipe_graph import (
 )
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code, engine
-from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
+from neusee.workflows.recipe.blocks.settings_block import Mismatch
 from neusee.workflows.recipe.distributions.shapes import written
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override

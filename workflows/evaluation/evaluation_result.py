@@ -37,9 +37,9 @@ from neusee.workflows.evaluation.pipelines import (
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_rivals import EqualProtection
-from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings, Mismatch
+from neusee.workflows.recipe.blocks.settings_block import EvaluateSettings, Mismatch
 from neusee.workflows.recipe.text.overrides import Override
-from neusee.workflows.report.study_folder import Progress
+from neusee.workflows.report.study_report import Progress
 from neusee.workflows.store.result_store import Store, compute_once
 
 # --- mask optics ----------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from neusee.workflows.evaluation.pipelines import (
     PipelineRecipes,
     one_line,
 )
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code

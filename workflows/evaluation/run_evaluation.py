@@ -18,9 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from neusee.workflows.evaluation import equal_protection
 from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
-from neusee.workflows.evaluation.equal_protection import protect, read_protection
 from neusee.workflows.evaluation.evaluation_page import (
     COLUMNS,
     draw_pictures,
@@ -47,22 +45,27 @@ from neusee.workflows.evaluation.evaluation_scenes import (
 from neusee.workflows.evaluation.pipelines import (
     CASES,
     DRAWN,
+    PROTECTION_COLUMNS,
     EvaluationRefused,
     Pipeline,
     PipelineRecipes,
     base_recipe,
     compose_pipelines,
     named_apart,
+    protect,
+    protection_document,
+    protection_rows,
     read_pipelines,
+    read_protection,
     refuse_fixed_laser,
 )
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_rivals import EqualProtection
-from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
+from neusee.workflows.recipe.blocks.settings_block import EvaluateSettings
 from neusee.workflows.recipe.text.overrides import Override
-from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun, silent
+from neusee.workflows.report.study_report import CsvTable, Progress, StudyReport, StudyRun, silent
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
@@ -314,7 +317,7 @@ def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, An
         "small": result.small,
         "reference": result.reference,
         "lasers": [None if metres is None else metres * 1e9 for metres in result.wavelengths],
-        **equal_protection.as_document(result),
+        **protection_document(result),
         "computed": bench.computed,
         "seconds a point": bench.seconds / bench.computed if bench.computed else None,
         "summary": summary(result),
@@ -339,8 +342,8 @@ def _report(result: EvaluationResult) -> StudyReport:
     }
     if result.protection is not None:
         tables["protection.csv"] = (
-            equal_protection.COLUMNS,
-            equal_protection.protection_rows(result),
+            PROTECTION_COLUMNS,
+            protection_rows(result),
         )
     shown_facts = (
         "command",

@@ -11,7 +11,7 @@ from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.resolved_keys import Resolved
 from neusee.workflows.explain.change_causes import Comparison, Origin
 from neusee.workflows.explain.stored_origin import because, keys_in, state_of
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import nearest
 from neusee.workflows.graph.recipe_graph import Event, Recipe, Step, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store

@@ -28,7 +28,7 @@ from neusee.workflows.graph.final_values import Config
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.sealed_files import text_of
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report.study_folder import Progress, silent
+from neusee.workflows.report.study_report import Progress, silent
 from neusee.workflows.store.result_store import Store
 
 # --- descriptor file ------------------------------------------------------------------------------

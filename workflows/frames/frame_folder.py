@@ -15,7 +15,7 @@ import numpy as np
 from neusee.nodes.calibrate import FrameHeader, frame_header, frame_means
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.units import read_any
-from neusee.workflows.report.study_folder import Progress, silent
+from neusee.workflows.report.study_report import Progress, silent
 
 # --- frame names ----------------------------------------------------------------------------------
 

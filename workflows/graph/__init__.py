@@ -3,6 +3,6 @@
 The graph of steps and wires, the final values with their sources, and the records and errors of a
 run. Nothing here reads a file, looks up a result in the cache or runs a step.
 Offers: `recipe_graph.Recipe`, `recipe_graph.Step`, `recipe_graph.needed`, `final_values.Config`,
-        `diagnostics.Diagnostic`, `diagnostics.RecipeError`, `run_error.RunError`,
+        `errors.Diagnostic`, `errors.RecipeError`, `errors.RunError`,
         `recipe_graph.StepRecord`, `recipe_graph.Event`.
 """

@@ -9,13 +9,13 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, Literal
 
 from neusee.nodes import Check, Node, TensorStats
-from neusee.workflows.graph.diagnostics import Location, nearest
+from neusee.workflows.graph.errors import Location, nearest
 from neusee.workflows.graph.final_values import Config, Setting
 
 if TYPE_CHECKING:
     from neusee.nodes.calibrate import Traceability
-    from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
+    from neusee.workflows.recipe.blocks.settings_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain
 

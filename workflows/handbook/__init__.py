@@ -2,6 +2,6 @@
 
 The text of a page stands in `recipes/guide`, and this room names none of them. What commands and
 nodes say of themselves comes from `cli`.
-Offers: `site_build.build_handbook`, `guide_pages.read_pages`,
+Offers: `site_build.build_handbook`, `site_build.read_pages`,
         `recipe_and_python_reference.python_page`.
 """

@@ -25,7 +25,7 @@ from neusee.workflows.keys.user_code import FREE, OwnCode, taint_code
 from neusee.workflows.observation import kernel_layer, python_watch
 from neusee.workflows.observation import python_watch as audit_events
 from neusee.workflows.observation.covered_paths import decides
-from neusee.workflows.observation.hidden_variables import Asked, hidden_while_importing
+from neusee.workflows.observation.environment_variables import Asked, hidden_while_importing
 from neusee.workflows.observation.kernel_layer import NoServer, NotificationClient
 from neusee.workflows.observation.left_state import is_of_library, watch_state
 from neusee.workflows.observation.python_watch import Watch, WatchedImports, WatchedThreads

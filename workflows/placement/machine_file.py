@@ -26,7 +26,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.placement.tasks_and_devices import BUS, Cluster, Device, Link
 from neusee.workflows.recipe.text.yaml_values import Value, kind, read
 from neusee.workflows.store.cache_settings import UNITS

@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import chain, permutations
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import nearest
 
 # --- tasks and devices ----------------------------------------------------------------------------
 

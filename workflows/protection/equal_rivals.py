@@ -27,8 +27,8 @@ from neusee.workflows.protection.protection_camera import (
     FrontMeasures,
     FrontSettings,
     ProtectionCamera,
+    usual_condition,
 )
-from neusee.workflows.protection.unknown_conditions import usual_condition
 from neusee.workflows.store.result_store import Store
 
 # --- equal rivals ---------------------------------------------------------------------------------

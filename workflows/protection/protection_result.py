@@ -24,12 +24,13 @@ from neusee.workflows.protection.equal_rivals import (
     quiet_picture,
 )
 from neusee.workflows.protection.protection_camera import (
+    Condition,
     Front,
     FrontBench,
     FrontMeasures,
     refuse_no_mask,
+    usual_condition,
 )
-from neusee.workflows.protection.unknown_conditions import Condition, usual_condition
 
 #: by measure, the best value over candidates and the rival that has it
 Best = Mapping[str, tuple[float, Rival]]

@@ -8,7 +8,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.graph.errors import Diagnostic, nearest
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, needed
 from neusee.workflows.recipe.steps import Wiring
 from neusee.workflows.recipe.text.references import BROKEN, References, Scope

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neusee.nodes import calibrate as calibrate
     from neusee.workflows.observation import observed_call as observed_call
-    from neusee.workflows.recipe.blocks import evaluate_block as evaluate_block
     from neusee.workflows.recipe.blocks import safety_block as safety_block
     from neusee.workflows.recipe.blocks import settings_block as settings_block
     from neusee.workflows.recipe.blocks import train_block as train_block
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 _MODULES = (
     "nodes.calibrate",
     "workflows.observation.observed_call",
-    "workflows.recipe.blocks.evaluate_block",
     "workflows.recipe.blocks.safety_block",
     "workflows.recipe.blocks.settings_block",
     "workflows.recipe.blocks.train_block",

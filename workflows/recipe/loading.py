@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, visible
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, visible
 from neusee.workflows.graph.final_values import Config, Setting, changes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.keys.sealed_files import head_of
@@ -61,8 +61,8 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from neusee.nodes.calibrate import Traceability
-    from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
+    from neusee.workflows.recipe.blocks.settings_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
 
 
@@ -290,7 +290,7 @@ def _settings_blocks(
         return composed, None, None, None, None
     composed, training = lazy.train_block.read_training(composed, class_context(modules))
     composed, lifting = lazy.train_block.read_lift_training(composed)
-    composed, evaluation = lazy.evaluate_block.read_evaluate(composed)
+    composed, evaluation = lazy.settings_block.read_evaluate(composed)
     if TRACED not in composed.root.items:
         return composed, training, lifting, evaluation, None
     composed, traceability = lazy.settings_block.read_block(

@@ -21,10 +21,10 @@ from typing import Any
 import neusee.nodes
 from neusee.nodes import Node
 from neusee.nodes.own_modules import FAMILY, import_file, network_classes, note_module
-from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.graph.errors import Diagnostic, nearest
 from neusee.workflows.recipe import lazy_imports as lazy
+from neusee.workflows.recipe.text.other_spellings import instead
 from neusee.workflows.recipe.text.recipe_files import NO_CODE_VARIABLE, is_strange
-from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 # --- node families --------------------------------------------------------------------------------

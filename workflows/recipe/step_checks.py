@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from neusee.nodes import Node, ParameterError
 from neusee.nodes.parameters import is_file, texts_of
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
+from neusee.workflows.graph.errors import Diagnostic, Location, nearest
 from neusee.workflows.graph.final_values import Setting
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order, ordered
 from neusee.workflows.graph.step_shapes import (
@@ -40,9 +40,9 @@ from neusee.workflows.recipe import lazy_imports as lazy
 from neusee.workflows.recipe.node_families import Own, class_context, nodes_of
 from neusee.workflows.recipe.steps import Declared
 from neusee.workflows.recipe.text.field_errors import message_of
+from neusee.workflows.recipe.text.other_spellings import instead, new_name
 from neusee.workflows.recipe.text.recipe_files import NO_CODE_VARIABLE, is_strange, refuse_outside
 from neusee.workflows.recipe.text.references import References, broken
-from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, kind
 
 if TYPE_CHECKING:

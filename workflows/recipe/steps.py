@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from neusee.nodes import Node
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
 from neusee.workflows.recipe.node_families import OwnFamilies, find_node, is_known
+from neusee.workflows.recipe.text.other_spellings import became_input, new_name
 from neusee.workflows.recipe.text.references import BROKEN, References, Scope, broken
-from neusee.workflows.recipe.text.renamed_keys import became_input, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 # --- step declarations ----------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes.units import read_any
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.recipe.distributions.joint_distribution import Joint
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain

@@ -21,8 +21,7 @@ from typing import Any, Self
 
 import torch
 
-from neusee.workflows.engine.machine_resources import process_memory
-from neusee.workflows.engine.memory_limits import MemoryLimit
+from neusee.workflows.engine.machine_resources import MemoryLimit, process_memory
 from neusee.workflows.engine.wanted_steps import wanted
 from neusee.workflows.engine.worker_processes import deaf_fork, ignore_interrupts
 from neusee.workflows.graph.recipe_graph import Recipe, StepRecord, needed

@@ -19,8 +19,8 @@ from neusee.workflows.graph.recipe_graph import Recipe, by_family, in_order
 from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.figures.camera_pictures import centre, high
 from neusee.workflows.report.figures.style import encoded
-from neusee.workflows.report.result_numbers import table
-from neusee.workflows.report.study_page import filled
+from neusee.workflows.report.run_folder import filled
+from neusee.workflows.report.run_summary import table
 
 if TYPE_CHECKING:
     from torch import Tensor

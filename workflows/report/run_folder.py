@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import csv
+import functools
 import json
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -14,12 +16,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import date, datetime
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.keys.sealed_files import bytes_of, head_of, text_of
 from neusee.workflows.report.run_crate import remove_crate, restore_crate, write_crate
-from neusee.workflows.report.study_page import compiled, filled
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.runner import Result
@@ -276,6 +278,46 @@ def _lines(values: object) -> str:
             f"{json.dumps(name)}: {json.dumps(value)}" for name, value in sorted(values.items())
         )
         + "\n}"
+    )
+
+
+# --- templates of all pages -----------------------------------------------------------------------
+
+SHORT = 16  #: characters of the longest text that a table does not break at a hyphen
+_BREAK = re.compile(r"(?<=[_,/.])(?=[a-z])|(?=\[)")  #: where a long word may go on in a new line
+
+
+def filled(template: str, **values: Any) -> str:
+    """Return the HTML that an HTML template of the folder ``templates`` gives for the given
+    ``values``.
+    """
+    return str(compiled(template).render(**values))
+
+
+@functools.cache
+def compiled(template: str) -> Any:
+    """Return an HTML template of the folder ``templates``, read and compiled once."""
+    from jinja2 import Environment, StrictUndefined
+
+    text = (Path(__file__).parent / "templates" / template).read_text(encoding="utf-8")
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    environment.filters["code"] = _with_code
+    environment.filters["breaks"] = _with_breaks
+    return environment.from_string(text)
+
+
+def _with_code(text: str) -> str:
+    """Return text as HTML, with each part between backticks as code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
+
+
+def _with_breaks(text: str) -> str:
+    """Return text as HTML in which a long word such as ``developed_quality[mask]`` may go on in
+    a new line.
+    """
+    return " ".join(
+        _BREAK.sub("<wbr>", escape(word)) if len(word) > SHORT else escape(word)
+        for word in text.split(" ")
     )
 
 

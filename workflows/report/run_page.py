@@ -21,10 +21,9 @@ from neusee.workflows.keys.cache_key import file_digest
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.paper_readings import consequences, in_force
-from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_folder import present_time
 from neusee.workflows.report.run_pictures import GRAPH, TIMELINE
-from neusee.workflows.report.run_summary import said_of_frame, story
+from neusee.workflows.report.run_summary import expected, metrics, said_of_frame, story, table
 from neusee.workflows.report.tolerance_spent import spectral_error, spent
 from neusee.workflows.store.cache_settings import format_size
 

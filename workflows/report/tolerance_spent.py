@@ -12,8 +12,8 @@ from neusee.workflows.engine.placement_inputs import past_costs
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.engine.wanted_steps import SPECTRAL, spectral_steps
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import Recipe, StepRecord, Substitution, dependents, needed
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.tolerance.error_norm import error_of
 from neusee.workflows.tolerance.error_propagation import COVERAGE
 

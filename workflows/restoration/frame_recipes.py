@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from neusee.nodes.sensor import FRAME_SUFFIXES
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import compose

@@ -12,7 +12,7 @@ import torch
 
 from neusee.nodes.laser import KINDS, SpotDamage, damaged_pixels, heated_spot
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, unknown_step
 from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray

@@ -36,7 +36,7 @@ from neusee.nodes.laser import (
 from neusee.nodes.sensor import line_saturation, saturation
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, Step, unknown_step
 from neusee.workflows.recipe.blocks.safety_block import Dazzle, EyeDazzle, LaserChannels, Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray

@@ -27,7 +27,7 @@ from neusee.nodes.laser import (
     stopped_share,
     widest_heated_diameter,
 )
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import BEAM, Lens, Safety
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain

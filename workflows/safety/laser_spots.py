@@ -27,9 +27,8 @@ from neusee.nodes.laser import (
 from neusee.nodes.values import Psf
 from neusee.workflows.engine.execution import RunSeries
 from neusee.workflows.engine.runner import Result, run
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, RecipeError, RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe.blocks.safety_block import Safety, Scatter
 from neusee.workflows.recipe.distributions.shapes import FloatArray
 from neusee.workflows.safety.damage_pattern import step_of

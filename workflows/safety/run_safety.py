@@ -11,8 +11,7 @@ from neusee.nodes.laser import BrightPixels
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code, engine
-from neusee.workflows.report.study_folder import StudyReport, StudyRun
-from neusee.workflows.report.study_page import Marked, Section
+from neusee.workflows.report.study_report import Marked, Section, StudyReport, StudyRun
 from neusee.workflows.safety.damage_pattern import DeadPixels
 from neusee.workflows.safety.exposures import Spread
 from neusee.workflows.safety.laser_spots import Veil

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neusee.nodes.laser import DamagePart, State, state_of, worst_state
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import SATURATION, Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray

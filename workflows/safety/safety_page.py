@@ -16,8 +16,7 @@ from neusee.workflows.report.figures.style import (
     canvas,
     drawn,
 )
-from neusee.workflows.report.study_folder import StudyReport
-from neusee.workflows.report.study_page import Mark, Section, marked_column
+from neusee.workflows.report.study_report import Mark, Section, StudyReport, marked_column
 from neusee.workflows.safety import safety_estimate, safety_text
 from neusee.workflows.safety.damage_pattern import DamagePattern, DeadPixels
 from neusee.workflows.safety.exposures import QUANTILES

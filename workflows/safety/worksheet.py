@@ -25,7 +25,7 @@ from neusee.nodes.laser import (
     train_limit,
     underfilled,
 )
-from neusee.workflows.report.study_page import filled
+from neusee.workflows.report.run_folder import filled
 from neusee.workflows.safety.exposure_limits import EyeDazzleRow, EyeFinding, saturating
 from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding
 from neusee.workflows.safety.safety_text import UNITS, laser_text

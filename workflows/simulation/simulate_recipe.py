@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.engine.local_executor import memory_limit
-from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
+from neusee.workflows.engine.machine_resources import MemoryLimit, guarded, limited
 from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_job import Executor

@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeVar
 
 import xxhash
 
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import nearest
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.keys.sealed_files import (
     Kind,

@@ -15,32 +15,29 @@ writes a folder with a page, a table and pictures, and continues after an interr
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.engine.runner import Result, run
+from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.keys.cache_key import Key, key_of
+from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.sealed_files import text_of
-from neusee.workflows.report.study_folder import StudyOutcome, StudyRun
+from neusee.workflows.report.study_report import StudyOutcome, StudyRun
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-
-# --- study refused --------------------------------------------------------------------------------
-
-# Error for a study that has nothing to study, raised before anything long runs.
 
 
 class StudyRefused(ValueError):
     """Error for a study whose recipe or options leave nothing to study; the message names the
     remedy.
     """
-
-
-# --- run study ------------------------------------------------------------------------------------
-
-# Studies of a recipe: accuracy, stability, left-out steps, calibration, uncertainty and equal
-# protection.
 
 
 KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty", "protection")
@@ -62,8 +59,7 @@ def study_recipe(
     progress: is called with a line of text for each finished part. options: arguments of the kind
     of study.
     """
-    room = kind.replace("-", "_")
-    module = import_module(f"neusee.workflows.studies.{room}.{room}_study")
+    module = import_module(f"neusee.workflows.studies.{kind.replace('-', '_')}_study")
     study_run = StudyRun(kind, recipe, command)
     outcome: StudyOutcome = module.study(recipe, store or open_store(), progress, **options)
     document = study_run.document(outcome.content)
@@ -74,3 +70,42 @@ def count_failures(folder: Path) -> int:
     """Return the number of failed tests of a finished study, from its ``provenance.json``."""
     document: dict[str, Any] = json.loads(text_of(folder / "provenance.json"))
     return int(document.get("failed", 0))
+
+
+# --- cold runs ------------------------------------------------------------------------------------
+
+# Cold runs start with an empty store and compute every step that the outputs depend on.
+
+
+@contextmanager
+def cold(store: Store) -> Iterator[Store]:
+    """Yield a temporary store with the code digests of ``store`` and no results, and delete the
+    temporary store.
+    """
+    with TemporaryDirectory(prefix="neusee-") as folder:
+        if os.path.isfile(store.code_memo):
+            shutil.copyfile(store.code_memo, Path(folder) / store.code_memo.name)
+        yield Store(folder)
+
+
+def run_cold(recipe: Recipe, store: Store, device: str = "cpu") -> Result:
+    """Run ``recipe`` on ``device`` with a temporary store that has no results, and return the
+    result.
+    """
+    with cold(store) as empty_store:
+        return run(recipe, empty_store, device=device)
+
+
+def key_parts(recipe: Recipe, code: Code, device: str = "cpu") -> list[Any]:
+    """Return the parts of a store key that identify a run: output keys, tolerance, and True for
+    a full computation.
+    """
+    keys: dict[str, Key] = {}
+    for name in needed(recipe, recipe.outputs):
+        keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, code, device)
+    return [
+        [keys[name] for name in recipe.outputs],
+        recipe.tolerance,
+        recipe.exact,
+        recipe.estimates,
+    ]

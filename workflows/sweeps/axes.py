@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text.overrides import Override, overrides_of, read_override
 

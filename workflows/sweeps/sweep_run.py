@@ -4,21 +4,26 @@ one table.
     sweep("first_light", {"sensor.read_noise": ["5 e-", "10 e-"], "doe": ["axicon", "vortex"]})
 
 Results are stored by key: a stopped sweep continues when the same sweep runs again, and results
-that points share are computed once.
+that points share are computed once. The results are rows of a file, a table for each point in a
+line, or an `xarray.Dataset`.
 """
 
 from __future__ import annotations
 
 import html
+import importlib.util
+import itertools
 import os
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from neusee.nodes import units
 from neusee.workflows.engine.provenance import versions
 from neusee.workflows.engine.worker_processes import workers_for
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.text.overrides import Override
@@ -27,23 +32,265 @@ from neusee.workflows.report.terminal_text import indented
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Argument, Axis, points, read_axes, read_words
-from neusee.workflows.sweeps.point_order import Sharing, sharing
 from neusee.workflows.sweeps.sweep_points import (
     OnError,
     PointOutcome,
+    Sharing,
     SweepPlan,
     outcomes,
     plan_sweep,
+    sharing,
 )
-from neusee.workflows.sweeps.sweep_table import (
-    AxisColumn,
-    column,
-    dataset,
-    header,
-    require_xarray,
-    rows_of,
-    wide,
-)
+
+if TYPE_CHECKING:
+    from neusee.workflows.sweeps.axes import Point
+    from neusee.workflows.sweeps.sweep_points import ResultNumber
+
+
+# --- sweep table ----------------------------------------------------------------------------------
+
+# Table of the results of a sweep: its columns, its rows in a file, and the text of its cells.
+
+
+#: columns after the axes
+AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")
+
+
+@dataclass(frozen=True, slots=True)
+class AxisColumn:
+    """Table column of one axis of a sweep; its header has a unit if all values have the same
+    physical dimension.
+    """
+
+    name: str
+    header: str
+    cells: tuple[Any, ...]  #: the values of the axis, in order
+    si: tuple[Any, ...]
+    unit: str  #: of ``si``; empty for pure numbers and for words
+
+
+def column(axis: Axis) -> AxisColumn:
+    """Return the table column of an axis of a sweep: numbers in their common unit, or in SI units
+    if units differ.
+
+    Words are unchanged.
+    """
+    values = [coordinate.value for coordinate in axis.coordinates]
+    header = f"{axis.name} (axis)" if axis.name in ("point", *AFTER) else axis.name
+    quantities = _alike(values)
+    if quantities:
+        return _of_quantities(axis.name, header, quantities)
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        return AxisColumn(axis.name, header, tuple(values), tuple(map(float, values)), "")
+    words = tuple(coordinate.shown for coordinate in axis.coordinates)
+    return AxisColumn(axis.name, header, words, words, "")
+
+
+def _alike(values: Sequence[Any]) -> list[_Quantity]:
+    """Return the values as quantities if all are quantities of one SI unit, and else none."""
+    quantities = [quantity for quantity in map(_quantity, values) if quantity is not None]
+    one_unit = len({quantity.si_unit for quantity in quantities}) == 1
+    return quantities if one_unit and len(quantities) == len(values) else []
+
+
+def _of_quantities(name: str, header: str, quantities: Sequence[_Quantity]) -> AxisColumn:
+    """Return the column of quantities of one SI unit, in their own unit if all have the same."""
+    si_values, unit = tuple(quantity.si for quantity in quantities), quantities[0].si_unit
+    if len({quantity.unit for quantity in quantities}) > 1:
+        return AxisColumn(name, f"{header} ({unit})", si_values, si_values, unit)
+    numbers = tuple(quantity.number for quantity in quantities)
+    return AxisColumn(name, f"{header} ({quantities[0].unit})", numbers, si_values, unit)
+
+
+@dataclass(frozen=True, slots=True)
+class _Quantity:
+    number: float
+    unit: str
+    si: float
+    si_unit: str
+
+
+def _quantity(value: Any) -> _Quantity | None:
+    """Return a text such as ``450 nm`` as a quantity; None for anything else."""
+    match = units._NUMBER.fullmatch(value.strip()) if isinstance(value, str) else None
+    for si_unit, scale in units._SCALE.items():
+        if match and match[2].strip() in scale:
+            return _Quantity(
+                float(match[1]), match[2].strip(), units.read_quantity(value, si_unit), si_unit
+            )
+    return None
+
+
+# --- rows -----------------------------------------------------------------------------------------
+
+
+def header(columns: Sequence[AxisColumn]) -> list[str]:
+    """Return the names of all columns of ``sweep.csv``."""
+    return ["point", *(c.header for c in columns), *AFTER]
+
+
+def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[list[Any]]:
+    """Yield the table rows of one point of a sweep: one row for each number, or a single row
+    without a number.
+
+    A point has no numbers if it failed or if its results have none.
+    """
+    point_columns = [outcome.point.number, *point_cells(outcome.point, columns)]
+    status = "failed" if outcome.state == "failed" else "ok"
+    last_columns = [round(outcome.seconds, 6), outcome.state == "cached", outcome.message]
+    # without numbers, one row with the step that failed
+    for number in outcome.numbers or ((outcome.step, "", "", ""),):
+        yield [*point_columns, status, *number, *last_columns]
+
+
+def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
+    """Return each result of one point of a sweep as text: a single number, or the range of the
+    numbers of an array.
+
+    Single numbers come first.
+    """
+    results: dict[str, list[float]] = {}
+    for step, quantity, _, value in numbers:
+        results.setdefault(f"{step}.{quantity}".rstrip("."), []).append(value)
+    return {
+        name: _range_of(values)
+        # False before True: single numbers first
+        for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)
+    }
+
+
+def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> list[list[str]]:
+    """Return the rows of a text table of a sweep: a header, then one row for each point with its
+    results.
+    """
+    results = [headline(outcome.numbers) for outcome in outcomes]
+    names = list(dict.fromkeys(itertools.chain.from_iterable(results)))
+    rows = [["point", *(axis_column.header for axis_column in columns), *names, "state", "seconds"]]
+    for outcome, result in zip(outcomes, results, strict=True):
+        cells = [cell_text(cell) for cell in point_cells(outcome.point, columns)]
+        values = [result.get(name, "") for name in names]
+        rows.append(
+            [str(outcome.point.number), *cells, *values, outcome.state, f"{outcome.seconds:.3f}"]
+        )
+    return rows
+
+
+def point_cells(point: Point, columns: Sequence[AxisColumn]) -> list[Any]:
+    """Return the axis values of one point of a sweep as they appear in the table."""
+    return [axis_column.cells[i] for axis_column, i in zip(columns, point.place, strict=True)]
+
+
+def _range_of(values: Sequence[float]) -> str:
+    """Return a single number as text, or the range of several."""
+    return f"{values[0]:.4g}" if len(values) == 1 else f"{min(values):.3g} … {max(values):.3g}"
+
+
+def cell_text(cell: Any) -> str:
+    """Return a table cell as text; a float has at most six significant digits."""
+    return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
+
+
+# --- sweep files ----------------------------------------------------------------------------------
+
+# The results of a sweep as an `xarray.Dataset`, whose named dimensions are the axes of the sweep.
+
+
+_PACKAGES = ("xarray", "h5netcdf", "h5py")
+
+
+def require_xarray(asked_by: str) -> None:
+    """Raise `RecipeError` unless xarray, h5netcdf and h5py are installed."""
+    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        text = f'needs {" and ".join(missing)}: pip install "neusee[xarray]"'
+        raise RecipeError([Diagnostic(Location(asked_by), "", text)])
+
+
+def dataset(
+    outcomes: Sequence[PointOutcome],
+    columns: Sequence[AxisColumn],
+    paired: bool,
+    about: Mapping[str, str],
+) -> Any:
+    """Return the results of a sweep as an `xarray.Dataset` whose dimensions are the axes, with
+    coordinates in SI units.
+
+    Paired axes give the one dimension ``point``. A result of several numbers has the further
+    dimension ``<result> index``. A point that failed or did not run is NaN; ``ran`` is true at
+    points that have numbers.
+    """
+    import numpy
+    import xarray
+
+    shape, axis_names = _shape(columns, paired)
+    coords = {axis_column.name: _coordinate(axis_column, paired) for axis_column in columns}
+    has_run, seconds = numpy.zeros(shape, bool), numpy.full(shape, numpy.nan)
+    arrays: dict[str, Any] = {}
+    taken_names = {"ran", "seconds", *coords}
+    lengths = _lengths(outcomes, taken_names)
+    for outcome in outcomes:
+        # paired axes have one index
+        indices = outcome.point.place[:1] if paired else outcome.point.place
+        seconds[indices], has_run[indices] = outcome.seconds, outcome.state != "failed"
+        for name, index, value in _named(outcome, taken_names):
+            if name not in arrays:
+                array_shape = (*shape, lengths[name]) if name in lengths else shape
+                arrays[name] = numpy.full(array_shape, numpy.nan)
+            # an empty index is that of a single number
+            arrays[name][(*indices, index or 0) if name in lengths else indices] = value
+    results = {name: (_dims(name, axis_names, lengths), array) for name, array in arrays.items()}
+    own_variables = {"ran": (axis_names, has_run), "seconds": (axis_names, seconds, {"units": "s"})}
+    return xarray.Dataset({**results, **own_variables}, coords, dict(about))
+
+
+def _shape(columns: Sequence[AxisColumn], paired: bool) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the sizes and the names of the dimensions of the axes."""
+    if paired:
+        return (len(columns[0].si),), ("point",)
+    return tuple(len(axis_column.si) for axis_column in columns), tuple(
+        axis_column.name for axis_column in columns
+    )
+
+
+def _named(outcome: PointOutcome, taken: Collection[str]) -> Iterator[tuple[str, int | str, float]]:
+    """Yield name, index and value of each number of a point."""
+    for step, quantity, index, value in outcome.numbers:
+        yield _variable(step, quantity, taken), index, value
+
+
+def _coordinate(column: AxisColumn, paired: bool) -> tuple[str, list[Any], dict[str, str]]:
+    """Return the coordinate of an axis along its dimension."""
+    units = {"units": column.unit} if column.unit else {}
+    return "point" if paired else column.name, list(column.si), units
+
+
+def _dims(name: str, dims: tuple[str, ...], long: Container[str]) -> tuple[str, ...]:
+    """Return the dimensions of a result: those of the axes, and one of several numbers."""
+    return (*dims, f"{name} index") if name in long else dims
+
+
+def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
+    """Return the largest length of each result that is an array, over all points of the sweep."""
+    lengths: dict[str, int] = {}
+    for outcome in outcomes:
+        for name, index, _ in _named(outcome, taken):
+            if index != "":
+                lengths[name] = max(lengths.get(name, 0), int(index) + 1)
+    return lengths
+
+
+def _variable(step: str, field: str, taken: Collection[str]) -> str:
+    """Return the name of a result in the `xarray.Dataset`, different from the names of all
+    coordinates.
+    """
+    name = f"{step}.{field}".rstrip(".").replace("/", "_")
+    return f"{name} (result)" if name in taken else name
+
+
+# --- sweep ----------------------------------------------------------------------------------------
+
+# A sweep from its axes to its result and its folder.
+
 
 SweepState = Literal["complete", "stopped", "interrupted"]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from neusee.nodes import ErrorBound, TensorStats
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step, StepRecord, Wire, needed
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_shapes import forms_of, tensors_of
 from neusee.workflows.tolerance.skip_decision import UNKNOWN, ErrorBudget, FactsOf
 

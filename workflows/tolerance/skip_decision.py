@@ -10,8 +10,8 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes import TensorStats
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution, Wire
-from neusee.workflows.graph.run_error import RunError
 
 # --- zero effect steps ----------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import (
     FRAME,
     TOLD,

@@ -20,8 +20,8 @@ from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import file_digest
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
-from neusee.workflows.training.loop.resumable_loop import Losses
 from neusee.workflows.training.process_mesh import Mesh
+from neusee.workflows.training.resumable_loop import Losses
 from neusee.workflows.training.training_pictures import HELD_OUT, Sample, Samples, Shared
 
 CONFIDENCE = 0.9  #: of the interval of a mean over photographs

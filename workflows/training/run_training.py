@@ -1,4 +1,4 @@
-"""The training of a mask and of the network behind it, in two stages, with its files."""
+"""The training of a mask and of the network behind it, in two stages, with its inputs and files."""
 
 from __future__ import annotations
 
@@ -15,132 +15,38 @@ import torch
 from neusee.nodes import ParameterError, doe
 from neusee.nodes.file_headers import safetensors_need
 from neusee.nodes.network_weights import file_metadata
+from neusee.nodes.own_modules import Architecture
 from neusee.nodes.restore import Restorer, export_network, require_exportable
+from neusee.nodes.restore import network as network_node
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Stamp, file_digest, file_stamps
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
+from neusee.workflows.keys.code_digest import Code, outline
+from neusee.workflows.recipe.blocks.train_block import KEY, Network, Stage, Training
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training import held_out
 from neusee.workflows.training.camera_mismatch import CameraMismatch
+from neusee.workflows.training.design_run import MASK, design_in, design_inputs, designed
 from neusee.workflows.training.held_out import Best, Split, Validation
-from neusee.workflows.training.loop.recorded_inputs import RecordedInputs, folder_of, prepare_folder
-from neusee.workflows.training.loop.resumable_loop import (
+from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
+from neusee.workflows.training.recorded_inputs import (
+    CAMERA,
+    CameraInputs,
+    RecordedFile,
+    RecordedInputs,
+    folder_of,
+    prepare_folder,
+)
+from neusee.workflows.training.resumable_loop import (
     Losses,
     Progress,
     ResumableLoop,
     Watch,
     export,
 )
-from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
-from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
-from neusee.workflows.training.training_inputs import inputs_of
 from neusee.workflows.training.training_iteration import Learner, WarmStart
 from neusee.workflows.training.training_page import curves, png, strip, write_page
 from neusee.workflows.training.training_pictures import require_alone, samples_of
-
-# --- unchanged files ------------------------------------------------------------------------------
-
-# Files that must stay as they are while a training runs: its photographs, which are read again and
-# again.
-
-
-@dataclass
-class UnchangedFiles:
-    """Files with the digests that their training recorded before its first iteration."""
-
-    contents: Mapping[Path, str]
-    _stamps: dict[Path, Stamp] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, paths: Iterable[Path]) -> UnchangedFiles:
-        """Note the content of files."""
-        return cls({path: file_digest(path) for path in paths})
-
-    def require(self) -> None:
-        """Raise ValueError if a file is gone or has another content; a file that was only
-        touched is the same.
-        """
-        for path, content in self.contents.items():
-            try:
-                stamp = file_stamps(path)[0]
-                # size and time are as at the last look, so that the file is not read again
-                if self._stamps.get(path) == stamp:
-                    continue
-                is_same = file_digest(path) == content
-            except OSError as error:
-                raise ValueError(
-                    self._said(path, f"cannot be read any more ({error.strerror})")
-                ) from error
-            if not is_same:
-                raise ValueError(self._said(path, "has another content now"))
-            self._stamps[path] = stamp
-
-    @staticmethod
-    def _said(path: Path, change: str) -> str:
-        """Return the message of an error: which photograph has changed, and what to do."""
-        return (
-            f"the photograph {path} {change}, after this training began with it; the checkpoint"
-            " before is kept: put the file back and give the command again to go on, or give the"
-            " command as it is to begin anew"
-        )
-
-
-# --- tensorboard log ------------------------------------------------------------------------------
-
-# The TensorBoard log of a training, with its losses and pictures by iteration.
-
-
-def open_board(folder: Path, first: int) -> Any:
-    """Return a TensorBoard writer for a training, which hides older events from iteration ``first``
-    on.
-
-    Raises ValueError if TensorBoard is not installed.
-    """
-    try:
-        module = importlib.import_module("torch.utils.tensorboard")
-    except ImportError as error:
-        text = (
-            f'TensorBoard is not installed ({error}): pip install -e ".[tensorboard]", or leave'
-            " tensorboard false"
-        )
-        raise ValueError(f"train.tensorboard: {text}") from error
-    return module.SummaryWriter(str(folder / "tensorboard"), purge_step=first)
-
-
-# --- exported files -------------------------------------------------------------------------------
-
-# The trained network as a file that other programs run, beside its weights.
-
-
-def require_exports(net: Restorer, settings: Training) -> None:
-    """Raise ValueError before a training whose network cannot be exported as ``train.export``
-    asks.
-    """
-    for kind in settings.export:
-        try:
-            require_exportable(net, f".{kind}")
-        except ParameterError as error:
-            raise ValueError(f"{KEY}.export: {error}") from error
-
-
-def write_exports(folder: Path, net: Restorer, settings: Training) -> None:
-    """Write the best network of a training, or the last one if no state is the best, as
-    ``train.export`` asks.
-    """
-    if not settings.export:
-        return
-    from safetensors.torch import load_file
-
-    name = "best" if (folder / "best.safetensors").is_file() else "network"
-    file = folder / f"{name}.safetensors"
-    safetensors_need(file, 2.0)
-    network = copy.deepcopy(net).cpu().float()
-    network.stored.load_state_dict(load_file(file))
-    for kind in settings.export:
-        export_network(network, folder / f"{name}.{kind}")
-
 
 # --- run training ---------------------------------------------------------------------------------
 
@@ -585,3 +491,240 @@ def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
     params, wires = {"file": file, "depth": 1e-6, "scale": 0.1}, {"stop": step.wires["stop"]}
     learnt = replace(step, node=doe.pixelwise, params=params, wires=wires)
     return replace(recipe, steps={**recipe.steps, settings.learn: learnt})
+
+
+# --- inputs ---------------------------------------------------------------------------------------
+
+# Photographs, files, code and settings, whose digest is a part of the name of the folder.
+
+#: settings that change no weight
+_WITHOUT_EFFECT = {"tensorboard", "keep_pool", "export", "keep", "show"}
+#: recorded by what they name
+_BY_CONTENT = {"photographs", "start", "cameras", "mismatch", "network", "mask"}
+_OF_VALIDATION = {"held_out", "held_out_pictures", "validate_every", "patience"}
+#: nodes that an iteration calls itself
+_COMPUTE = ("losses", "metrics", "restore", "doe", "scene", "resampling")
+_LOOPS = (
+    "training_iteration",
+    "training_pictures",
+    "camera_mismatch",
+    "held_out",
+    "resumable_loop",
+)  #: files of the program that decide the pictures and the steps of the optimisers
+
+
+def inputs_of(
+    recipe: Recipe, settings: Training, parts: Split, start: WarmStart | None, code: Code
+) -> RecordedInputs:
+    """Return everything that can change a trained network or mask.
+
+    Raises ValueError with place and fix for code of the user that reads what cannot be followed.
+    """
+    camera = _cameras(recipe, settings, code)
+    design = design_inputs(recipe, settings.design, code) if settings.learn is not None else None
+    files = dict(design.files) if design else {}
+    if start is not None:
+        files[f"{KEY}.start"] = RecordedFile(start.file.name, start.digest)
+    return RecordedInputs(
+        kind="training",
+        recipe=recipe.name,
+        settings={
+            **camera.settings,
+            **_settings(settings, parts),
+            **(design.settings if design else {}),
+        },
+        steps={**camera.steps, **(design.steps if design else {})},
+        laws={**camera.laws, **(design.laws if design else {})},
+        code={**_code(settings.network, code), **(design.code if design else {})},
+        files=files,
+        photographs=recorded(parts.trained.paths),
+        held_out=recorded(parts.held_out),
+    )
+
+
+def recorded(paths: Sequence[Path]) -> tuple[RecordedFile, ...]:
+    """Return names and digests of files; a file is read once in a process."""
+    return tuple(map(RecordedFile.of, paths))
+
+
+def _cameras(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
+    """Return what the camera of a training and its further cameras contribute."""
+    joined = _camera(recipe, settings, code)
+    for number, camera in enumerate(recipe.cameras, 2):
+        joined = joined.joined(_camera(camera, settings, code).named(f"{CAMERA}{number}: "))
+    return joined
+
+
+def _camera(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
+    """Return what a camera contributes.
+
+    The scene step does not count, because the training itself makes the scenes; its shape does.
+    """
+    read_steps = (settings.picture, settings.truth, settings.psf, settings.light, settings.learn)
+    outputs = [name for name in read_steps if name is not None and name in recipe.steps]
+    camera = CameraInputs.of(recipe, outputs, code, computed=(settings.scene,))
+    scene = recipe.steps.get(settings.scene)
+    scene_shape = list(scene.params.get("shape") or ()) if scene else []
+    return CameraInputs(
+        {**camera.settings, f"{settings.scene}.shape": scene_shape}, camera.steps, camera.laws
+    )
+
+
+def _settings(settings: Training, parts: Split) -> dict[str, Any]:
+    """Return the settings of the block by path, without those of files and of the mask design."""
+    excluded = _WITHOUT_EFFECT | _BY_CONTENT | (set() if parts.held_out else _OF_VALIDATION)
+    train_settings = settings.model_dump(mode="json", exclude=excluded)
+    train_settings["network"] = network_settings(settings.network)
+    return dict(_flat(train_settings, KEY))
+
+
+def network_settings(network: Network) -> dict[str, Any]:
+    """Return the settings of a network; a class of the user is its name, with its arguments."""
+    if network.architecture is None:
+        return {"kind": network.kind, "width": network.width, **network.options}
+    return {
+        "class": str(network.architecture),
+        **network.model_dump(include={"parameters", "multiple"}),
+    }
+
+
+def _flat(block: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
+    """Return the single values of a nested mapping, each with its path.
+
+    An empty mapping counts as a value.
+    """
+    flat_settings: list[tuple[str, Any]] = []
+    for name, value in block.items():
+        inner_path = f"{path}.{name}"
+        flat_settings += (
+            _flat(value, inner_path) if isinstance(value, dict) and value else [(inner_path, value)]
+        )
+    return flat_settings
+
+
+def _code(network: Network, code: Code) -> dict[str, str]:
+    """Return digests of the code that no step of the recipe names: losses, networks, and the
+    loop itself.
+    """
+    digests = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in _COMPUTE}
+    folder = Path(__file__).parent
+    for name in _LOOPS:
+        digests[f"neusee/workflows/training/{name}.py"] = outline(
+            (folder / f"{name}.py").read_bytes()
+        ).digest
+    if network.architecture is not None:
+        digests[f"the network {network.architecture}"] = code_of_class(network.architecture, code)
+    return digests
+
+
+def code_of_class(architecture: Architecture, code: Code) -> str:
+    """Return the digest of the code of a network class and of what it imports; refuse what
+    cannot be followed.
+    """
+    network = architecture.network
+    try:
+        return code.of(network_node, ((network.__module__, network.__qualname__),))
+    except LookupError as error:
+        raise ValueError(f"{KEY}.network.architecture {architecture}: {error.args[0]}") from error
+
+
+# --- unchanged files ------------------------------------------------------------------------------
+
+# Files that must stay as they are while a training runs: its photographs, which are read again and
+# again.
+
+
+@dataclass
+class UnchangedFiles:
+    """Files with the digests that their training recorded before its first iteration."""
+
+    contents: Mapping[Path, str]
+    _stamps: dict[Path, Stamp] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, paths: Iterable[Path]) -> UnchangedFiles:
+        """Note the content of files."""
+        return cls({path: file_digest(path) for path in paths})
+
+    def require(self) -> None:
+        """Raise ValueError if a file is gone or has another content; a file that was only
+        touched is the same.
+        """
+        for path, content in self.contents.items():
+            try:
+                stamp = file_stamps(path)[0]
+                # size and time are as at the last look, so that the file is not read again
+                if self._stamps.get(path) == stamp:
+                    continue
+                is_same = file_digest(path) == content
+            except OSError as error:
+                raise ValueError(
+                    self._said(path, f"cannot be read any more ({error.strerror})")
+                ) from error
+            if not is_same:
+                raise ValueError(self._said(path, "has another content now"))
+            self._stamps[path] = stamp
+
+    @staticmethod
+    def _said(path: Path, change: str) -> str:
+        """Return the message of an error: which photograph has changed, and what to do."""
+        return (
+            f"the photograph {path} {change}, after this training began with it; the checkpoint"
+            " before is kept: put the file back and give the command again to go on, or give the"
+            " command as it is to begin anew"
+        )
+
+
+# --- tensorboard log ------------------------------------------------------------------------------
+
+# The TensorBoard log of a training, with its losses and pictures by iteration.
+
+
+def open_board(folder: Path, first: int) -> Any:
+    """Return a TensorBoard writer for a training, which hides older events from iteration ``first``
+    on.
+
+    Raises ValueError if TensorBoard is not installed.
+    """
+    try:
+        module = importlib.import_module("torch.utils.tensorboard")
+    except ImportError as error:
+        text = (
+            f'TensorBoard is not installed ({error}): pip install -e ".[tensorboard]", or leave'
+            " tensorboard false"
+        )
+        raise ValueError(f"train.tensorboard: {text}") from error
+    return module.SummaryWriter(str(folder / "tensorboard"), purge_step=first)
+
+
+# --- exported files -------------------------------------------------------------------------------
+
+# The trained network as a file that other programs run, beside its weights.
+
+
+def require_exports(net: Restorer, settings: Training) -> None:
+    """Raise ValueError before a training whose network cannot be exported as ``train.export``
+    asks.
+    """
+    for kind in settings.export:
+        try:
+            require_exportable(net, f".{kind}")
+        except ParameterError as error:
+            raise ValueError(f"{KEY}.export: {error}") from error
+
+
+def write_exports(folder: Path, net: Restorer, settings: Training) -> None:
+    """Write the best network of a training, or the last one if no state is the best, as
+    ``train.export`` asks.
+    """
+    if not settings.export:
+        return
+    from safetensors.torch import load_file
+
+    name = "best" if (folder / "best.safetensors").is_file() else "network"
+    file = folder / f"{name}.safetensors"
+    safetensors_need(file, 2.0)
+    network = copy.deepcopy(net).cpu().float()
+    network.stored.load_state_dict(load_file(file))
+    for kind in settings.export:
+        export_network(network, folder / f"{name}.{kind}")

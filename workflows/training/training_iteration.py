@@ -38,12 +38,12 @@ from neusee.nodes.restore import (
 )
 from neusee.nodes.values import FilterFacts, Psf, Stop
 from neusee.workflows.engine.node_call import call
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.recipe.blocks.train_block import KEY, Network, Stage, Training
-from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
 from neusee.workflows.training.process_mesh import ALONE, Mesh
+from neusee.workflows.training.resumable_loop import Losses, averaged, require_finite
 from neusee.workflows.training.training_pictures import Sample, Samples, Shared
 
 # --- picture batches ------------------------------------------------------------------------------

@@ -20,8 +20,8 @@ from neusee.workflows.report.figures.style import (
     drawn,
     encoded,
 )
-from neusee.workflows.report.study_page import Section, page
-from neusee.workflows.training.loop.resumable_loop import write_whole
+from neusee.workflows.report.study_report import Section, page
+from neusee.workflows.training.resumable_loop import write_whole
 
 # --- training figures -----------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from neusee.nodes.scene import Change, Photographs, symmetry
 from neusee.nodes.values import FilterFacts, WienerProblem
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import place
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import nearest
 from neusee.workflows.graph.recipe_graph import TOLD, Recipe, Step, dependents, needed
 from neusee.workflows.keys.cache_key import device_kind, digest, is_private, key_of
 from neusee.workflows.keys.code_digest import Code, engine

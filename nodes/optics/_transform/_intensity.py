@@ -14,7 +14,7 @@ from neusee.nodes.optics._transform._fused import FusedPupil, available, operato
 from neusee.nodes.optics._transform._pupil_field import Field, Screens, View, refuse_too_many_turns
 from neusee.nodes.optics._transform._sample_axis import Workspace, borrowed, patch_of
 from neusee.nodes.optics._transform._scaled_transform import Method, propagate
-from neusee.nodes.torch_func import one_by_one, transformed
+from neusee.nodes.precision import one_by_one, transformed
 
 _ONCE = "the PSF has no second derivative here: differentiate without create_graph=True"
 KEPT_FIELD_BYTES = 1 << 30  #: bytes; focal fields up to this size are kept for back-propagation

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from neusee.nodes.precision import transformed
 from neusee.nodes.restore._inverse._conjugate_gradients import (
     LOWEST,
     Preconditioner,
@@ -26,7 +27,6 @@ from neusee.nodes.restore._inverse._masked_blur import (
     variance,
     widened,
 )
-from neusee.nodes.torch_func import transformed
 
 # --- hidden pixels --------------------------------------------------------------------------------
 

@@ -21,8 +21,19 @@ from neusee.nodes.restore._lasers._candidates import (
     nearest_of_many,
 )
 from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, LampLight, Laser
-from neusee.nodes.restore._lasers._joint_fit import Data, Fit, Parts, censored, fitted, misfit_of
-from neusee.nodes.restore._lasers._whitening import Filter, Weights, filter_of, noise_of, weights_of
+from neusee.nodes.restore._lasers._frame_likelihood import (
+    Data,
+    Filter,
+    Fit,
+    Parts,
+    Weights,
+    censored,
+    filter_of,
+    fitted,
+    misfit_of,
+    noise_of,
+    weights_of,
+)
 
 # --- greedy search --------------------------------------------------------------------------------
 

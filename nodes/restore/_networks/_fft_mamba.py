@@ -22,7 +22,7 @@ from neusee.nodes.restore._networks._restorer import (
     restored,
     restorer_checks,
 )
-from neusee.nodes.restore._scan._selective_scan import selective_scan
+from neusee.nodes.restore._networks._selective_scan import selective_scan
 from neusee.nodes.units import Count, DataFile, Layers
 
 # --- scan layer -----------------------------------------------------------------------------------

@@ -25,8 +25,8 @@ from neusee.nodes.restore._inverse._wiener import (
     pose,
     unpacked,
 )
+from neusee.nodes.restore._networks._convolutional_networks import NAFNet
 from neusee.nodes.restore._networks._restorer import Restorer
-from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
 from neusee.nodes.units import Count, DataFile, Electrons, Layers
 from neusee.nodes.values import Bands, Psf
 

@@ -17,8 +17,7 @@ from neusee.nodes.calibrate import (
     sheet_budgets,
     variance_shares,
 )
-from neusee.nodes.calibrate._laboratory import laboratory_contributions
-from neusee.nodes.calibrate._uncertainty_budget import coverage_factor
+from neusee.nodes.calibrate._uncertainty_budget import coverage_factor, laboratory_contributions
 from neusee.nodes.values import Levels
 
 K, ETA, NOISE, OFFSET, PIXELS = 0.25, 0.5, 12.0, 60.0, 4096

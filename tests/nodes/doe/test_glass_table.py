@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from neusee.nodes import ParameterError, doe
-from neusee.nodes.doe._glass_table import Sellmeier
-from neusee.nodes.doe._refractive_index import excess_index
+from neusee.nodes.doe._refractive_index import Sellmeier, excess_index
 from neusee.nodes.values import Bands
 
 #: Malitson, J. Opt. Soc. Am. 55, 1205 (1965): coefficients, and computed indices of his Table at

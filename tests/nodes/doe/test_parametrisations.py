@@ -10,8 +10,13 @@ from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, doe, optics
-from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
-from neusee.nodes.doe._unet_height_map import HeightNet, coordinates, fresh, height_of
+from neusee.nodes.doe._parametrisations import (
+    PARAMETRISATIONS,
+    HeightNet,
+    coordinates,
+    fresh,
+    height_of,
+)
 from neusee.nodes.resampling import enlarge
 
 STOP = optics.stop(samples=64, pitch=5e-6, diameter=320e-6)

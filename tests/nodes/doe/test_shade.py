@@ -13,7 +13,7 @@ from neusee.nodes.doe import shade
 from neusee.nodes.metrics import light_outside, lsr
 from neusee.nodes.optics import psf, pupil, stop
 from neusee.nodes.spectra import bands
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

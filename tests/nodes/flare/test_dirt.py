@@ -20,8 +20,8 @@ from neusee.nodes.flare._dirt import (
     _streams,
     stamp,
 )
+from neusee.nodes.optics._pupil import screen, surface
 from neusee.nodes.optics._pupil_grid import grid_of, inside, pupil_grid
-from neusee.nodes.optics._zernike import screen, surface
 
 STOP = optics.stop(samples=128, pitch=10e-6, diameter=1.28e-3)
 FILTHY = {"dust": 30.0, "scratches": 10.0, "grease": 0.2, "smudges": 0.5, "dents": 0.4}

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.metrics import limits, lsr, most_contrast, mtf
-from neusee.nodes.metrics._suppression_ratios import least_lsr, most_unsuppressed, shares
+from neusee.nodes.metrics._suppression import least_lsr, most_unsuppressed, shares
 from neusee.nodes.values import Psf
 
 

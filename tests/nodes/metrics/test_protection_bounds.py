@@ -10,7 +10,7 @@ import torch
 from scipy.special import j1
 
 from neusee.nodes import doe, metrics, optics
-from neusee.nodes.metrics._protection_bounds import CLEAR
+from neusee.nodes.metrics._suppression import CLEAR
 from neusee.nodes.spectra import bands
 from neusee.nodes.values import Bands, Psf
 

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import doe, optics
-from neusee.nodes.optics._pupil import phase_steps
+from neusee.nodes.optics._pupil import combine, noll, phase_steps, screen, surface
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, inside, polar, pupil_grid
-from neusee.nodes.optics._zernike import combine, noll, screen, surface
 from neusee.nodes.values import Bands, Dirt
 
 LENS = {"pitch": 10e-6, "diameter": 2e-3}

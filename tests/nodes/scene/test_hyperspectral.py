@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError
 from neusee.nodes.scene import hyperspectral
-from neusee.nodes.scene._spectral_exr import read_spectral, spectral_channels, write_spectral
+from neusee.nodes.scene._exr import read_spectral, spectral_channels, write_spectral
 from neusee.nodes.spectra import bands
 
 NM = 1e-9

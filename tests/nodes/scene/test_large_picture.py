@@ -12,9 +12,9 @@ import torch
 from PIL import Image
 
 from neusee.nodes import ParameterError, input_files
-from neusee.nodes.scene import _picture_scaling as _large_picture
+from neusee.nodes.scene import _picture_changes as _large_picture
 from neusee.nodes.scene import exr, photograph
-from neusee.nodes.scene._picture_scaling import framed
+from neusee.nodes.scene._picture_changes import framed
 
 SIZES = [
     ((101, 67), (8, 8)), ((101, 67), (30, 50)), ((67, 101), (67, 100)), ((50, 60), (75, 75)), ((50, 60), (50, 60)),

@@ -9,7 +9,7 @@ from PIL import Image
 
 from neusee.nodes import ParameterError
 from neusee.nodes.scene import photograph
-from neusee.nodes.scene._picture_scaling import covering, framed
+from neusee.nodes.scene._picture_changes import covering, framed
 
 
 def saved(folder, array, name="a.png", **how):

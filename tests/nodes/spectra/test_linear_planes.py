@@ -5,7 +5,7 @@ error is a bound.
 import pytest
 import torch
 
-from neusee.nodes.spectra import _linear_lift as lifts
+from neusee.nodes.spectra import _lift as lifts
 from neusee.nodes.spectra import bands, lift_lmmse, lift_lmmse_mixture
 from neusee.nodes.spectra._low_rank_cube import linear_planes
 

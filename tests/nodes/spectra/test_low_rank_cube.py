@@ -18,7 +18,7 @@ from neusee.nodes.spectra import (
     responses,
     rows,
 )
-from neusee.nodes.spectra._linear_lift import _estimator
+from neusee.nodes.spectra._lift import _estimator
 from neusee.nodes.values import Bands, LowRankCube
 
 NM = 1e-9

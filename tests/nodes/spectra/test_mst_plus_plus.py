@@ -7,7 +7,7 @@ import torch
 
 from neusee.nodes import ParameterError
 from neusee.nodes.spectra import bands, lift_mst_plus_plus
-from neusee.nodes.spectra._mst_plus_plus import MSTPlusPlus
+from neusee.nodes.spectra._lift import MSTPlusPlus
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)

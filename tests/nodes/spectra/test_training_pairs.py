@@ -12,8 +12,8 @@ import torch
 from neusee.nodes import ParameterError
 from neusee.nodes.spectra import bands, grain, leaves, lift_lmmse, metamers, reflectances, render
 from neusee.nodes.spectra._cie_tables import paints, to_srgb
-from neusee.nodes.spectra._metamers import metameric_blacks
-from neusee.nodes.spectra._mst_plus_plus import lift_pictures, start_mst_plus_plus
+from neusee.nodes.spectra._lift import lift_pictures, start_mst_plus_plus
+from neusee.nodes.spectra._plausible_spectra import metameric_blacks
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)
@@ -153,7 +153,7 @@ def test_grain_has_the_deviation_that_is_asked_for():
 
 
 def test_a_network_starts_at_the_linear_estimate(measured):
-    from neusee.nodes.spectra._linear_lift import lift_matrix
+    from neusee.nodes.spectra._lift import lift_matrix
 
     linear = lift_matrix(measured, SCENE.centres)
     net = start_mst_plus_plus(generator(), linear)

@@ -11,8 +11,7 @@ from types import SimpleNamespace
 from neusee.workflows.answers import repeated_command
 from neusee.workflows.answers import repeated_command as installed_program
 from neusee.workflows.answers import repeated_command as typed_command
-from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
-from neusee.workflows.report.study_page import Section, said
+from neusee.workflows.report.study_report import Section, StudyReport, StudyRun, as_json, said
 from neusee.workflows.store.shared_folder import Disk
 
 WORDS = ("safety", "mine.yaml", "a.b=1")

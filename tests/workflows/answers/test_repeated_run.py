@@ -13,9 +13,13 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.answers import repeated_command
 from neusee.workflows.answers import witnesses as stored_results
-from neusee.workflows.answers.results_folder import FOLDER, TOOK, RunResults
-from neusee.workflows.answers.stored_answer import read_answer
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.answers.stored_answer import (
+    FOLDER_MARK,
+    SECONDS_MARK,
+    RunResults,
+    read_answer,
+)
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report.run_crate import CRATE
@@ -77,7 +81,7 @@ class Runs:
         text = "{}/report.html in {} s"
         if not done.document["missed"]:
             results = RunResults(done.folder, Path("runs"), done.document, done.taken, store)
-            command.keep(text.format(FOLDER, TOOK), self.as_json, small, results)
+            command.keep(text.format(FOLDER_MARK, SECONDS_MARK), self.as_json, small, results)
         return text.format(folder, f"{done.document['seconds']:.2f}")
 
     def again(self):

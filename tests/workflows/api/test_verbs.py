@@ -12,8 +12,7 @@ import neusee
 from neusee.workflows.api import verbs
 from neusee.workflows.calibration import run_calibration
 from neusee.workflows.studies import run_study
-from neusee.workflows.training import run_training
-from neusee.workflows.training.lift import lift_run
+from neusee.workflows.training import lift_training, run_training
 
 SMALL = {
     "optics": {"samples": 96, "pitch": "84.15 um", "bands": 5, "window": [24, 24]},
@@ -122,7 +121,7 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
     monkeypatch.setattr(run_calibration, "calibrate", room("calibrate"))
     monkeypatch.setattr(run_study, "study_recipe", room("study"))
     monkeypatch.setattr(run_training, "train", room("train"))
-    monkeypatch.setattr(lift_run, "train_lift", room("lift"))
+    monkeypatch.setattr(lift_training, "train_lift", room("lift"))
     recipe, progress, watch = neusee.load("train_small"), print, lambda *found: None
     store = neusee.Store("there")
     assert neusee.calibrate(recipe, store=store, out="o", progress=progress, draws=200) == Path(

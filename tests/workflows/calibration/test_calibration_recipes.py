@@ -8,7 +8,7 @@ from PIL import Image
 
 from neusee.workflows.cli.catalogue import node_lines
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.simulation.simulate_recipe import recipe_text, simulate
 from neusee.workflows.store.result_store import Store

@@ -19,7 +19,7 @@ from neusee.workflows.calibration.log_posterior import (
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration.posterior_tests import SensorSimulator, walk_draws
+from neusee.workflows.studies.posterior_tests import SensorSimulator, walk_draws
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

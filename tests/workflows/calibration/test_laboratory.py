@@ -11,13 +11,13 @@ import torch
 from neusee.nodes.calibrate import Laboratory
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.identifiability import Identifiability
-from neusee.workflows.calibration.laboratory import (
+from neusee.workflows.calibration.uncertainty_budget import (
     RELATIVE,
     laboratory_of,
     with_laboratory,
     without_efficiency,
 )
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 
 NAMES = ("gain", "quantum_efficiency", "dark_signal")

@@ -110,7 +110,7 @@ def shorten(command, monkeypatch):
         monkeypatch.setattr(evaluation_page, "draw_pictures", lambda result: {})
         monkeypatch.setattr(evaluation_page, "sections", lambda *_: [])
     elif command == "study":
-        from neusee.workflows.studies.leave_out import leave_out_study
+        from neusee.workflows.studies import leave_out_study
 
         monkeypatch.setattr(leave_out_study, "measure_scenes", lambda *_: [])
 

@@ -16,7 +16,7 @@ import pytest
 
 from neusee.workflows.api import verbs
 from neusee.workflows.cli import app
-from neusee.workflows.cli.command_options import FewLines, ProgressLines, option_words
+from neusee.workflows.cli.command_frame import FewLines, ProgressLines, option_words
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.filterwarnings("default")]
 
@@ -106,7 +106,7 @@ def stopping_at(path, call):
 
 
 def test_ctrl_c_in_a_training_names_the_checkpoint(neusee, here, monkeypatch):
-    from neusee.workflows.training.loop.resumable_loop import StateFile
+    from neusee.workflows.training.resumable_loop import StateFile
 
     def trained(recipe, out, **options):
         StateFile(out / f"{recipe.name}_train_1a2b" / "state.pt").write(
@@ -248,7 +248,7 @@ def test_a_missing_extra_is_named(neusee, monkeypatch):
 
 
 def test_every_long_command_prints_one_json_object(neusee, here, monkeypatch):
-    from neusee.workflows.studies.leave_out import leave_out_study
+    from neusee.workflows.studies import leave_out_study
 
     monkeypatch.setattr(leave_out_study, "measure_scenes", lambda *_: [])
     calls = {

@@ -9,7 +9,7 @@ import pytest
 
 from neusee.nodes import input_files as input_size
 from neusee.workflows.cli import app
-from neusee.workflows.engine.memory_limits import limited
+from neusee.workflows.engine.machine_resources import limited
 from tests import file_bombs as bombs
 
 RECIPE = """# A picture.

@@ -165,7 +165,11 @@ SLOW = {
         "neusee.workflows.sweeps",
     ),
     "train": (["train", "train_small"], "open", "run_training."),
-    "study": (["study", "stability", "laser_free"], "import", "neusee.workflows.studies.stability"),
+    "study": (
+        ["study", "stability", "laser_free"],
+        "import",
+        "neusee.workflows.studies.stability_study",
+    ),
     "safety": (["safety", "safety_pointer"], "open", "run_safety."),
     "safety, while it writes": (["safety", "pulse.yaml"], "open", "provenance.json"),
     "calibrate": (["calibrate", "calibrate"], "open", "run_calibration."),

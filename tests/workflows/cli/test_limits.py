@@ -408,8 +408,8 @@ def test_a_height_network_and_a_lift_refuse_weights_that_are_not_finite(tmp_path
     from safetensors.torch import save_file
 
     from neusee.nodes import ParameterError, doe, spectra
-    from neusee.nodes.doe._unet_height_map import HeightNet
-    from neusee.nodes.spectra._mst_plus_plus import start_mst_plus_plus
+    from neusee.nodes.doe._parametrisations import HeightNet
+    from neusee.nodes.spectra._lift import start_mst_plus_plus
 
     nets = {"height": HeightNet(4), "lift": start_mst_plus_plus(torch.Generator().manual_seed(0))}
     for name, net in nets.items():

@@ -10,8 +10,12 @@ from contextlib import suppress
 
 import pytest
 
-from neusee.workflows.engine.machine_resources import process_memory
-from neusee.workflows.engine.memory_limits import MemoryLimit, limited, refusing_allocations
+from neusee.workflows.engine.machine_resources import (
+    MemoryLimit,
+    limited,
+    process_memory,
+    refusing_allocations,
+)
 from tests.workflows.program_forks import Programs
 
 GB = 10**9

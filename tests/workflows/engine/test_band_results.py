@@ -15,7 +15,7 @@ from neusee.nodes.values import LowRankCube, Psf, Pupil
 from neusee.workflows import RunError, Store, load
 from neusee.workflows.engine import node_call as band_results
 from neusee.workflows.engine.node_call import call, call_by_band, plain_of
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Step, in_order
 from neusee.workflows.store import serialization
 from neusee.workflows.store.band_files import Blobs, Stacked

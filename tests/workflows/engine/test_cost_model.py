@@ -20,7 +20,7 @@ from neusee.workflows.engine.cost_model import (
     sizes_of,
 )
 from neusee.workflows.engine.placement_inputs import MOST_PARTS, parts_of, past_costs
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.store.result_store import Store
 

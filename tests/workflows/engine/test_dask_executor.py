@@ -11,7 +11,7 @@ import torch
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.store.result_store import Store
 
 distributed = pytest.importorskip("distributed")

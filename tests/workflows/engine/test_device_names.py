@@ -10,7 +10,7 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.engine.local_executor import check_devices
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.store.result_store import Store
 

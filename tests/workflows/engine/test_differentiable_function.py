@@ -12,9 +12,8 @@ from torch.autograd import gradcheck
 from neusee.nodes import TensorStats, node
 from neusee.workflows.engine.differentiable_function import _Ends, as_function
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location, RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

@@ -7,7 +7,7 @@ import pytest
 from neusee.nodes import node
 from neusee.workflows.engine.dispatch import Loop, chains_of
 from neusee.workflows.engine.step_job import Lane, Outcome, StepJob
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Step
 
 

@@ -15,9 +15,8 @@ from neusee.workflows.engine import step_job
 from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.machine_resources import process_memory
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location, RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 
 BIG = 1 << 20

@@ -14,7 +14,7 @@ from neusee.nodes.values import Psf
 from neusee.workflows.engine.dask_executor import kinds_of, work_here
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.step_job import StepJob
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.sealed_files import seal_record, signature, unseal_record
 from neusee.workflows.store.result_store import Store

@@ -9,20 +9,20 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine import machine_resources as memory_use
-from neusee.workflows.engine import memory_limits as memory_watch
+from neusee.workflows.engine import machine_resources
 from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.machine_resources import (
+    MemoryLimit,
     PeakMemory,
     free_memory,
+    guarded,
+    limited,
     process_memory,
     process_peak,
 )
-from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location, RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 
 MB = 10**6
@@ -74,7 +74,7 @@ def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finish
         LOOKED.set()
         return seen[-1]
 
-    monkeypatch.setattr(memory_watch, "process_memory", look)
+    monkeypatch.setattr(machine_resources, "process_memory", look)
     store = Store(tmp_path)
     limit = program_memory() + 300 * MB
     with pytest.raises(
@@ -113,8 +113,8 @@ def test_an_error_that_comes_too_late_for_the_step_is_raised_at_its_end():
 
 TRACED = """
 import sys, threading
-from neusee.workflows.engine import memory_limits
-from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
+from neusee.workflows.engine import machine_resources
+from neusee.workflows.engine.machine_resources import MemoryLimit, guarded, limited
 
 def step():
     return lambda: here
@@ -122,7 +122,7 @@ def step():
 try:
     with limited(1e15), guarded():
         here = threading.get_ident()
-        memory_limits._inside[here] = True  # told to stop when the step has ended
+        machine_resources._inside[here] = True  # told to stop when the step has ended
 except MemoryLimit:
     sys.settrace(lambda *_: None)
     step()
@@ -156,11 +156,11 @@ def test_the_peak_of_the_process_is_not_forgotten_when_a_step_is_measured():
 
 def test_runs_that_follow_at_once_look_at_the_free_memory_once(monkeypatch):
     looks, now = [], [100.0]
-    monkeypatch.setattr(memory_use, "_free_memory", lambda: looks.append(1) or len(looks))
-    monkeypatch.setattr(memory_use.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(memory_use, "_told", [-1.0, 0.0])
+    monkeypatch.setattr(machine_resources, "_free_memory", lambda: looks.append(1) or len(looks))
+    monkeypatch.setattr(machine_resources.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(machine_resources, "_told", [-1.0, 0.0])
     assert [free_memory(), free_memory()] == [1, 1]
-    now[0] += 1.01 * memory_use.FRESH
+    now[0] += 1.01 * machine_resources.FRESH
     assert free_memory() == 2
     now[0] = 1.0  # a clock of another boot
     assert free_memory() == 3

@@ -14,9 +14,8 @@ from neusee.nodes import Check, node
 from neusee.nodes.values import Bands
 from neusee.workflows.engine import execution
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location, RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store import payload as small_results
 from neusee.workflows.store import serialization
 from neusee.workflows.store.result_store import Store

@@ -149,10 +149,10 @@ def test_what_cannot_be_is_refused_before_any_work(words, said, lab, monkeypatch
 
 
 def test_the_package_is_named_where_it_is_missing(lab, monkeypatch, capsys):
-    from neusee.workflows.cli import command_options
+    from neusee.workflows.cli import command_frame
 
     monkeypatch.chdir(lab)
-    monkeypatch.setattr(command_options, "find_spec", lambda name: None)
+    monkeypatch.setattr(command_frame, "find_spec", lambda name: None)
     with pytest.raises(SystemExit) as end:
         app.main(["run", "lab.yaml", "--executor", "slurm:2"])
     assert end.value.code == 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from neusee.nodes import node
 from neusee.workflows.engine.runner import shortest_first
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 
 

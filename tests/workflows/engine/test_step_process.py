@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.workflows.engine.machine_resources import process_memory
-from neusee.workflows.engine.memory_limits import MemoryLimit, limited
+from neusee.workflows.engine.machine_resources import MemoryLimit, limited, process_memory
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork
 from neusee.workflows.keys.user_code import OwnCode
 from neusee.workflows.observation import kernel_layer

@@ -15,7 +15,7 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.keys import user_code as tainted_code
 from neusee.workflows.keys.cache_key import is_private
 from neusee.workflows.store.result_store import Store

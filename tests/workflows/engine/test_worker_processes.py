@@ -13,7 +13,7 @@ import warnings
 import pytest
 import torch
 
-from neusee.workflows.engine import memory_limits as memory_watch
+from neusee.workflows.engine import machine_resources as memory_watch
 from neusee.workflows.engine import worker_processes
 from neusee.workflows.engine.worker_processes import shared, shared_in_order, workers_for
 

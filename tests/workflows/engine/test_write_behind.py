@@ -16,7 +16,7 @@ import torch
 from neusee.workflows.engine import step_job as write_behind
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.step_job import WriteBehind
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.store.result_store import Store
 
 SPEC = importlib.util.spec_from_file_location(

@@ -15,11 +15,11 @@ from neusee.nodes import metrics
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.equal_protection import protect
 from neusee.workflows.evaluation.pipelines import (
     NONE,
     EvaluationRefused,
     compose_pipelines,
+    protect,
     read_pipelines,
 )
 from neusee.workflows.evaluation.run_evaluation import evaluate

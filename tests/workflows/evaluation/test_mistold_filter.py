@@ -19,9 +19,9 @@ from neusee.workflows.evaluation.evaluation_result import told_with_errors
 from neusee.workflows.evaluation.evaluation_scenes import scenes
 from neusee.workflows.evaluation.pipelines import CASES, compose_pipelines, read_pipelines
 from neusee.workflows.evaluation.run_evaluation import evaluate
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.recipe_graph import TOLD
-from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
+from neusee.workflows.recipe.blocks.settings_block import Mismatch
 from neusee.workflows.store.result_store import Store
 
 SMALL = [

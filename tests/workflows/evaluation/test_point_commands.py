@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
-from neusee.workflows.evaluation.equal_protection import protect
 from neusee.workflows.evaluation.evaluation_points import (
     EvaluationPoints,
     PointCommands,
@@ -26,6 +25,7 @@ from neusee.workflows.evaluation.pipelines import (
     Pipeline,
     compose_pipelines,
     named_apart,
+    protect,
     read_pipelines,
 )
 from neusee.workflows.protection.equal_rivals import EqualProtection

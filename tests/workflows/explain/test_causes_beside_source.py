@@ -12,7 +12,7 @@ import neusee.nodes
 from neusee.workflows.engine.runner import run
 from neusee.workflows.explain import change_causes as code_changes
 from neusee.workflows.explain.why_rerun import why_lines
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys import code_digest, module_origin
 from neusee.workflows.keys import loaded_state as process_settings

@@ -9,7 +9,7 @@ import pytest
 from neusee.nodes import node
 from neusee.workflows.engine.cost_model import Estimate
 from neusee.workflows.explain.cluster_forecast import cluster_lines, simulated
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.placement.machine_file import read_machines
 

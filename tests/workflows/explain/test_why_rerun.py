@@ -14,7 +14,7 @@ from neusee.workflows.explain import change_causes, stored_origin, why_rerun
 from neusee.workflows.explain.change_causes import Comparison, Pair, edits
 from neusee.workflows.explain.stored_origin import why_key_lines
 from neusee.workflows.explain.why_rerun import explained, why_lines
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import load

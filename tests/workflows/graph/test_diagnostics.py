@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, nearest
 
 NAMES = ("axicon", "flat", "vortex")
 

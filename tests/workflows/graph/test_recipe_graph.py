@@ -1,6 +1,6 @@
 import pytest
 
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Step, in_order, needed
 from neusee.workflows.recipe.text.yaml_values import Value
 
@@ -76,7 +76,7 @@ def test_a_chain_of_10000_steps_is_bound_and_ordered(toy):
 
 
 def test_a_loop_of_10000_steps_is_found_and_told_in_short(toy):
-    from neusee.workflows.graph.diagnostics import RecipeError
+    from neusee.workflows.graph.errors import RecipeError
     from neusee.workflows.recipe.loading import check
 
     with pytest.raises(RecipeError, match=r"cycle: s\d+ -> .* \(9988 more\)") as caught:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import neusee.recipes
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.handbook.json_schema import REFERENCE, schema
 from neusee.workflows.recipe.text.yaml_values import parse
 

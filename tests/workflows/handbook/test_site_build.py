@@ -12,9 +12,10 @@ from typer.main import get_command
 import neusee
 from neusee.workflows.cli import app
 from neusee.workflows.cli.handbook_reference import reference_pages
-from neusee.workflows.handbook import guide_pages as command_pictures
 from neusee.workflows.handbook import site_build as build
-from neusee.workflows.handbook.guide_pages import (
+from neusee.workflows.handbook import site_build as command_pictures
+from neusee.workflows.handbook.recipe_and_python_reference import escaped, prose, table
+from neusee.workflows.handbook.site_build import (
     GUIDE,
     NoPicture,
     Picture,
@@ -24,7 +25,6 @@ from neusee.workflows.handbook.guide_pages import (
     with_pictures,
     write_files,
 )
-from neusee.workflows.handbook.recipe_and_python_reference import escaped, prose, table
 from neusee.workflows.recipe.loading import groups
 from neusee.workflows.recipe.node_families import all_nodes
 

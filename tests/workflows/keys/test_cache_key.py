@@ -14,7 +14,7 @@ import torch
 import neusee.nodes
 from neusee.nodes import node
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys import code_digest
 from neusee.workflows.keys.cache_key import digest, file_digest, key_of, plain, stream_seed
@@ -325,7 +325,7 @@ from neusee.nodes.trial import head, tail
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import key_of
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 mark, code, keys = Location("trial.yaml", 1, 1), Code(Path(sys.argv[2])), {}
 params = {"factor": 10.0, "file": Path(sys.argv[1]) / "offset.txt"}
 for step in (Step("head", head, {"start": 2.0}, {}, mark, {}), Step("tail", tail, params, {"x": "head"}, mark, {})):

@@ -19,9 +19,8 @@ import torch
 
 import neusee.nodes
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location, RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from neusee.nodes import node
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys import code_digest as known_keys
 from neusee.workflows.keys.cache_key import key_of

@@ -15,7 +15,7 @@ import torch
 from neusee.nodes import own_modules, scene
 from neusee.nodes.own_modules import import_missing, own_files
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.node_families import import_own

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.placement.heft_schedule import Device, Link
 from neusee.workflows.placement.machine_file import examples, read_machines
 from neusee.workflows.recipe.loading import groups

@@ -18,8 +18,9 @@ from neusee.workflows.protection.protection_camera import (
     FrontBench,
     FrontSettings,
     ProtectionCamera,
+    draw_conditions,
+    usual_condition,
 )
-from neusee.workflows.protection.unknown_conditions import draw_conditions, usual_condition
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["optics.samples=128", "optics.pitch=63.125 um", "optics.bands=3", "optics.window=[64, 64]"]

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from neusee.workflows.protection.unknown_conditions import (
+from neusee.workflows.protection.protection_camera import (
     UnknownLaws,
     draw_conditions,
     usual_condition,

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neusee import recipes
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.step_shapes import alike
 from neusee.workflows.recipe import step_checks as bound_steps
 from neusee.workflows.recipe import step_checks as graph_cache

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 
 MINE = """\

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.global_settings import NAMES
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report import contents

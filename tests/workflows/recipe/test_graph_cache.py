@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe import loading
 from neusee.workflows.recipe import step_checks as graph_cache
 from neusee.workflows.recipe.text import composition

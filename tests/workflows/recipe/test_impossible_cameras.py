@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 from tests.impossible_values import Case, cases, fault_of_run, outcome
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import neusee
-from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import Location, RunError
 from neusee.workflows.recipe import loading
-from neusee.workflows.recipe.blocks import evaluate_block, train_block
+from neusee.workflows.recipe.blocks import settings_block, train_block
 from neusee.workflows.recipe.blocks import train_block as train_lift_block
 from neusee.workflows.recipe.loading import groups, load, recipes
 from neusee.workflows.recipe.text.yaml_values import parse
@@ -327,7 +326,7 @@ def test_one_wrong_value_that_many_steps_use_is_one_mistake(mistakes):
 
 
 def test_the_lines_are_aligned(read):
-    from neusee.workflows.graph.diagnostics import RecipeError
+    from neusee.workflows.graph.errors import RecipeError
 
     with pytest.raises(RecipeError) as caught:
         read(swap("gain: 0.37", "gian: 0.37"), "sensor.bitts=3")
@@ -368,6 +367,6 @@ def test_the_settings_of_trainings_are_imported_for_recipes_that_have_one():
     assert loading.BLOCKS == (
         train_block.KEY,
         train_lift_block.LIFT_KEY,
-        evaluate_block.KEY,
+        settings_block.KEY,
         loading.TRACED,
     )

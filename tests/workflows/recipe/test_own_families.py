@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import neusee
 from neusee.workflows import Store, load, run
 from neusee.workflows.cli.app import app
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.handbook import json_schema
 from neusee.workflows.recipe import node_families
 from neusee.workflows.recipe.loading import families_of

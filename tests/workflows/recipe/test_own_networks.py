@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from neusee.nodes import restore
 from neusee.nodes.own_modules import Architecture
 from neusee.workflows import RecipeError, Store, load, run
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import RunError
 from neusee.workflows.recipe.node_families import NO_CODE_VARIABLE
 
 NETWORK = '''\

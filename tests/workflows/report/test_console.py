@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neusee.nodes import Check, TensorStats, node
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Event, Recipe, Step, StepRecord
 from neusee.workflows.report import console as console_room
 from neusee.workflows.report.terminal_text import commands_to_try

@@ -19,9 +19,9 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine.memory_limits import MemoryLimit
+from neusee.workflows.engine.machine_resources import MemoryLimit
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step, StepRecord
 from neusee.workflows.report import files_beside
 from neusee.workflows.report import files_beside as drawing_process

@@ -24,8 +24,8 @@ from neusee.nodes import Check, node
 from neusee.nodes.metrics import Quality
 from neusee.workflows import Recipe, RecipeError, Step, Store, load
 from neusee.workflows.engine.result_values import arrays_of
-from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.report import notebook, result_numbers
+from neusee.workflows.graph.errors import Location
+from neusee.workflows.report import notebook, run_summary
 
 CAMERA = """\
 # A camera of toys.
@@ -518,7 +518,7 @@ def test_the_overview_is_shown_by_one_stretch():
 
 
 def test_showing_a_result_computes_nothing_that_took_long(store, monkeypatch):
-    for module in (notebook, result_numbers):
+    for module in (notebook, run_summary):
         monkeypatch.setattr(module, "TABLE", {"row": {"peak/I_sat": "ramp"}})
     result = neusee.run(small(), store=store, outputs=["half"])
     known = {"peak/I_sat", "row"}

@@ -15,7 +15,7 @@ import torch
 from neusee.nodes import node
 from neusee.nodes.values import Bands, Psf, Pupil
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import contents, run_pictures
 from neusee.workflows.report.figures import camera_pictures as camera_overview

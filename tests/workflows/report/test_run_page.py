@@ -13,10 +13,10 @@ import torch
 
 import neusee
 from neusee.nodes import Check, node
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
-from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures
+from neusee.workflows.report import run_folder, run_page, run_pictures, run_summary
 from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report import run_page as run_timing
 from neusee.workflows.report.run_folder import find_run, new_run
@@ -294,14 +294,12 @@ def test_outputs_read_back_as_they_are(done):
     ("promised", "met"), [(6.0, True), (6.05, True), (6.1, False), (-6.0, False)]
 )
 def test_expected_numbers_are_met_or_missed(promised, met):
-    rows = result_numbers.expected(
-        recipe(promised=promised), lambda step: torch.tensor([6.0, 12.0])
-    )
+    rows = run_summary.expected(recipe(promised=promised), lambda step: torch.tensor([6.0, 12.0]))
     assert [r["ok"] for r in rows] == [met]
 
 
 def test_a_number_that_is_none_is_missed():
-    rows = result_numbers.expected(
+    rows = run_summary.expected(
         recipe(promised=6.0), lambda step: torch.tensor([float("nan"), 12.0])
     )
     assert not rows[0]["ok"]

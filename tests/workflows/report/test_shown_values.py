@@ -13,7 +13,7 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import run_pictures as shown_values
 from neusee.workflows.report.run_folder import NotWritten

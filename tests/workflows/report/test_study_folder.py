@@ -8,8 +8,7 @@ import json
 import pytest
 
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report.study_folder import StudyReport, StudyRun, silent
-from neusee.workflows.report.study_page import Section
+from neusee.workflows.report.study_report import Section, StudyReport, StudyRun, silent
 
 
 @pytest.fixture

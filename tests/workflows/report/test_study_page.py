@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from neusee.workflows.report.study_page import (
+from neusee.workflows.report.study_report import (
     Marked,
     Section,
     marked_column,

@@ -15,7 +15,7 @@ from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report.tolerance_spent import said_of_errors, spent
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.leave_out.left_out_steps import OmissionComparison
+from neusee.workflows.studies.left_out_steps import OmissionComparison
 from neusee.workflows.tolerance import cheaper_steps
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of

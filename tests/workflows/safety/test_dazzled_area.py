@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import j0
 
 from neusee.workflows import Store, load
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate
 

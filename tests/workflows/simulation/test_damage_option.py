@@ -7,7 +7,7 @@ import torch
 
 import neusee
 from neusee.workflows import Store, load
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 
 RECIPE = """\
 # A small camera in watts with damage.

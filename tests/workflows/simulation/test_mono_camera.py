@@ -11,10 +11,10 @@ from PIL import Image
 from safetensors.torch import save_file
 
 import neusee
+from neusee.nodes.restore._networks._convolutional_networks import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
 from neusee.nodes.scene import grey
-from neusee.nodes.scene._spectral_exr import exr_parts
+from neusee.nodes.scene._exr import exr_parts
 from neusee.workflows import Store, load
 
 #: quantum efficiency in percent by wavelength in nm, as a data sheet draws it

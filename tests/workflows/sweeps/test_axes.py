@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.sweeps.axes import MOST, Axis, points, read_axes, read_words, split, values_of
 
 PLAIN = st.text("abcxyz019.-_ ", min_size=1, max_size=8).map(str.strip).filter(bool)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from neusee.nodes import node
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.sweeps import sweep_points as kept_recipes
 from neusee.workflows.sweeps.sweep_points import KeptRecipe

@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from neusee.workflows.sweeps.point_order import PointJob, best_order, filled, sharing, work_left
+from neusee.workflows.sweeps.sweep_points import PointJob, best_order, filled, sharing, work_left
 
 REACH = {"pupil": "a", "psf": "ab", "scene": "b", "sensor": "abc", "noise": "c", "fixed": ""}
 CHAIN = {

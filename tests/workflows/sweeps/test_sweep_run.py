@@ -18,11 +18,10 @@ import torch
 from neusee.workflows import load
 from neusee.workflows.cli.sweep_screen import run_sweep
 from neusee.workflows.engine import local_executor
-from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.errors import RecipeError, RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps import sweep_points
-from neusee.workflows.sweeps import sweep_table as sweep_files
+from neusee.workflows.sweeps import sweep_run as sweep_files
 from neusee.workflows.sweeps.sweep_run import sweep
 from tests.workflows.crate_rules import faults
 

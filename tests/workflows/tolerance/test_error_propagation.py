@@ -11,7 +11,7 @@ import torch
 from neusee.nodes import ErrorBound, TensorStats, node
 from neusee.workflows.engine import runner
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step, StepRecord, Substitution
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_norm import largest_error

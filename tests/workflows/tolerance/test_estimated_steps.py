@@ -8,7 +8,7 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import changed
 from neusee.workflows.report.tolerance_spent import said_of_economies, said_of_errors, spent
 from neusee.workflows.store.result_store import Store

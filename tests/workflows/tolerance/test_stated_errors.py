@@ -10,7 +10,7 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_norm import error_of
 from neusee.workflows.tolerance.error_propagation import COVERAGE

@@ -86,7 +86,7 @@ def test_a_lens_without_scatter_is_no_step_at_all(states):
     ],
 )
 def test_mistakes_are_located(change, message):
-    from neusee.workflows.graph.diagnostics import RecipeError
+    from neusee.workflows.graph.errors import RecipeError
 
     with pytest.raises(RecipeError) as error:
         small(change)

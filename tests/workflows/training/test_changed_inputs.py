@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 from neusee.nodes.losses import _restoration_losses
 from neusee.nodes.restore import NAFNet, start_network
 from neusee.workflows import Store, load
-from neusee.workflows.training.loop.recorded_inputs import prepare_folder
+from neusee.workflows.training.recorded_inputs import prepare_folder
 from neusee.workflows.training.run_training import BegunTraining, UnchangedFiles, train
 
 TINY = [

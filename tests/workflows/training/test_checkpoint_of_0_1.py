@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from neusee.workflows.training.loop.resumable_loop import StateFile
+from neusee.workflows.training.resumable_loop import StateFile
 
 
 def written(path, parts, edition=1):

@@ -22,8 +22,7 @@ from neusee.workflows.evaluation.pipelines import (
 )
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.training.process_mesh import ALONE, Mesh
-from neusee.workflows.training.run_training import train
-from neusee.workflows.training.training_inputs import code_of_class, network_settings
+from neusee.workflows.training.run_training import code_of_class, network_settings, train
 
 TINY = [
     "optics.samples=64",

@@ -26,7 +26,7 @@ from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, as_function, load
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.blocks.train_block import MaskSettings, Rates
-from neusee.workflows.training.mask_design import design_page
+from neusee.workflows.training import design_run
 from neusee.workflows.training.run_training import frozen, train
 from neusee.workflows.training.training_pictures import Shared, TrainingStream
 from tests.workflows.crate_rules import faults
@@ -520,7 +520,7 @@ def command(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
     monkeypatch.chdir(tmp_path)
     # they take longer than what is tested
-    monkeypatch.setattr(design_page, "pictures", lambda *_: {})
+    monkeypatch.setattr(design_run, "pictures", lambda *_: {})
 
     def call(*words):
         with pytest.raises(SystemExit) as end:

@@ -14,7 +14,7 @@ from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.training.held_out import Split, _by_photograph
 from neusee.workflows.training.process_mesh import Mesh, MeshError
-from neusee.workflows.training.training_inputs import inputs_of
+from neusee.workflows.training.run_training import inputs_of
 from neusee.workflows.training.training_pictures import (
     HELD_OUT,
     SeveralCameras,

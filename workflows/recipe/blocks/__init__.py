@@ -3,5 +3,5 @@
 The settings of training, of the design of a mask and of an evaluation, which are read and checked
 with their locations. Nothing here trains a network or a mask.
 Offers: `train_block.Training`, `train_block.LiftTraining`, `train_block.MaskTraining`,
-        `evaluate_block.EvaluateSettings`.
+        `settings_block.EvaluateSettings`.
 """

@@ -38,7 +38,7 @@ from neusee.nodes.units import (
     Wavelength,
     Waves,
 )
-from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.graph.errors import Diagnostic, nearest
 from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, located
 from neusee.workflows.recipe.text.recipe_files import refuse_outside
 from neusee.workflows.recipe.text.references import References, Scope, broken

@@ -1,19 +1,20 @@
-"""Blocks of settings in a recipe: their base class, the types of their values, and a reader that
-reports mistakes.
+"""Blocks of settings in a recipe: their base class, the types of their values, a reader that
+reports mistakes, and the smallest block, `evaluate`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError
 
 from neusee.nodes.parameters import ParameterModel
-from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.nodes.units import Length, Waves
+from neusee.workflows.graph.errors import Diagnostic, nearest
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.field_errors import message_of
-from neusee.workflows.recipe.text.renamed_keys import instead
+from neusee.workflows.recipe.text.other_spellings import instead
 from neusee.workflows.recipe.text.yaml_values import Value
 
 Weight = Annotated[float, Field(ge=0, le=1e9)]
@@ -90,3 +91,50 @@ def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
                 annotation,
             )
     return list(model.model_fields)
+
+
+# --- the block `evaluate`: the errors in what the restorer is told --------------------------------
+
+KEY = "evaluate"  #: key of the block in a recipe
+
+
+class Mismatch(SettingsBlock):
+    """Errors in what a restorer is told, each tried by itself; 0 or false leaves an error out."""
+
+    pixels: Annotated[float, Field(ge=0, le=100)] = 0.5  #: of the place of the laser, along y and x
+    wavelength: Annotated[Length, Field(ge=0, le=100e-9)] = 2e-9  #: of the laser
+    defocus: Waves = 0.1  #: of the lens, for scene and laser, peak to valley at 550 nm
+    dirt: bool = True  #: whether the dirt of the window is not told
+    #: null: the largest of the evaluation
+    strength: Annotated[float, Field(gt=0, le=1e18)] | None = None
+    scenes: Number = 5  #: the first scenes with a laser
+
+
+class EvaluateSettings(SettingsBlock):
+    """Settings of `neusee evaluate` in the recipe key ``evaluate``."""
+
+    mismatch: Mismatch | None = Mismatch()  #: null: the restorer is always told the truth
+    #: drawn: the first laser of the recipe, its wavelength by its law
+    lasers: Literal["in turn", "drawn"] = "in turn"
+    scenes: Number | Literal["all"] = 20  #: all: every photograph of the folder once
+    pipelines: str = "flat+none, five_half_rings+wiener"
+    reference: str = ""  #: of these pipelines; empty: the first
+    #: peak of a laser behind each pipeline
+    equal_protection: Annotated[float, Field(gt=0, lt=1)] | None = None
+    by: Literal["best", "filter", "stop"] = "best"
+    #: true: the pipelines as they are are evaluated too, beside those of equal protection
+    beside: bool = False
+    #: changes of the recipe for the figure with the lasers, such as sensor.c1=0.2
+    figure: tuple[str, ...] = ()
+
+
+def read_evaluate(composed: Composed) -> tuple[Composed, EvaluateSettings | None]:
+    """Return a recipe without its block ``evaluate``, and the settings from the block; report
+    mistakes.
+    """
+    block = composed.root.items.get(KEY)
+    return (
+        (composed, None)
+        if block is None
+        else read_block(composed, KEY, EvaluateSettings, block.plain)
+    )

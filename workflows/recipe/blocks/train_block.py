@@ -36,7 +36,7 @@ from neusee.nodes.units import (
     Wavelength,
     Waves,
 )
-from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.graph.errors import Diagnostic, nearest
 from neusee.workflows.recipe.blocks.settings_block import (
     Beta,
     GradientNorm,

@@ -16,14 +16,14 @@ import numpy as np
 from neusee.nodes.file_headers import npy_needs, npz_needs
 from neusee.nodes.input_files import head_of, lines_of, refuse_other_than_file
 from neusee.nodes.units import read_any, read_written
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.errors import Location
 from neusee.workflows.keys.sealed_files import NotRegular, text_of
 from neusee.workflows.keys.sealed_files import (
     refuse_other_than_file as refuse_other_than_file_regular_file,
 )
 from neusee.workflows.recipe.distributions.shapes import FloatArray, scores_between
+from neusee.workflows.recipe.text.other_spellings import POSTERIOR_NAMES
 from neusee.workflows.recipe.text.recipe_files import refuse_outside
-from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 
 # --- sample table ---------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes.units import read_any, read_written
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
+from neusee.workflows.graph.errors import Diagnostic, Location, nearest
 from neusee.workflows.recipe.distributions.joint_distribution import (
     read_columns,
     require_samples,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes.units import KNOWN_UNITS, read_any
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
+from neusee.workflows.graph.errors import Diagnostic, Location, nearest
 from neusee.workflows.recipe.distributions.joint_distribution import (
     BARE_GAIN,
     GAIN_UNIT,
@@ -26,8 +26,8 @@ from neusee.workflows.recipe.distributions.joint_distribution import (
 from neusee.workflows.recipe.distributions.law_text import Difference, is_law, read_law
 from neusee.workflows.recipe.distributions.shapes import Law, written
 from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.other_spellings import POSTERIOR_NAMES
 from neusee.workflows.recipe.text.references import BROKEN
-from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 KEY = "posterior"  #: key of the block in a recipe

@@ -7,9 +7,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
-from neusee.workflows.recipe.text.defaults_list import Choice, Option, choice, entries_of
-from neusee.workflows.recipe.text.extended_recipes import Extension, Written
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, nearest
+from neusee.workflows.recipe.text.extended_recipes import (
+    Choice,
+    Extension,
+    Option,
+    Written,
+    choice,
+    entries_of,
+)
 from neusee.workflows.recipe.text.overrides import Override, apply, read_override
 from neusee.workflows.recipe.text.recipe_files import (
     NO_CODE_VARIABLE,

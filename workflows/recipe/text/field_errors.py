@@ -10,7 +10,7 @@ import re
 from pydantic_core import ErrorDetails
 
 from neusee.nodes.units import in_words, read_written
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.errors import nearest
 from neusee.workflows.recipe.text.yaml_values import Value
 
 #: words of a limit, by the name that a model gives to the limit

@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.recipe.text.hydra_habits import advice_on_argument
-from neusee.workflows.recipe.text.renamed_keys import instead
+from neusee.workflows.recipe.text.other_spellings import advice_on_argument, instead
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, parse
 
 # --- overrides ------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from importlib.resources import files
 from pathlib import Path
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, nearest
 
 # --- no code --------------------------------------------------------------------------------------
 

@@ -12,11 +12,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
-from neusee.workflows.graph.diagnostics import UNREAD, Diagnostic
-from neusee.workflows.recipe.text.hydra_habits import advice_on_reference
+from neusee.workflows.graph.errors import UNREAD, Diagnostic
+from neusee.workflows.recipe.text.other_spellings import advice_on_reference, instead, new_name
 from neusee.workflows.recipe.text.overrides import RESERVED
 from neusee.workflows.recipe.text.recipe_files import packaged
-from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 _REFERENCE = re.compile(r"\$\{([^${}]*)\}")

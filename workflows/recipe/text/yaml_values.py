@@ -17,9 +17,9 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode
 from ruamel.yaml.tokens import ScalarToken
 
-from neusee.workflows.graph.diagnostics import CONTROL, Diagnostic, Location, RecipeError, visible
+from neusee.workflows.graph.errors import CONTROL, Diagnostic, Location, RecipeError, visible
 from neusee.workflows.keys.sealed_files import NotRegular, opened
-from neusee.workflows.recipe.text.hydra_habits import (
+from neusee.workflows.recipe.text.other_spellings import (
     ADVICE_ON_HEADER,
     advice_on_key,
     package_line,

@@ -12,7 +12,7 @@ from PIL import Image
 from pydantic import ValidationError
 
 from neusee.nodes.calibrate import descriptor, descriptor_frames, descriptor_series, reduce
-from neusee.nodes.calibrate._emva_descriptor import _parsed
+from neusee.nodes.calibrate._measurement_files import _parsed
 from neusee.workflows.keys.cache_key import plain
 
 DATA = Path(

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from neusee.nodes.calibrate import _frame_statistics, levels, reduce
+from neusee.nodes.calibrate import _light_levels, levels, reduce
 
 STACKS = hnp.arrays(
     st.sampled_from([np.uint8, np.uint16, np.int32, np.float32, np.float64]),
@@ -92,7 +92,7 @@ def test_a_lamp_that_drifts_within_a_pair_is_no_noise():
 @given(STACKS)
 @settings(max_examples=100, deadline=None)
 def test_the_histogram_is_numpys(stack):
-    value, count = _frame_statistics.histogram(torch.from_numpy(stack))
+    value, count = _light_levels.histogram(torch.from_numpy(stack))
     wanted = np.unique(stack, return_counts=True)
     np.testing.assert_array_equal(value.numpy(), wanted[0])
     np.testing.assert_array_equal(count.numpy(), wanted[1])
@@ -102,7 +102,7 @@ def test_the_histogram_is_numpys(stack):
 def test_pieces_give_what_the_whole_gives(monkeypatch, scatter):
     frames = noise(3, 40, 50)
     whole = one(frames, scatter)
-    monkeypatch.setattr(_frame_statistics, "_PIECE", 100)
+    monkeypatch.setattr(_light_levels, "_PIECE", 100)
     for a, b in zip(one(frames, scatter), whole, strict=True):
         assert torch.allclose(a, b, rtol=1e-14, atol=0)
 

@@ -197,7 +197,7 @@ def test_threads_never_share_a_workspace():
 
 
 def test_workspaces_are_kept_but_not_collected():
-    from neusee.nodes.optics._transform import _sample_axis as _workspace
+    from neusee.nodes.optics._transform import _sample_axis
 
     with borrowed(torch.float32, CPU) as first:
         memory = first.take("x", 100).data_ptr()
@@ -206,4 +206,4 @@ def test_workspaces_are_kept_but_not_collected():
     with borrowed(torch.float32, CPU) as again:
         assert again is first
         assert again.take("x", 50).data_ptr() == memory
-    assert len(_workspace._idle) <= 2
+    assert len(_sample_axis._idle) <= 2

@@ -8,7 +8,7 @@ import torch
 from scipy.stats import norm
 
 from neusee.nodes import restore
-from neusee.nodes.restore._lasers._joint_fit import censored
+from neusee.nodes.restore._lasers._frame_likelihood import censored, filled, filter_of
 from neusee.nodes.restore._lasers._line_pattern import (
     Lens,
     grid_patterns,
@@ -16,7 +16,6 @@ from neusee.nodes.restore._lasers._line_pattern import (
     line_moves,
     line_pattern,
 )
-from neusee.nodes.restore._lasers._whitening import filled, filter_of
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, inputs, pupil_of, tensor
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore._lasers import _joint_fit
+from neusee.nodes.restore._lasers import _frame_likelihood
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -20,6 +20,6 @@ def test_values_that_hardly_differ_are_told_apart_in_a_large_frame(seed):
         [shared * (1 + 1e-3 * rng.normal(size=shared.size)) for _ in range(4)]
     ).astype(np.float32)
     parts = (SimpleNamespace(precision=torch.zeros(4)),)
-    found = _joint_fit._normal(parts, torch.from_numpy(columns)).numpy()
+    found = _frame_likelihood._normal(parts, torch.from_numpy(columns)).numpy()
     exact = np.array([[np.dot(a.astype(float), b.astype(float)) for b in columns] for a in columns])
     assert np.linalg.eigvalsh(found) == pytest.approx(np.linalg.eigvalsh(exact), rel=1e-6)

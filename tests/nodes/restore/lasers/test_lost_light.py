@@ -14,6 +14,7 @@ from scipy.stats import norm
 
 from neusee.nodes.restore._lasers._components import Camera, Laser, lamp_light
 from neusee.nodes.restore._lasers._find_lasers import at_the_aperture
+from neusee.nodes.restore._lasers._frame_likelihood import NORMAL, fitted, misfit_of, spreads
 from neusee.nodes.restore._lasers._greedy_search import (
     Choice,
     Found,
@@ -21,7 +22,6 @@ from neusee.nodes.restore._lasers._greedy_search import (
     _data,
     without_scattered,
 )
-from neusee.nodes.restore._lasers._joint_fit import NORMAL, fitted, misfit_of, spreads
 from neusee.nodes.restore._lasers._line_pattern import Lens
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import found_in, inputs

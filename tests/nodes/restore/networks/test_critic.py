@@ -8,7 +8,7 @@ from torch import nn
 from torch.testing import assert_close
 
 from neusee.nodes.losses import gradient_penalty
-from neusee.nodes.restore._networks._critic import Critic, critic_slopes, critics
+from neusee.nodes.restore._networks._convolutional_networks import Critic, critic_slopes, critics
 from neusee.nodes.restore._networks._restorer import parameter_groups
 
 

@@ -13,9 +13,9 @@ from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, restore
 from neusee.nodes.resampling import resize
+from neusee.nodes.restore._networks._convolutional_networks import NAFBlock, NAFNet, UNet
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._restorer import parameter_groups, start_network
-from neusee.nodes.restore._networks._unet_and_nafnet import NAFBlock, NAFNet, UNet
 
 SMALL = {"width": 4, "blocks": 2, "states": 3}
 MAKE = {

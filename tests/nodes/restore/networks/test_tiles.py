@@ -12,8 +12,8 @@ from torch.testing import assert_close
 
 from neusee.nodes import restore
 from neusee.nodes.resampling import resize
+from neusee.nodes.restore._networks._convolutional_networks import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network, tiled
-from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
 
 
 def seeded():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from neusee.workflows import load
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.distributions.law_text import KINDS, read_law
 from neusee.workflows.recipe.distributions.shapes import (
     Discrete,

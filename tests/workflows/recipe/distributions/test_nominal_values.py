@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from neusee.workflows import load
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.distributions.joint_distribution import Joint, read_posterior, summary
 from neusee.workflows.recipe.distributions.law_text import is_law, read_law
 from neusee.workflows.simulation.simulate_recipe import recipe_text

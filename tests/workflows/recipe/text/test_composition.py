@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.text.composition import compose
 
 MINE = "# Mine.\ndefaults:\n  - lens: wide\n  - laser: null\nlens: {f: 3}\nseed: 1\noutputs: [a]\n"

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from neusee.workflows.cli.app import main
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.recipe.loading import load

@@ -5,7 +5,7 @@ names them.
 import pytest
 
 from neusee.workflows.evaluation.pipelines import EvaluationRefused, read_pipelines
-from neusee.workflows.graph.diagnostics import Location, RecipeError
+from neusee.workflows.graph.errors import Location, RecipeError
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.recipe_files import (
     NO_CODE_VARIABLE,

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from neusee.workflows import load
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.text.composition import compose
 
 MINE = "# Mine.\ndefaults:\n  - lens: wide\n  - laser: null\nlens: {f: 3}\nseed: 1\noutputs: [a]\n"

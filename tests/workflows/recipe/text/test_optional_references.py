@@ -2,7 +2,7 @@
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 
 TEXT = """\

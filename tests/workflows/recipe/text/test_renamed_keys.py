@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from neusee import recipes
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.node_families import families
-from neusee.workflows.recipe.text.renamed_keys import instead, new_name, old_names
+from neusee.workflows.recipe.text.other_spellings import instead, new_name, old_names
 
 RECIPES = ("first_light", "calibrate", "calibrate_camera")
 #: by the block of a key, the recipe that has it; else first_light

@@ -4,7 +4,7 @@ import pytest
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError, YAMLStreamError
 
-from neusee.workflows.graph.diagnostics import Location, RecipeError
+from neusee.workflows.graph.errors import Location, RecipeError
 from neusee.workflows.recipe.text.yaml_values import directive_mistake, explained, parse
 
 MISTAKES = [

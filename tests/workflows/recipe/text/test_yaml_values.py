@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neusee.workflows.graph.diagnostics import CONTROL, Location, RecipeError
+from neusee.workflows.graph.errors import CONTROL, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text.yaml_values import parse, read
 

@@ -12,8 +12,8 @@ from neusee.nodes import losses, metrics
 from neusee.workflows import load
 from neusee.workflows.recipe.blocks.train_block import DesignError, MaskTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design.design_page import against_stops
-from neusee.workflows.training.mask_design.design_terms import NOMINAL, CameraLaws, Terms
+from neusee.workflows.training.design_run import against_stops
+from neusee.workflows.training.design_terms import NOMINAL, CameraLaws, Terms
 
 SMALL = [
     "optics.samples=48",

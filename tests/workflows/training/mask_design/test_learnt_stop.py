@@ -14,10 +14,10 @@ from neusee.nodes import losses
 from neusee.workflows import load
 from neusee.workflows.recipe.blocks.train_block import MaskTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design import design_page
-from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
-from neusee.workflows.training.mask_design.design_run import design, mask_figures
-from neusee.workflows.training.mask_design.design_terms import Terms
+from neusee.workflows.training import design_run
+from neusee.workflows.training import mask_optimisers as gradient_descent
+from neusee.workflows.training.design_run import design, mask_figures
+from neusee.workflows.training.design_terms import Terms
 
 SMALL = [
     "optics.samples=48",
@@ -52,7 +52,7 @@ def how(**values):
 def test_the_loss_falls_with_mask_and_stop_and_the_recipe_repeats_it(
     kind, recipe, store, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(design_page, "pictures", lambda *_: {})
+    monkeypatch.setattr(design_run, "pictures", lambda *_: {})
     given, said = how(kind=kind, iterations=12, learning_rate=0.1), []
     terms = Terms(recipe, given, store)
     start = gradient_descent.shape_of(terms, 0)

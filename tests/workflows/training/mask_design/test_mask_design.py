@@ -16,16 +16,16 @@ from neusee.nodes.doe import half_rings
 from neusee.workflows import load
 from neusee.workflows.report.figures import optics
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.loop.resumable_loop import StateFile
-from neusee.workflows.training.mask_design import design_page
-from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
-from neusee.workflows.training.mask_design.design_run import (
+from neusee.workflows.training import design_run
+from neusee.workflows.training import mask_optimisers as gradient_descent
+from neusee.workflows.training.design_run import (
     DesignError,
     MaskTraining,
     design,
     mask_figures,
 )
-from neusee.workflows.training.mask_design.design_terms import Terms
+from neusee.workflows.training.design_terms import Terms
+from neusee.workflows.training.resumable_loop import StateFile
 
 SMALL = [
     "optics.samples=64",
@@ -62,7 +62,7 @@ def recipe():
 def without_pictures(request, monkeypatch):
     """Pictures take longer than what is tested; one test looks at them."""
     if "file_is_the_mask" not in request.node.name:
-        monkeypatch.setattr(design_page, "pictures", lambda *_: {})
+        monkeypatch.setattr(design_run, "pictures", lambda *_: {})
 
 
 def loss_of(terms, height):
@@ -124,9 +124,9 @@ def test_the_losses_of_several_starts_have_a_legend():
     rows = [
         {"start": i, "iteration": n, "loss": 1.0 + i, "lsr": -n} for i in range(3) for n in range(4)
     ]
-    figure = design_page.history.__wrapped__(rows)
+    figure = design_run.history.__wrapped__(rows)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["0", "1", "2"]
-    assert design_page.history.__wrapped__(rows[:4]).legends == []
+    assert design_run.history.__wrapped__(rows[:4]).legends == []
 
 
 @pytest.mark.parametrize(("kind", "values"), [("pixelwise", {}), ("unet", {"starts": 2}),

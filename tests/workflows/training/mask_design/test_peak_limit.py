@@ -14,10 +14,10 @@ from safetensors.torch import load_file
 from neusee.nodes import losses
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design import design_page
-from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
-from neusee.workflows.training.mask_design.design_run import MaskTraining, design
-from neusee.workflows.training.mask_design.design_terms import Terms
+from neusee.workflows.training import design_run
+from neusee.workflows.training import mask_optimisers as gradient_descent
+from neusee.workflows.training.design_run import MaskTraining, design
+from neusee.workflows.training.design_terms import Terms
 
 SMALL = [
     "optics.samples=64",
@@ -51,7 +51,7 @@ def how(**values):
     "weights", [{"filtered_error": 1}, {"information": 1}], ids=lambda w: next(iter(w))
 )
 def test_the_loss_falls_and_the_page_has_the_rival(weights, recipe, store, tmp_path, monkeypatch):
-    monkeypatch.setattr(design_page, "pictures", lambda *_: {})
+    monkeypatch.setattr(design_run, "pictures", lambda *_: {})
     given = how(weights={"lsr": 0, "bsr": 0, **weights}, iterations=8)
     terms, said = Terms(recipe, given, store), []
     start = gradient_descent.shape_of(terms, 0)(terms.stop)

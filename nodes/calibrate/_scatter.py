@@ -1,0 +1,732 @@
+"""The scatter of a lens, estimated from rings about an overexposed point source.
+
+In this order: rings of frames, their likelihood, the prior, the coordinates of a sampler.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+from torch.special import log_ndtr
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.calibrate._light_levels import refuse_unreadable, stack
+from neusee.nodes.calibrate._priors import Factor, Free, Positive, Prior, Ridge, believed, freed
+from neusee.nodes.calibrate._sensor_likelihood import Likelihood, without_details
+from neusee.nodes.flare._stray_light import lobe, on_far_pixels, scattered_share
+from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._saturation import Well, refuse_without_room, refuse_without_steps
+from neusee.nodes.units import (
+    DataFiles,
+    Diameter,
+    Electrons,
+    FocalLength,
+    Gain,
+    PixelPitch,
+    Real,
+    Wavelength,
+)
+
+# --- point source ---------------------------------------------------------------------------------
+
+# Reduction of overexposed frames of a point source to rings of pixels, from which the scatter of a
+# lens is fitted.
+
+
+Place = Annotated[float, Field(ge=0, le=1e6)]  #: pixels, from the middle of the first pixel
+Numbers = NDArray[np.float64]
+_CUT = 0.95  #: share of saturation from which a number says only that the pixel holds more
+_BELOW = 5.0  #: standard deviations by which a ring must lie below this cut to be averaged
+_WIDER = 1.04  #: ratio of the radii of a ring, from the radius at which this is wider than a pixel
+_PARTS = 4  #: parts of a ring, each of which has a radius of its own
+_LEAST = 16.0  #: pixels from the source to the first ring, below which pixels are not small
+_RINGS = 6  #: least number of rings that can tell anything of the scatter
+
+
+class Rings(NamedTuple):
+    """The mean signal in rings of pixels about an overexposed point source, and the rings that
+    are cut off.
+    """
+
+    mean: Tensor  #: (ring,) float64, e- of a pixel in one exposure, without offset
+    pixels: Tensor  #: (ring,) float64, number of pixels, of all frames
+    ring: Tensor  #: (part,) int64, ring of each part
+    square: Tensor  #: (part,) float64, pixels², mean squared distance from the source
+    weight: Tensor  #: (part,) float64, number of pixels
+    cut_square: Tensor  #: (cut,) float64, pixels², of each ring whose every pixel is cut off
+    cut: Tensor  #: () float64, e-: a pixel that is cut off has at least this signal
+    centre: Tensor  #: (2,) float64, y and x of the source, from the middle of the first pixel
+
+
+class _Camera(NamedTuple):
+    gain: float
+    offset: float
+    full_well: float
+    bits: int
+    read_noise: float
+
+    @property
+    def cut(self) -> float:
+        """Return the digital number above which a pixel says only that it holds more."""
+        return _CUT * min(2.0**self.bits - 1, self.full_well * self.gain)
+
+
+@node()
+def point_source(
+    *,
+    files: DataFiles,
+    gain: Gain,
+    offset: Electrons,
+    full_well: Well,
+    read_noise: Electrons,
+    bits: Bits = 16,
+    centre: tuple[Place, Place] | None = None,
+) -> Rings:
+    """Average the signal of an overexposed point source over rings about the source, and find the
+    rings cut off.
+
+    The source is at ``centre``, or in the middle of the saturated pixels. A pixel above 95 % of
+    saturation says only that it holds more. Averaged rings begin beyond 16 pixels, where the mean
+    lies five standard deviations below that cut; of the rings inside, those whose every pixel is
+    cut off are kept as a limit.
+
+    Shapes: files of (y, x) numbers -> rings (ring,), parts of rings (part,).
+    Units:  DN -> e-.
+    Error:  the centre from saturated pixels: 0.1 pixels, which changes a ring by (0.1 / r)**2. Lone
+            bright pixels beyond the core are left out.
+    Raises: ParameterError before the run, or ValueError, for frames without a saturated pixel, a
+            source that is not in the frame, numbers above the converter, and too few rings.
+    Source: photon-transfer model of EMVA Standard 1288, release 4.0 Linear; Peterson, Proc. SPIE
+            5178 (2004), 184.
+    """
+    camera = _Camera(gain, offset, full_well, bits, read_noise)
+    return reduce_rings(stack(files).astype(np.float64), camera, centre)
+
+
+@point_source.preflight
+def _(*, files: Sequence[Path], centre: tuple[float, float] | None, **params: Any) -> list[str]:
+    refuse_unreadable("files", files)
+    refuse_without_room(
+        params["full_well"], offset=params["offset"], read_noise=params["read_noise"]
+    )
+    refuse_without_steps(params["full_well"], gain=params["gain"], bits=params["bits"])
+    camera = _Camera(**{name: params[name] for name in _Camera._fields})
+    try:
+        reduce_rings(stack(files).astype(np.float64), camera, centre)
+    except ValueError as error:
+        raise ParameterError("files", str(error)) from None
+    return []
+
+
+@point_source.check
+def _(result: Rings, *others: Any, **params: Any) -> list[Check]:
+    first, last = (float(result.square[i].sqrt()) for i in (0, -1))
+    y, x = result.centre.tolist()
+    text = (
+        f"{len(result.mean)} rings from {first:.0f} to {last:.0f} pixels about the source at"
+        f" ({y:.1f}, {x:.1f})"
+    )
+    return [Check(text, bool((result.pixels > 0).all()))]
+
+
+def reduce_rings(frames: Numbers, camera: _Camera, centre: tuple[float, float] | None) -> Rings:
+    """Return the rings of frames (frame, y, x) of digital numbers; raise ValueError for frames
+    that tell nothing.
+    """
+    _refuse_numbers(frames, camera)
+    frame_shape = frames.shape[1:]
+    source_position = _middle(frames, camera) if centre is None else centre
+    if not all(-0.5 <= c <= n - 0.5 for c, n in zip(source_position, frame_shape, strict=True)):
+        raise ValueError(
+            f"the source at ({source_position[0]:g}, {source_position[1]:g}) is not in the frame of"
+            f" {frame_shape[0]} x {frame_shape[1]} pixels: give `centre` as y and x, in pixels"
+        )
+    y, x = np.ogrid[: frame_shape[0], : frame_shape[1]]
+    squared_distance = ((y - source_position[0]) ** 2 + (x - source_position[1]) ** 2).astype(
+        np.float64
+    )
+    sector = _part(squared_distance)
+    signal = frames / camera.gain - camera.offset
+    is_cut: NDArray[np.bool_] = np.asarray((frames >= camera.cut).any(0))
+    # `sector` numbers the parts of all rings: ring number = part number // _PARTS
+    first_ring = _first_ring(frames, sector // _PARTS, camera)
+    unsaturated = (sector >= first_ring * _PARTS) & ~is_cut
+    cut_squares = _cut_rings(squared_distance, sector // _PARTS, is_cut, first_ring)
+    # the last three fields of `Rings`
+    limits = (cut_squares, camera.cut / camera.gain - camera.offset, source_position)
+    rings = _averaged(signal, squared_distance, sector, unsaturated)
+    return Rings(*rings, *(torch.as_tensor(x, dtype=torch.float64) for x in limits))
+
+
+def _refuse_numbers(frames: Numbers, camera: _Camera) -> None:
+    """Raise ValueError for numbers that the converter cannot give, and for frames without a
+    saturated pixel.
+    """
+    brightest = float(frames.max())
+    if brightest > 2**camera.bits - 1:
+        raise ValueError(
+            f"the frames hold {brightest:.0f} DN, which {camera.bits} bits cannot: give the `bits`"
+            " of the files"
+        )
+    if brightest < camera.cut:
+        raise ValueError(
+            f"no pixel is saturated: the brightest has {brightest:.0f} DN of"
+            f" {camera.cut / _CUT:.0f} DN: expose longer, or check `bits`, `full_well` and `gain`"
+        )
+
+
+def _middle(frames: Numbers, camera: _Camera) -> tuple[float, float]:
+    """Return the middle of the saturated pixels; a median first excludes lone pixels far from
+    the source.
+    """
+    y, x = np.nonzero((frames >= camera.cut).all(0))
+    if not len(y):
+        raise ValueError(
+            "no pixel is saturated in every frame: give frames of one exposure, or give `centre`"
+        )
+    distance = np.hypot(y - np.median(y), x - np.median(x))
+    is_near = distance <= 3 * max(float(np.median(distance)), 1.0)
+    return float(y[is_near].mean()), float(x[is_near].mean())
+
+
+def _part(square: Numbers) -> NDArray[np.int64]:
+    """Return the number of the part of a ring to which each pixel belongs, from its squared
+    distance.
+
+    Each ring has `_PARTS` parts. Rings are one pixel wide up to a radius, and grow by the ratio
+    `_WIDER` from there on.
+    """
+    radius = np.sqrt(square)
+    first_wide_radius = 1 / (_WIDER - 1)  # below this radius rings are one pixel wide
+    ring_of_wide = first_wide_radius + np.log(
+        np.maximum(radius, first_wide_radius) / first_wide_radius
+    ) / math.log(_WIDER)
+    part_number: NDArray[np.int64] = np.floor(
+        _PARTS * np.where(radius < first_wide_radius, radius, ring_of_wide)
+    ).astype(np.int64)
+    return part_number
+
+
+def _first_ring(frames: Numbers, ring: NDArray[np.int64], camera: _Camera) -> int:
+    """Return the number of the first ring beyond which every ring lies clearly below saturation,
+    lone bright pixels aside, at least `_LEAST`.
+
+    ``ring`` has the number of each pixel's ring.
+    """
+    pixel_count = np.bincount(ring.ravel())
+    is_cut = (frames >= camera.cut).any(0)
+    mean = np.bincount(ring.ravel(), frames.mean(0).ravel()) / pixel_count.clip(1)
+    # DN: shot noise K mean above the offset, and read noise
+    noise = np.sqrt(np.maximum(mean * camera.gain, 0) + (camera.read_noise * camera.gain) ** 2)
+    many_cut = np.bincount(ring.ravel(), is_cut.ravel()) > 0.05 * pixel_count
+    is_bright = (mean + _BELOW * noise >= camera.cut) | many_cut
+    return max(int(np.flatnonzero(is_bright & (pixel_count > 0)).max(initial=-1)) + 1, int(_LEAST))
+
+
+def _cut_rings(
+    square: Numbers, ring: NDArray[np.int64], cut: NDArray[np.bool_], first: int
+) -> Numbers:
+    """Return the mean squared distance of each ring inside ``first`` and beyond 16 pixels whose
+    every pixel is cut.
+    """
+    pixel_count, cut_count, sum_of_squares = (
+        np.bincount(ring.ravel(), x.ravel()) for x in (np.ones_like(square), cut, square)
+    )
+    ring_numbers = np.arange(len(pixel_count))
+    all_cut = (
+        (ring_numbers < first)
+        & (ring_numbers >= _LEAST)
+        & (pixel_count > 0)
+        & (cut_count == pixel_count)
+    )
+    mean_squares: Numbers = sum_of_squares[all_cut] / pixel_count[all_cut]
+    return mean_squares
+
+
+def _averaged(
+    signal: Numbers, square: Numbers, sector: NDArray[np.int64], unsaturated: NDArray[np.bool_]
+) -> tuple[Tensor, ...]:
+    """Return mean and number of pixels of each ring, and ring, mean squared distance and pixels
+    of each part.
+    """
+    part_numbers, part_of_pixel = np.unique(sector[unsaturated], return_inverse=True)
+    part_pixels = np.bincount(part_of_pixel).astype(np.float64)
+    part_distances, part_means = (
+        np.bincount(part_of_pixel, values[unsaturated]) / part_pixels
+        for values in (square, signal.mean(0))
+    )
+    ring_numbers, ring_of_part = np.unique(part_numbers // _PARTS, return_inverse=True)
+    if len(ring_numbers) < _RINGS:
+        raise ValueError(
+            f"only {len(ring_numbers)} rings of pixels lie between the saturated pixels and the"
+            " edge of the frame: expose less, or give a larger frame with the source in it"
+        )
+    ring_pixels = np.bincount(ring_of_part, part_pixels)
+    columns = (
+        np.bincount(ring_of_part, part_pixels * part_means) / ring_pixels,
+        # of all frames
+        ring_pixels * len(signal),
+        ring_of_part.astype(np.int64),
+        part_distances,
+        part_pixels,
+    )
+    return tuple(torch.as_tensor(x) for x in columns)
+
+
+# --- likelihood -----------------------------------------------------------------------------------
+
+# The likelihood of the rings about an overexposed point source under the Harvey-Shack scatter of a
+# lens.
+
+
+Scattered = Annotated[float, Field(ge=0, le=100)]  #: a standard deviation; 0 for none
+#: relative: how well the mean wing of the core is that of a ring that is one pixel wide
+_FRINGES = 0.02
+
+
+@node()
+def stray_light(
+    rings: Rings,
+    *,
+    b0: Positive,
+    l: Positive,  # noqa: E741 (the symbol of the literature)
+    s: Real,
+    electrons: Annotated[Electrons, Field(gt=0)],
+    background: Real = 0.0,
+    core: Scattered = 1.0,
+    scatter: Scattered = 0.0,
+    read_noise: Electrons,
+    gain: Gain,
+    focal_length: FocalLength,
+    diameter: Diameter,
+    pixel_pitch: PixelPitch,
+    wavelength: Wavelength,
+    told: bool = True,
+) -> Likelihood:
+    """Compute the likelihood of the rings about a point source under one Harvey-Shack surface at
+    the entrance pupil.
+
+    The mean of a pixel is ``electrons`` times ((1 - TIS) core + scattered light) plus
+    ``background``; ``electrons`` are those of the whole source in one exposure, and the distance r
+    stands for the direction cosine r / focal_length. The core is ``core`` times the mean
+    diffraction wing of a round aperture, wavelength N pitch**2 / (pi**3 r**3) with N = focal_length
+    / diameter. The mean of a ring is normal, with shot noise, ``read_noise``, rounding, and a
+    relative standard deviation ``scatter`` for what the model lacks, such as fringes and unequal
+    pixels. The mean of a ring whose every pixel is cut off is at least the cut. Any number may be a
+    tensor (walker,).
+
+    Shapes: rings -> log (walker,), deviance (walker, ring), scaled (walker, row).
+    Units:  b0 1/sr; electrons, background, read_noise e- of one exposure; log in nats.
+    Error:  parts of rings are averaged over squared distance, 1e-4 of a ring. Diffraction fringes
+            are averaged; a ring one fringe wide keeps a few per cent of them, which ``scatter``
+            must cover.
+    Source: Harvey, thesis, Univ. of Arizona (1976); Peterson, Proc. SPIE 5178 (2004), 184; wing of
+            the core: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2, the energy
+            outside a radius for large radii.
+    """
+    source_values = {
+        "electrons": electrons,
+        "background": background,
+        "core": core,
+        "scatter": scatter,
+    }
+    scatter_values = {"b0": b0, "l": l, "s": s, **source_values}
+    parameters = {
+        name: torch.as_tensor(x, dtype=torch.float64)[..., None]
+        for name, x in scatter_values.items()
+    }
+    # wavelength x f-number in pixels, and the direction cosine of a pixel
+    lens_scales = (wavelength * focal_length / (diameter * pixel_pitch), pixel_pitch / focal_length)
+    ring_mean = (
+        _averaged_rings(_light(parameters, rings.square, *lens_scales), rings)
+        + parameters["background"]
+    )
+    # e-^2: shot noise, read noise and rounding
+    pixel_variance = ring_mean.clamp_min(0) + read_noise**2 + 1 / (12 * gain**2)
+    variance = (
+        pixel_variance / rings.pixels
+        + (parameters["scatter"] * (ring_mean - parameters["background"])).square()
+    )
+    residuals = (rings.mean - ring_mean) / variance.sqrt()
+    cut_signal = _light(parameters, rings.cut_square, *lens_scales) + parameters["background"]
+    # logarithm of the probability that a ring whose every pixel is cut lies above the cut
+    log_above = log_ndtr(
+        (cut_signal - rings.cut) / (cut_signal * torch.hypot(parameters["scatter"], _ripple()))
+    )
+    log_likelihood = -0.5 * (residuals.square() + variance.log()).sum(-1) + log_above.sum(-1)
+    # a surface cannot scatter all light
+    checked_log = log_likelihood.where(_total(parameters)[..., 0] < 1, -torch.inf)
+    if not told:
+        return without_details(checked_log)
+    # squared derivatives of a residual and of its log width sum, on average, to the Fisher
+    # information
+    scaled_rows = torch.cat(torch.broadcast_tensors(residuals, 0.5 * variance.log()), -1)  # type: ignore[no-untyped-call]
+    return Likelihood(
+        checked_log,
+        residuals.square(),
+        torch.ones_like(rings.mean),
+        scaled_rows,
+        ring_mean,
+        variance,
+    )
+
+
+@stray_light.check
+def _(result: Likelihood, rings: Rings, **params: Any) -> list[Check]:
+    if not len(result.degrees_of_freedom):
+        return []
+    return [Check(f"deviance {float(result.deviance.sum()):.4g} of {len(rings.mean)} rings")]
+
+
+def _ripple() -> Tensor:
+    """Return the relative deviation of a ring by diffraction fringes, as a tensor."""
+    return torch.tensor(_FRINGES, dtype=torch.float64)
+
+
+def _total(numbers: Mapping[str, Tensor]) -> Tensor:
+    """Return the share of the light that the surface scatters (TIS)."""
+    return scattered_share(numbers["b0"], numbers["l"], numbers["s"])
+
+
+def _light(numbers: dict[str, Tensor], square: Tensor, fringe: float, scale: float) -> Tensor:
+    """Return the electrons of the source in pixels at squared distances; ``fringe`` is
+    wavelength N in pixels.
+    """
+    light: Tensor = numbers["electrons"] * share_of_light(numbers, square, fringe, scale)
+    return light
+
+
+def share_of_light(
+    numbers: Mapping[str, Tensor], square: Tensor, fringe: float, scale: float
+) -> Tensor:
+    """Return the share of the light that core and scatter send into pixels at squared distances
+    from the source.
+
+    ``fringe`` is wavelength N in pixels, and ``scale`` the direction cosine of a pixel.
+    """
+    b0, l, s = (numbers[name] for name in ("b0", "l", "s"))  # noqa: E741
+    veil = on_far_pixels(lobe(b0, l, s, torch.tensor(scale, dtype=torch.float64)), square)
+    return (1 - _total(numbers).clamp_max(1)) * numbers["core"] * diffraction_wing(
+        square, fringe
+    ) + veil
+
+
+def diffraction_wing(square: Tensor, fringe: float) -> Tensor:
+    """Return the mean share of light per pixel of a round aperture far from the source, with the
+    pixel integrated.
+    """
+    # second factor: the pixel is integrated, Laplacian of r^-3 over 24
+    return fringe / (math.pi**3 * square**1.5) * (1 + 9 / (24 * square))
+
+
+def _averaged_rings(parts: Tensor, rings: Rings) -> Tensor:
+    """Return the mean over the parts of each ring, (..., ring)."""
+    share = (
+        rings.weight
+        / torch.zeros_like(rings.mean).index_add(0, rings.ring, rings.weight)[rings.ring]
+    )
+    return parts.new_zeros(*parts.shape[:-1], len(rings.mean)).index_add(
+        -1, rings.ring, parts * share
+    )
+
+
+def guess_scatter(
+    rings: Rings, believed: Mapping[str, float], params: Mapping[str, Any]
+) -> dict[str, float]:
+    """Return a first guess of the scatter: over a grid of l and s, the b0 and background that fit
+    the rings best.
+
+    Guesses that scatter more than all light are left out.
+
+    Shapes: rings; numbers by name, with the names of ``believed``; ``params`` are those of
+            `stray_light`.
+    Units:  those of `stray_light`.
+    Error:  a start for a search, not an estimate.
+    Source: linear least squares.
+    """
+    cosine_of_pixel, best_values, least_misfit = (
+        params["pixel_pitch"] / params["focal_length"],
+        dict(believed),
+        math.inf,
+    )
+    # one over the standard error of each ring's mean
+    weight = (
+        rings.pixels
+        / (rings.mean.clamp_min(0) + params["read_noise"] ** 2 + 1 / params["gain"] ** 2)
+    ).sqrt()
+    fringe = (
+        params["wavelength"] * params["focal_length"] / (params["diameter"] * params["pixel_pitch"])
+    )
+    wing = diffraction_wing(rings.square, fringe)
+    for l in (believed["l"] * 3.0**n for n in range(-4, 5)):  # noqa: E741
+        for s in (believed["s"] + 0.35 * n for n in range(-4, 5)):
+            unit_lobe = lobe(
+                *(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s, cosine_of_pixel))
+            )
+            design = torch.stack(
+                [
+                    _averaged_rings(on_far_pixels(unit_lobe, rings.square), rings),
+                    torch.ones_like(rings.mean),
+                ],
+                1,
+            )
+            design[:, 0] *= believed["electrons"]
+            scattered = rings.mean - believed["electrons"] * believed["core"] * _averaged_rings(
+                wing, rings
+            )
+            # b0 and background enter linearly: weighted linear least squares for each l and s
+            solution = torch.linalg.lstsq(
+                design * weight[:, None], (scattered * weight)[:, None]
+            ).solution[:, 0]
+            misfit = float(((design @ solution - scattered) * weight).square().sum())
+            scattered_light = float(solution[0]) * float(
+                scattered_share(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s)))
+            )
+            if misfit < least_misfit and 0 < scattered_light < 1:
+                least_misfit, best_values = (
+                    misfit,
+                    best_values | {"b0": float(solution[0]), "l": l, "s": s},
+                )
+    return best_values
+
+
+# --- prior and coordinates ------------------------------------------------------------------------
+
+_FAR = 30.0  #: factor on l at which a fit is compared
+_MOST = 0.3  #: share of scattered light up to which a narrower lobe is compared
+_LINEAR = frozenset({"s", "background"})
+
+
+@node()
+def stray_prior(
+    *,
+    b0: tuple[Positive, Factor] | None = None,
+    l: tuple[Positive, Factor] | None = None,  # noqa: E741 (the symbol of the literature)
+    s: tuple[Real, Positive] | None = None,
+    electrons: tuple[Electrons, Factor] | None = None,
+    background: tuple[Real, Positive] | None = None,
+    core: tuple[Positive, Factor] | None = None,
+    scatter: tuple[Positive, Factor] | None = None,
+) -> Prior:
+    """Collect the priors of the scatter of a lens and of the source; a parameter without a prior is
+    held fixed.
+
+    A prior is a median and a factor: [0.4, 10] means a tenth to ten times the median with a
+    probability of two thirds. The priors of ``s`` and ``background`` are a mean and a standard
+    deviation.
+
+    Shapes: -> (7,).
+    Units:  those of `stray_light`.
+    Error:  exact.
+    Raises: ValueError where no parameter is free, or where a median or width is not positive.
+    Source: log-normal and normal distributions.
+    """
+    return believed(
+        dict(zip(SCATTER_NAMES, (b0, l, s, electrons, background, core, scatter), strict=True)),
+        _LINEAR,
+    )
+
+
+#: the parameters of `stray_light` that may be free
+SCATTER_NAMES = tuple(inspect.signature(stray_prior.fn).parameters)
+
+
+@stray_prior.check
+def _(result: Prior, **params: object) -> list[Check]:
+    free = freed(SCATTER_NAMES, result)
+    return [Check(f"{len(free)} free: {', '.join(free)}")]
+
+
+class Sight(NamedTuple):
+    """What a frame shows of a lens: the radii of the first and the last ring, and the scales of
+    a pixel.
+    """
+
+    inner: float  #: pixels from the source
+    outer: float  #: pixels from the source
+    fringe: float  #: wavelength N in pixels
+    scale: float  #: direction cosine of a pixel
+
+    @classmethod
+    def of(cls, rings: Rings, lens: Mapping[str, Any]) -> Sight:
+        """Return what the rings of a frame show; ``lens`` are parameters of `stray_light`."""
+        fringe = (
+            lens["wavelength"] * lens["focal_length"] / (lens["diameter"] * lens["pixel_pitch"])
+        )
+        inner, outer = (
+            float(rings.square[rings.ring == ring].mean()) ** 0.5
+            for ring in (0, len(rings.mean) - 1)
+        )
+        return cls(inner, outer, fringe, lens["pixel_pitch"] / lens["focal_length"])
+
+
+@dataclass(frozen=True)
+class ScatterCoordinates(Free):
+    """Coordinates of the scatter of a lens in which what a frame determines does not depend on what
+    it leaves open.
+
+    Where b0, l and s are free, their coordinates are ln l, the logarithm of the BSDF at a distance
+    between those of the first and the last ring, and the logarithm of the negative slope of the
+    BSDF there in double logarithms. Rings determine the last two, whatever l is. The coordinate of
+    the electrons is the logarithm of the signal of the source in the first ring, and that of the
+    background the whole signal in the last ring; without a ``sight`` they are the logarithm of the
+    electrons, and the background. Other parameters are logarithms.
+    """
+
+    every: ClassVar[tuple[str, ...]] = SCATTER_NAMES
+    linear: ClassVar[frozenset[str]] = _LINEAR
+    bent: ClassVar[bool] = True
+    sight: Sight | None = None
+
+    def seen_by(self, rings: Rings, lens: Mapping[str, Any]) -> ScatterCoordinates:
+        """Return the coordinates for the rings of a frame; ``lens`` are parameters of
+        `stray_light`.
+        """
+        return replace(self, sight=Sight.of(rings, lens))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Return a readable name of each sampler coordinate."""
+        label_of = {"b0": "ln BSDF", "s": "ln slope"} if self._joint else {}
+        label_of |= {"electrons": "ln first ring", "background": "last ring"} if self.sight else {}
+        return tuple(
+            label_of.get(name, ("" if name in self.linear else "ln ") + name) for name in self.names
+        )
+
+    def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
+        """Convert parameters of the scatter to sampler coordinates (..., free parameter)."""
+        values = {
+            name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names
+        }
+        columns = dict(zip(self.names, self.scaled(values).unbind(-1), strict=True))
+        if self._joint:
+            squared_ratio = self._square(columns["l"])
+            # ln BSDF = ln b0 + s/2 ln(1 + q), with q = (beta / l)^2 between the rings
+            columns["b0"] = columns["b0"] + values["s"] / 2 * torch.log1p(squared_ratio)
+            # the slope of ln BSDF over ln beta is s q / (1 + q)
+            columns["s"] = (-values["s"]).log() + torch.log(squared_ratio / (1 + squared_ratio))
+        if self.sight:
+            share_in_first, share_in_last = self._shares(self.sight, values)
+            if "background" in columns:
+                columns["background"] = (
+                    columns["background"] + self._of("electrons", values) * share_in_last
+                )
+            if "electrons" in columns:
+                columns["electrons"] = columns["electrons"] + share_in_first.log()
+        return torch.stack(torch.broadcast_tensors(*(columns[name] for name in self.names)), -1)  # type: ignore[no-untyped-call]
+
+    def parameters(self, place: Tensor) -> dict[str, Tensor]:
+        """Convert sampler coordinates (..., free parameter) to parameters of the scatter."""
+        columns = dict(zip(self.names, place.unbind(-1), strict=True))
+        if self._joint:
+            squared_ratio = self._square(columns["l"])
+            # the inverse of `place`
+            columns["s"] = -columns["s"].exp() * (1 + squared_ratio) / squared_ratio
+            columns["b0"] = columns["b0"] - columns["s"] / 2 * torch.log1p(squared_ratio)
+        values = {name: x if name in self.linear else x.exp() for name, x in columns.items()}
+        if self.sight:
+            share_in_first, share_in_last = self._shares(self.sight, values)
+            if "electrons" in values:
+                values["electrons"] = values["electrons"] / share_in_first
+            if "background" in values:
+                values["background"] = (
+                    values["background"] - self._of("electrons", values) * share_in_last
+                )
+        return values
+
+    def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Return the log prior density per unit of the sampler coordinates, up to a constant.
+
+        The coordinates of electrons and background are shifted by what the other parameters say,
+        which leaves volumes as they are; that of s contributes the factor -s.
+        """
+        log_density = -0.5 * self.whitened(parameters).square().sum(-1)
+        return log_density + (-parameters["s"]).log() if self._joint else log_density
+
+    @property
+    def _joint(self) -> bool:
+        """Return True if b0, l and s are all free, so that their coordinates are mixed."""
+        return {"b0", "l", "s"} <= set(self.names)
+
+    def _of(self, name: str, values: Mapping[str, Tensor]) -> Tensor:
+        """Return the value of a parameter, free or held."""
+        return (
+            values[name] if name in values else torch.tensor(self.held[name], dtype=torch.float64)
+        )
+
+    def _shares(self, sight: Sight, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the shares of the light in a pixel of the first and of the last ring."""
+        parameters = {name: self._of(name, values)[..., None] for name in ("b0", "l", "s", "core")}
+        squared_radii = torch.tensor([sight.inner**2, sight.outer**2], dtype=torch.float64)
+        share_in_first, share_in_last = share_of_light(
+            parameters, squared_radii, sight.fringe, sight.scale
+        ).unbind(-1)
+        return share_in_first, share_in_last
+
+    def _square(self, log_l: Tensor) -> Tensor:
+        """Return (beta / l)**2 at the direction cosine beta between the rings, or in the middle
+        of the prior of l.
+        """
+        if self.sight:
+            # of the geometric mean of the radii of the first and the last ring
+            log_cosine = math.log(self.sight.scale) + 0.5 * math.log(
+                self.sight.inner * self.sight.outer
+            )
+            return (2 * (log_cosine - log_l)).exp()
+        return (2 * (self.prior.centre[SCATTER_NAMES.index("l")] - log_l)).exp()
+
+    def ridges(self, place: Tensor) -> list[Ridge]:
+        """Return a much narrower and a much wider lobe with the same scatter outside and inside of
+        it.
+
+        Outside of l only b0 l**(-s) is seen, and inside of l only b0. The core keeps its
+        brightness, if it is free.
+        """
+        if not {"b0", "l"} <= set(self.names):
+            return []
+        lobe_values = {
+            **{name: torch.tensor(x) for name, x in self.held.items()},
+            **self.parameters(place),
+        }
+        l, s = lobe_values["l"], lobe_values["s"]  # noqa: E741
+        ridges = [
+            Ridge(
+                self._moved(lobe_values, 1.0, _FAR),
+                {"l": "lower"},
+                "l: only a lower limit, beyond the frame",
+            )
+        ]
+        # the narrowest lobe that still scatters a moderate share of the light
+        for factor in (_FAR, 10.0, 3.0):
+            peak_factor = float(factor ** -float(s))
+            if float(scattered_share(lobe_values["b0"] * peak_factor, l / factor, s)) < _MOST:
+                text = "b0 and l only as b0 l^(-s): l lies within the saturated pixels"
+                narrow_lobe = self._moved(lobe_values, peak_factor, 1 / factor)
+                return [*ridges, Ridge(narrow_lobe, {"l": "upper", "b0": "lower"}, text)]
+        return ridges
+
+    def _moved(self, lobe_values: Mapping[str, Tensor], peak: float, width: float) -> Tensor:
+        """Return the coordinates with b0 times ``peak`` and l times ``width``, where a free core,
+        or else the electrons, keep the brightness of the core as before.
+        """
+        b0, l, s = lobe_values["b0"] * peak, lobe_values["l"] * width, lobe_values["s"]  # noqa: E741
+        core, electrons = lobe_values["core"], lobe_values["electrons"]
+        unscattered_before, unscattered_after = (
+            1 - scattered_share(*x) for x in ((lobe_values["b0"], lobe_values["l"], s), (b0, l, s))
+        )
+        core_factor = unscattered_before / unscattered_after.clamp_min(1 - _MOST)
+        if "core" in self.names:
+            core = core * core_factor
+        elif "electrons" in self.names:
+            b0, electrons = b0 / core_factor, electrons * core_factor
+        return self.place({**lobe_values, "b0": b0, "l": l, "core": core, "electrons": electrons})

@@ -1,0 +1,557 @@
+"""The likelihood of a frame given lasers and lamps: whitened residual, clipped pixels, and the most
+likely values with their intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate, pad
+
+from neusee.nodes.optics._transform._fft_transforms import smooth
+from neusee.nodes.restore._lasers._components import NANOMETRE, Lamp, Laser
+
+# --- whitening ------------------------------------------------------------------------------------
+
+# A linear filter that makes the residual of a frame nearly white, so that squares of it can be
+# compared.
+#
+# Clipped pixels are filled from their neighbours, a short filter removes the smooth part of the
+# scene, and each pixel is divided by what its neighbourhood says of noise and of details of the
+# scene. The same filter acts on every pattern, so that filling makes no error of its own.
+
+_RADIUS = 8  #: pixels, of the filter
+_AROUND = 9  #: pixels a side, over which the variance of details is averaged
+_MEAN = 5  #: pixels a side, over which the mean that photon noise follows is averaged
+_UNSEEN = 1e12  #: e-^2, variance that stands for a pixel that is not seen
+LOST = 0.3  #: variance of a filled pixel, as a share of that of the channel
+_LEAST = 0.05  #: variance of details at a pixel, as a share of that of the frame
+
+
+class Weights(NamedTuple):
+    """The inverse root of the covariance of the three channels in each pixel: diagonal, and one
+    colour of details.
+    """
+
+    diagonal: Tensor  #: (channel, y, x), 1 / standard deviation of each channel by itself
+    grey: Tensor  #: (channel, y, x), details that all channels share, over the former
+    share: Tensor  #: (1, y, x), factor of the product of the two
+
+    def __call__(self, filtered: Tensor) -> Tensor:
+        """Return filtered pictures (..., channel, y, x) as numbers of mean 0 and variance 1."""
+        scaled = self.diagonal * filtered
+        # (D^2 + s s')^(-1/2) applied for all channels, up to a rotation: one shared colour s
+        return scaled - self.grey * (self.share * (self.grey * scaled).sum(-3, keepdim=True))
+
+    def twice(self, filtered: Tensor) -> Tensor:
+        """Return the product of these weights' transpose and of what they make of filtered
+        pictures.
+        """
+        white = self(filtered)
+        return self.diagonal * (
+            white - self.grey * (self.share * (self.grey * white).sum(-3, keepdim=True))
+        )
+
+    def pair(self, first: int, other: int) -> Tensor:
+        """Return the element (y, x) of the inverse covariance for two channels."""
+        shared_square = self.grey.square().sum(0)
+        shared_part = (
+            (2.0 - self.share[0] * shared_square)
+            * self.share[0]
+            * self.grey[first]
+            * self.grey[other]
+        )
+        return self.diagonal[first] * self.diagonal[other] * (float(first == other) - shared_part)
+
+
+class Filter(NamedTuple):
+    """Fill the pixels that are not seen from their neighbours, then remove what is smooth."""
+
+    seen: Tensor  #: (channel, y, x), 1 or 0
+    kernel: Tensor  #: (side, side), symmetric
+
+    def __call__(self, pictures: Tensor) -> Tensor:
+        """Return pictures (..., channel, y, x), or (..., 1, y, x) of the same values in each
+        channel, filtered.
+        """
+        return self.sharp(filled(pictures, self.seen))
+
+    def sharp(self, pictures: Tensor) -> Tensor:
+        """Return whole pictures (..., y, x) of any size without what is smooth."""
+        return _convolved(pictures, self.kernel.to(pictures))
+
+    def squared(self, variances: Tensor) -> Tensor:
+        """Return the variance of filtered pictures, given that of independent pixels: (channel,
+        y, x).
+        """
+        return _convolved(variances, self.kernel.to(variances).square())
+
+
+def _convolved(pictures: Tensor, kernel: Tensor) -> Tensor:
+    """Return pictures (..., y, x), continued as in a mirror, convolved with a symmetric kernel
+    of odd sides.
+    """
+    flat = pictures.reshape(-1, *pictures.shape[-2:])
+    rim = len(kernel) // 2
+    padded = pad(flat, (rim,) * 4, mode="reflect")
+    size = [smooth(n) for n in padded.shape[-2:]]
+    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
+    y, x = pictures.shape[-2:]
+    # the kernel's middle is `rim` in, and the padding another `rim`
+    inner: Tensor = torch.fft.irfft2(product, s=size)[
+        :, 2 * rim : 2 * rim + y, 2 * rim : 2 * rim + x
+    ]
+    return inner.reshape(pictures.shape)
+
+
+def filled(pictures: Tensor, unclipped: Tensor) -> Tensor:
+    """Return pictures (..., channel, y, x) in which pixels that are not seen follow the pixels
+    around them.
+    """
+    pictures_by_channel = pictures.expand(*pictures.shape[:-3], *unclipped.shape)
+    if bool(unclipped.all()):
+        return pictures_by_channel
+    return _from_coarse(pictures_by_channel.reshape(-1, *unclipped.shape), unclipped).view(
+        pictures_by_channel.shape
+    )
+
+
+def _from_coarse(pictures: Tensor, unclipped: Tensor) -> Tensor:
+    """Return pictures (picture, channel, y, x) whose clipped pixels are filled from the means over
+    two by two pixels; where none of these is seen, from the means over four by four, and so on.
+    """
+    y, x = unclipped.shape[-2:]
+    if bool(unclipped.all()) or max(y, x) < 2:
+        return pictures
+    odd_padding = (0, x % 2, 0, y % 2)
+    seen_share = avg_pool2d(pad(unclipped, odd_padding), 2)
+    block_means = avg_pool2d(pad(pictures * unclipped, odd_padding), 2) / seen_share.clamp_min(0.1)
+    filled_from_coarse = interpolate(
+        _from_coarse(block_means, (seen_share > 0).to(unclipped)), scale_factor=2, mode="bilinear"
+    )
+    return torch.where(unclipped > 0, pictures, filled_from_coarse[..., :y, :x])
+
+
+def box(pictures: Tensor, side: int) -> Tensor:
+    """Return the mean over squares of ``side`` pixels, an odd number; beyond the edge there is
+    nothing.
+    """
+    flat = pictures.reshape(-1, 1, *pictures.shape[-2:])
+    for window, rim in (((side, 1), (side // 2, 0)), ((1, side), (0, side // 2))):
+        flat = avg_pool2d(flat, window, stride=1, padding=rim, count_include_pad=False)
+    return flat.reshape(pictures.shape)
+
+
+def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
+    """Return the filter that makes a scene with the spectrum of this picture, and its noise,
+    nearly white.
+    """
+    grey = filled(picture, unclipped).mean(0)
+    y_window, x_window = (
+        torch.hann_window(n, periodic=False, dtype=grey.dtype, device=grey.device)
+        for n in grey.shape
+    )
+    window = y_window[:, None] * x_window
+    grey = (grey - (grey * window).sum() / window.sum()) * window
+    power = torch.fft.rfft2(grey).abs().square() / window.square().sum()
+    fy, fx = torch.fft.fftfreq(grey.shape[0]).to(grey), torch.fft.rfftfreq(grey.shape[1]).to(grey)
+    frequency = torch.hypot(fy[:, None], fx)
+    noise_level = noise.mean() / len(noise)
+    middle_frequencies = (frequency > 0.05) & (frequency < 0.2)
+    # a scene has the power strength / f^3, and the powers of a periodogram are exponential, with a
+    # median of ln 2 times the mean
+    scene_strength = ((power - noise_level) * frequency**3)[middle_frequencies].median() / 0.69
+    side = 2 * _RADIUS + 1
+    kernel_frequencies = torch.fft.fftfreq(64).to(grey)
+    kernel_frequency = torch.hypot(kernel_frequencies[:, None], torch.fft.rfftfreq(64).to(grey))
+    # 1 / sqrt(strength / f^3 + noise): what makes the sum white
+    spectrum = (
+        kernel_frequency**3
+        / (scene_strength.clamp_min(1e-6 * noise_level) + noise_level * kernel_frequency**3)
+    ).sqrt()
+    kernel = torch.fft.irfft2(spectrum, s=(64, 64)).roll((_RADIUS, _RADIUS), (0, 1))[:side, :side]
+    taper = torch.hann_window(side + 2, periodic=False, dtype=grey.dtype, device=grey.device)[1:-1]
+    taper = taper[:, None] * taper
+    kernel = kernel * taper
+    # of sum 0, so that it passes no mean
+    kernel = kernel - taper * (kernel.sum() / taper.sum())
+    return Filter(unclipped, kernel / kernel.square().sum().sqrt())
+
+
+def noise_of(electrons: Tensor, unclipped: Tensor, read_noise: float) -> Tensor:
+    """Return the variance of the noise of each pixel: its local mean, and the read noise."""
+    return box(filled(electrons, unclipped), _MEAN).clamp_min(1.0) + read_noise**2
+
+
+def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) -> Weights:
+    """Return what each pixel of a filtered residual is divided by: noise, and the details around
+    that pixel.
+    """
+    unclipped = use.seen
+    spread = masked_variance(picture, unclipped)
+    noise_variance = use.squared(noise) + LOST * spread * use.squared(1.0 - unclipped)
+    scene_colour = (picture * unclipped).sum((-2, -1)) / unclipped.sum((-2, -1)).clamp_min(1.0)
+    scene_colour = (scene_colour / scene_colour.abs().max().clamp_min(1e-9)).clamp_min(0.05)[
+        :, None, None
+    ]
+    seen_precision = unclipped / noise_variance
+    precision = (scene_colour.square() * seen_precision).sum(0, keepdim=True)
+    # the most likely detail that has the scene's colour in all channels
+    grey_details = (scene_colour * seen_precision * filtered).sum(
+        0, keepdim=True
+    ) / precision.clamp_min(1e-30)
+    any_seen = (precision > 0).to(unclipped)
+    # their mean square, less the variance that noise gives them
+    detail_variance = _around(grey_details.square(), any_seen) - _around(
+        1.0 / precision.clamp_min(1e-12), any_seen
+    )
+    detail_variance = detail_variance.clamp_min(0.0)
+    detail_variance = torch.maximum(
+        detail_variance, _LEAST * (detail_variance * any_seen).sum() / any_seen.sum().clamp_min(1.0)
+    )
+    colour_variance = _around((filtered - scene_colour * grey_details).square(), unclipped)
+    variance = torch.where(unclipped > 0, torch.maximum(noise_variance, colour_variance), _UNSEEN)
+    diagonal = variance.rsqrt()
+    shared_deviation = scene_colour * detail_variance.sqrt() * diagonal
+    shared_square = shared_deviation.square().sum(0, keepdim=True)
+    # (1 + s s')^(-1/2) = 1 - s s' (1 - (1 + |s|^2)^(-1/2)) / |s|^2
+    share = (1.0 - (1.0 + shared_square).rsqrt()) / shared_square.clamp_min(1e-30)
+    return Weights(diagonal, shared_deviation, share)
+
+
+def _around(values: Tensor, unclipped: Tensor) -> Tensor:
+    """Return the mean over the pixels of a square around each pixel that are not clipped."""
+    return box(values * unclipped, _AROUND) / box(unclipped.expand_as(values), _AROUND).clamp_min(
+        1e-9
+    )
+
+
+def masked_variance(picture: Tensor, unclipped: Tensor) -> Tensor:
+    """Return the variance of the pixels that are seen, of each channel: (channel, 1, 1)."""
+    count = unclipped.sum((-2, -1), keepdim=True).clamp_min(1.0)
+    mean = (picture * unclipped).sum((-2, -1), keepdim=True) / count
+    return ((picture - mean).square() * unclipped).sum((-2, -1), keepdim=True) / count
+
+
+# --- censored -------------------------------------------------------------------------------------
+
+# Clipped pixels in a fit: each says that its light was at least full, and nothing more.
+#
+# The light of a clipped pixel is that of the lasers and lamps and that of the scene, which follows
+# the pixels around it. The probability that the sum is full is a normal survival function, of the
+# photons and of what the neighbours do not tell.
+
+
+_BRIGHT = 0.01  #: probability that the scene alone clips a pixel, so that no laser must explain it
+#: of a pixel, because pixels within about three share the error of what their neighbours tell
+_WORTH = 1 / 9
+
+
+class Censored(NamedTuple):
+    """The clipped pixels of a frame, and how well the light of each is known from its
+    neighbours.
+    """
+
+    seen: Tensor  #: (channel, y, x), 1 or 0
+    spread: Tensor  #: (pixel,), e-, standard deviation of the charge of each clipped pixel
+
+    def misfits(self, residual: Tensor) -> Tensor:
+        """Return numbers (pixel,) whose half square is minus the log likelihood, for the frame
+        less all parts, e-.
+        """
+        return _root(self._over(residual))[0]
+
+    def slopes(self, residual: Tensor, columns: Tensor) -> Tensor:
+        """Return how each number falls with each value (value, pixel); ``columns`` is what `lit`
+        makes of its light.
+        """
+        return _root(self._over(residual))[1] * columns / self.spread
+
+    def lit(self, pictures: Tensor) -> Tensor:
+        """Return of pictures (..., channel, y, x) the light of clipped pixels beyond that of
+        their neighbours.
+        """
+        return (pictures - filled(pictures, self.seen)) * (1.0 - self.seen)
+
+    def of(self, pictures: Tensor) -> Tensor:
+        """Return the clipped pixels of pictures: (..., pixel)."""
+        return pictures[..., self.seen == 0]
+
+    def _over(self, residual: Tensor) -> Tensor:
+        return self.of(filled(residual, self.seen) - residual) / self.spread
+
+
+def _root(over: Tensor) -> tuple[Tensor, Tensor]:
+    """Return numbers whose half square is `_WORTH` times the misfit of clipped pixels, and how they
+    fall with ``over``.
+
+    ``over`` is by how many standard deviations the light of a pixel exceeds what fills it. The
+    misfit is -log(1 - p), where p is the probability that the pixel is not full, and the scene
+    alone does not fill it.
+    """
+    below_full = (1.0 - _BRIGHT) * torch.special.ndtr(-over)
+    root = (-2.0 * torch.log1p(-below_full)).sqrt()
+    density = torch.exp(-0.5 * over.square()) / (2.0 * torch.pi) ** 0.5
+    # derivative of sqrt(-2 log(1 - p)) with respect to the deviations
+    slope = (1.0 - _BRIGHT) * density / ((1.0 - below_full) * root.clamp_min(1e-6))
+    return _WORTH**0.5 * root, _WORTH**0.5 * slope
+
+
+def censored(
+    electrons: Tensor, unclipped: Tensor, scene: Tensor, read_noise: float
+) -> Censored | None:
+    """Return the clipped pixels of a frame, of which ``scene`` is what the parts do not explain;
+    None without any.
+    """
+    if bool(unclipped.all()):
+        return None
+    variance = electrons.clamp_min(1.0) + read_noise**2 + LOST * masked_variance(scene, unclipped)
+    return Censored(unclipped, variance[unclipped == 0].sqrt())
+
+
+# --- joint fit ------------------------------------------------------------------------------------
+
+# The most likely values of all lasers and lamps of a frame at once, by steps of Gauss and Newton.
+
+
+Parts = tuple[Laser | Lamp, ...]
+#: factors of the diagonal, tried in this order until a step lowers the misfit
+_DAMPED = (0.0, 1e-3, 1e-1, 10.0)
+_PIECE = 1 << 16  #: numbers at a time whose float64 copies fit in the cache
+_ENOUGH = 0.02  #: log likelihood, a smaller gain of which ends the steps
+
+
+class Data(NamedTuple):
+    """What is fitted: a frame, and what its pixels count."""
+
+    electrons: Tensor  #: (channel, y, x)
+    use: Filter
+    weights: Weights
+    clipped: Censored | None = None  #: None leaves the clipped pixels out
+
+
+class Fit(NamedTuple):
+    """Lasers and lamps, and how well they explain a frame."""
+
+    parts: Parts
+    misfit: float  #: half the sum of squares of the white residual and of the errors of responses
+    normal: Tensor  #: (value, value), matrix of second derivatives of the misfit
+    #: (value, number), slopes of the white residual, and of the misfits of clipped pixels after it
+    columns: Tensor
+    rest: Tensor  #: (number,), the white residual, and the misfits of clipped pixels after it
+
+
+def fitted(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> Fit:
+    """Return the parts after at most ``steps`` steps, each of which lowers the misfit, with the
+    slopes at the end.
+    """
+    parts_fitted, remainder, white_residual, misfit = _walked(data, tuple(parts), steps)
+    columns = _columns(data, parts_fitted, remainder)
+    return Fit(parts_fitted, misfit, _normal(parts_fitted, columns), columns, white_residual)
+
+
+def misfit_of(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> tuple[Parts, float]:
+    """Return the parts after at most ``steps`` steps, and their misfit."""
+    fitted_parts, _, _, misfit = _walked(data, tuple(parts), steps)
+    return fitted_parts, misfit
+
+
+def _walked(data: Data, now: Parts, steps: int) -> tuple[Parts, Tensor, Tensor, float]:
+    """Return the parts after at most ``steps`` steps, the frame less their light, the white
+    residual and the misfit.
+    """
+    remainder, white_residual, misfit = _misfit(data, now)
+    for _ in range(steps):
+        next_fit = _step(data, now, remainder, white_residual, misfit)
+        if next_fit is None:
+            break
+        # next_fit is (parts, remainder, residual, misfit)
+        gain = misfit - next_fit[3]
+        now, remainder, white_residual, misfit = next_fit
+        if gain < _ENOUGH:
+            break
+    return now, remainder, white_residual, misfit
+
+
+def _step(
+    data: Data, now: Parts, left: Tensor, white_residual: Tensor, misfit: float
+) -> tuple[Parts, Tensor, Tensor, float] | None:
+    """Return the parts after one step, and what `_misfit` says of them; None if no step lowers
+    the misfit.
+    """
+    columns = _columns(data, now, left)
+    normal = _normal(now, columns)
+    prior_pull = torch.cat([component.values * component.precision for component in now])
+    slope = columns @ white_residual - prior_pull
+    sizes = [len(component.values) for component in now]
+    for damping in _DAMPED:
+        step = solved(normal + damping * normal.diagonal().diag(), slope).to(slope)
+        moved = tuple(
+            component.moved(own_step)
+            for component, own_step in zip(now, torch.split(step, sizes), strict=True)
+        )
+        remainder, residual_after, misfit_after = _misfit(data, moved)
+        if misfit_after < misfit:
+            return moved, remainder, residual_after, misfit_after
+    return None
+
+
+def _columns(data: Data, parts: Parts, left: Tensor) -> Tensor:
+    """Return the slopes of what `_misfit` squares: (value, number)."""
+    white = torch.cat(
+        [data.weights(component.columns(data.use.__call__)).flatten(1) for component in parts]
+    )
+    if data.clipped is None:
+        return white
+    clipped_light = torch.cat(
+        [data.clipped.of(component.columns(data.clipped.lit)) for component in parts]
+    )
+    return torch.cat([white, data.clipped.slopes(left, clipped_light)], 1)
+
+
+def _normal(parts: Parts, columns: Tensor) -> Tensor:
+    """Return the matrix (value, value) of second derivatives: products of slopes, and the prior's
+    precision.
+    """
+    return (
+        products(columns) + torch.cat([component.precision for component in parts]).double().diag()
+    )
+
+
+def products(columns: Tensor) -> Tensor:
+    """Return the products (value, value) of columns (value, number), summed in float64, a piece at
+    a time.
+
+    Of a million numbers float32 loses 1e-4 of a product, and what tells strength from responses is
+    smaller than that.
+    """
+    total = torch.zeros(len(columns), len(columns), dtype=torch.float64, device=columns.device)
+    for first in range(0, columns.shape[1], _PIECE):
+        piece = columns[:, first : first + _PIECE].double()
+        total += piece @ piece.T
+    return total
+
+
+def solved(normal: Tensor, right: Tensor) -> Tensor:
+    """Solve a normal system, whose values have any scale, in spite of values that nothing tells."""
+    scale = normal.diagonal().clamp_min(1e-30).rsqrt()
+    scaled_matrix = scale[:, None] * normal * scale
+    scaled_matrix = scaled_matrix + 1e-12 * torch.eye(len(scaled_matrix)).to(scaled_matrix)
+    row_scale = scale if right.ndim == 1 else scale[:, None]
+    solution: Tensor = row_scale * torch.linalg.solve(
+        scaled_matrix, row_scale * right.to(scaled_matrix)
+    )
+    return solution
+
+
+def _misfit(data: Data, parts: Parts) -> tuple[Tensor, Tensor, float]:
+    """Return the frame less the light of the parts, the numbers that are squared, and the
+    misfit.
+    """
+    remainder = data.electrons
+    for component in parts:
+        remainder = remainder - component.electrons()
+    numbers = data.weights(data.use(remainder)).flatten()
+    if data.clipped is not None:
+        numbers = torch.cat([numbers, data.clipped.misfits(remainder)])
+    prior = sum(
+        float((component.precision * component.values.square()).sum()) for component in parts
+    )
+    return remainder, numbers, 0.5 * (float(numbers.double().square().sum()) + prior)
+
+
+# --- intervals ------------------------------------------------------------------------------------
+
+# How well a frame tells the values of each laser: from the curvature of the fit and the scatter of
+# its residual.
+
+
+NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % interval
+_BLOCK = 8  #: pixels a side of blocks whose residuals count as independent of one another
+#: pixels, pixels and nm, standard deviations of what dirt and defocus change
+_MODEL = (0.0036, 0.0036, 0.08)
+#: the same over the root of the number of pixels seen, whose scattered light is random
+_GRAINS = (0.23, 0.23, 5.9)
+#: standard deviation of the wavelength from the unknown shape of a line, over the width of the line
+_SHAPE = 0.03
+_AMOUNT = 0.0015  #: the same of the electrons of each channel, relative
+
+
+class Spread(NamedTuple):
+    """How well a frame tells the values of one laser."""
+
+    covariance: Tensor  #: (value, value), of y, x (pixels), nm, and the electrons of each channel
+    #: (channel,) e-, standard deviation of these electrons behind a lens that is as its recipe says
+    ideal: Tensor
+
+
+def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
+    """Return for each laser how well its values are told.
+
+    ``unclipped`` (channel, y, x) is 0 for clipped pixels, which the fit has after all others, if at
+    all. The inverse of the second derivatives is enlarged where the slopes of blocks of the frame
+    scatter more than the model says.
+    """
+    value_count = len(fit.normal)
+    inverse = solved(fit.normal, torch.eye(value_count).to(fit.normal))
+    # each number's part of the slope of the misfit with respect to each value
+    scores_by_number = (fit.columns * fit.rest).double()
+    pictures = scores_by_number[:, : unclipped.numel()].view(value_count, *unclipped.shape)
+    if scores_by_number.shape[1] > unclipped.numel():
+        pictures[:, unclipped == 0] = scores_by_number[
+            :, unclipped.numel() :
+        ]  # a clipped pixel has no residual
+    scores = pictures.sum(1)
+    # up to whole blocks
+    rows_missing, columns_missing = (-n % _BLOCK for n in unclipped.shape[-2:])
+    blocks = (
+        pad(scores, (0, columns_missing, 0, rows_missing))
+        .unfold(1, _BLOCK, _BLOCK)
+        .unfold(2, _BLOCK, _BLOCK)
+        .sum((-2, -1))
+        .flatten(1)
+    )
+    prior = fit.normal - products(fit.columns)
+    # Huber's sandwich: the scatter of the blocks' scores in place of their expectation
+    sandwich = inverse @ (blocks @ blocks.T + prior) @ inverse
+    deviation_growth = (
+        (sandwich.diagonal() / inverse.diagonal().clamp_min(1e-300)).clamp_min(1.0).sqrt()
+    )
+    covariance = deviation_growth[:, None] * inverse * deviation_growth
+    laser_spreads, first_value = [], 0
+    for component in fit.parts:
+        own_values = slice(first_value, first_value + len(component.values))
+        first_value += len(component.values)
+        if isinstance(component, Laser):
+            pixels = int(unclipped.amin(0).sum())
+            covariance_of_laser, ideal_covariance = (
+                _of_channels(component, matrix[own_values, own_values], pixels)
+                for matrix in (covariance, inverse)
+            )
+            # after y, x and nm come the electrons of the channels
+            laser_spreads.append(
+                Spread(covariance_of_laser, ideal_covariance.diagonal()[3:].sqrt())
+            )
+    return laser_spreads
+
+
+def _of_channels(laser: Laser, own: Tensor, pixels: int) -> Tensor:
+    """Return the covariance of place, wavelength and electrons of each channel, with what the model
+    neglects.
+
+    ``pixels`` counts those that no channel clips.
+    """
+    slopes = laser.channel_slopes().to(own)
+    # from y, x, nm, ... of `Laser.values` to y, x, nm and the electrons of each channel
+    jacobian = torch.zeros(3 + len(slopes), len(own)).to(own)
+    jacobian[:3, :3] = torch.eye(3).to(own)
+    jacobian[3:] = slopes
+    neglected = torch.zeros(len(jacobian)).to(own)
+    grain_variance = torch.tensor(_GRAINS).to(own).square() / max(pixels, 1)
+    neglected[:3] = torch.tensor(_MODEL).to(own).square() + grain_variance
+    neglected[2] += (_SHAPE * laser.fwhm.to(own) / NANOMETRE).square()
+    neglected[3:] = (_AMOUNT * laser.channels()).square().to(own)
+    return jacobian @ own @ jacobian.T + neglected.diag()

@@ -1,0 +1,233 @@
+"""Variables of the environment: those that decide no result or that keys count, and those that
+libraries do not have while own code runs, because no key counts them.
+
+A key has the variables that own code names or declares. What a library reads on its own, such as a
+backend or a folder of settings, no key has: it finds the variable unset, whatever the environment
+says, unless the code declares it, ``depends=["env:NAME"]``. Own code itself always finds the truth,
+and what it reads without a declaration is noted.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+import sysconfig
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from neusee.workflows.observation import python_watch
+from neusee.workflows.observation.covered_paths import is_installed, is_of_neusee
+
+# --- known variables ------------------------------------------------------------------------------
+
+# Variables that decide no result, or that keys count by what they do.
+
+
+_COUNTED = ("OMP", "MKL", "OPENBLAS", "NUMEXPR")
+_OF_LOCALE = ("ALL", "CTYPE", "NUMERIC", "TIME", "COLLATE", "MESSAGES", "MONETARY")
+OF_THREADS = (*(f"{name}_NUM_THREADS" for name in _COUNTED), "VECLIB_MAXIMUM_THREADS")
+OF_LANGUAGES = ("LANG", "LANGUAGE", *(f"LC_{name}" for name in _OF_LOCALE))
+_WHO = ("HOME", "USER", "LOGNAME", "USERNAME")
+_PLACES = ("PATH", "VIRTUAL_ENV", "TMPDIR", "TZ", "TZDIR", "LOCPATH")
+_FEW = frozenset({*_PLACES, *OF_THREADS, *OF_LANGUAGES, *_WHO})
+_OF_PROGRAMS = (
+    "LD_",
+    "DYLD_",
+    "PYTHON",
+    "CONDA",
+    "XDG_",
+    "NEUSEE_",
+    "GLIBC_",
+    "MALLOC_",
+    "TORCH",
+    "PYTORCH",
+)
+_OF_DEVICES = ("CUDA", "NVIDIA", "HIP", "ROCM", "OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_")
+#: of terminals and windows, for which many libraries ask
+_TERMINALS = ("COLUMNS", "LINES", "TERM", "COLORTERM", "NO_COLOR", "FORCE_COLOR", "CI", "PWD")
+OF_WINDOWS = frozenset({*_TERMINALS, "DISPLAY", "WAYLAND_DISPLAY", "MPLBACKEND"})
+
+
+def is_known(name: str) -> bool:
+    """Return True for a variable that decides no result, or that keys count."""
+    return name in _FEW or name.startswith((*_OF_PROGRAMS, *_OF_DEVICES))
+
+
+# --- hidden variables -----------------------------------------------------------------------------
+
+ALL = "(all of them)"  #: in place of a name, where code asks for all variables
+_IMPORT = "<frozen importlib"  #: begins the name of the file of Python's own import
+
+
+@dataclass
+class Asked:
+    """Variables that code asked for and no key has."""
+
+    #: set, and hidden from the library that asked
+    of_libraries: dict[str, None] = field(default_factory=dict)
+    of_own_code: dict[str, None] = field(default_factory=dict)  #: set or not
+
+
+class _Shown(dict[bytes, bytes]):
+    """The variables that libraries have; who asks for another one decides whether it is found."""
+
+    def __init__(
+        self, environment: Mapping[bytes, bytes], declared: frozenset[str], asked: Asked
+    ) -> None:
+        super().__init__(
+            {
+                name: value
+                for name, value in environment.items()
+                if is_shown(os.fsdecode(name), declared)
+            }
+        )
+        self.hidden = {name: value for name, value in environment.items() if name not in self}
+        self._declared, self._asked = declared, asked
+
+    def __missing__(self, name: bytes) -> bytes:
+        """Return a hidden variable to own code and to neusee; raise `KeyError` to a library."""
+        asker, variable = _who_asks(), os.fsdecode(name)
+        # those of terminals and windows are not worth a word
+        if asker == "library" and name in self.hidden and variable not in OF_WINDOWS:
+            self._asked.of_libraries[variable] = None
+        # once all are asked for, single names say no more
+        if (
+            asker == "own"
+            and not is_shown(variable, self._declared)
+            and ALL not in self._asked.of_own_code
+        ):
+            self._asked.of_own_code[variable] = None
+        if asker == "library" or name not in self.hidden:
+            raise KeyError(name)
+        return self.hidden[name]
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Yield the names of all variables to own code and to neusee, and of those that are not
+        hidden to a library.
+        """
+        asker = _who_asks()
+        if asker == "own":
+            self._asked.of_own_code[ALL] = None
+        return iter([*self.keys(), *(() if asker == "library" else self.hidden)])
+
+
+def is_shown(name: str, declared: frozenset[str]) -> bool:
+    """Return True for a variable that each library has."""
+    return name in declared or is_known(name)
+
+
+def hide_for_good(declared: frozenset[str]) -> Asked:
+    """Hide variables from libraries in the rest of this process, a fork; return what will be asked
+    for.
+
+    Libraries of C do not find them either.
+    """
+    asked_variables = Asked()
+    shown = _show_few(declared, asked_variables)
+    posix = sys.modules.get("posix")
+    for name in shown.hidden:
+        os.unsetenv(name)
+        # what another import of `os` would read
+        if posix is not None:
+            posix.environ.pop(name, None)
+    return asked_variables
+
+
+@contextmanager
+def hidden_while_importing(declared: frozenset[str]) -> Iterator[Asked]:
+    """Hide variables from the libraries of Python that the ``with`` block imports."""
+    asked_variables, environment_before = Asked(), _data(os.environ)
+    shown_variables = _show_few(declared, asked_variables)
+    try:
+        yield asked_variables
+    finally:
+        _set_data(
+            # with what was set meanwhile; hidden variables have their earlier values
+            {**shown_variables.hidden, **shown_variables}
+            | {
+                name: value
+                for name, value in environment_before.items()
+                if name in shown_variables.hidden
+            }
+        )
+
+
+def _show_few(declared: frozenset[str], asked: Asked) -> _Shown:
+    """Let libraries find the declared and known variables alone; return these, with the hidden
+    ones.
+    """
+    shown = _Shown(_data(os.environ), declared, asked)
+    _set_data(shown)
+    return shown
+
+
+def _data(environ: os._Environ[str]) -> dict[bytes, bytes]:
+    """Return the dict behind ``os.environ``."""
+    return environ._data  # type: ignore[attr-defined, no-any-return]
+
+
+def _set_data(data: dict[bytes, bytes]) -> None:
+    """Set the dict behind ``os.environ`` and ``os.environb``."""
+    os.environ._data = data  # type: ignore[attr-defined]
+    os.environb._data = data  # type: ignore[attr-defined]
+
+
+# --- who asks -------------------------------------------------------------------------------------
+
+
+def _who_asks() -> str:
+    """Return whose code asks: the nearest that is not of the standard library is ``own``,
+    ``library`` or ``neusee``.
+
+    A module of the standard library that asks while it is imported counts as a library.
+    """
+    # the caller of the method of `_Shown`
+    frame = sys._getframe(2)
+    while frame is not None:
+        if frame.f_code.co_filename.startswith(_IMPORT):
+            return "library"
+        owner = _owner(frame.f_code.co_filename)
+        if owner != "python":
+            return owner
+        frame = frame.f_back  # type: ignore[assignment]
+    return "neusee"
+
+
+@functools.cache
+def _standard() -> tuple[str, ...]:
+    """Return the folders of the standard library."""
+    return tuple({_real(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")})
+
+
+@functools.cache
+def _owner(file: str) -> str:
+    """Return whose code a file is: python, neusee, library or own."""
+    # code without a file, such as that of a dataclass
+    if file.startswith("<"):
+        return "python"
+    path = _real(file)
+    if _is_of_python(path):
+        return "python"
+    if is_of_neusee(path):
+        return "neusee"
+    return "library" if is_installed(path) else "own"
+
+
+def _real(file: str) -> str:
+    """Return the real path of a file; an observed call does not look for it itself."""
+    watch = python_watch.watch_here()
+    if watch is None:
+        return os.path.realpath(file)
+    was_trusted = watch.trust(True)
+    try:
+        return os.path.realpath(file)
+    finally:
+        watch.trust(was_trusted)
+
+
+def _is_of_python(path: str) -> bool:
+    """Return True for a file of the standard library."""
+    is_in_library = any(path.startswith(f"{folder}{os.sep}") for folder in _standard())
+    return is_in_library and "site-packages" not in path and "dist-packages" not in path

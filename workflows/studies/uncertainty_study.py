@@ -1,0 +1,419 @@
+"""The uncertainty study: the scatter of a recipe's outputs because of uncertain values in the
+recipe.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from neusee.workflows.graph.errors import RecipeError
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.recipe.distributions.joint_distribution import Z_90
+from neusee.workflows.recipe.distributions.nominal_values import told
+from neusee.workflows.recipe.uncertain_inputs import (
+    NEGLIGIBLE,
+    SCRAMBLES,
+    InputDraws,
+    Inputs,
+)
+from neusee.workflows.report.study_report import Content, Progress, StudyOutcome, StudyReport
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.output_draws import (
+    AllowedDraws,
+    FloatArray,
+    Numbers,
+    OutputDraws,
+    Scatter,
+    refuse_combinations,
+    scatter,
+    worst_known,
+)
+from neusee.workflows.studies.run_study import StudyRefused
+from neusee.workflows.studies.sobol_indices import indices
+from neusee.workflows.studies.uncertainty_page import (
+    UncertaintyResult,
+    draw_pictures,
+    lead,
+    sections,
+)
+
+LEAST = 64  #: draws before the first decision to stop
+_RARE = 3.09  #: normal score of the quantile at 99.9 %
+_ROUND = 16  #: independent draws in each further round
+#: draws for the mean and standard deviation of pictures; the deviation is known to 13 %
+PICTURED = 32
+_KEPT = ("mean", "sd")  #: of each picture
+_COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
+
+
+def study(
+    recipe: Recipe,
+    store: Store,
+    progress: Progress,
+    error: float = 0.05,
+    most: int = 1000,
+    points: str = "draws",
+    workers: int = 0,
+    device: str = "cpu",
+    until: Sequence[str] = (),
+) -> StudyOutcome:
+    """Sample inputs, up to ``most`` times, until all output standard deviations are known to the
+    relative ``error``.
+
+    With ``until``, names of outputs or of single quantities, only their deviations decide. On the
+    CPU, ``workers`` processes compute draws; 0 means one for each free processor.
+    """
+    inputs = _inputs(recipe)
+    _chosen([name.partition(".")[0] for name in until], inputs.recipe.outputs)
+    sequences = SCRAMBLES if points == "sobol" else 0
+    allowed = AllowedDraws(inputs, _points(inputs, recipe.seed, most, points), sequences)
+    allowed.extend(LEAST)
+    refuse_combinations(inputs, _ends(inputs), allowed)
+    draws = OutputDraws(inputs, store, device, workers)
+    result = _measure(inputs, draws, allowed, progress, StopRule(error, sequences, tuple(until)))
+    content = _document(result, draws)
+    return StudyOutcome(digest(content["quantities"]), content, _report(result))
+
+
+@dataclass(frozen=True)
+class StopRule:
+    """When a study has enough draws."""
+
+    wanted: float  #: relative error of each standard deviation
+    sequences: int  #: number of Sobol sequences; 0 for independent draws
+    until: tuple[str, ...]  #: outputs or quantities whose standard deviations decide; empty for all
+
+    @property
+    def text(self) -> str:
+        """Return the standard deviations that decide, in words."""
+        return (
+            f"standard deviations of {', '.join(self.until)}"
+            if self.until
+            else "every standard deviation"
+        )
+
+    def needed(self, count: int, error: float, available: int) -> int:
+        """Return about how many draws are needed, from the ``error`` of ``count`` draws."""
+        return (
+            count
+            if error <= self.wanted
+            else min(available, int(count * (error / self.wanted) ** 2))
+        )
+
+    def following(self, count: int) -> int:
+        """Return the number of draws of the next round after ``count`` draws."""
+        # Sobol points are evenly spread only for a power of two
+        return max(LEAST, 2 * count if self.sequences else count + _ROUND)
+
+
+def _inputs(recipe: Recipe) -> Inputs:
+    """Return the uncertain inputs of a recipe; raise `StudyRefused` if there are none to vary."""
+    try:
+        return Inputs.of(recipe, negligible=NEGLIGIBLE)
+    except RecipeError:
+        raise
+    except ValueError as error:
+        raise StudyRefused(str(error)) from error
+
+
+def _points(inputs: Inputs, seed: int, limit: int, points: str) -> InputDraws:
+    """Return ``limit`` draws of the inputs at most: independent ones, or Sobol points.
+
+    Sobol points are as many as `SCRAMBLES` times a power of two.
+    """
+    if points == "sobol":
+        return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(limit, LEAST) / SCRAMBLES)), seed)
+    return inputs.independent(limit if inputs.most is None else min(limit, inputs.most), seed)
+
+
+def _ends(inputs: Inputs) -> FloatArray:
+    """Return the input values of each run: all at their medians, then one input at its 5 % and
+    at its 95 % quantile.
+    """
+    return np.concatenate(
+        [inputs.at(np.zeros((1, len(inputs.names)))), _one_at_a_time(inputs, Z_90)]
+    )
+
+
+def _one_at_a_time(inputs: Inputs, score: float) -> FloatArray:
+    """Return input values with one input at each of two opposite normal scores, and all others
+    at their medians.
+    """
+    scores = []
+    for direction in np.eye(len(inputs.names)):
+        scores += [-score * direction, score * direction]
+    return inputs.at(np.stack(scores))
+
+
+def _chosen(until: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the ``names`` that ``until`` means, or all; raise `StudyRefused` for a name
+    of none of them.
+    """
+    if not until:
+        return tuple(names)
+    deciding = dict[str, None]()
+    for name in until:
+        quantities_of_name = _means(name, names)
+        if not quantities_of_name:
+            raise StudyRefused(
+                f"--until {name}: no output with numbers has this name; there are"
+                f" {', '.join(names)}"
+            )
+        deciding |= dict.fromkeys(quantities_of_name)
+    return tuple(name for name in names if name in deciding)
+
+
+def _deciding(
+    until: Sequence[str], varying: Sequence[str], constant: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the numbers that decide when to stop; raise `StudyRefused` for an output that
+    depends on no input.
+    """
+    constants = [name for name in until if _means(name, constant) and not _means(name, varying)]
+    if constants:
+        raise StudyRefused(
+            f"--until {constants[0]}: this output depends on no uncertain input, and does not vary"
+        )
+    return _chosen(until, varying)
+
+
+def _means(name: str, quantities: Sequence[str]) -> list[str]:
+    """Return those of ``quantities`` of an output or of a single quantity."""
+    return [
+        quantity
+        for quantity in quantities
+        if quantity == name or quantity.startswith((f"{name}.", f"{name}["))
+    ]
+
+
+def _measure(
+    inputs: Inputs, draws: OutputDraws, allowed: AllowedDraws, progress: Progress, rule: StopRule
+) -> UncertaintyResult:
+    """Draw until the standard deviations that decide are known well enough, and
+    return the result.
+    """
+    _say_inputs(inputs, draws, rule.sequences, progress)
+    end_runs = draws.numbers(_ends(inputs))
+    if not end_runs[0]:
+        raise StudyRefused(
+            "the outputs are pictures only: add an output with numbers, such as restored_quality"
+        )
+    # run 0 has all inputs at their medians
+    deciding = _deciding(rule.until, list(end_runs[0]), draws.is_constant)
+    _say_constant(inputs, draws, end_runs, deciding, progress)
+    pictures = draws.pictures(allowed.values[:PICTURED])
+    numbers = list[Numbers]()
+    # at least one round
+    while allowed.tried < allowed.available or not numbers:
+        allowed.extend(rule.following(allowed.tried) if numbers else LEAST)
+        # further draws alone: those before are known
+        numbers += draws.numbers(allowed.values[len(numbers) :])
+        values = _by_quantity(numbers)
+        scattered = {
+            name: scatter(values_of_quantity, rule.sequences)
+            for name, values_of_quantity in values.items()
+        }
+        least_known = worst_known({name: scattered[name] for name in deciding})
+        error = scattered[least_known].error
+        needed = rule.needed(len(numbers), error, allowed.available)
+        progress(
+            f"{len(numbers)} draws of about {needed}: {rule.text} to {error:.1%} ({least_known})"
+        )
+        if error <= rule.wanted:
+            break
+    swings = _swings(inputs, end_runs, values, scattered)
+    return UncertaintyResult(
+        inputs=inputs,
+        points=InputDraws(allowed.z, allowed.values),
+        values=values,
+        scatter=scattered,
+        middle=end_runs[0],
+        swings=swings,
+        shares={name: indices(inputs.shapes, allowed.z, values[name][:, 0]) for name in swings},
+        pictures=pictures,
+        is_constant=draws.is_constant,
+        wanted=rule.wanted,
+        sequences=rule.sequences,
+        deciding=deciding,
+        left_out=allowed.statement,
+    )
+
+
+def _say_inputs(inputs: Inputs, draws: OutputDraws, sequences: int, progress: Progress) -> None:
+    """Print the inputs, what was cut off their distributions, and the outputs that depend on
+    none of them.
+    """
+    progress(
+        f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs"
+        " depend on them"
+    )
+    for name, note in inputs.notes.items():
+        progress(f"{name} = {inputs.uncertain.said(name)}: {note}")
+    if draws.is_constant:
+        progress(
+            f"outputs that depend on no input, and do not vary: {', '.join(draws.is_constant)}"
+        )
+    if inputs.has_table and sequences:
+        progress(
+            "a Sobol sequence draws from the columns of the table and their rank correlation, not"
+            " its rows"
+        )
+    progress(f"steps that depend on no input: {draws.ready():.1f} s")
+
+
+def _say_constant(
+    inputs: Inputs,
+    draws: OutputDraws,
+    ends: Sequence[Numbers],
+    deciding: Sequence[str],
+    progress: Progress,
+) -> None:
+    """Print which numbers do not vary in the first runs; raise `StudyRefused` if none of those
+    that decide varies.
+    """
+    same_in_all = _constant(ends)
+    if set(deciding) <= set(same_in_all):  # the rare ends of the distributions may tell more
+        ends = [*ends, *draws.numbers(_one_at_a_time(inputs, _RARE))]
+        same_in_all = _constant(ends)
+    if same_in_all:
+        progress(
+            f"{', '.join(same_in_all)}: the same in the first {len(ends)} runs, one input after"
+            " another at its ends"
+        )
+    if set(deciding) <= set(same_in_all):
+        raise StudyRefused(
+            f"nothing varies: {', '.join(deciding)} {'is' if len(deciding) == 1 else 'are'} the"
+            f" same in {len(ends)} runs, with all inputs at their medians, and with each at its 5"
+            " %, 95 %, 0.1 % and 99.9 % quantile. Name outputs that the inputs change, or write"
+            " wider distributions"
+        )
+
+
+def _constant(runs: Sequence[Numbers]) -> list[str]:
+    """Return the names of the quantities that are the same in all runs."""
+    return [name for name, values in _by_quantity(runs).items() if scatter(values).is_constant]
+
+
+def _by_quantity(runs: Sequence[Numbers]) -> dict[str, FloatArray]:
+    """Return the values (run, element) of each quantity."""
+    return {name: np.array([run[name] for run in runs]) for name in runs[0]}
+
+
+def _swings(
+    inputs: Inputs,
+    ends: Sequence[Numbers],
+    values: Mapping[str, FloatArray],
+    scattered: Mapping[str, Scatter],
+) -> dict[str, list[tuple[str, float, float]]]:
+    """Return each output number with one input at its 5 % and 95 % quantile; skip numbers
+    proportional to others.
+    """
+    swings: dict[str, list[tuple[str, float, float]]] = {}
+    for name, values_of_number in values.items():
+        is_finite = (
+            np.isfinite(values_of_number).all()
+            and np.isfinite([end_run[name] for end_run in ends]).all()
+        )
+        varies = is_finite and values_of_number.shape[1] == 1 and not scattered[name].is_constant
+        if varies and not any(
+            _proportional(values_of_number[:, 0], values[earlier_number][:, 0])
+            for earlier_number in swings
+        ):
+            # run 0 is at the medians; then each input at its 5 % and its 95 % in turn
+            pairs = zip(inputs.labels, ends[1::2], ends[2::2], strict=True)
+            swings[name] = [
+                (label, low_run[name][0], high_run[name][0]) for label, low_run, high_run in pairs
+            ]
+    return swings
+
+
+def _proportional(x: FloatArray, y: FloatArray) -> bool:
+    """Return True if ``x`` is ``y`` times a constant, by their ratio where ``y`` is largest."""
+    index = int(np.abs(y).argmax())
+    return y[index] != 0 and bool(np.allclose(x * y[index], y * x[index], rtol=1e-9, atol=0.0))
+
+
+def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
+    """Return the numbers of the study as JSON values."""
+    return {
+        "draws": len(result.points.z),
+        "points": "sobol" if result.sequences else "draws",
+        "computed": draws.computed,
+        "seconds a draw": draws.seconds / draws.computed if draws.computed else None,
+        "failed": result.failed,
+        "error": result.error,
+        "wanted": result.wanted,
+        "decided by": list(result.deciding),
+        "inputs": result.input_rows,
+        "posterior": told(result.inputs.uncertain.standings),
+        "cut off": dict(result.inputs.notes),
+        "left out": result.left_out,
+        "idle": list(result.inputs.idle),
+        "still": list(result.is_constant),
+        "quantities": {name: _plain(result, name) for name in result.values},
+        "sensitivity": {name: asdict(shares) for name, shares in result.shares.items()},
+    }
+
+
+def _plain(result: UncertaintyResult, name: str) -> dict[str, Any]:
+    """Return the scatter of one quantity as JSON values."""
+    scattered = result.scatter[name]
+    arrays = {
+        statistic: getattr(scattered, statistic).tolist()
+        for statistic in ("mean", "sd", "low", "high")
+    }
+    return {"error": scattered.error, "middle": list(result.middle[name]), **arrays}
+
+
+def _report(result: UncertaintyResult) -> StudyReport:
+    """Return the page of the study, with its tables, draws and pictures."""
+    pictures = draw_pictures(result)
+    named_draws = zip(result.inputs.names, result.points.values.T, strict=True)
+    files: dict[str, Content] = {"draws.npz": _npz({**dict(named_draws), **result.values})}
+    if result.pictures:
+        arrays = {}
+        for name, moments in result.pictures.items():
+            for statistic, moment in zip(_KEPT, moments, strict=True):
+                arrays[f"{name} {statistic}"] = moment.numpy()
+        files["pictures.npz"] = _npz(arrays)
+    return StudyReport(
+        f"{result.inputs.recipe.name}: uncertainty",
+        lead(result),
+        sections(result, pictures),
+        pictures,
+        tables={"table.csv": (_COLUMNS, _rows(result))},
+        files=files,
+        shown=("command", "date", "seconds", "draws", "computed", "seconds a draw", "versions"),
+    )
+
+
+def _rows(result: UncertaintyResult) -> list[Sequence[Any]]:
+    """Return the rows of table.csv: one for each element of each quantity."""
+    rows: list[Sequence[Any]] = []
+    for name, scattered in result.scatter.items():
+        columns = zip(
+            result.middle[name],
+            scattered.mean,
+            scattered.sd,
+            scattered.low,
+            scattered.high,
+            strict=True,
+        )
+        rows += [
+            (name, element if len(scattered.mean) > 1 else "", *row)
+            for element, row in enumerate(columns)
+        ]
+    return rows
+
+
+def _npz(arrays: Mapping[str, Any]) -> bytes:
+    """Return arrays as the bytes of a file of NumPy."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
