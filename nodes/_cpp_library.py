@@ -65,11 +65,11 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
-    facts = [_first(lines, word) for word in ("model name", "flags", "Features")]
+    facts = [_first_line(lines, word) for word in ("model name", "flags", "Features")]
     return "\n".join([platform.platform(), platform.machine(), platform.processor(), *facts])
 
 
-def _first(lines: list[str], word: str) -> str:
+def _first_line(lines: list[str], word: str) -> str:
     """Return the first line that begins with a word, or an empty text."""
     return next((line for line in lines if line.startswith(word)), "")
 
@@ -87,12 +87,12 @@ def _compiler() -> str:
     return compiler
 
 
-def _first_error(done: subprocess.CompletedProcess[str]) -> str:
+def _first_error(process: subprocess.CompletedProcess[str]) -> str:
     """Return the first line of a compiler that names an error, or its exit status."""
-    for line in done.stderr.splitlines():
+    for line in process.stderr.splitlines():
         if "error" in line:
             return line.strip()
-    return f"exit status {done.returncode}"
+    return f"exit status {process.returncode}"
 
 
 def _compile(code: Path, rounding: str, where: Path) -> None:

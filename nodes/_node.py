@@ -26,10 +26,11 @@ if TYPE_CHECKING:
 # Statistics and error bounds of tensors, which an engine reads in place of the tensors.
 
 
-_FEW = 64  #: up to this many elements, a loop in Python is faster than five calls of torch
-#: elements of one part, and elements that are summed in the precision of the tensor
-_PART, _ROW = 1 << 17, 1 << 10
-_SUMMED = 1e-4  #: relative round-off of a sum, which float32 rows of 1024 elements keep far below
+_FEW_ELEMENTS = 64  #: up to this many elements, a loop in Python is faster than five calls of torch
+_PART_ELEMENTS = 1 << 17  #: elements that are measured at once
+_ROW_ELEMENTS = 1 << 10  #: elements that are summed in the precision of the tensor
+#: relative round-off of a sum, which float32 rows of 1024 elements keep far below
+_SUM_ROUND_OFF = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class TensorStats:
         if tensor.numel() == 0:
             return cls(shape, dtype, math.nan, math.nan, 0.0, 0, True)
         tensor = tensor.abs() if tensor.is_complex() else tensor
-        few_elements = tensor.reshape(-1).tolist() if tensor.numel() <= _FEW else []
+        few_elements = tensor.reshape(-1).tolist() if tensor.numel() <= _FEW_ELEMENTS else []
         # a sum in Python is exact enough, and an overflow goes the long way below
         if few_elements and math.isfinite(total := float(sum(few_elements))):
             return cls(
@@ -98,7 +99,7 @@ class TensorStats:
         square_sum = (
             math.floor(count_at_top) * highest**2 + middle_value**2 + count_at_bottom * lowest**2
         )
-        return min(largest_absolute, math.sqrt(square_sum / count) * (1 + _SUMMED))
+        return min(largest_absolute, math.sqrt(square_sum / count) * (1 + _SUM_ROUND_OFF))
 
 
 def _measure(flat: Tensor) -> tuple[float, float, float, int]:
@@ -109,14 +110,18 @@ def _measure(flat: Tensor) -> tuple[float, float, float, int]:
 
     # truth values and half precision are measured in float32
     is_small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
-    part_statistics = [_measure_piece(piece, is_small) for piece in torch.split(flat, _PART)]
+    part_statistics = [
+        _measure_piece(piece, is_small) for piece in torch.split(flat, _PART_ELEMENTS)
+    ]
     minima, maxima, sums, counts = (
         torch.stack(values) for values in zip(*part_statistics, strict=True)
     )
     lowest, highest, total = (float(x) for x in (minima.min(), maxima.max(), sums.sum()))
     # the sum of a row overflowed
     if math.isinf(total) and math.isfinite(lowest) and math.isfinite(highest):
-        total = float(sum(piece.sum(dtype=torch.float64) for piece in torch.split(flat, _PART)))
+        total = float(
+            sum(piece.sum(dtype=torch.float64) for piece in torch.split(flat, _PART_ELEMENTS))
+        )
     return lowest, highest, total, int(counts.sum())
 
 
@@ -127,7 +132,7 @@ def _measure_piece(piece: Tensor, small: bool) -> tuple[Tensor, Tensor, Tensor, 
     import torch
 
     piece = piece.float() if small else piece
-    rows = piece.view(-1, _ROW) if piece.numel() % _ROW == 0 else piece[None]
+    rows = piece.view(-1, _ROW_ELEMENTS) if piece.numel() % _ROW_ELEMENTS == 0 else piece[None]
     low, high = torch.aminmax(piece)
     return low, high, rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(piece)
 
@@ -301,8 +306,8 @@ class ParameterError(ValueError):
     runs.
 
     Args: the name of the parameter, and one sentence with the value and the fix. The name
-            ``direction.angle`` means the
-    parameter ``angle`` of the step that computes the input ``direction``.
+            ``direction.angle`` means the parameter ``angle`` of the step that computes the input
+            ``direction``.
     """
 
     def __init__(self, parameter: str, message: str) -> None:
@@ -321,6 +326,26 @@ def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
     return attach
 
 
+@dataclass(frozen=True, slots=True)
+class NodeTraits:
+    """What an engine must know of a node beside its function; `node` explains each field."""
+
+    device: Device = "any"  #: where the node may run
+    rtol: float = 1e-5  #: error that the node may have, relative to its reference
+    #: axis of the bands in inputs and in "return", for a node that treats each band by itself
+    bands: Mapping[str, int] | None = None
+    accepts_channel_sums: Sequence[str] = ()  #: inputs that may be weighted sums over the bands
+    #: inputs that are the same in every band where another is a weighted sum over the bands
+    needs_band_invariant: Sequence[str] = ()
+    accepts_low_rank: Sequence[str] = ()  #: inputs that may be low-rank cubes
+    #: groups of inputs, the first of which is light that is only added: an entry that is 0 is left
+    #: out, with the entry of the same number in the rest of the group
+    additive_inputs: Sequence[tuple[str, ...]] = ()
+    before_run: bool = False  #: True for a node without inputs that is computed before the plan
+    #: what the function reads beside its arguments, such as "table.csv" or "env:X"
+    depends: Sequence[str] = ()
+
+
 class Node:
     """A function that computes one step of a recipe, with typed parameters and hooks such as
     checks.
@@ -330,48 +355,26 @@ class Node:
     cube.
     """
 
-    def __init__(
-        self,
-        fn: Callable[..., Any],
-        device: Device = "any",
-        rtol: float = 1e-5,
-        bands: Mapping[str, int] | None = None,
-        accepts_channel_sums: Sequence[str] = (),
-        needs_band_invariant: Sequence[str] = (),
-        accepts_low_rank: Sequence[str] = (),
-        additive_inputs: Sequence[tuple[str, ...]] = (),
-        before_run: bool = False,
-        depends: Sequence[str] = (),
-    ) -> None:
-        """Describe a node by its function and by what an engine must know of it.
-
-        ``device`` is where it may run, and ``rtol`` the error that it may have, relative to its
-        reference. ``bands`` names the axis of the bands in inputs and in "return", for a node that
-        treats each band by itself. ``accepts_channel_sums`` names inputs that may be weighted sums
-        over the bands, if the inputs in ``needs_band_invariant`` are the same in every band;
-        ``accepts_low_rank`` names inputs that may be low-rank cubes. ``additive_inputs`` are groups
-        of inputs, the first of which is light that is only added: an entry that is 0 is left out,
-        with the entry of the same number in the rest of the group. A node ``before_run`` has no
-        inputs and is computed before the plan. ``depends`` are texts that name what the function
-        reads beside its arguments, such as "table.csv" or "env:X".
-        """
+    def __init__(self, fn: Callable[..., Any], traits: NodeTraits | None = None) -> None:
+        """Describe a node by its function and by what an engine must know of it."""
+        traits = traits or NodeTraits()
         functools.update_wrapper(self, fn)
-        self.fn, self.device, self.rtol = fn, device, rtol
-        self.accepts_channel_sums = tuple(accepts_channel_sums)
-        self.needs_band_invariant = tuple(needs_band_invariant)
-        self.accepts_low_rank = tuple(accepts_low_rank)
-        self.additive_inputs = tuple(additive_inputs)
+        self.fn, self.device, self.rtol = fn, traits.device, traits.rtol
+        self.accepts_channel_sums = tuple(traits.accepts_channel_sums)
+        self.needs_band_invariant = tuple(traits.needs_band_invariant)
+        self.accepts_low_rank = tuple(traits.accepts_low_rank)
+        self.additive_inputs = tuple(traits.additive_inputs)
         self.channel_sum_form: Node | None = None
         self.low_rank_form: Node | None = None
         self.hooks = Hooks()
         self._read_signature()
-        self.bands = bands and self._declared(bands)
-        self.before_run = before_run
-        self._require_texts(depends)
-        self.depends = tuple(depends)
+        self.bands = traits.bands and self._checked_bands(traits.bands)
+        self.before_run = traits.before_run
+        self._require_texts(traits.depends)
+        self.depends = tuple(traits.depends)
         #: the declared variables of the environment at the import, which a module may read only
         #: then
-        self.environment = {name: os.environ.get(name) for name in _variables(depends)}
+        self.environment = {name: os.environ.get(name) for name in _environment_names(self.depends)}
         self._refuse_inputs_before_run()
         _registered[fn.__module__, fn.__name__] = self
 
@@ -444,7 +447,7 @@ class Node:
         ]
         return ".".join([*public_names, self.fn.__name__])
 
-    def _declared(self, bands: Mapping[str, int]) -> Mapping[str, int]:
+    def _checked_bands(self, bands: Mapping[str, int]) -> Mapping[str, int]:
         """Return the axes of the bands, unchangeable; raise ValueError unless they name inputs and
         "return".
         """
@@ -526,7 +529,7 @@ def registered_nodes() -> tuple[Node, ...]:
     return tuple(_registered.values())
 
 
-def _variables(depends: Sequence[str]) -> list[str]:
+def _environment_names(depends: Sequence[str]) -> list[str]:
     """Return the names of the variables of the environment among declared dependencies."""
     return [entry.removeprefix("env:") for entry in depends if entry.startswith("env:")]
 
@@ -576,18 +579,18 @@ def node(
             names of modules. The page ``recipes/guide/code_changes.md`` lists the constructs that
             need an entry.
     """
-    return lambda fn: Node(
-        fn,
-        device,
-        rtol,
-        bands,
-        accepts_channel_sums,
-        needs_band_invariant,
-        accepts_low_rank,
-        additive_inputs,
-        before_run,
-        depends,
+    traits = NodeTraits(
+        device=device,
+        rtol=rtol,
+        bands=bands,
+        accepts_channel_sums=accepts_channel_sums,
+        needs_band_invariant=needs_band_invariant,
+        accepts_low_rank=accepts_low_rank,
+        additive_inputs=additive_inputs,
+        before_run=before_run,
+        depends=depends,
     )
+    return lambda fn: Node(fn, traits)
 
 
 __all__ = [

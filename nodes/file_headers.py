@@ -27,8 +27,8 @@ _MAT_MATRIX, _MAT_COMPRESSED, _MAT_INT32 = 14, 15, 5  #: types of elements
 _MAT_COMPLEX = 0x0800
 #: bytes of a value by the class of an array; a cell, a struct or a sparse array has none
 _MAT_CLASSES = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
-#: errors of an archive that is damaged or none, whose reader says what is wrong
-_BROKEN = (
+#: errors of a damaged archive, or of a file that is no archive; its reader says what is wrong
+_ARCHIVE_ERRORS = (
     zipfile.BadZipFile,
     ValueError,
     EOFError,
@@ -38,19 +38,18 @@ _BROKEN = (
     RuntimeError,
     zlib.error,
 )
-_CHUNK = 1 << 18  #: bytes that are decompressed at once to count them
-_HEADER = 100_000_000  #: bytes of the header of a .safetensors file, at most, as its library has it
+_CHUNK_BYTES = 1 << 18  #: bytes that are decompressed at once to count them
+#: bytes of the header of a .safetensors file, at most, as its library has it
+_HEADER_BYTES = 100_000_000
 
 
-def npy_needs(
-    file: Path | str, copies: float, beside: float = 0.0, parameter: str = "file"
-) -> None:
+def npy_needs(file: Path | str, copies: float, beside: float = 0.0) -> None:
     """Ask for the memory of a .npy file: ``copies`` of its numbers, and ``beside`` bytes for each
     of them.
 
     Raises ParameterError for a file that is shorter than its header says.
     """
-    with opened(file, parameter) as open_file:
+    with opened(file) as open_file:
         try:
             shape, dtype = _npy_header(open_file)
         except (ValueError, EOFError, SyntaxError, TypeError):
@@ -62,10 +61,8 @@ def npy_needs(
             f"its header states {in_bytes(count * dtype.itemsize)} of numbers, and"
             f" {in_bytes(bytes_after)} follow"
         )
-        raise ParameterError(
-            parameter, f"{file} cannot be read: {text}: copy or save the file again"
-        )
-    needs(count * (copies * dtype.itemsize + beside), file, _numbers(shape, dtype), parameter)
+        raise ParameterError("file", f"{file} cannot be read: {text}: copy or save the file again")
+    needs(count * (copies * dtype.itemsize + beside), file, _numbers(shape, dtype))
 
 
 def _numbers(shape: tuple[int, ...], dtype: Any) -> str:
@@ -117,7 +114,7 @@ def _npz_headers(
     headers = []
     with (
         opened(file, parameter) as open_file,
-        suppress(*_BROKEN),
+        suppress(*_ARCHIVE_ERRORS),
         zipfile.ZipFile(open_file) as archive,
     ):
         for entry in archive.infolist():
@@ -137,7 +134,7 @@ def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> N
     with opened(file, parameter) as open_file:
         file_size = os.fstat(open_file.fileno()).st_size
         needs(copies * file_size, file, f"a file of {in_bytes(file_size)}", parameter)
-        with suppress(*_BROKEN), zipfile.ZipFile(open_file) as archive:
+        with suppress(*_ARCHIVE_ERRORS), zipfile.ZipFile(open_file) as archive:
             sizes = [entry.file_size for entry in archive.infolist()]
     content = f"{len(sizes)} files of {in_bytes(sum(sizes))} in {in_bytes(file_size)}"
     needs(copies * sum(sizes), file, content, parameter)
@@ -154,18 +151,18 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
     with opened(file, parameter) as open_file:
         size, length_bytes = os.fstat(open_file.fileno()).st_size, open_file.read(8)
         length = int.from_bytes(length_bytes, "little")
-        if len(length_bytes) < 8 or length > min(size - 8, _HEADER):
+        if len(length_bytes) < 8 or length > min(size - 8, _HEADER_BYTES):
             text = f"{in_bytes(length)} of header, and the file has {in_bytes(size)}"
-            raise _not_whole(file, text, parameter)
+            raise _error_of_header(file, text, parameter)
         # 16 bytes in memory for each one of the header, when it is parsed
         needs(16.0 * length + copies * size, file, f"tensors of {in_bytes(size)}", parameter)
-        end_of_tensors = _last_byte(open_file.read(length))
+        end_of_tensors = _end_of_tensors(open_file.read(length))
     if end_of_tensors > size - 8 - length:
         text = f"{in_bytes(end_of_tensors)} of tensors, and {in_bytes(size - 8 - length)} follow"
-        raise _not_whole(file, text, parameter)
+        raise _error_of_header(file, text, parameter)
 
 
-def _not_whole(file: Path | str, why: str, parameter: str) -> ParameterError:
+def _error_of_header(file: Path | str, why: str, parameter: str) -> ParameterError:
     """Return the error of a .safetensors file whose header ``why`` says does not fit the file."""
     text = (
         f"{Path(file).name} is not a safetensors file and cannot be read: its header states {why}"
@@ -173,17 +170,18 @@ def _not_whole(file: Path | str, why: str, parameter: str) -> ParameterError:
     return ParameterError(parameter, f"{text}: copy or save the file again")
 
 
-def _last_byte(header: bytes) -> int:
+def _end_of_tensors(header: bytes) -> int:
     """Return the byte at which the tensors end, or 0 for a header that the library refuses."""
     try:
         return max(
-            (int(entry["data_offsets"][1]) for entry in _entries(json.loads(header))), default=0
+            (int(entry["data_offsets"][1]) for entry in _tensor_entries(json.loads(header))),
+            default=0,
         )
     except (ValueError, TypeError, LookupError, RecursionError):
         return 0
 
 
-def _entries(header: Any) -> Iterator[Any]:
+def _tensor_entries(header: Any) -> Iterator[Any]:
     """Return what a header says of each tensor."""
     return (entry for name, entry in header.items() if name != "__metadata__")
 
@@ -203,7 +201,7 @@ def mat_needs(
     with opened(file, parameter) as open_file:
         size = os.fstat(open_file.fileno()).st_size
         total, largest, asked_bytes = 0.0, 0.0, float(SMALL)
-        for begins_variable, size_of_part in _mat_sizes(open_file, size):
+        for begins_variable, size_of_part in _mat_variable_bytes(open_file, size):
             total = total + size_of_part if together or not begins_variable else size_of_part
             largest = max(largest, total)
             # ask again only where it grew by `SMALL`, because each question takes time
@@ -215,7 +213,7 @@ def mat_needs(
     needs(copies * largest, file, f"variables of {in_bytes(largest)}", parameter)
 
 
-def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
+def _mat_variable_bytes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
     """Yield the bytes of each variable of a file of version 5 or older, compressed ones in parts.
 
     The first value is True where a variable begins.
@@ -232,7 +230,7 @@ def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
         if kind == _MAT_COMPRESSED:
             inflated_bytes, stated_bytes = 0, 0
             for piece in _inflated(raw, length):
-                stated_bytes = stated_bytes or _mat_stated(piece[8:], byte_order)
+                stated_bytes = stated_bytes or _mat_stated_bytes(piece[8:], byte_order)
                 bytes_before, inflated_bytes = inflated_bytes, inflated_bytes + len(piece)
                 # what is stated at first, then what exceeds it
                 yield (
@@ -241,13 +239,16 @@ def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
                     - (max(bytes_before, stated_bytes) if bytes_before else 0),
                 )
         elif kind == _MAT_MATRIX:
-            yield True, max(min(length, size), _mat_stated(raw.read(min(length, 4096)), byte_order))
+            yield (
+                True,
+                max(min(length, size), _mat_stated_bytes(raw.read(min(length, 4096)), byte_order)),
+            )
         else:
             return  # scipy says what is damaged
         raw.seek(next_element)
 
 
-def _mat_stated(piece: bytes, order: str) -> int:
+def _mat_stated_bytes(piece: bytes, order: str) -> int:
     """Return the bytes of the numbers of a variable as they are read, from its flags and
     dimensions; 0 if unknown.
     """
@@ -268,20 +269,18 @@ def _inflated(raw: BinaryIO, length: int) -> Iterator[bytes]:
     decompressor, bytes_left, compressed = zlib.decompressobj(), length, b""
     with suppress(zlib.error):  # scipy says what is damaged
         while not decompressor.eof:
-            compressed = compressed or raw.read(min(bytes_left, _CHUNK))
+            compressed = compressed or raw.read(min(bytes_left, _CHUNK_BYTES))
             if not compressed:
                 return
             bytes_left -= 0 if decompressor.unconsumed_tail else len(compressed)
-            yield decompressor.decompress(compressed, _CHUNK)
+            yield decompressor.decompress(compressed, _CHUNK_BYTES)
             compressed = decompressor.unconsumed_tail
 
 
 # --- FITS and HDF5, whose libraries read headers alone --------------------------------------------
 
 
-def fits_needs(
-    file: Path | str, shape: tuple[int, ...], bits: int, parameter: str = "file"
-) -> None:
+def fits_needs(file: Path | str, shape: tuple[int, ...], bits: int) -> None:
     """Ask for the memory of an image of a FITS file: its numbers, scaled to float64, and the
     copy of the caller.
     """
@@ -291,24 +290,23 @@ def fits_needs(
         number_count * (abs(bits) / 8 + 16),
         file,
         f"{' x '.join(map(str, shape))} numbers of {abs(bits)} bits",
-        parameter,
     )
 
 
-def refuse_packed(file: Path | str, parameter: str = "file") -> None:
+def refuse_packed(file: Path | str) -> None:
     """Raise ParameterError for a file that is compressed as a whole, which a library would
     unpack without a limit.
     """
-    with opened(file, parameter) as open_file:
+    with opened(file) as open_file:
         magic_bytes = open_file.read(6)
     # gzip, bzip2, zip, xz and compress
     if magic_bytes.startswith((b"\x1f\x8b", b"BZh", b"PK\x03\x04", b"\xfd7zXZ", b"\x1f\x9d")):
         raise ParameterError(
-            parameter, f"{file} is compressed as a whole: unpack it, such as by gunzip"
+            "file", f"{file} is compressed as a whole: unpack it, such as by gunzip"
         )
 
 
-def hdf5_needs(file: Path | str, groups: Any, copies: float = 1.0) -> None:
+def hdf5_needs(file: Path | str, groups: Any) -> None:
     """Ask for the memory of all data in the opened ``groups`` of an HDF5 file, from their shapes
     and types.
     """
@@ -317,7 +315,7 @@ def hdf5_needs(file: Path | str, groups: Any, copies: float = 1.0) -> None:
         for data in group.values():
             if hasattr(data, "shape"):
                 total += math.prod(map(int, data.shape)) * data.dtype.itemsize
-    needs(copies * total, file, f"data of {in_bytes(total)}")
+    needs(total, file, f"data of {in_bytes(total)}")
 
 
 # --- picture bytes --------------------------------------------------------------------------------
@@ -326,48 +324,42 @@ def hdf5_needs(file: Path | str, groups: Any, copies: float = 1.0) -> None:
 
 
 #: bytes of a pixel of Pillow
-_IN_MEMORY = {"1": 1, "L": 1, "P": 1, "LA": 4, "I;16": 2, "I;16B": 2, "I;16L": 2}
-_COEFFICIENTS = 6  #: bytes of a pixel of a JPEG that is stored in several scans
+_BYTES_OF_PIXEL = {"1": 1, "L": 1, "P": 1, "LA": 4, "I;16": 2, "I;16B": 2, "I;16L": 2}
+_JPEG_BYTES = 6  #: bytes of a pixel of a JPEG that is stored in several scans
 _WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH = 256, 257, 258, 277, 322, 323
 _TIFF_TAGS = frozenset((_WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH))
 #: of the types of a TIFF tag that are whole numbers
 _TIFF_SIZES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _EXR_SIZES = {0: 4, 1: 2, 2: 4}  #: bytes of a number, by the type of the channel
 _MULTIPART, _DEEP = 1 << 12, 1 << 11
-_LONGEST = 1 << 20  #: bytes of a list of channels, at most
+_CHANNEL_LIST_BYTES = 1 << 20  #: bytes of a list of channels, at most
 
 
-def picture_needs(file: Path, image: Any, beside: float, parameter: str = "file") -> None:
+def picture_needs(file: Path, image: Any, beside: float) -> None:
     """Ask for the memory of the first picture that Pillow has opened, with ``beside`` bytes for
     each of its pixels.
     """
-    bytes_a_pixel = _IN_MEMORY.get(image.mode, 4) + beside
-    bytes_a_pixel += _COEFFICIENTS if image.format in ("JPEG", "MPO") else 0
+    bytes_a_pixel = _BYTES_OF_PIXEL.get(image.mode, 4) + beside
+    bytes_a_pixel += _JPEG_BYTES if image.format in ("JPEG", "MPO") else 0
     needs(
-        bytes_a_pixel * image.width * image.height,
-        file,
-        f"{image.width} x {image.height} pixels",
-        parameter,
+        bytes_a_pixel * image.width * image.height, file, f"{image.width} x {image.height} pixels"
     )
 
 
-def pages_need(
-    file: Path, image: Any, copies: float, beside: float = 0.0, parameter: str = "file"
-) -> None:
+def pages_need(file: Path, image: Any, copies: float, beside: float = 0.0) -> None:
     """Ask for the memory of all pages of a file that Pillow has opened.
 
     There are ``copies`` of the numbers of each page, and ``beside`` bytes for each of its pixels.
     """
     if image.format == "TIFF":
-        tiff_needs(file, copies, beside, parameter)
+        tiff_needs(file, copies, beside)
         return
     pages, pixels_a_page = int(getattr(image, "n_frames", 1)), image.width * image.height
-    bytes_a_pixel = copies * _IN_MEMORY.get(image.mode, 4) + beside
+    bytes_a_pixel = copies * _BYTES_OF_PIXEL.get(image.mode, 4) + beside
     needs(
         pages * pixels_a_page * bytes_a_pixel,
         file,
         f"{pages} pages of {image.width} x {image.height} pixels",
-        parameter,
     )
 
 
@@ -388,26 +380,19 @@ class Page(NamedTuple):
         return self.samples * max(self.sample, 8) / 8 * max(self.width * self.height, self.tile)
 
 
-def tiff_needs(
-    file: Path, copies: float, beside: float = 0.0, parameter: str = "file", first: bool = False
-) -> None:
+def tiff_needs(file: Path, copies: float, beside: float = 0.0, first: bool = False) -> None:
     """Ask for the memory of all pages of a TIFF file, or of the ``first`` one, as `pages_need`
     does.
     """
     count, total, page = 0, 0.0, Page(0, 0, 8, 1, 0)
     # the reader says what a damaged file lacks
-    with opened(file, parameter) as open_file, suppress(struct.error):
+    with opened(file) as open_file, suppress(struct.error):
         for page in tiff_pages(open_file):
             count += 1
             total += copies * page.bytes + beside * page.width * page.height
             if first:
                 break
-    needs(
-        total,
-        file,
-        f"{count} page{'s' * (count != 1)} of {page.width} x {page.height} pixels",
-        parameter,
-    )
+    needs(total, file, f"{count} page{'s' * (count != 1)} of {page.width} x {page.height} pixels")
 
 
 def tiff_pages(raw: BinaryIO) -> Iterator[Page]:
@@ -436,19 +421,19 @@ def _tiff_page(raw: BinaryIO, place: int, order: str, big: bool) -> tuple[Page, 
     """Return the page whose directory begins at ``place``, and the place of the next directory."""
     count_format, entry_format, address_format = ("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")
     raw.seek(place)
-    (count,) = struct.unpack(f"{order}{count_format}", raw.read(8 if big else 2))
-    entry_struct = struct.Struct(f"{order}{entry_format}")
+    count_struct, entry_struct, address_struct = (
+        struct.Struct(f"{order}{form}") for form in (count_format, entry_format, address_format)
+    )
+    (count,) = count_struct.unpack(raw.read(count_struct.size))
     values: dict[int, int] = {}
     for _ in range(min(count, 65536)):
         tag, value_type, length, value = entry_struct.unpack(raw.read(entry_struct.size))
         if tag in _TIFF_TAGS and value_type in _TIFF_SIZES:
             values[tag] = _tiff_number(raw, order, _TIFF_SIZES[value_type], length, value)
-    address_bytes = raw.read(8 if big else 4)
-    (next_directory,) = (
-        struct.unpack(f"{order}{address_format}", address_bytes)
-        if len(address_bytes) == (8 if big else 4)
-        else (0,)
-    )
+    address_bytes = raw.read(address_struct.size)
+    next_directory = 0
+    if len(address_bytes) == address_struct.size:
+        (next_directory,) = address_struct.unpack(address_bytes)
     page = Page(
         values.get(_WIDTH, 0),
         values.get(_HEIGHT, 0),
@@ -486,21 +471,21 @@ class ExrPart(NamedTuple):
         return self.width * self.height * sum(self.channels.values())
 
 
-def exr_needs(file: Path | str, beside: float = 8.0, parameter: str = "file") -> None:
+def exr_needs(file: Path | str, beside: float = 8.0) -> None:
     """Ask for the memory of an OpenEXR file: all channels of all parts, which the library reads at
     once.
 
     ``beside`` are the bytes for each value of the largest part that the caller makes of them. A
     part with deep samples is refused, because its header does not say how many there are.
     """
-    with opened(file, parameter) as open_file:
+    with opened(file) as open_file:
         try:
             part_sizes = list(exr_part_sizes(open_file))
         except (struct.error, ValueError):
             return  # the library says what a damaged file lacks
     if any(exr_part.deep for exr_part in part_sizes):
         raise ParameterError(
-            parameter, f"{file} has deep samples, several a pixel: flatten the picture"
+            "file", f"{file} has deep samples, several a pixel: flatten the picture"
         )
     values = max(
         (exr_part.width * exr_part.height * len(exr_part.channels) for exr_part in part_sizes),
@@ -509,9 +494,7 @@ def exr_needs(file: Path | str, beside: float = 8.0, parameter: str = "file") ->
     largest = max(part_sizes, key=lambda exr_part: exr_part.bytes, default=ExrPart(0, 0, {}, False))
     content = f"{largest.width} x {largest.height} pixels in {len(largest.channels)} channels"
     content += f", and {len(part_sizes) - 1} other parts" if len(part_sizes) > 1 else ""
-    needs(
-        sum(exr_part.bytes for exr_part in part_sizes) + beside * values, file, content, parameter
-    )
+    needs(sum(exr_part.bytes for exr_part in part_sizes) + beside * values, file, content)
 
 
 def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
@@ -543,7 +526,7 @@ def _exr_attributes(raw: BinaryIO, end: int) -> dict[str, bytes]:
         (size,) = struct.unpack("<i", raw.read(4))
         if not 0 <= size <= end - raw.tell():
             raise ValueError("an attribute is longer than the file")
-        if name in ("dataWindow", "channels", "type") and size <= _LONGEST:
+        if name in ("dataWindow", "channels", "type") and size <= _CHANNEL_LIST_BYTES:
             attributes[name] = raw.read(size)
         else:
             raw.seek(size, os.SEEK_CUR)
@@ -551,7 +534,7 @@ def _exr_attributes(raw: BinaryIO, end: int) -> dict[str, bytes]:
 
 
 def _exr_text(raw: BinaryIO) -> str:
-    """Read a text that ends with a zero; raise ValueError for one that is no name."""
+    """Read a name that ends with a zero; raise ValueError where no zero ends it in time."""
     letters = bytearray()
     while (letter := raw.read(1)) != b"\0":
         letters += letter

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 #: ns by which a clock that is corrected slowly may differ from the steady one
-_SLACK = 1_000_000_000
+_CLOCK_SLACK = 1_000_000_000
 
 
 class Moment:
@@ -30,11 +30,11 @@ class Moment:
         that is earlier.
         """
         by_now = time.time_ns() - (time.monotonic_ns() - self._steady)
-        return by_now if by_now < self._clock - _SLACK else self._clock
+        return by_now if by_now < self._clock - _CLOCK_SLACK else self._clock
 
 
-_began: dict[str, Moment] = {}
-_FIRST = Moment()
+_import_moments: dict[str, Moment] = {}
+_THIS_IMPORT = Moment()
 
 
 class _Clock:
@@ -46,7 +46,7 @@ class _Clock:
     def find_spec(
         name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> None:
-        _began[name] = Moment()
+        _import_moments[name] = Moment()
 
 
 def import_time(module: str) -> int:
@@ -54,7 +54,7 @@ def import_time(module: str) -> int:
 
     For a module that was imported before this one, return the time of the import of this module.
     """
-    return _began.get(module, _FIRST).time()
+    return _import_moments.get(module, _THIS_IMPORT).time()
 
 
 sys.meta_path.insert(0, _Clock)

@@ -30,8 +30,8 @@ __depends__ = ["unaffected:file", "unaffected:resource", "unaffected:_measures",
 SMALL = 16 << 20  #: bytes that every reader may take without asking
 TEXT = 64 << 20  #: bytes of a text that is read as a whole, at most
 LINE = 1_000_000  #: characters of a line of a table, at most
-_GROUP = Path("/sys/fs/cgroup")
-_KINDS = (
+_CONTROL_GROUP = Path("/sys/fs/cgroup")
+_KINDS_OF_FILE = (
     (stat.S_ISFIFO, "a pipe"),
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
@@ -93,14 +93,14 @@ def free_memory() -> Room:
             * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
         )
     with suppress(OSError, ValueError):
-        limit = int((_GROUP / "memory.max").read_text())
+        limit = int((_CONTROL_GROUP / "memory.max").read_text())
         statistics = dict(
-            line.split() for line in (_GROUP / "memory.stat").read_text().splitlines()
+            line.split() for line in (_CONTROL_GROUP / "memory.stat").read_text().splitlines()
         )
         rooms.append(
             float(
                 limit
-                - int((_GROUP / "memory.current").read_text())
+                - int((_CONTROL_GROUP / "memory.current").read_text())
                 # cached files, which the system gives back when memory is short
                 + int(statistics["inactive_file"])
             )
@@ -132,9 +132,9 @@ def kind_of(mode: int) -> str:
     """Return what stands in the place of a file, such as ``a pipe``, or an empty text for a
     regular file.
     """
-    return (
-        "" if stat.S_ISREG(mode) else next((kind for fits, kind in _KINDS if fits(mode)), "no file")
-    )
+    if stat.S_ISREG(mode):
+        return ""
+    return next((kind for fits, kind in _KINDS_OF_FILE if fits(mode)), "no file")
 
 
 def refuse_other_than_file(file: Path | str, parameter: str = "file") -> None:
@@ -238,7 +238,8 @@ VALUES = 1_000_000_000  #: numbers in a cube, a height map or a frame, at most; 
 ROWS = 1_000_000  #: lines of a table, at most
 #: ns after a change of a file in which a second change may not change its times
 _SETTLED = 2_000_000_000
-_CELLS = 8.0  #: bytes in memory for each byte of a table, in texts of cells of several digits
+#: bytes in memory for each byte of a table, in texts of cells of several digits
+_BYTES_OF_CELLS = 8.0
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
 
 Result = TypeVar("Result")
@@ -311,12 +312,10 @@ def not_finite(file: Path, count: int) -> str:
     """Return the message for a file with values that are NaN or infinite, or an empty text for a
     count of 0.
     """
+    if not count:
+        return ""
     fix = "replace these values by finite numbers, such as 0"
-    return (
-        f"{file.name} holds {count} values that are not finite (NaN or infinity): {fix}"
-        if count
-        else ""
-    )
+    return f"{file.name} holds {count} values that are not finite (NaN or infinity): {fix}"
 
 
 def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
@@ -328,7 +327,9 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
     rows than the limit.
     """
     # an empty line in place of a comment keeps the numbers of the lines
-    reader = csv.reader("" if line.startswith("#") else line for line in lines_of(file, _CELLS))
+    reader = csv.reader(
+        "" if line.startswith("#") else line for line in lines_of(file, _BYTES_OF_CELLS)
+    )
     is_first = True
     try:
         for count, row in enumerate(reader):

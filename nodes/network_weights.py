@@ -70,7 +70,7 @@ def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any])
             "weights", f"{weights.name} is not a safetensors file: {error}"
         ) from error
     if stored_options is not None:
-        _same_options(_options(stored_options, weights), options, weights)
+        _refuse_other_options(_stored_options(stored_options, weights), options, weights)
     for name in sorted(shapes | stored):
         if shapes.get(name) != stored.get(name):
             text = f"{weights.name}: {name} is {stored.get(name)}, {called} has {shapes.get(name)}"
@@ -98,15 +98,17 @@ def wrong_weights(weights: Path, name: str, tensor: Tensor) -> str:
     """
     count = int((~torch.isfinite(tensor)).sum())
     fix = "train the network again, or give an earlier file"
+    if not count:
+        return ""
     return (
         f"{weights.name}: {name} holds {count} values that are not finite (NaN or infinity): {fix}"
-        if count
-        else ""
     )
 
 
-def _options(text: str, weights: Path) -> Mapping[str, Any]:
-    """Return the options in the metadata of a file; raise ParameterError for text that is none."""
+def _stored_options(text: str, weights: Path) -> Mapping[str, Any]:
+    """Return the options in the metadata of a file; raise ParameterError for a text that holds no
+    options.
+    """
     try:
         options = json.loads(text)
     except ValueError:
@@ -118,7 +120,9 @@ def _options(text: str, weights: Path) -> Mapping[str, Any]:
     return options
 
 
-def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weights: Path) -> None:
+def _refuse_other_options(
+    trained: Mapping[str, Any], options: Mapping[str, Any], weights: Path
+) -> None:
     """Raise ParameterError if the options in a weights file differ from the options of the network
     to load.
 
@@ -128,13 +132,17 @@ def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weight
     for name in options:
         if name in trained and trained[name] != options[name]:
             text = (
-                f"{weights.name} was trained with {name}: {_word(trained[name])}, and this network"
-                f" has {name}: "
+                f"{weights.name} was trained with {name}: {_as_written(trained[name])}, and this"
+                f" network has {name}: "
             )
-            fix = "name that class" if name == "class" else f"write {name}: {_word(trained[name])}"
-            raise ParameterError("weights", f"{text}{_word(options[name])}; {fix}")
+            fix = (
+                "name that class"
+                if name == "class"
+                else f"write {name}: {_as_written(trained[name])}"
+            )
+            raise ParameterError("weights", f"{text}{_as_written(options[name])}; {fix}")
 
 
-def _word(value: object) -> str:
+def _as_written(value: object) -> str:
     """Return an option as a recipe writes it."""
     return value if isinstance(value, str) else json.dumps(value, sort_keys=True)

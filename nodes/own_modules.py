@@ -130,7 +130,9 @@ def _refuse_taken(name: str, file: Path) -> None:
     """Raise `ImportError` if ``import name`` does not mean ``file``."""
     loaded_module = sys.modules.get(name)
     file_of_name = (
-        getattr(loaded_module, "__file__", None) if loaded_module is not None else _found(name)
+        getattr(loaded_module, "__file__", None)
+        if loaded_module is not None
+        else _file_of_import(name)
     )
     # a module of Python itself has no file
     if loaded_module is not None and file_of_name is None:
@@ -139,7 +141,7 @@ def _refuse_taken(name: str, file: Path) -> None:
         raise ImportError(f"the name {name} is that of {file_of_name}: rename {file}")
 
 
-def _found(name: str) -> str | None:
+def _file_of_import(name: str) -> str | None:
     """Return the file that ``import name`` would load, or None."""
     try:
         spec = importlib.util.find_spec(name)
@@ -182,7 +184,7 @@ __depends__ = ["unaffected:importlib.import_module"]
 #: key of the pydantic context: a function that returns the module of a family, or raises
 #: LookupError
 FAMILY = "family"
-_FORM = "must be the name of a network class in a family of your own, such as mynet.SmallUNet"
+_NAME_FORM = "must be the name of a network class in a family of your own, such as mynet.SmallUNet"
 
 
 @dataclass(frozen=True)
@@ -233,10 +235,10 @@ class Architecture:
         """Raise ValueError for an argument that the class does not take."""
         for name in written:
             if name not in named:
-                raise ValueError(f"{self} takes no argument {name}; {_nearest(str(name), named)}")
+                raise ValueError(f"{self} takes no argument {name}; {_hint(str(name), named)}")
 
 
-def _read(value: Any, info: ValidationInfo) -> Architecture:
+def _network_class_of(value: Any, info: ValidationInfo) -> Architecture:
     """Return the network class that a recipe or a caller names; raise ValueError with the most
     similar name.
     """
@@ -248,7 +250,7 @@ def _read(value: Any, info: ValidationInfo) -> Architecture:
         return Architecture(f"{value.__module__}.{value.__qualname__}", value)
     family, _, name = value.partition(".") if isinstance(value, str) else ("", "", "")
     if not family.isidentifier() or not name.isidentifier():
-        raise ValueError(_FORM)
+        raise ValueError(_NAME_FORM)
     module = _module_of_family(family, info)
     classes = network_classes(module)
     if name in classes:
@@ -259,15 +261,17 @@ def _read(value: Any, info: ValidationInfo) -> Architecture:
             if inspect.isabstract(getattr(module, name))
             else "no class of torch.nn.Module"
         )
-        raise ValueError(f"{value} is {kind}; {_nearest(name, classes)}")
-    raise ValueError(f"{family} has no network class {name}; {_nearest(name, classes)}")
+        raise ValueError(f"{value} is {kind}; {_hint(name, classes)}")
+    raise ValueError(f"{family} has no network class {name}; {_hint(name, classes)}")
 
 
 def _module_of_family(family: str, info: ValidationInfo) -> ModuleType:
     """Return the module of a family; raise ValueError where no recipe says which module it is."""
     module_of: Callable[[str], ModuleType] | None = (info.context or {}).get(FAMILY)
     if module_of is None:
-        raise ValueError(f"{_FORM}; here only a recipe can name a class: give the class itself")
+        raise ValueError(
+            f"{_NAME_FORM}; here only a recipe can name a class: give the class itself"
+        )
     try:
         return module_of(family)
     except LookupError as error:
@@ -279,7 +283,7 @@ def _module_of_family(family: str, info: ValidationInfo) -> ModuleType:
 #: a network class, which a recipe names as ``family.Class``
 NetworkClass = Annotated[
     Architecture,
-    PlainValidator(_read, json_schema_input_type=str),
+    PlainValidator(_network_class_of, json_schema_input_type=str),
     PlainSerializer(str, return_type=str),
 ]
 
@@ -302,7 +306,7 @@ def _is_network_of(module: ModuleType, value: object) -> bool:
     return defined_here and not inspect.isabstract(value)
 
 
-def _nearest(name: str, candidates: Any) -> str:
+def _hint(name: str, candidates: Any) -> str:
     """Return a hint with the most similar of the known names, or with all of them."""
     close = difflib.get_close_matches(name, list(candidates), 1)
     if close:

@@ -34,10 +34,9 @@ class ParameterModel(BaseModel):
         other statements.
         """
         field = cls.model_fields[str(info.field_name)]
-        if not _takes_truth(field.annotation) and _has_truth(value):
-            raise ValueError(
-                f"{str(_first_truth(value)).lower()} is not a value here: write a number or a text"
-            )
+        truth = _first_truth(value)
+        if truth is not None and not _takes_truth(field.annotation):
+            raise ValueError(f"{str(truth).lower()} is not a value here: write a number or a text")
         return value
 
 
@@ -48,10 +47,6 @@ def _takes_truth(hint: Any) -> bool:
     if isinstance(hint, type) and issubclass(hint, BaseModel):
         return True  # a model checks its own values
     return any(_takes_truth(argument) for argument in get_args(hint))
-
-
-def _has_truth(value: Any) -> bool:
-    return _first_truth(value) is not None
 
 
 def _first_truth(value: Any) -> bool | None:

@@ -63,7 +63,7 @@ def refuse_not_finite(why: str, **values: Tensor | float) -> None:
 # everywhere.
 
 
-_GUARD = threading.RLock()
+_TF32_LOCK = threading.RLock()
 
 
 @contextmanager
@@ -77,7 +77,7 @@ def exact_convolutions(picture: Tensor, deterministic: bool = False) -> Iterator
         yield
         return
     with (
-        _GUARD,
+        _TF32_LOCK,
         cudnn.flags(enabled=True, benchmark=False, deterministic=deterministic, allow_tf32=False),
     ):
         yield
@@ -85,7 +85,7 @@ def exact_convolutions(picture: Tensor, deterministic: bool = False) -> Iterator
 
 def tf32_setting() -> bool:
     """Return True if the process allows TF32 outside `exact_convolutions`."""
-    with _GUARD:
+    with _TF32_LOCK:
         return bool(torch.backends.cudnn.allow_tf32)
 
 

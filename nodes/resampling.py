@@ -20,12 +20,13 @@ def mirrored(x: Tensor, down: int, right: int) -> Tensor:
     if down == right == 0:
         return x
     rows, columns = (
-        _indices(n, n + add, x.device) for n, add in zip(x.shape[-2:], (down, right), strict=True)
+        _mirrored_indices(n, n + add, x.device)
+        for n, add in zip(x.shape[-2:], (down, right), strict=True)
     )
     return x[..., rows, :][..., columns]
 
 
-def _indices(size: int, padded: int, device: torch.device) -> Tensor:
+def _mirrored_indices(size: int, padded: int, device: torch.device) -> Tensor:
     """Return the index of the sample that each of ``padded`` places shows, mirrored at both
     ends.
     """
@@ -48,7 +49,7 @@ def enlarge(image: Tensor, height: int, width: int) -> Tensor:
     order.
     """
     rows, columns = (
-        _interpolation(n, new, image)
+        _bicubic_matrix(n, new, image)
         for n, new in zip(image.shape[-2:], (height, width), strict=True)
     )
     return rows @ image @ columns.T
@@ -64,13 +65,14 @@ def resize(image: Tensor, height: int, width: int) -> Tensor:
     """
     image = single(image)
     rows, columns = (
-        _keys(n, new).to(image) for n, new in zip(image.shape[-2:], (height, width), strict=True)
+        _keys_matrix(n, new).to(image)
+        for n, new in zip(image.shape[-2:], (height, width), strict=True)
     )
     with torch.autocast(image.device.type, enabled=False):
         return rows @ image @ columns.T
 
 
-def _interpolation(size: int, new: int, like: Tensor) -> Tensor:
+def _bicubic_matrix(size: int, new: int, like: Tensor) -> Tensor:
     """Return the matrix (new, size) that interpolates ``size`` samples bicubically to ``new``
     samples.
     """
@@ -79,7 +81,7 @@ def _interpolation(size: int, new: int, like: Tensor) -> Tensor:
 
 
 @functools.lru_cache(maxsize=64)
-def _keys(size: int, new: int) -> Tensor:
+def _keys_matrix(size: int, new: int) -> Tensor:
     """Return the matrix (new, size) float64 of antialiased bicubic resampling by Keys' kernel.
 
     The kernel is cut off at the edges of the picture, and the weights of each row sum to 1.

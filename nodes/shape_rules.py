@@ -14,14 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_MOST = 2**60  #: bytes of a tensor; more than any machine has, and torch cannot count much further
+#: bytes of a tensor; more than any machine has, and torch cannot count much further
+_LARGEST_TENSOR = 2**60
 
 
 def blank(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     """Return a tensor without values, on the device ``meta``; raise OverflowError above 2**60
     bytes.
     """
-    if math.prod(shape) * dtype.itemsize > _MOST:
+    if math.prod(shape) * dtype.itemsize > _LARGEST_TENSOR:
         raise OverflowError(
             f"a result of {' x '.join(map(str, shape))} values exceeds 2**60 bytes: choose smaller"
             " sizes"

@@ -23,7 +23,8 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-_SCALE: dict[str, dict[str, float]] = {
+#: by SI unit, the units that a recipe may write and the size of each in it
+SCALES: dict[str, dict[str, float]] = {
     "m": {
         "m": 1.0,
         "cm": 1e-2,
@@ -47,8 +48,8 @@ _SCALE: dict[str, dict[str, float]] = {
     "waves": {"waves": 1.0, "wave": 1.0},
     "DN/e-": {"DN/e-": 1.0, "e-/DN": 1.0},
 }
-KNOWN_UNITS = tuple(_SCALE)  #: SI units of the values of a recipe
-_USUAL = {
+KNOWN_UNITS = tuple(SCALES)  #: SI units of the values of a recipe
+_USUAL_UNITS = {
     "m": "um",
     "s": "ms",
     "rad": "mrad",
@@ -67,13 +68,13 @@ def read_quantity(value: Any, si: str) -> float:
     match = _NUMBER.fullmatch(str(value).strip())
     if isinstance(value, bool) or match is None:
         raise ValueError(
-            f"is not a quantity: write a number and a unit, such as '1 {_USUAL.get(si, si)}'"
+            f"is not a quantity: write a number and a unit, such as '1 {_USUAL_UNITS.get(si, si)}'"
         )
     number, unit = float(match[1]), match[2].strip()
     if not unit:
         raise ValueError(f"needs a unit: write {_with_unit(match[1], si)}")
-    if unit not in _SCALE[si]:
-        raise ValueError(f"has the wrong unit {unit!r}: write one of {', '.join(_SCALE[si])}")
+    if unit not in SCALES[si]:
+        raise ValueError(f"has the wrong unit {unit!r}: write one of {', '.join(SCALES[si])}")
     if not math.isfinite(number):
         raise ValueError("the number must be finite")
     return _in_si(number, si, unit)
@@ -83,13 +84,13 @@ def _with_unit(number: str, si: str) -> str:
     """Return the example that an error message suggests for a number without a unit."""
     if si == "DN/e-":
         return f"{number} e-/DN or {number} DN/e- (EMVA's K is DN/e-)"
-    return f"{number} {_USUAL.get(si, si)} (one of {', '.join(_SCALE[si])})"
+    return f"{number} {_USUAL_UNITS.get(si, si)} (one of {', '.join(SCALES[si])})"
 
 
 def _in_si(number: float, si: str, unit: str) -> float:
     """Return a number of a unit in the SI unit ``si``; a reciprocal unit inverts it."""
     if unit not in _RECIPROCAL:
-        return number * _SCALE[si][unit]
+        return number * SCALES[si][unit]
     if number == 0:
         raise ValueError("the number must be greater than 0")
     return 1.0 / number
@@ -114,12 +115,12 @@ def read_written(text: Any) -> tuple[float, str, bool]:
     """
     match = _NUMBER.fullmatch(str(text).strip())
     unit = match[2].strip() if match else ""
-    si = next((si for si, units in _SCALE.items() if unit in units), "")
+    si = next((si for si, units in SCALES.items() if unit in units), "")
     if isinstance(text, bool) or match is None or (unit and not si):
         raise ValueError(f"{text} is neither a number nor a quantity, such as 0.5 or '1 um'")
     if not math.isfinite(float(match[1])):
         raise ValueError(f"the number {text} is not finite")
-    return float(match[1]) * (_SCALE[si][unit] if si else 1.0), si, unit in _RECIPROCAL
+    return float(match[1]) * (SCALES[si][unit] if si else 1.0), si, unit in _RECIPROCAL
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ def in_words(number: float, si: str) -> str:
     """
     units = {
         unit: scale
-        for unit, scale in _SCALE.get(si, {}).items()
+        for unit, scale in SCALES.get(si, {}).items()
         if unit.isascii() and unit not in (*_RECIPROCAL, "cm")
     }
     if si == "rad" and abs(number) > 0.1:
@@ -155,7 +156,7 @@ def in_words(number: float, si: str) -> str:
     return f"{number / units.get(unit, 1.0):.6g} {unit}".strip()
 
 
-_MOST_DARK = 1e12  #: electrons of one exposure, or of a second
+_LARGEST_DARK_CURRENT = 1e12  #: electrons of one exposure, or of a second
 
 
 class ElectronsPerSecond(NamedTuple):
@@ -167,18 +168,18 @@ class ElectronsPerSecond(NamedTuple):
 def _read_dark_current(value: Any) -> float | ElectronsPerSecond:
     """Return a dark current in e- of one exposure, or in e-/s if the text has such a unit."""
     quantity_text, unit = str(value).strip(), "e-/s"
-    is_by_time = not isinstance(value, bool) and quantity_text.endswith(tuple(_SCALE[unit]))
+    is_by_time = not isinstance(value, bool) and quantity_text.endswith(tuple(SCALES[unit]))
     current = read_quantity(value, unit) if is_by_time else read_quantity(value, "e-")
     if current < 0:
         raise ValueError("the dark current must be 0 or more")
-    if current > _MOST_DARK:
-        raise ValueError(f"the dark current must be at most {_MOST_DARK:.0e} e-")
+    if current > _LARGEST_DARK_CURRENT:
+        raise ValueError(f"the dark current must be at most {_LARGEST_DARK_CURRENT:.0e} e-")
     return ElectronsPerSecond(current) if is_by_time else current
 
 
 #: electrons of one exposure, or electrons per second
 DarkCurrent = Annotated[
-    Annotated[float, Field(ge=0, le=_MOST_DARK)] | ElectronsPerSecond,
+    Annotated[float, Field(ge=0, le=_LARGEST_DARK_CURRENT)] | ElectronsPerSecond,
     BeforeValidator(_read_dark_current, json_schema_input_type=str),
 ]
 
@@ -317,7 +318,7 @@ class IsFile:
     """
 
 
-def _existing(path: Path) -> Path:
+def existing_file(path: Path) -> Path:
     """Return the path of a regular file; raise ValueError for anything else."""
     try:
         is_folder = path.is_dir()
@@ -333,7 +334,7 @@ def _existing(path: Path) -> Path:
     return path
 
 
-DataFile = Annotated[Path, AfterValidator(_existing), IsFile()]  #: path of a file that exists
+DataFile = Annotated[Path, AfterValidator(existing_file), IsFile()]  #: path of a file that exists
 
 
 def files_of(written: Any) -> list[Path]:

@@ -19,9 +19,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from neusee.nodes import own_modules
-from neusee.nodes.restore._networks._convolutional_networks import NAFNet
-from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._wiener_networks import Informed
+from neusee.nodes.restore import Informed, NAFNet, start_network
 from neusee.workflows.frames.sensor_group import FIRST
 from neusee.workflows.recipe import node_families
 from tests.deepinv_without_torchvision import deepinv_or_skip

@@ -528,9 +528,9 @@ MUTANTS = (
         within("nodes/flare", "dirt.py::test_soft_kinds_have_the_asked_strength"),
     ),
     Mutant(
-        "nodes/calibrate/_emva_sheet.py",
-        "_QUANTIZATION = 1.0 / 12.0",
-        "_QUANTIZATION = 0.0",
+        "nodes/calibrate/_emva_quantities.py",
+        "QUANTIZATION = 1.0 / 12.0",
+        "QUANTIZATION = 0.0",
         within("nodes/calibrate", "emva_fit.py::test_exact_levels_give_the_exact_camera"),
     ),
     Mutant(
@@ -553,7 +553,7 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/calibrate/_frame_pairs.py",
-        "odds = _SOUND * min(1.0, pairs / CLEAN_PAIRS) ** 2",
+        "odds = _ODDS_OF_NO_FAULT * min(1.0, pairs / CLEAN_PAIRS) ** 2",
         "odds = _SOUND",
         within(
             "nodes/calibrate/validity",
@@ -1463,12 +1463,15 @@ MUTANTS = (
             "ring_mean[upper_index - 1] * (1 - fraction) + ring_mean[upper_index] * fraction\n    )",
             "ring_mean[upper_index] * (1 - fraction) + ring_mean[upper_index - 1] * fraction)",
         ),
-        ("[remaining * _beyond(light, squared_radius) for", "[_beyond(light, squared_radius) for"),
         (
-            "return torch.where(squared_radius <= NEAR**2, near_light, far_light), _total(lobes)",
-            "return torch.where(squared_radius <= NEAR**2, near_light, far_light), lobes[0][2]",
+            "[light.arriving * _light_up_to_end(light.lobe, squared_radius) for",
+            "[_light_up_to_end(light.lobe, squared_radius) for",
         ),
-        ("squared_radius <= NEAR**2, near_light", "squared_radius <= NEAR, near_light"),
+        ("return veil, _total_scatter(lobes)", "return veil, lobes[0].share"),
+        (
+            "squared_radius <= NEAR_PIXELS**2, near_light",
+            "squared_radius <= NEAR_PIXELS, near_light",
+        ),
     ),
     *faults(
         "nodes/flare/_stray_light.py",

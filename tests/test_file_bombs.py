@@ -115,7 +115,7 @@ import h5py
 from neusee.nodes import calibrate, scene
 from neusee.nodes.file_headers import hdf5_needs
 from neusee.nodes.calibrate import frame_header
-from neusee.nodes.calibrate._measurement_files import _parsed as descriptor
+from neusee.nodes.calibrate._measurement_files import parsed_descriptor as descriptor
 from neusee.nodes.doe._height_map_files import map_header
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.network_weights import fits
@@ -127,7 +127,7 @@ from neusee.nodes.scene._photograph import list_photographs
 from neusee.nodes.sensor._frame_file import read_frame
 from neusee.nodes.spectra._plausible_spectra import _read as reflectances
 from neusee.nodes.spectra._lift import _read as lift_weights
-from neusee.nodes.units import _existing as existing
+from neusee.nodes.units import existing_file as existing
 from neusee.workflows import load
 from neusee.workflows.calibration.emcee_sampler import _read as chain
 from neusee.workflows.comparison.run_record import _json as record

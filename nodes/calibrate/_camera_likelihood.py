@@ -10,7 +10,9 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes.calibrate._emva_quantities import LEAST_DARK_VARIANCE
 from neusee.nodes.calibrate._emva_sheet import Share, without_histograms
+from neusee.nodes.calibrate._light_levels import COARSE_DEVIATION
 from neusee.nodes.calibrate._sensor_likelihood import ROUNDED, Likelihood, without_details
 from neusee.nodes.sensor._digitization import Rounding
 from neusee.nodes.units import Efficiency, Electrons, Exposure, Gain, Real
@@ -18,12 +20,9 @@ from neusee.nodes.values import Levels
 
 Scattered = Annotated[float, Field(ge=0, le=100)]  #: a standard deviation; 0 for none
 _ITERATIONS = 40  #: of the inverse of a response that bends by less than a half
-_QUIET = 0.24  #: DN2, least variance that EMVA 1288 accepts for a signal
-#: DN, standard deviation below which levels keep a histogram although no number is cut off
-_COARSE = 0.8
 
 
-class _Camera(NamedTuple):
+class CameraValues(NamedTuple):
     """The parameters of a camera; each tensor is (..., 1) float64."""
 
     gain: Tensor  #: K at no signal, DN/e-
@@ -38,7 +37,7 @@ class _Camera(NamedTuple):
     twist: Tensor
 
 
-#: the parameter of `camera` for each field of `_Camera`
+#: the parameter of `camera` for each field of `CameraValues`
 CAMERA_PARAMETERS = (
     "gain",
     "quantum_efficiency",
@@ -122,10 +121,10 @@ def camera(
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2 and 6.6 (photon transfer); Janesick,
             Photon Transfer.
     """
-    fitted_index, largest_signal, shortest_dark = _used(levels, share)
+    fitted_index, largest_signal, shortest_dark = levels_to_fit(levels, share)
     dark = (dark_signal, temporal_dark_noise, dark_current)
     parameters = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
-    sensor = _Camera(*(torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters))
+    sensor = CameraValues(*(torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters))
     sensor = sensor._replace(current=sensor.current / dark_exposure)
     # index 1 of `ROUNDED` is the variance that rounding adds, DN2
     residuals = _residuals(
@@ -166,7 +165,10 @@ def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
     if not len(result.degrees_of_freedom):
         return []
     deviance, fitted = float(result.deviance.sum()), result.degrees_of_freedom > 0
-    count, coarse_count = int(fitted.sum()), int((levels.variance[fitted] < _QUIET).sum())
+    count, coarse_count = (
+        int(fitted.sum()),
+        int((levels.variance[fitted] < LEAST_DARK_VARIANCE).sum()),
+    )
     checks = [
         Check(
             f"deviance {deviance:.4g} for {2 * count} means and variances, from {count} of"
@@ -183,8 +185,8 @@ def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
         checks.append(Check(f"{text} {float(shortest_fitted):.4g} s", False))
     if coarse_count:
         text = (
-            f"{coarse_count} levels with a variance below {_QUIET} DN2, where rounding is not"
-            " independent noise"
+            f"{coarse_count} levels with a variance below {LEAST_DARK_VARIANCE} DN2, where rounding"
+            " is not independent noise"
         )
         checks.append(Check(text, False))
     return checks
@@ -203,12 +205,12 @@ def expected_levels(levels: Levels, params: Mapping[str, Any]) -> Levels:
     Raises: ValueError as `camera`.
     Source: the model of `camera`.
     """
-    fitted_index, largest_signal, shortest_dark = _used(levels, params["share"])
+    fitted_index, largest_signal, shortest_dark = levels_to_fit(levels, params["share"])
     fitted_levels = without_histograms(levels, fitted_index)
     parameters = {
         name: torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS
     }
-    sensor = _Camera(*parameters.values())
+    sensor = CameraValues(*parameters.values())
     current = sensor.current / params["dark_exposure"]
     electrons = sensor.efficiency * fitted_levels.photons + current * (
         fitted_levels.exposure - shortest_dark
@@ -222,7 +224,7 @@ def expected_levels(levels: Levels, params: Mapping[str, Any]) -> Levels:
             * electrons
             * (1.0 + sensor.bend * share_of_largest + sensor.twist * share_of_largest.square())
         )
-    slope = _signal(signal, largest_signal, sensor).slope
+    slope = camera_signal(signal, largest_signal, sensor).slope
     variance = slope.square() * (sensor.noise.square() + electrons) + ROUNDED[params["rounding"]][1]
     all_levels = without_histograms(levels, torch.arange(len(levels.mean)))
     return all_levels._replace(
@@ -232,7 +234,7 @@ def expected_levels(levels: Levels, params: Mapping[str, Any]) -> Levels:
 
 
 def _residuals(
-    levels: Levels, top: float, camera: _Camera, first: float, quantization: float
+    levels: Levels, top: float, camera: CameraValues, first: float, quantization: float
 ) -> _Residuals:
     """Return the residuals of the measured log variances and means in standard deviations, with
     the logarithms of these standard deviations.
@@ -240,7 +242,7 @@ def _residuals(
     ``top`` is the largest signal used and ``quantization`` the variance of rounding (DN, DN2),
     ``first`` the shortest dark exposure in s.
     """
-    signal = _signal(levels.mean - camera.signal, top, camera)
+    signal = camera_signal(levels.mean - camera.signal, top, camera)
     variance = signal.slope.square() * (camera.noise.square() + signal.electrons) + quantization
     possible = signal.possible & (variance > quantization)
     variance = variance.where(possible, 1.0)
@@ -271,7 +273,7 @@ def _residuals(
     return _Residuals(columns[:2], columns[2:4], *columns[4:])
 
 
-def _signal(signal: Tensor, top: float, camera: _Camera) -> _Signal:
+def camera_signal(signal: Tensor, top: float, camera: CameraValues) -> _Signal:
     """Convert measured signals, DN above the dark level, to electrons by the inverse of the
     camera's response.
     """
@@ -288,11 +290,11 @@ def _signal(signal: Tensor, top: float, camera: _Camera) -> _Signal:
     )
 
 
-def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
+def levels_to_fit(levels: Levels, share: float) -> tuple[Tensor, float, float]:
     """Return the indices of the light levels to fit, their largest signal in DN, and the
     shortest dark exposure.
     """
-    is_dark, unclipped = levels.photons == 0, ~_piled(levels)
+    is_dark, unclipped = levels.photons == 0, ~_piles_up(levels)
     if not bool((is_dark & unclipped).any()):
         raise ValueError(
             "no dark level is free of clipped numbers, so the offset of the camera is unknown: "
@@ -327,7 +329,7 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
     return fitted.nonzero().squeeze(1), largest_signal, float(levels.exposure[shortest])
 
 
-def _piled(levels: Levels) -> Tensor:
+def _piles_up(levels: Levels) -> Tensor:
     """Return a mask of the levels whose numbers pile up at an end of the range.
 
     Such levels have a histogram; one that has it for coarse numbers alone, with little variance and
@@ -336,4 +338,4 @@ def _piled(levels: Levels) -> Tensor:
     has_histogram, has_zero = (torch.zeros_like(levels.mean, dtype=torch.bool) for _ in range(2))
     has_histogram[levels.cell_level] = True
     has_zero[levels.cell_level[levels.cell_value == 0]] = True
-    return has_histogram & (has_zero | (levels.variance >= _COARSE**2))
+    return has_histogram & (has_zero | (levels.variance >= COARSE_DEVIATION**2))

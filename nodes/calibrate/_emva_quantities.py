@@ -17,7 +17,7 @@ from neusee.nodes.values import Levels
 
 
 Bound = Literal["", "<", ">"]
-_WHOLE = (1e3, 1e7)  #: values that are shown as whole numbers
+_WHOLE_RANGE = (1e3, 1e7)  #: values that are shown as whole numbers
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,9 @@ class Quantity:
         if self.value is None:
             return "not measured"
         number = (
-            f"{self.value:.0f}" if _WHOLE[0] <= abs(self.value) < _WHOLE[1] else f"{self.value:.4g}"
+            f"{self.value:.0f}"
+            if _WHOLE_RANGE[0] <= abs(self.value) < _WHOLE_RANGE[1]
+            else f"{self.value:.4g}"
         )
         return f"{self.bound} {number} {self.unit}".strip()
 
@@ -69,10 +71,11 @@ class Quantity:
 
 
 FloatArray = NDArray[np.float64]
-SENSITIVITY = 0.7  #: share of saturation up to which gain and responsivity are fitted
-LINEARITY = (0.05, 0.95)  #: shares of saturation between which the response is compared with a line
+FITTED_SHARE = 0.7  #: share of saturation up to which gain and responsivity are fitted
+#: shares of saturation between which the response is compared with a line
+LINEAR_RANGE = (0.05, 0.95)
 #: a maximum of the variance below this share of the greatest one is noise of saturated levels
-_PLATEAU = 0.5
+_PEAK_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -107,12 +110,12 @@ class PhotonTransfer:
     @property
     def fitted(self) -> NDArray[np.bool_]:
         """True for the lit levels from 0 to 70 % of saturation."""
-        return np.asarray(self.signal <= SENSITIVITY * self.signal[self.saturation])
+        return np.asarray(self.signal <= FITTED_SHARE * self.signal[self.saturation])
 
     @property
     def linear(self) -> NDArray[np.bool_]:
         """True for the lit levels from 5 to 95 % of saturation."""
-        low, high = (share * self.signal[self.saturation] for share in LINEARITY)
+        low, high = (share * self.signal[self.saturation] for share in LINEAR_RANGE)
         return np.asarray((self.signal >= low) & (self.signal <= high))
 
 
@@ -131,9 +134,7 @@ def photon_transfer(levels: Levels) -> PhotonTransfer:
     )
     dark = np.flatnonzero(photons == 0)
     dark = dark[np.argsort(exposure[dark], kind="stable")]
-    lit = np.flatnonzero(photons > 0)
-    # by light, then by exposure
-    lit = lit[np.lexsort((exposure[lit], photons[lit]))]
+    lit = lit_order(photons, exposure)
     if not len(dark):
         raise ValueError("a sheet of EMVA 1288 needs dark frames: give a level without light")
     if len(lit) < 2:
@@ -172,7 +173,14 @@ def saturation_point(variance: FloatArray) -> int:
             peak = i
         elif i == 0 or variance[i - 1] < variance[peak]:
             break
-    return peak if variance[peak] >= _PLATEAU * variance.max() else int(variance.argmax())
+    return peak if variance[peak] >= _PEAK_SHARE * variance.max() else int(variance.argmax())
+
+
+def lit_order(photons: FloatArray, exposure: FloatArray) -> NDArray[np.int64]:
+    """Return the indices of the lit levels, by light and then by exposure."""
+    lit = np.flatnonzero(photons > 0)
+    order: NDArray[np.int64] = lit[np.lexsort((exposure[lit], photons[lit]))]
+    return order
 
 
 def slope_through_origin(x: FloatArray, y: FloatArray) -> float:
@@ -210,10 +218,11 @@ def relative_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 QUANTIZATION = 1.0 / 12.0  #: sigma_q^2, DN2
 #: DN2, least temporal dark variance that rounding leaves measurable; its root is 0.49 DN
-COARSE = 0.24
-_LINE = 2  #: exposures that a slope needs more than
-_SURE = 2.0  #: standard errors of a slope below which no slope is told
-_NO_GAIN = "K is not told, so that no value in electrons is"
+LEAST_DARK_VARIANCE = 0.24
+_LINE_EXPOSURES = 2  #: exposures that a slope needs more than
+_SLOPE_SIGMA = 2.0  #: standard errors of a slope below which no slope is told
+#: why a quantity in electrons has no value
+NO_GAIN = "K is not told, so that no value in electrons is"
 _NO_LIGHT = "the photons of the levels are not told"
 
 
@@ -255,15 +264,15 @@ def sensitivity(transfer: PhotonTransfer, photons_told: bool = True) -> list[Qua
     response = _responsivity(transfer, k, photons_told)
     eta = _efficiency(response, k, photons_told)
     noise, coarse = dark_noise(transfer)
-    thresholds = _least(transfer, k, eta, noise, coarse)
+    thresholds = _thresholds(transfer, k, eta, noise, coarse)
     return [
         eta,
         k,
         _inverse(k),
         response,
-        *_dark(transfer, k, noise, coarse),
+        *_dark_noise_and_signal(transfer, k, noise, coarse),
         *thresholds,
-        *_greatest(transfer, k, eta, thresholds),
+        *_saturation_and_range(transfer, k, eta, thresholds),
     ]
 
 
@@ -271,12 +280,11 @@ def dark_noise(transfer: PhotonTransfer) -> tuple[float, bool]:
     """Return sigma_y.dark in DN at exposure 0, and True if rounding hides it, so that 0.49 DN is
     only a limit.
     """
-    if len(np.unique(transfer.dark_exposure)) > _LINE:
-        # value at the exposure 0
-        variance = line(transfer.dark_exposure, transfer.dark_variance)[1]
+    if len(np.unique(transfer.dark_exposure)) > _LINE_EXPOSURES:
+        _, variance = line(transfer.dark_exposure, transfer.dark_variance)
     else:
         variance = float(transfer.dark_variance[0])
-    return math.sqrt(max(variance, COARSE)), variance < COARSE
+    return math.sqrt(max(variance, LEAST_DARK_VARIANCE)), variance < LEAST_DARK_VARIANCE
 
 
 def linearity(transfer: PhotonTransfer) -> Linearity | None:
@@ -319,18 +327,24 @@ def dark_current(transfer: PhotonTransfer) -> list[Quantity]:
     of_variance = Quantity("mu_I_var", "μ_I.var", "dark current, from the variances", "e-/s")
     gain_value, exposures = gain(transfer).value, transfer.dark_exposure
     count = len(np.unique(exposures))
-    reason = "" if gain_value else _NO_GAIN
-    if count <= _LINE:
+    reason = "" if gain_value else NO_GAIN
+    if count <= _LINE_EXPOSURES:
         reason = f"dark frames at {count} exposure{'s' * (count > 1)}: three or more are needed"
     if reason or not gain_value:
         return [of_mean.untold(reason), of_variance.untold(reason)]
-    from_means = _slope(of_mean, exposures, transfer.dark_mean, gain_value)
-    if dark_noise(transfer)[1]:
+    from_means = _slope_over_exposure(of_mean, exposures, transfer.dark_mean, gain_value)
+    _, is_coarse = dark_noise(transfer)
+    if is_coarse:
         return [from_means, of_variance.untold("rounding hides the variance of the dark")]
-    return [from_means, _slope(of_variance, exposures, transfer.dark_variance, gain_value**2)]
+    return [
+        from_means,
+        _slope_over_exposure(of_variance, exposures, transfer.dark_variance, gain_value**2),
+    ]
 
 
-def _slope(blank: Quantity, times: FloatArray, values: FloatArray, scale: float) -> Quantity:
+def _slope_over_exposure(
+    blank: Quantity, times: FloatArray, values: FloatArray, scale: float
+) -> Quantity:
     """Return the slope of values over exposures in units of ``scale``, if it is at least twice
     its standard error.
     """
@@ -339,7 +353,7 @@ def _slope(blank: Quantity, times: FloatArray, values: FloatArray, scale: float)
     slope_error = math.sqrt(
         float(residuals @ residuals) / (len(times) - 2) / float(((times - times.mean()) ** 2).sum())
     )
-    if slope > 0 and slope >= _SURE * slope_error:
+    if slope > 0 and slope >= _SLOPE_SIGMA * slope_error:
         return blank.told(slope / scale)
     return blank.untold(
         f"no rise with the exposure: {slope / scale:.3g} {blank.unit}, with a standard error of"
@@ -351,16 +365,20 @@ def _responsivity(transfer: PhotonTransfer, k: Quantity, photons_told: bool) -> 
     """Return the responsivity in DN per photon from the levels up to 70 % of saturation."""
     blank = Quantity("R", "R", "responsivity", "DN/photon")
     fitted = transfer.fitted
-    if not photons_told or fitted.sum() < 2:
-        return blank.untold(k.reason if photons_told else _NO_LIGHT)
+    if not photons_told:
+        return blank.untold(_NO_LIGHT)
+    if fitted.sum() < 2:
+        return blank.untold(k.reason)
     return blank.told(slope_through_origin(transfer.photons[fitted], transfer.signal[fitted]))
 
 
 def _efficiency(response: Quantity, k: Quantity, photons_told: bool) -> Quantity:
     """Return the quantum efficiency in %, responsivity over gain."""
     blank = Quantity("eta", "η", "quantum efficiency", "%")
+    if not photons_told:
+        return blank.untold(_NO_LIGHT)
     if response.value is None or k.value is None:
-        return blank.untold(_NO_GAIN if photons_told else _NO_LIGHT)
+        return blank.untold(NO_GAIN)
     return blank.told(100 * response.value / k.value)
 
 
@@ -370,11 +388,13 @@ def _inverse(k: Quantity) -> Quantity:
     return blank.untold(k.reason) if k.value is None else blank.told(1 / k.value)
 
 
-def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> list[Quantity]:
+def _dark_noise_and_signal(
+    transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool
+) -> list[Quantity]:
     """Return temporal dark noise and dark signal in DN and in electrons."""
     rounding_reason = (
-        f"the dark noise is below the {math.sqrt(COARSE):.2f} DN that the standard sets, because"
-        " rounding hides it"
+        f"the dark noise is below the {math.sqrt(LEAST_DARK_VARIANCE):.2f} DN that the standard"
+        " sets, because rounding hides it"
     )
     bound: Bound = "<" if coarse else ""
     in_numbers = Quantity("sigma_y_dark", "σ_y.dark", "temporal dark noise", "DN").told(
@@ -384,7 +404,7 @@ def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> 
     signal = Quantity("mu_d", "μ_d", "dark signal, with the offset of the converter", "e-")
     mean = Quantity("mu_y_dark", "μ_y.dark", "dark signal", "DN").told(float(transfer.dark_mean[0]))
     if k.value is None:
-        return [in_numbers, blank.untold(_NO_GAIN), mean, signal.untold(_NO_GAIN)]
+        return [in_numbers, blank.untold(NO_GAIN), mean, signal.untold(NO_GAIN)]
     electrons = math.sqrt(noise**2 - QUANTIZATION) / k.value
     return [
         in_numbers,
@@ -394,7 +414,7 @@ def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> 
     ]
 
 
-def _least(
+def _thresholds(
     transfer: PhotonTransfer, k: Quantity, eta: Quantity, noise: float, coarse: bool
 ) -> list[Quantity]:
     """Return the absolute sensitivity threshold, the light whose signal equals its noise, in
@@ -406,7 +426,7 @@ def _least(
     photons = Quantity("mu_p_min", "μ_p.min", "absolute sensitivity threshold", "photons")
     electrons = Quantity("mu_e_min", "μ_e.min", "absolute sensitivity threshold", "e-")
     if k.value is None:
-        return [photons.untold(_NO_GAIN), electrons.untold(_NO_GAIN)]
+        return [photons.untold(NO_GAIN), electrons.untold(NO_GAIN)]
     # EMVA 1288: sigma_y.dark / K + 1/2
     threshold_electrons, bound_sign = noise / k.value + 0.5, "<" if coarse else ""
     reason = "a limit, as the dark noise is" if coarse else ""
@@ -417,7 +437,7 @@ def _least(
     return [photons.told(100 * threshold_electrons / eta.value, bound, reason), of_electrons]
 
 
-def _greatest(
+def _saturation_and_range(
     transfer: PhotonTransfer, k: Quantity, eta: Quantity, thresholds: list[Quantity]
 ) -> list[Quantity]:
     """Return saturation in photons and in electrons, the greatest SNR, and the dynamic range.
@@ -437,7 +457,7 @@ def _greatest(
     if eta.value is not None:
         photons = in_photons.told(float(transfer.photons[saturation]), bound, reason)
     if k.value is None:
-        electrons = in_electrons.untold(_NO_GAIN)
+        electrons = in_electrons.untold(NO_GAIN)
     elif eta.value is not None:
         # EMVA 1288: mu_e.sat = eta mu_p.sat
         electrons = in_electrons.told(

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._emva_quantities import (
-    COARSE,
+    LEAST_DARK_VARIANCE,
+    QUANTIZATION,
     Bound,
     FloatArray,
     Linearity,
@@ -37,7 +38,6 @@ from neusee.nodes.values import Levels
 
 
 Share = Annotated[float, Field(gt=0, le=1)]
-_QUANTIZATION = 1.0 / 12.0  #: DN2, of rounding to the nearest number
 
 
 class LeastSquares(NamedTuple):
@@ -103,14 +103,15 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
         for x in (lit_levels, darks_of_lit)
     )
     gain_error = (
-        _error(mean[fitted_index], lit_variance, dark_variance, nearest_dark[fitted_index]) / gain
+        _slope_error(mean[fitted_index], lit_variance, dark_variance, nearest_dark[fitted_index])
+        / gain
     )
     # variance of a mean over all pixels
     lit_variance, dark_variance = (
         (x.variance / x.pixels)[fitted_index] for x in (lit_levels, darks_of_lit)
     )
     responsivity_error = (
-        _error(
+        _slope_error(
             lit_levels.photons[fitted_index],
             lit_variance,
             dark_variance,
@@ -177,7 +178,7 @@ def _slope(x: Tensor, y: Tensor) -> Tensor:
     return (x @ y) / (x @ x)
 
 
-def _error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
+def _slope_error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
     """Return the standard error of the slope (x y) / (x x) of a line through the origin.
 
     ``own`` is the variance of each lit value, ``dark`` that of the dark value subtracted from it.
@@ -201,7 +202,7 @@ def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
     variance, freedom = (
         x[_shortest_dark(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom)
     )
-    noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
+    noise = (variance - QUANTIZATION).clamp_min(0.0).sqrt()
     # d(sqrt(v)) = dv / (2 sqrt(v)), with the relative error sqrt(2 / nu) of v
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
 
@@ -223,9 +224,9 @@ def _dark_current(levels: Levels, dark: Tensor) -> Tensor:
 # to the light.
 
 
-#: least number of levels of a local fit, and the share of all levels that a fit takes
-_WINDOW, _SHARE = 5, 0.25
-_KNOWN = 0.03  #: relative standard error of a slope above which nothing follows from it
+_LOCAL_LEVELS = 5  #: least number of levels of a local fit
+_LOCAL_SHARE = 0.25  #: share of all levels that a local fit takes
+_KNOWN_SLOPE_ERROR = 0.03  #: relative standard error of a slope above which nothing follows from it
 
 
 class GeneralModel(NamedTuple):
@@ -255,7 +256,7 @@ def general_model(transfer: PhotonTransfer) -> GeneralModel | None:
     signal = np.concatenate([[0.0], transfer.signal[up_to_saturation]])
     if len(np.unique(light)) < 4 or len(np.unique(light)) < len(light):
         return None
-    slope, error = _slopes(light, signal)
+    slope, error = _local_slopes(light, signal)
     # slope times light is the signal
     ratio = (
         light[1:]
@@ -294,12 +295,12 @@ def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> l
         float(model.error[0]),
         float(model.error[1 + int(model.ratio.argmax())]),
     )
-    bound, reason = _end_of_light(transfer)
-    told_snr = greatest_snr.untold(_SCATTERS.format(error_at_greatest))
-    if error_at_greatest <= _KNOWN:
+    bound, reason = _bound_of_brightest(transfer)
+    told_snr = greatest_snr.untold(_SCATTER_REASON.format(error_at_greatest))
+    if error_at_greatest <= _KNOWN_SLOPE_ERROR:
         told_snr = greatest_snr.told(20 * math.log10(float(model.ratio.max())), bound, reason)
-    if error_at_dark > _KNOWN:
-        lacking_reason = _SCATTERS.format(error_at_dark)
+    if error_at_dark > _KNOWN_SLOPE_ERROR:
+        lacking_reason = _SCATTER_REASON.format(error_at_dark)
         return [
             threshold_blank.untold(lacking_reason),
             told_snr,
@@ -307,7 +308,7 @@ def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> l
         ]
     threshold = _threshold(transfer, model)
     decibels = 20 * math.log10(float(model.photons[-1]) / threshold)
-    if float(transfer.dark_variance[0]) < COARSE:
+    if float(transfer.dark_variance[0]) < LEAST_DARK_VARIANCE:
         rounding_reason = "rounding hides the dark noise"
         told_threshold, told_range = (
             threshold_blank.told(threshold, "<", rounding_reason),
@@ -326,23 +327,25 @@ def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> l
 
 
 #: why a slope of the general model is not told
-_SCATTERS = "the light scatters from level to level, so that the slope is known to {:.0%} only"
+_SCATTER_REASON = (
+    "the light scatters from level to level, so that the slope is known to {:.0%} only"
+)
 
 
-def _end_of_light(transfer: PhotonTransfer) -> tuple[Bound, str]:
+def _bound_of_brightest(transfer: PhotonTransfer) -> tuple[Bound, str]:
     """Return the bound of what follows from the brightest level, and the reason of the bound."""
     return ("", "") if transfer.saturated else (">", "saturation was not reached")
 
 
-def _slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _local_slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the slope at each point of a parabola through the nearest points, and the relative
     standard error of each slope.
 
     The scatter of the points is a share of their values, the same share everywhere; it is taken
     from the deviations of the points from their parabolas.
     """
-    # an odd number of points: at least `_WINDOW`, and about `_SHARE` of all
-    window_length = min(len(x), max(_WINDOW, 2 * round(_SHARE * len(x) / 2) + 1))
+    # an odd number of points: at least `_LOCAL_LEVELS`, and about `_LOCAL_SHARE` of all
+    window_length = min(len(x), max(_LOCAL_LEVELS, 2 * round(_LOCAL_SHARE * len(x) / 2) + 1))
     slopes, error_weights, relative_residuals = [], [], []
     for index in range(len(x)):
         first = min(max(0, index - window_length // 2), len(x) - window_length)
@@ -369,7 +372,7 @@ def _slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _threshold(transfer: PhotonTransfer, model: GeneralModel) -> float:
     """Return the light whose signal equals its noise in time, in photons."""
-    dark_variance = max(float(transfer.variance_dark[0]), COARSE)
+    dark_variance = max(float(transfer.variance_dark[0]), LEAST_DARK_VARIANCE)
     variance_per_photon = max(0.0, float(transfer.excess[0]) / float(model.photons[0]))
     slope = float(model.slope[0])
     # (slope x)^2 = dark variance + variance per photon * x

@@ -24,17 +24,19 @@ from neusee.nodes.scene._exr import exr_header
 
 
 #: pixel modes that Pillow reads without conversion
-_GREY = ("L", "I", "I;16", "I;16B", "I;16L", "F")
+_GREY_MODES = ("L", "I", "I;16", "I;16B", "I;16L", "F")
 FITS = (".fits", ".fit", ".fts")  #: suffixes
-_TOP = 1 << 24  #: DN; above any converter
-_WHOLE = 11  #: bytes of a number while it is compared with a whole number: 8, and 3 of flags
+#: DN; above any converter, and the limit of exact whole numbers in float32
+LARGEST_NUMBER = 1 << 24
+#: bytes of a number while it is compared with a whole number: 8, and 3 of flags
+_BYTES_COMPARED = 11
 
 
-def read(file: Path) -> NDArray[np.int32]:
+def read_frames(file: Path) -> NDArray[np.int32]:
     """Read the frames of a file, (frame, y, x) int32; raise ValueError for a file without raw
     frames.
     """
-    reader = readable(file)
+    reader = reader_of(file)
     refuse_other_than_file(file)
     stack = reader(file)
     if stack.ndim not in (2, 3) or not stack.size:
@@ -43,16 +45,16 @@ def read(file: Path) -> NDArray[np.int32]:
         )
     with np.errstate(invalid="ignore"):
         numbers = stack.astype(np.int64)
-    not_digital = (numbers != stack) | (numbers < 0) | (numbers >= _TOP)
+    not_digital = (numbers != stack) | (numbers < 0) | (numbers >= LARGEST_NUMBER)
     if not_digital.any():
         raise ValueError(
             f"{file} holds {stack[not_digital][0]}, not a digital number: give raw frames, whole"
-            f" numbers from 0 to {_TOP - 1}"
+            f" numbers from 0 to {LARGEST_NUMBER - 1}"
         )
     return numbers.astype(np.int32).reshape(-1, *stack.shape[-2:])
 
 
-def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
+def reader_of(file: Path) -> Callable[[Path], NDArray[Any]]:
     """Return the function that reads files of this suffix; raise ValueError for an unknown
     suffix.
     """
@@ -67,7 +69,7 @@ def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
     return _READERS[suffix]
 
 
-def _picture(file: Path) -> NDArray[Any]:
+def _read_picture(file: Path) -> NDArray[Any]:
     """Read the pages of a PNG or TIFF file as frames (frame, y, x); raise ValueError for colour,
     other depths and pages of different sizes.
     """
@@ -75,8 +77,8 @@ def _picture(file: Path) -> NDArray[Any]:
 
     try:
         with Image.open(file) as image:
-            pages_need(file, image, 2.0, _WHOLE)
-            pages = [_page(file, page) for page in ImageSequence.Iterator(image)]
+            pages_need(file, image, 2.0, _BYTES_COMPARED)
+            pages = [_read_page(file, page) for page in ImageSequence.Iterator(image)]
     except UnidentifiedImageError:
         raise ValueError(
             f"{file} is not a readable picture: save the frame as 16-bit grey PNG"
@@ -86,7 +88,7 @@ def _picture(file: Path) -> NDArray[Any]:
     return np.stack(pages)
 
 
-def _page(file: Path, page: Any) -> NDArray[Any]:
+def _read_page(file: Path, page: Any) -> NDArray[Any]:
     refuse_page(file, page)
     return np.array(page)
 
@@ -95,7 +97,7 @@ def refuse_page(file: Path, page: Any) -> None:
     """Raise ValueError for a page of a picture file that does not hold raw grey numbers."""
     depth = head_of(file, 25)[24:] if page.format == "PNG" else b"\x08"
     if (
-        page.mode not in _GREY
+        page.mode not in _GREY_MODES
         or page.format not in ("PNG", "TIFF")
         or depth not in (b"\x08", b"\x10")
     ):
@@ -105,11 +107,11 @@ def refuse_page(file: Path, page: Any) -> None:
         )
 
 
-def _exr(file: Path) -> NDArray[Any]:
+def _read_exr(file: Path) -> NDArray[Any]:
     """Read the one channel of an OpenEXR file (y, x); raise ValueError for several channels."""
     import OpenEXR
 
-    exr_needs(file, 4 + _WHOLE)
+    exr_needs(file, 4 + _BYTES_COMPARED)
     with OpenEXR.File(str(file), separate_channels=True) as opened_file:
         channels = opened_file.channels()
         if len(channels) != 1:
@@ -119,7 +121,7 @@ def _exr(file: Path) -> NDArray[Any]:
         return np.array(next(iter(channels.values())).pixels)
 
 
-def _fits(file: Path) -> NDArray[Any]:
+def _read_fits(file: Path) -> NDArray[Any]:
     """Read the first image of a FITS file, with the zero point and scale of the header applied."""
     from astropy.io import fits
 
@@ -129,8 +131,8 @@ def _fits(file: Path) -> NDArray[Any]:
         return np.array(_first_image(file, opened_file).data)
 
 
-def _npy(file: Path) -> NDArray[Any]:
-    npy_needs(file, 1.0, _WHOLE)
+def _read_npy(file: Path) -> NDArray[Any]:
+    npy_needs(file, 1.0, _BYTES_COMPARED)
     values: NDArray[Any] = np.load(file, allow_pickle=False)
     return values
 
@@ -165,7 +167,7 @@ def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
         bits, zero = int(header["BITPIX"]), float(header.get("BZERO", 0))
         lowest = zero - (2 ** (bits - 1) if bits > 8 else 0)  # eight bits have no sign
         is_scaled = float(header.get("BSCALE", 1)) != 1 or zero % 1 != 0 or "BLANK" in header
-        may_hold_others = is_scaled or bits < 0 or lowest < 0 or lowest + 2**bits > _TOP
+        may_hold_others = is_scaled or bits < 0 or lowest < 0 or lowest + 2**bits > LARGEST_NUMBER
         # its blocks of 2880 bytes, of which the last one may be short
         packed = isinstance(image, fits.CompImageHDU)
         image_bytes = (
@@ -183,12 +185,12 @@ def _first_image(file: Path, opened: Any) -> Any:
 
 
 _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
-    ".png": _picture,
-    ".tif": _picture,
-    ".tiff": _picture,
-    ".exr": _exr,
-    ".npy": _npy,
-    **dict.fromkeys(FITS, _fits),
+    ".png": _read_picture,
+    ".tif": _read_picture,
+    ".tiff": _read_picture,
+    ".exr": _read_exr,
+    ".npy": _read_npy,
+    **dict.fromkeys(FITS, _read_fits),
 }
 
 
@@ -229,7 +231,7 @@ def _check_picture(file: Path) -> str:
             refuse_page(file, image)
             pages_need(file, image, 2.0)
             strips = zip(
-                *(_numbers(image, tag) for tag in (_STRIP_STARTS, _STRIP_LENGTHS)), strict=False
+                *(_tag_numbers(image, tag) for tag in (_STRIP_STARTS, _STRIP_LENGTHS)), strict=False
             )
             # the checksums of a PNG; for a TIFF, the end of the last strip against the size of the
             # file
@@ -241,7 +243,7 @@ def _check_picture(file: Path) -> str:
                     " copy the file again"
                 )
             elif image.mode in ("I", "F"):
-                read(file)
+                read_frames(file)
     except UnidentifiedImageError:
         return f"{file} is not a readable picture: save the frame as 16-bit grey PNG"
     except Image.DecompressionBombError:
@@ -249,12 +251,12 @@ def _check_picture(file: Path) -> str:
     return ""
 
 
-def _numbers(image: Any, tag: int) -> tuple[int, ...]:
+def _tag_numbers(image: Any, tag: int) -> tuple[int, ...]:
     """Return the numbers of a TIFF tag, empty for another file."""
     return tuple(getattr(image, "tag_v2", {}).get(tag, ()))
 
 
-def _numpy(file: Path) -> str:
+def _check_npy(file: Path) -> str:
     """Return a message for a .npy file that is too large, holds no numbers or no digital numbers,
     else an empty text.
     """
@@ -302,7 +304,7 @@ def _wrong_numbers(file: Path, shape: tuple[int, ...], doubtful: bool) -> str:
     """
     if doubtful or len(shape) not in (2, 3) or not math.prod(shape):
         try:
-            read(file)
+            read_frames(file)
         except ValueError as error:
             return str(error)
     return ""
@@ -325,7 +327,7 @@ _CHECKS: dict[str, Callable[[Path], str]] = {
     ".png": _check_picture,
     ".tif": _check_picture,
     ".tiff": _check_picture,
-    ".npy": _numpy,
+    ".npy": _check_npy,
     ".exr": _check_exr,
     **dict.fromkeys(FITS, _check_fits),
 }
@@ -375,26 +377,19 @@ def frame_header(file: Path) -> FrameHeader:
     Raises: ValueError for an unknown kind of file, a damaged file, colour, and numbers that are not
             counts.
     """
-    readable(file)
+    reader_of(file)
     if problem := frame_problem(file):
         raise ValueError(problem)
     suffix = file.suffix.lower()
-    count, shape, bits, stated = _HEADERS.get(
-        suffix, _header_of_fits if suffix in FITS else _plain
-    )(file)
+    count, shape, bits, stated = _HEADERS[suffix](file)
     # `Exposure Time`, `ExposureTime` and `EXPOSURE_TIME` are one key
     values = {re.sub(r"[^a-z]", "", str(key).lower()): value for key, value in stated.items()}
-    photons = next((_number(values[key], False) for key in _LIGHTS if key in values), None)
-    return FrameHeader(
-        count,
-        shape,
-        bits,
-        next((_number(values[key]) for key in _TIMES if key in values), None),
-        photons,
-    )
+    exposure = next((_header_number(values[key]) for key in _TIMES if key in values), None)
+    photons = next((_header_number(values[key], False) for key in _LIGHTS if key in values), None)
+    return FrameHeader(count, shape, bits, exposure, photons)
 
 
-def _number(value: Any, is_time: bool = True) -> float | None:
+def _header_number(value: Any, is_time: bool = True) -> float | None:
     """Return the number in a value of a header, a time in seconds or (not ``is_time``) a number of
     photons; None for a text without one, for a time that is not above 0 and for negative photons.
     """
@@ -415,10 +410,10 @@ def _fraction(value: Any) -> float | None:
     return float(match[1]) / float(match[2]) or None if match else None
 
 
-_Found = tuple[int, tuple[int, int], int, Mapping[str, Any]]
+_HeaderValues = tuple[int, tuple[int, int], int, Mapping[str, Any]]
 
 
-def _header_of_picture(file: Path) -> _Found:
+def _header_of_picture(file: Path) -> _HeaderValues:
     """Return number of frames, size (y, x), bits and stated values of a PNG or TIFF file."""
     from PIL import Image
 
@@ -427,7 +422,7 @@ def _header_of_picture(file: Path) -> _Found:
         exif = image.getexif()
         stated: dict[str, Any] = {
             **_texts(image.info),
-            **_described(str(exif.get(_DESCRIPTION, ""))),
+            **_pairs_in(str(exif.get(_DESCRIPTION, ""))),
         }
         for tags in (exif, exif.get_ifd(_EXIF)):
             if _EXPOSURE in tags:
@@ -447,12 +442,12 @@ def _texts(info: Mapping[Any, Any]) -> dict[str, Any]:
     return {str(key): value for key, value in info.items() if isinstance(value, str | int | float)}
 
 
-def _described(text: str) -> dict[str, str]:
+def _pairs_in(text: str) -> dict[str, str]:
     """Return the pairs such as ``ExposureTime=0.01 s`` in a text."""
     return {key.strip(): value for key, value in _PAIR.findall(text)}
 
 
-def _header_of_fits(file: Path) -> _Found:
+def _header_of_fits(file: Path) -> _HeaderValues:
     """Return number of frames, size (y, x), bits and stated values of a FITS file."""
     from astropy.io import fits
 
@@ -466,10 +461,10 @@ def _header_of_fits(file: Path) -> _Found:
         }
         bits = abs(int(header["BITPIX"]))
     shape = fits_image(file)[0]
-    return *_stack(shape), bits, stated
+    return *_count_and_size(shape), bits, stated
 
 
-def _header_of_exr(file: Path) -> _Found:
+def _header_of_exr(file: Path) -> _HeaderValues:
     """Return one frame, its size (y, x), 32 bits and the stated values of an OpenEXR file."""
     import OpenEXR
 
@@ -478,16 +473,16 @@ def _header_of_exr(file: Path) -> _Found:
         header = dict(opened_file.header())
         shape = next(iter(opened_file.channels().values())).pixels.shape
     stated = {"exposuretime" if key == "expTime" else key: value for key, value in header.items()}
-    return *_stack(shape), 32, stated
+    return *_count_and_size(shape), 32, stated
 
 
-def _plain(file: Path) -> _Found:
+def _header_of_npy(file: Path) -> _HeaderValues:
     npy_needs(file, 1.0)
     array = np.load(file, mmap_mode="r", allow_pickle=False)
-    return *_stack(array.shape), 8 * array.dtype.itemsize, {}
+    return *_count_and_size(array.shape), 8 * array.dtype.itemsize, {}
 
 
-def _stack(shape: tuple[int, ...]) -> tuple[int, tuple[int, int]]:
+def _count_and_size(shape: tuple[int, ...]) -> tuple[int, tuple[int, int]]:
     """Return the number of frames and the size (y, x) of an array (y, x) or (frame, y, x)."""
     return (1 if len(shape) == 2 else int(shape[0])), (int(shape[-2]), int(shape[-1]))
 
@@ -498,7 +493,7 @@ def frame_means(file: Path) -> list[tuple[float, float]]:
     """
     return [
         (float(x.mean(dtype=np.float64)), float(x.std(dtype=np.float64)) / x.size**0.5)
-        for x in read(file)
+        for x in read_frames(file)
     ]
 
 
@@ -506,7 +501,7 @@ def frame_divisor(file: Path) -> int:
     """Return the greatest common divisor of the numbers of a file of frames; 0 for numbers that
     are all 0.
     """
-    return int(np.gcd.reduce(np.unique(read(file))))
+    return int(np.gcd.reduce(np.unique(read_frames(file))))
 
 
 _HEADERS = {
@@ -514,5 +509,6 @@ _HEADERS = {
     ".tif": _header_of_picture,
     ".tiff": _header_of_picture,
     ".exr": _header_of_exr,
-    ".npy": _plain,
+    ".npy": _header_of_npy,
+    **dict.fromkeys(FITS, _header_of_fits),
 }

@@ -19,8 +19,10 @@ from neusee.nodes.calibrate._light_levels import Scatter, histogram
 # a test or not.
 
 
-_POINTS, _REACH = 2001, 8.0  #: points of a posterior, and standard errors beyond estimate and zero
-_SOUND = 9.0  #: odds of no fault at all, before frames of at least `CLEAN_PAIRS` are seen
+_POSTERIOR_POINTS = 2001  #: evenly spaced
+_POSTERIOR_REACH = 8.0  #: standard errors beyond estimate and zero
+#: odds of no fault at all, before frames of at least `CLEAN_PAIRS` are seen
+_ODDS_OF_NO_FAULT = 9.0
 #: pairs of pixels in the lit levels of the fit from which frames that show no fault hide little
 CLEAN_PAIRS = 4e6
 
@@ -44,15 +46,15 @@ class Hidden:
     gain: float = 0.0  #: change of the logarithm of the gain for 1
     noise: float = 0.0  #: change of the logarithm of the dark noise in DN for 1
     positive: bool = False  #: True if the logarithm cannot be negative
-    sound: float = 0.0  #: probability of no fault, from `probably_sound`
+    sound: float = 0.0  #: probability of no fault, from `chance_of_no_fault`
 
     def posterior(self) -> tuple[Tensor, Tensor]:
         """Return points of the logarithm and their probabilities, both (point,)."""
-        lowest = min(0.0, self.estimate) - _REACH * self.error
-        highest = max(0.0, self.estimate) + _REACH * self.error
-        points = torch.linspace(
-            0.0 if self.positive else lowest, highest, _POINTS, dtype=torch.float64
-        )
+        lowest = min(0.0, self.estimate) - _POSTERIOR_REACH * self.error
+        if self.positive:
+            lowest = 0.0
+        highest = max(0.0, self.estimate) + _POSTERIOR_REACH * self.error
+        points = torch.linspace(lowest, highest, _POSTERIOR_POINTS, dtype=torch.float64)
         # Cauchy distribution about 0; of a logarithm that cannot be negative, its upper half
         density = 1 / (math.pi * self.scale * (1 + (points / self.scale).square()))
         if self.positive:
@@ -79,14 +81,14 @@ class Hidden:
         return (-0.5 * (((points - self.estimate) / self.error).square() - least_squares)).exp()
 
 
-def probably_sound(pairs: float) -> float:
+def chance_of_no_fault(pairs: float) -> float:
     """Return the probability of no fault before frames are seen, for a number of pairs of pixels in
     lit levels.
 
     Frames of few pixels cannot show a fault that would matter: then nobody should believe that
     there is none. The odds rise with the square of the pairs, up to 9 at `CLEAN_PAIRS`.
     """
-    odds = _SOUND * min(1.0, pairs / CLEAN_PAIRS) ** 2
+    odds = _ODDS_OF_NO_FAULT * min(1.0, pairs / CLEAN_PAIRS) ** 2
     return odds / (1 + odds)
 
 
@@ -109,18 +111,20 @@ def open_errors(hidden: Sequence[Hidden]) -> dict[str, float]:
 
 
 Verdict = Literal["passed", "modelled", "widened", "refused"]
-ALARM = 1e-3  #: probability with which chance alone fails one test of a whole measurement
+#: probability with which chance alone fails one test of a whole measurement
+FALSE_ALARM_RATE = 1e-3
 #: relative error of gain or dark noise above which frames are refused, and below which intervals
 #: widen
-REFUSED = 0.02
-_WINDOW = 1024  #: pixels of the central window on a side, in which patterns and noise are tested
-_TESTED = 1 << 21  #: pixels of a level in all tested frames together
-_BLOCK = 8  #: pixels by which the window is aligned, as blocks of a compressed picture are
-_PILED = 5.0  #: standard deviations of counting by which numbers pile up at an end
-_LEAST = 20  #: least count of pixels that pile up
-_FLAT = 0.5  #: share of the greatest variance below which a brighter level is saturated
-_AT_ZERO = 5e-3  #: share of the pixels at 0, which hides numbers below 0
-_MOST = 16  #: frames of a level whose noise and patterns are tested
+REFUSED_ERROR = 0.02
+#: pixels of the central window on a side, in which patterns and noise are tested
+_WINDOW_SIDE = 1024
+_TESTED_PIXELS = 1 << 21  #: pixels of a level in all tested frames together
+_BLOCK_SIDE = 8  #: pixels by which the window is aligned, as blocks of a compressed picture are
+_PILE_SIGMA = 5.0  #: standard deviations of counting by which numbers pile up at an end
+_PILE_PIXELS = 20  #: least count of pixels that pile up
+_FLAT_SHARE = 0.5  #: share of the greatest variance below which a brighter level is saturated
+_ZERO_SHARE = 5e-3  #: share of the pixels at 0, which hides numbers below 0
+_TESTED_FRAMES = 16  #: frames of a level whose noise and patterns are tested
 #: what to do about refused frames, by the name of the test
 _REMEDIES = {
     "white noise": "take raw frames: without denoising, sharpening, interpolation and compression",
@@ -131,7 +135,7 @@ _REMEDIES = {
     "no drift within a level": "write `scatter: steady`, or let the lamp settle",
     "homogeneity of the light": "light the sensor evenly, or cut the frames to their even part",
 }
-_FLOOR = 1e-12  #: DN2, so that frames without noise divide by more than 0
+VARIANCE_FLOOR = 1e-12  #: DN2, so that frames without noise divide by more than 0
 
 
 class Stack(NamedTuple):
@@ -159,7 +163,7 @@ class Level(NamedTuple):
     second: Tensor  #: (pair, y, x), as `first`
     #: (pair, y, x) DN, second less first, without what the lamp changed from the first to the
     #: second
-    apart: Tensor
+    differences: Tensor
     drift: Tensor  #: (pair,) DN, mean of the second frame less mean of the first
     variance: float  #: DN2, temporal, without the drift of the mean
     mean: float  #: DN
@@ -176,7 +180,7 @@ class Level(NamedTuple):
     @property
     def paired(self) -> bool:
         """Return True for a level of two or more frames."""
-        return len(self.apart) > 0
+        return len(self.differences) > 0
 
     @property
     def low(self) -> bool:
@@ -184,7 +188,7 @@ class Level(NamedTuple):
         a few pixels.
         """
         at_zero = float(self.pixels[self.value == 0].sum())
-        return at_zero > _AT_ZERO * float(self.pixels.sum()) or _piled(
+        return at_zero > _ZERO_SHARE * float(self.pixels.sum()) or _piled(
             self, self.value, self.pixels
         )
 
@@ -224,13 +228,13 @@ class Evidence(NamedTuple):
         return self.strength > self.limit
 
 
-def prepared(stack: Stack) -> Level:
+def paired_level(stack: Stack) -> Level:
     """Return the pairs and the histogram of a light level; frame 0 forms a pair with 1, 2 with
     3, and so on.
     """
     unmasked = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
     numbers, counts = histogram(unmasked)
-    frames = _window(stack.frames)
+    frames = _central_window(stack.frames)
     pairs = len(frames) // 2
     means, centred = _centred(frames, stack.mask)
     # frames 0, 2, 4 ... and 1, 3, 5 ...
@@ -243,7 +247,7 @@ def prepared(stack: Stack) -> Level:
         scatter=stack.scatter,
         first=first,
         second=second,
-        apart=differences,
+        differences=differences,
         drift=means[1 : 2 * pairs : 2] - means[: 2 * pairs : 2],
         variance=_variance(differences),
         mean=float((numbers * counts).sum()) / float(counts.sum()),
@@ -267,7 +271,9 @@ def fitted_levels(levels: Sequence[Level], share: float | None) -> list[Level]:
     )
     largest_signal = math.inf if share is None else share * saturation_signal
     return [
-        _steadied(level, dark)._replace(fitted=level.dark or level.mean - dark <= largest_signal)
+        _without_flicker(level, dark)._replace(
+            fitted=level.dark or level.mean - dark <= largest_signal
+        )
         for level in levels
     ]
 
@@ -279,7 +285,7 @@ def dark_and_lit(levels: Sequence[Level]) -> tuple[list[Level], list[Level]]:
     return dark, lit
 
 
-def saturated(levels: Sequence[Level]) -> list[Level]:
+def saturated_levels(levels: Sequence[Level]) -> list[Level]:
     """Return the levels whose numbers pile up at the highest number, or whose variance has fallen
     above its maximum.
 
@@ -293,7 +299,7 @@ def saturated(levels: Sequence[Level]) -> list[Level]:
     return [level for level in levels if level.high or _is_flat(level, peak)]
 
 
-def tested(levels: Sequence[Level]) -> list[Level]:
+def levels_to_test(levels: Sequence[Level]) -> list[Level]:
     """Return the paired levels whose noise is tested: those that the fit uses, without a pile at
     an end.
     """
@@ -309,11 +315,11 @@ def _is_flat(level: Level, peak: Level) -> bool:
         level.paired
         and not level.dark
         and level.mean > peak.mean
-        and level.variance < _FLAT * peak.variance
+        and level.variance < _FLAT_SHARE * peak.variance
     )
 
 
-def _steadied(level: Level, dark: float) -> Level:
+def _without_flicker(level: Level, dark: float) -> Level:
     """Return a lit level without what a change of the lamp between the frames of a pair adds to
     their difference.
 
@@ -329,16 +335,16 @@ def _steadied(level: Level, dark: float) -> Level:
     pattern_power = (level.first * level.second).mean((1, 2)).clamp_min(0.0)
     # uneven light, the common pattern of both frames, times the change of the light
     flicker = float((relative_drift[:, 0, 0].square() * pattern_power).mean()) / 2
-    return level._replace(apart=differences, variance=_variance(differences), flicker=flicker)
+    return level._replace(differences=differences, variance=_variance(differences), flicker=flicker)
 
 
-def _variance(apart: Tensor) -> float:
+def _variance(differences: Tensor) -> float:
     """Return the temporal variance of differences (pair, y, x) of two frames, without the drift of
     the mean: half their mean square, with one degree of freedom a pair less; NaN without a pair.
     """
     return (
-        float(apart.square().sum()) / 2 / max(1, apart.numel() - len(apart))
-        if len(apart)
+        float(differences.square().sum()) / 2 / max(1, differences.numel() - len(differences))
+        if len(differences)
         else math.nan
     )
 
@@ -351,7 +357,7 @@ def _centred(frames: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     if mask is None:
         means = numbers.mean((1, 2))
         return means, (numbers - means[:, None, None]).float()
-    unmasked = ~_window(mask[None])[0]
+    unmasked = ~_central_window(mask[None])[0]
     means = (numbers * unmasked).sum((1, 2)) / unmasked.sum().clamp_min(1)
     return means, ((numbers - means[:, None, None]) * unmasked).float()
 
@@ -361,15 +367,15 @@ def without_lines(x: Tensor) -> Tensor:
     return x - x.mean(2, keepdim=True) - x.mean(1, keepdim=True) + x.mean((1, 2), keepdim=True)
 
 
-def _window(frames: Tensor) -> Tensor:
+def _central_window(frames: Tensor) -> Tensor:
     """Return the middle of at most 16 frames, and fewer frames where they are large."""
-    first_pixels = [max(0, n - _WINDOW) // 2 // _BLOCK * _BLOCK for n in frames.shape[1:]]
-    central_window = frames[
-        :, first_pixels[0] : first_pixels[0] + _WINDOW, first_pixels[1] : first_pixels[1] + _WINDOW
-    ]
+    top, left = (
+        max(0, n - _WINDOW_SIDE) // 2 // _BLOCK_SIDE * _BLOCK_SIDE for n in frames.shape[1:]
+    )
+    window = frames[:, top : top + _WINDOW_SIDE, left : left + _WINDOW_SIDE]
     # an even number, for pairs
-    frame_count = _TESTED // max(1, central_window[0].numel()) // 2 * 2
-    return central_window[: min(_MOST, max(2, frame_count))]
+    frame_count = _TESTED_PIXELS // max(1, window[0].numel()) // 2 * 2
+    return window[: min(_TESTED_FRAMES, max(2, frame_count))]
 
 
 def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
@@ -379,22 +385,25 @@ def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
     The counts of numbers without a limit fall towards the ends. A full well fills two neighbouring
     numbers. Coarse numbers, with few values or little variance, are compared only at 0.
     """
-    lowest, at_zero = int(value[0]), int(value[0]) == 0
-    counts = [float(count[value == lowest + i].sum()) for i in range(4)]
-    if sum(counts) < _LEAST:
+    lowest = int(value[0])
+    first, second, third, fourth = (float(count[value == lowest + i].sum()) for i in range(4))
+    if first + second + third + fourth < _PILE_PIXELS:
         return False
-    first_and_second, pairs_of_numbers = counts[:2], (counts[0] + counts[1], counts[2] + counts[3])
     is_fine = level.paired and level.variance > 1.0 and len(value) > 8
-    # a list times False is empty: which comparisons are made
-    tests = [first_and_second] * (is_fine or at_zero) + [pairs_of_numbers] * is_fine
-    return any(
-        count_at_end >= _LEAST
-        and count_at_end - count_beside - 2 > _PILED * math.sqrt(count_at_end + count_beside)
-        for count_at_end, count_beside in tests
+    if (is_fine or lowest == 0) and _exceeds(first, second):
+        return True
+    return is_fine and _exceeds(first + second, third + fourth)
+
+
+def _exceeds(count_at_end: float, count_beside: float) -> bool:
+    """Return True if the count at an end exceeds that beside it by more than chance."""
+    excess = count_at_end - count_beside - 2
+    return count_at_end >= _PILE_PIXELS and excess > _PILE_SIGMA * math.sqrt(
+        count_at_end + count_beside
     )
 
 
-def strongest(
+def strongest_evidence(
     z: Sequence[Sequence[float]], others: Sequence[float] = (), sides: int = 1
 ) -> Evidence:
     """Return the strongest evidence of independent standard normal numbers (statistic, level), and
@@ -408,7 +417,8 @@ def strongest(
     all_numbers = [*chain.from_iterable(z), *sums_of_statistics, *others]
     strengths = [abs(x) for x in all_numbers] if sides == 2 else all_numbers
     return Evidence(
-        max(strengths, default=0.0), normal_limit(ALARM / sides / max(1, len(all_numbers)))
+        max(strengths, default=0.0),
+        normal_limit(FALSE_ALARM_RATE / sides / max(1, len(all_numbers))),
     )
 
 
@@ -421,7 +431,7 @@ def normal_limit(probability: float) -> float:
 
 def studentised(product: Tensor) -> float:
     """Return the sum of independent numbers of mean 0 in its own standard deviations."""
-    return float(product.sum()) / math.sqrt(float(product.square().sum()) + _FLOOR)
+    return float(product.sum()) / math.sqrt(float(product.square().sum()) + VARIANCE_FLOOR)
 
 
 def outcome(
@@ -442,7 +452,7 @@ def outcome(
             name, evidence.strength, evidence.limit, "modelled", f"{sentence}: {modelled}", shifts
         )
     largest_shift = max(shifts.values(), default=math.inf)
-    verdict: Verdict = "refused" if largest_shift > REFUSED else "widened"
+    verdict: Verdict = "refused" if largest_shift > REFUSED_ERROR else "widened"
     consequence = (
         f"an error of {100 * largest_shift:.2g} % may follow"
         if math.isfinite(largest_shift)
@@ -456,7 +466,7 @@ def _remedy(name: str, verdict: Verdict) -> str:
     return f"; {_REMEDIES[name]}" if verdict == "refused" and name in _REMEDIES else ""
 
 
-def bounded(
+def sized_outcome(
     name: str,
     evidence: Evidence,
     hidden: Sequence[Hidden],
@@ -476,7 +486,7 @@ def bounded(
             name, evidence.strength, evidence.limit, "passed", text, hidden=tuple(hidden)
         )
     verdict: Verdict = "modelled" if modelled else "widened"
-    if largest_error > REFUSED:
+    if largest_error > REFUSED_ERROR:
         verdict = "refused"
     text = (
         f"{sentence}: an error of {100 * largest_error:.2g} % may follow, and nothing is"

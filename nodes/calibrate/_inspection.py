@@ -12,24 +12,24 @@ from collections.abc import Iterable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from neusee.nodes.calibrate._emva_quantities import LEAST_DARK_VARIANCE
 from neusee.nodes.calibrate._frame_pairs import (
     FrameTest,
     Level,
     Stack,
     fitted_levels,
-    prepared,
-    saturated,
+    paired_level,
+    saturated_levels,
 )
 from neusee.nodes.calibrate._noise_tests import noise_tests
-from neusee.nodes.calibrate._pattern_tests import mosaic, pattern_tests
+from neusee.nodes.calibrate._pattern_tests import mosaic_test, pattern_tests
 
-_REACH = 8  #: numbers on either side of a number, which say how often it should occur
+_NEIGHBOURS = 8  #: numbers on either side of a number, which say how often it should occur
 #: least expected count of a number that is missing; chance leaves it out once in 1e11
-_EXPECTED = 25.0
-_CLIFF = 50.0  #: least count of each of three numbers beside a block of missing numbers
-_SIMILAR = 3.0  #: largest ratio of the counts of these three numbers
-_TAIL = 0.005  #: share of the pixels of a level at either end, where numbers need not occur
-_QUIET = 0.24  #: DN2, least dark variance of EMVA 1288: a standard deviation of 0.49 DN
+_EXPECTED_COUNT = 25.0
+_CLIFF_COUNT = 50.0  #: least count of each of three numbers beside a block of missing numbers
+_CLIFF_RATIO = 3.0  #: largest ratio of the counts of these three numbers
+_TAIL_SHARE = 0.005  #: share of the pixels of a level at either end, where numbers need not occur
 
 
 def number_tests(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
@@ -47,10 +47,16 @@ def number_tests(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
             (variance >= 0.24).
     """
     fitted = [level for level in levels if level.fitted]
-    return [codes(fitted), _black(fitted, exact), _white(levels, exact), *_coarse(fitted, exact)]
+    return [
+        missing_codes(fitted),
+        _clipped_black(fitted, exact),
+        _saturation(levels, exact),
+        *_dark_noise(fitted, exact),
+    ]
 
 
-def codes(levels: Sequence[Level]) -> FrameTest:
+def missing_codes(levels: Sequence[Level]) -> FrameTest:
+    """Test if every number occurs that its neighbours say should occur."""
     code_count = max(int(level.value[-1]) for level in levels) + 1
     lowest = min(int(level.value[0]) for level in levels)
     level_counts = [
@@ -59,14 +65,15 @@ def codes(levels: Sequence[Level]) -> FrameTest:
     ]
     total = sum(level_counts, torch.zeros(code_count, dtype=torch.float64))
     expected = sum(
-        (_expected(count) for count in level_counts), torch.zeros(code_count, dtype=torch.float64)
+        (_expected_counts(count) for count in level_counts),
+        torch.zeros(code_count, dtype=torch.float64),
     )
-    is_missing = (total == 0) & ((expected >= _EXPECTED) | _beside_cliff(total))
+    is_missing = (total == 0) & ((expected >= _EXPECTED_COUNT) | _beside_cliff(total))
     # numbers up to the lowest one of all need not occur
     is_missing[: lowest + 1] = False
     missing_count, expected_count = (
         int(is_missing.sum()),
-        int(((expected >= _EXPECTED) | (total >= _EXPECTED)).sum()),
+        int(((expected >= _EXPECTED_COUNT) | (total >= _EXPECTED_COUNT)).sum()),
     )
     if not missing_count:
         return FrameTest(
@@ -100,23 +107,23 @@ def codes(levels: Sequence[Level]) -> FrameTest:
     )
 
 
-def _expected(count: Tensor) -> Tensor:
+def _expected_counts(count: Tensor) -> Tensor:
     """Return the count (code,) that the neighbours on both sides predict for each number of one
     level; 0 in the tails, where numbers need not occur.
 
-    ``count`` has the counts of all numbers from 0 on. The smaller of the means of `_REACH` numbers
-    on each side is taken.
+    ``count`` has the counts of all numbers from 0 on. The smaller of the means of `_NEIGHBOURS`
+    numbers on each side is taken.
     """
     cumulated_share = count.cumsum(0) / count.sum()
-    in_middle = ((cumulated_share > _TAIL) & (cumulated_share < 1 - _TAIL)).double()
+    in_middle = ((cumulated_share > _TAIL_SHARE) & (cumulated_share < 1 - _TAIL_SHARE)).double()
     # means over a window are differences of cumulated sums
     cumulated_counts, cumulated_numbers = (
         (x * in_middle).cumsum(0) for x in (count, torch.ones_like(count))
     )
     index = torch.arange(len(count))
     before_window, end_of_window = (
-        (index - _REACH - 1).clamp_min(0),
-        (index + _REACH).clamp_max(len(count) - 1),
+        (index - _NEIGHBOURS - 1).clamp_min(0),
+        (index + _NEIGHBOURS).clamp_max(len(count) - 1),
     )
     mean_below = (cumulated_counts[(index - 1).clamp_min(0)] - cumulated_counts[before_window]) / (
         cumulated_numbers[(index - 1).clamp_min(0)] - cumulated_numbers[before_window]
@@ -140,13 +147,13 @@ def _beside_cliff(total: Tensor) -> Tensor:
     for three_counts in neighbours:
         stacked = torch.stack(three_counts)
         least, greatest = stacked.amin(0), stacked.amax(0)
-        cliffs |= (least >= _CLIFF) & (greatest <= _SIMILAR * least)
+        cliffs |= (least >= _CLIFF_COUNT) & (greatest <= _CLIFF_RATIO * least)
     # `roll` wraps around at both ends
     cliffs[:3], cliffs[-3:] = False, False
     return cliffs
 
 
-def _black(levels: Sequence[Level], exact: bool) -> FrameTest:
+def _clipped_black(levels: Sequence[Level], exact: bool) -> FrameTest:
     """Test if numbers pile up at the lowest number; `exact` likelihoods model a pile at 0."""
     clipped_levels = [level for level in levels if level.low]
     name, count = "no pile at the lowest number", float(len(clipped_levels))
@@ -165,11 +172,11 @@ def _black(levels: Sequence[Level], exact: bool) -> FrameTest:
     )
 
 
-def _white(levels: Sequence[Level], exact: bool) -> FrameTest:
+def _saturation(levels: Sequence[Level], exact: bool) -> FrameTest:
     """Tell which levels are saturated; a dark one refuses the frames unless the likelihood is
     ``exact``.
     """
-    full_levels = saturated(levels)
+    full_levels = saturated_levels(levels)
     name, count = "saturated levels are told", float(len(full_levels))
     if not full_levels:
         return FrameTest(name, 0.0, 0.0, "passed", "no level is saturated")
@@ -195,7 +202,7 @@ def _kinds_of_saturation(full: Sequence[Level]) -> Iterator[str]:
         )
 
 
-def _coarse(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
+def _dark_noise(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
     """Return the test of the least dark variance, or no test without paired dark levels."""
     darks = [level.variance for level in levels if level.dark and level.paired]
     return [coarse(min(darks), exact)] if darks else []
@@ -203,10 +210,10 @@ def _coarse(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
 
 def coarse(variance: float, exact: bool) -> FrameTest:
     """Return the test of the least variance of dark levels, DN2, against the limit of EMVA 1288."""
-    deviation, least_deviation = (math.sqrt(max(x, 0.0)) for x in (variance, _QUIET))
+    deviation, least_deviation = (math.sqrt(max(x, 0.0)) for x in (variance, LEAST_DARK_VARIANCE))
     name = "the dark noise exceeds rounding"
     text = f"the dark noise is {deviation:.2f} DN; the standard asks for {least_deviation:.2f} DN"
-    if variance >= _QUIET:
+    if variance >= LEAST_DARK_VARIANCE:
         # a smaller deviation is worse: both numbers are negative
         return FrameTest(name, -deviation, -least_deviation, "passed", text)
     if exact:
@@ -251,11 +258,14 @@ def inspect_frames(
     Raises: ValueError for frames that hold other than digital numbers.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2 and 6 (assumptions of the model).
     """
-    levels = fitted_levels([prepared(stack) for stack in stacks], share)
+    levels = fitted_levels([paired_level(stack) for stack in stacks], share)
     if not levels:
         return []
     # a mosaic or shifted numbers explain what all other tests would find
-    for frame_test in (*mosaic(levels), codes([level for level in levels if level.fitted])):
+    for frame_test in (
+        *mosaic_test(levels),
+        missing_codes([level for level in levels if level.fitted]),
+    ):
         if frame_test.verdict == "refused" and frame_test.explains_all:
             return [frame_test]
     return [*noise_tests(levels), *pattern_tests(levels), *number_tests(levels, exact)]

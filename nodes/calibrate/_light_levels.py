@@ -15,9 +15,14 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.calibrate._frame_files import frame_problem, read, readable
+from neusee.nodes.calibrate._frame_files import (
+    LARGEST_NUMBER,
+    frame_problem,
+    read_frames,
+    reader_of,
+)
 from neusee.nodes.sensor._digitization import Bits, Rounding, digitize
-from neusee.nodes.sensor._digitization import full_well as well_of
+from neusee.nodes.sensor._digitization import full_well as end_at_full_well
 from neusee.nodes.sensor._noise import Distribution, Spread, dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._saturation import Well, refuse_without_room, refuse_without_steps
 from neusee.nodes.units import (
@@ -41,12 +46,12 @@ from neusee.nodes.values import Levels
 Photons = Annotated[float, Field(ge=0, le=1e15)]  #: per pixel and exposure
 Temporal = Literal["temporal", "steady"]
 Scatter = Literal["all", "temporal", "steady"]
-_PIECE = 1 << 20  #: numbers of one block, so that no second copy of a stack is needed
-_TOP = 1 << 24  #: DN; above any converter, and the limit of exact whole numbers in float32
+_BLOCK_NUMBERS = 1 << 20  #: numbers of one block, so that no second copy of a stack is needed
 #: DN, standard deviation below which whole numbers are too coarse for a mean and a variance
-_COARSE = 0.8
-#: least count at an end; least excess in sigma; least excess as a ratio
-_FEW, _SURE, _RATIO = 8, 5.0, 5.0
+COARSE_DEVIATION = 0.8
+_PILE_COUNT = 8  #: least count of the two numbers at an end
+_PILE_SIGMA = 5.0  #: least excess in standard deviations of counting
+_PILE_RATIO = 5.0  #: least ratio to the expected count, for pixels that are unequal
 
 
 @node(rtol=1e-12)
@@ -85,7 +90,7 @@ def reduce(
             " one frame"
         )
     if mask is not None:
-        frames = _unmasked(frames, mask)
+        frames = _unmasked_pixels(frames, mask)
     _refuse_single(frames, scatter)
     numbers, counts = histogram(frames)
     total = float(counts.sum())
@@ -96,8 +101,8 @@ def reduce(
     else:
         # each pixel's mean is fitted, and with `steady` each frame's mean but one
         degrees_of_freedom = total - total / len(frames) - (scatter == "steady") * (len(frames) - 1)
-        variance = _within(frames, scatter == "steady") / degrees_of_freedom
-    keeps_histogram = _kept(
+        variance = _squares_within_pixels(frames, scatter == "steady") / degrees_of_freedom
+    keeps_histogram = _needs_histogram(
         numbers.double(), counts.double(), mean, math.sqrt(sum_of_squares / total), scatter == "all"
     )
     moments = (
@@ -120,7 +125,7 @@ def _refuse_single(frames: Tensor, scatter: Scatter) -> None:
         raise ValueError("one pixel value has no variance: give more pixels or frames")
 
 
-def _unmasked(frames: Tensor, mask: Tensor) -> Tensor:
+def _unmasked_pixels(frames: Tensor, mask: Tensor) -> Tensor:
     """Return the pixels (frame, 1, pixel) that a mask does not leave out."""
     if mask.shape != frames.shape[1:]:
         raise ValueError(
@@ -174,20 +179,20 @@ def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
     number.
     """
     counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
-    for piece in _pieces(frames.reshape(1, -1)):
-        piece_counts = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
+    for piece in _column_blocks(frames.reshape(1, -1)):
+        piece_counts = torch.bincount(_digital_numbers(piece).reshape(-1), minlength=len(counts))
         piece_counts[: len(counts)] += counts
         counts = piece_counts
     numbers = counts.nonzero().squeeze(1)
     return numbers.cpu(), counts[numbers].cpu()
 
 
-def _pieces(rows: Tensor) -> Iterator[Tensor]:
-    """Split a two-dimensional array by columns into blocks of about `_PIECE` elements."""
-    return iter(torch.split(rows, max(1, _PIECE // len(rows)), 1))
+def _column_blocks(rows: Tensor) -> Iterator[Tensor]:
+    """Split a two-dimensional array by columns into blocks of about `_BLOCK_NUMBERS` elements."""
+    return iter(torch.split(rows, max(1, _BLOCK_NUMBERS // len(rows)), 1))
 
 
-def _whole(piece: Tensor) -> Tensor:
+def _digital_numbers(piece: Tensor) -> Tensor:
     """Return pixel values as int64; raise ValueError for a value that no analogue-to-digital
     converter can give.
     """
@@ -196,25 +201,26 @@ def _whole(piece: Tensor) -> Tensor:
     # only frames of floating-point numbers may hold fractions
     if (
         low < 0
-        or high >= _TOP
+        or high >= LARGEST_NUMBER
         or (piece.is_floating_point() and not bool((numbers == piece).all()))
     ):
-        not_digital = (numbers < 0) | (numbers >= _TOP) | (numbers != piece)
+        not_digital = (numbers < 0) | (numbers >= LARGEST_NUMBER) | (numbers != piece)
         raise ValueError(
             f"frames hold {float(piece[not_digital][0]):g}, not a digital number: give whole"
-            f" numbers from 0 to {_TOP - 1}, as the camera gives them, neither corrected nor scaled"
+            f" numbers from 0 to {LARGEST_NUMBER - 1}, as the camera gives them, neither corrected"
+            " nor scaled"
         )
     return numbers
 
 
-def _within(frames: Tensor, steady: bool) -> float:
+def _squares_within_pixels(frames: Tensor, steady: bool) -> float:
     """Return the sum of squared deviations of all frames from each pixel's mean over the frames;
     ``steady`` also subtracts what each frame's mean contributes.
 
     The frames are taken in pieces of pixels, which need little memory.
     """
     piece_sums, frame_sums = [], torch.zeros(len(frames), dtype=torch.float64)
-    for piece in _pieces(frames.reshape(len(frames), -1)):
+    for piece in _column_blocks(frames.reshape(len(frames), -1)):
         numbers = piece.double()
         deviations = numbers - numbers.mean(0)
         piece_sums.append(float(deviations.square().sum()))
@@ -223,14 +229,14 @@ def _within(frames: Tensor, steady: bool) -> float:
     return max(0.0, math.fsum(piece_sums) - sum_by_frame_means)
 
 
-def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) -> bool:
+def _needs_histogram(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) -> bool:
     """Return True if the histogram of a level holds information that mean and variance lack:
     coarse numbers, or a pile at an end.
 
     ``sigma`` is the standard deviation in DN; ``alike`` says that pixels are equal, so that they
     follow one Gaussian distribution.
     """
-    if sigma < _COARSE:
+    if sigma < COARSE_DEVIATION:
         return True
     # each end holds two numbers, which begin half a number below the lower of them
     both_ends = (
@@ -271,7 +277,9 @@ class _End:
         )
         # the outermost number against the next one, the two outermost against the two beside them
         pairs = ((outermost, next_one), (outermost + next_one, sum(two_beside)))
-        return any(at_end - beside > _SURE * math.sqrt(at_end + beside) for at_end, beside in pairs)
+        return any(
+            at_end - beside > _PILE_SIGMA * math.sqrt(at_end + beside) for at_end, beside in pairs
+        )
 
 
 def _exceeds_gaussian(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
@@ -287,8 +295,8 @@ def _exceeds_gaussian(held: float, total: float, low: float, sigma: float, alike
         * 0.5
         * abs(math.erf((low + 2.0) / sigma / math.sqrt(2)) - math.erf(low / sigma / math.sqrt(2)))
     )
-    margin = _SURE * math.sqrt(expected) if alike else (_RATIO - 1) * expected
-    return held >= _FEW and held - expected > margin
+    margin = _PILE_SIGMA * math.sqrt(expected) if alike else (_PILE_RATIO - 1) * expected
+    return held >= _PILE_COUNT and held - expected > margin
 
 
 # --- saturation signal ----------------------------------------------------------------------------
@@ -296,7 +304,7 @@ def _exceeds_gaussian(held: float, total: float, low: float, sigma: float, alike
 # The signal at which the pixels of a camera are full, from levels beyond saturation.
 
 
-_FLAT = 0.5  #: share of the greatest variance below which a brighter level is full
+_FULL_SHARE = 0.5  #: share of the greatest variance below which a brighter level is full
 
 
 class SaturationSignal(NamedTuple):
@@ -332,7 +340,7 @@ def saturation_signal(levels: Levels) -> SaturationSignal | None:
     full_levels = [
         i
         for i in range(index_of_peak + 1, len(signal))
-        if float(variance[i]) < _FLAT * float(variance[index_of_peak])
+        if float(variance[i]) < _FULL_SHARE * float(variance[index_of_peak])
     ]
     if not full_levels:
         return None
@@ -396,7 +404,7 @@ def refuse_unreadable(parameter: str, files: Sequence[Path]) -> list[str]:
     """
     try:
         for file in files:
-            readable(file)
+            reader_of(file)
             if problem := frame_problem(file):
                 raise ParameterError(parameter, problem)
     except ParameterError:
@@ -410,7 +418,7 @@ def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
     """Read the frames of all files into one array; raise ValueError if the frames differ in
     size.
     """
-    stacks = [read(file) for file in files]
+    stacks = [read_frames(file) for file in files]
     for file, frames in zip(files, stacks, strict=True):
         if frames.shape[1:] != stacks[0].shape[1:]:
             raise ValueError(
@@ -425,7 +433,7 @@ def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
 # A node that simulates frames of a flat field by the same sensor steps as a picture.
 
 
-dark_of, read_of = dark_current, read_noise  # parameters below have the same names
+add_dark_current, add_read_noise = dark_current, read_noise  # parameters below have the same names
 
 
 @node()
@@ -468,9 +476,9 @@ def expose(
         spread=spread,
         rng=rng,
     )
-    electrons = dark_of(electrons, mean=dark_current * exposure / dark_exposure, rng=rng)
-    electrons = well_of(
-        read_of(electrons, offset=offset, read_noise=read_noise, rng=rng), capacity=full_well
+    electrons = add_dark_current(electrons, mean=dark_current * exposure / dark_exposure, rng=rng)
+    electrons = end_at_full_well(
+        add_read_noise(electrons, offset=offset, read_noise=read_noise, rng=rng), capacity=full_well
     )
     numbers: Tensor = digitize(electrons, gain=gain, rounding=rounding, bits=bits, rng=rng)
     return numbers
@@ -511,9 +519,10 @@ def _(result: Tensor, **params: Any) -> list[Check]:
 
 
 #: robust standard deviations of the pixels above their median from which a pixel is hot
-_FAR = 10.0
-_NORMAL = 1.4826  #: standard deviation of a normal distribution over its median absolute deviation
-_MOST = 0.05  #: share of the pixels above which they are no exceptions
+_HOT_SIGMA = 10.0
+#: standard deviation of a normal distribution over its median absolute deviation
+_SIGMA_OVER_MAD = 1.4826
+_HOT_SHARE = 0.05  #: share of the pixels above which they are no exceptions
 
 
 @node(rtol=0.0)
@@ -539,10 +548,10 @@ def hot_pixels(*, files: DataFiles, divisor: Divisor = 1) -> Tensor:
     median_of_means = pixel_means.median()
     # the mean of a few whole numbers is a multiple of a step, which hides a smaller deviation
     step = 1 / (12**0.5 * len(numbers))
-    width = _NORMAL * float((pixel_means - median_of_means).abs().median()) + step
+    width = _SIGMA_OVER_MAD * float((pixel_means - median_of_means).abs().median()) + step
     # in each frame: its smallest number is far above the median
-    is_hot: Tensor = numbers.amin(0) - median_of_means > _FAR * width
-    return is_hot if float(is_hot.double().mean()) <= _MOST else torch.zeros_like(is_hot)
+    is_hot: Tensor = numbers.amin(0) - median_of_means > _HOT_SIGMA * width
+    return is_hot if float(is_hot.double().mean()) <= _HOT_SHARE else torch.zeros_like(is_hot)
 
 
 @hot_pixels.preflight

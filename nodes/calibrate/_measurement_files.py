@@ -25,8 +25,8 @@ from neusee.nodes.values import Levels
 
 # --- descriptor of EMVA 1288 ----------------------------------------------------------------------
 
-_PAIR = 2  #: images of a level of the photon transfer
-_WORDS = {
+_PAIR_IMAGES = 2  #: images of a level of the photon transfer
+_LINE_FORMS = {
     "b": "b EXPOSURE_NS PHOTONS",
     "d": "d EXPOSURE_NS [0]",
     "n": "n BITS WIDTH HEIGHT",
@@ -35,7 +35,7 @@ _WORDS = {
 
 
 @dataclass
-class _Level:
+class _DescribedLevel:
     """The entries of an EMVA 1288 descriptor for one light level."""
 
     line: int
@@ -50,20 +50,20 @@ class _Measurement:
     bits: int = 24
     shape: tuple[int, int] | None = None
     release: str = ""  #: of EMVA 1288, as line v states it
-    levels: list[_Level] = field(default_factory=list)
+    levels: list[_DescribedLevel] = field(default_factory=list)
 
     @property
-    def transfer(self) -> list[_Level]:
+    def transfer(self) -> list[_DescribedLevel]:
         """The levels of the photon transfer: the pairs of images, or all levels if there is no
         pair.
         """
-        pairs = [level for level in self.levels if len(level.images) == _PAIR]
+        pairs = [level for level in self.levels if len(level.images) == _PAIR_IMAGES]
         return pairs or self.levels
 
     @property
-    def series(self) -> list[_Level]:
+    def series(self) -> list[_DescribedLevel]:
         """The levels of more images than a pair, for spatial quantities."""
-        return [level for level in self.levels if len(level.images) > _PAIR]
+        return [level for level in self.levels if len(level.images) > _PAIR_IMAGES]
 
 
 def _with_images(file: Any) -> tuple[Path, ...]:
@@ -75,7 +75,7 @@ def _with_images(file: Any) -> tuple[Path, ...]:
     path = Path(file)
     if not path.is_file():
         raise ValueError(f"no such file: {path}")
-    images = list(chain.from_iterable(level.images for level in _parsed(path).levels))
+    images = list(chain.from_iterable(level.images for level in parsed_descriptor(path).levels))
     for line, image in images:
         if not image.is_file():
             raise ValueError(
@@ -109,9 +109,12 @@ def descriptor(*, file: DescriptorFile, scatter: Temporal = "temporal") -> Level
             file).
     """
     files = _with_images(file)
-    measurement = _parsed(files[0])
+    measurement = parsed_descriptor(files[0])
     joined: Levels = levels(
-        [_reduced(files[0].name, measurement, level, scatter) for level in measurement.transfer]
+        [
+            _level_statistics(files[0].name, measurement, level, scatter)
+            for level in measurement.transfer
+        ]
     )
     return joined
 
@@ -140,7 +143,7 @@ def descriptor_frames(files: Sequence[Path]) -> Iterator[tuple[str, float, float
     ``files`` is the value of the parameter `file` of `descriptor`, whose first path is the
     descriptor.
     """
-    for level in _parsed(files[0]).transfer:
+    for level in parsed_descriptor(files[0]).transfer:
         frames = torch.from_numpy(stack([image for _, image in level.images]))
         yield f"line {level.line}", level.photons, level.exposure, frames
 
@@ -151,7 +154,7 @@ def descriptor_series(files: Sequence[Path]) -> Iterator[tuple[float, float, Ite
 
     ``files`` is as in `descriptor_frames`. Each image is read when its turn comes.
     """
-    for level in _parsed(files[0]).series:
+    for level in parsed_descriptor(files[0]).series:
         yield (
             level.photons,
             level.exposure,
@@ -165,7 +168,7 @@ def descriptor_release(files: Sequence[Path]) -> str:
 
     ``files`` is as in `descriptor_frames`.
     """
-    return _parsed(files[0]).release
+    return parsed_descriptor(files[0]).release
 
 
 def refuse_descriptor(file: Path) -> None:
@@ -175,7 +178,9 @@ def refuse_descriptor(file: Path) -> None:
     refuse_unreadable("file", _with_images(file)[1:])
 
 
-def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Temporal) -> Levels:
+def _level_statistics(
+    name: str, measurement: _Measurement, level: _DescribedLevel, scatter: Temporal
+) -> Levels:
     """Return the statistics of one level of a descriptor, which is called ``name``; raise
     ValueError for images of another size or of more bits than the descriptor says.
     """
@@ -196,7 +201,7 @@ def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Tempo
     return statistics
 
 
-def _parsed(path: Path) -> _Measurement:
+def parsed_descriptor(path: Path) -> _Measurement:
     """Return the measurement that a descriptor states, line by line; raise ValueError, with the
     line, for a mistake.
     """
@@ -204,7 +209,7 @@ def _parsed(path: Path) -> _Measurement:
     for number, line in _lines(path):
         kind, _, content = line.partition(" ")
         try:
-            _take(measurement, kind, content.strip(), path.parent, number)
+            _add_line(measurement, kind, content.strip(), path.parent, number)
         except ValueError as error:
             raise ValueError(f"{path.name}:{number}: {error}") from None
     for level in measurement.levels:
@@ -229,7 +234,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             yield number, line.strip().replace("\t", " ")
 
 
-def _take(measurement: _Measurement, kind: str, content: str, folder: Path, line: int) -> None:
+def _add_line(measurement: _Measurement, kind: str, content: str, folder: Path, line: int) -> None:
     """Add the content of one line of a descriptor to the measurement."""
     if kind == "i":
         if not measurement.levels:
@@ -238,24 +243,24 @@ def _take(measurement: _Measurement, kind: str, content: str, folder: Path, line
             )
         measurement.levels[-1].images.append((line, folder / content.replace("\\", "/")))
         return
-    if kind not in _WORDS:
+    if kind not in _LINE_FORMS:
         raise ValueError(f"cannot read {kind!r}: begin the line with v, n, b, d, i or #")
     words = content.split()
     try:
         # some laboratories write decimal commas
         numbers = [float(word.replace(",", ".")) for word in words]
         if kind == "n":
-            # the line states the width before the height
-            measurement.bits, measurement.shape = int(words[0]), (int(words[2]), int(words[1]))
+            bits, width, height = words[:3]
+            measurement.bits, measurement.shape = int(bits), (int(height), int(width))
         elif kind == "v":
             measurement.release = words[0].replace(",", ".")
         else:
-            measurement.levels.append(_level(line, kind, numbers))
+            measurement.levels.append(_level_of_line(line, kind, numbers))
     except (ValueError, IndexError):
-        raise ValueError(f"cannot read {kind} {content!r}: write {_WORDS[kind]}") from None
+        raise ValueError(f"cannot read {kind} {content!r}: write {_LINE_FORMS[kind]}") from None
 
 
-def _level(line: int, kind: str, numbers: list[float]) -> _Level:
+def _level_of_line(line: int, kind: str, numbers: list[float]) -> _DescribedLevel:
     """Return the light level of a descriptor line; raise ValueError for an invalid exposure or
     number of photons.
     """
@@ -266,13 +271,13 @@ def _level(line: int, kind: str, numbers: list[float]) -> _Level:
     ):
         raise ValueError
     # from nanoseconds to seconds
-    return _Level(line, photons, exposure * 1e-9)
+    return _DescribedLevel(line, photons, exposure * 1e-9)
 
 
 # --- table of moments -----------------------------------------------------------------------------
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_NUMBERS = {
+_CONDITIONS = {
     "photons": ">= 0",
     "exposure": "> 0",
     "pixels": ">= 1",
@@ -394,7 +399,7 @@ def _number(text: str | None, name: str, where: str) -> float:
     """Return the number in the cell of a column ``name``; raise ValueError, with the place
     ``where``, for a text that is no valid number of it.
     """
-    condition = _NUMBERS.get(name, "finite")
+    condition = _CONDITIONS.get(name, "finite")
     try:
         number = float(text or "")
     except ValueError:

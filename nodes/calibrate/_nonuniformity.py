@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neusee.nodes.calibrate._emva_quantities import Quantity
+from neusee.nodes.calibrate._emva_quantities import NO_GAIN, FloatArray, Quantity
 
 # --- nonuniformity --------------------------------------------------------------------------------
 
@@ -20,9 +20,8 @@ from neusee.nodes.calibrate._emva_quantities import Quantity
 # and by pixels.
 
 
-FloatArray = NDArray[np.float64]
-_SURE = 2.0  #: standard errors of a variance below which only a limit follows
-_LEAST = 8  #: pixels, side of the smallest frame
+_VARIANCE_SIGMA = 2.0  #: standard errors of a variance below which only a limit follows
+_SMALLEST_SIDE = 8  #: pixels, side of the smallest frame
 PARTS = ("total", "row", "column", "pixel")
 
 
@@ -87,10 +86,10 @@ def spatial_series(photons: float, exposure: float, frames: Iterable[Tensor]) ->
         count += 1
     if count < 2:
         raise ValueError(f"{count} frame(s) are no series: give two or more")
-    if min(sum_of_frames.shape) < _LEAST:
+    if min(sum_of_frames.shape) < _SMALLEST_SIDE:
         raise ValueError(
-            f"frames of {tuple(sum_of_frames.shape)} are too small for a series: give {_LEAST} x"
-            f" {_LEAST} or more"
+            f"frames of {tuple(sum_of_frames.shape)} are too small for a series: give"
+            f" {_SMALLEST_SIDE} x {_SMALLEST_SIDE} or more"
         )
     # unbiased variance of each pixel: (n sum of squares - square of the sum) / (n (n - 1))
     temporal_variance = (count * sum_of_squares - sum_of_frames**2).double() / (count * (count - 1))
@@ -113,7 +112,7 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
     rows, columns = series.total.shape
     # of an average of n frames; the mean of a line has it over its number of pixels
     temporal_rest = series.temporal / series.count
-    variances = _measured(series)
+    variances = _measured_variances(series)
     total_variance, row_variance, column_variance = (
         variances.total - temporal_rest,
         variances.row - temporal_rest / columns,
@@ -137,7 +136,7 @@ def chance_of_variances(series: SpatialSeries) -> SpatialVariances:
     nonuniformity.
     """
     rows, columns = series.total.shape
-    variances = _measured(series)
+    variances = _measured_variances(series)
     error_by_time = (
         series.temporal / series.count * math.sqrt(2 / (rows * columns * (series.count - 1)))
     )
@@ -155,7 +154,7 @@ def chance_of_variances(series: SpatialSeries) -> SpatialVariances:
     )
 
 
-def _measured(series: SpatialSeries) -> SpatialVariances:
+def _measured_variances(series: SpatialSeries) -> SpatialVariances:
     """Return the variances of the averaged frame, of the means of its rows and of the means of its
     columns, DN2, with what noise in time leaves in them; that of single pixels is NaN.
     """
@@ -172,32 +171,29 @@ def nonuniformity(patterns: Nonuniformity, gain: float | None) -> list[Quantity]
     Units:  as in each `Quantity`.
     Source: EMVA Standard 1288, release 4.0 Linear.
     """
-    return [*_dark(patterns.dark, gain), *_lit(patterns)]
+    return [*_dsnu(patterns.dark, gain), *_prnu(patterns)]
 
 
-def _dark(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
+def _dsnu(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
     """Return DSNU1288 in DN and in electrons, in total and of rows, columns and pixels; limits or
     reasons where the ``series`` of dark frames does not tell them.
     """
     quantities: list[Quantity] = []
     for i, pattern in enumerate(PARTS):
-        # key, symbol and name
-        naming = _names("DSNU", pattern, "dark signal nonuniformity")
-        in_numbers = Quantity(f"{naming[0]}_DN", f"{naming[1]}.DN", naming[2], "DN")
-        in_electrons = Quantity(naming[0], naming[1], naming[2], "e-")
+        key, symbol, name = _names("DSNU", pattern, "dark signal nonuniformity")
+        in_numbers = Quantity(f"{key}_DN", f"{symbol}.DN", name, "DN")
+        in_electrons = Quantity(key, symbol, name, "e-")
         if series is None:
             reason = "no series of dark frames is given, only pairs"
             quantities += [in_numbers.untold(reason), in_electrons.untold(reason)]
             continue
         # i counts the fields of `SpatialVariances`, in the order of `PARTS`
-        numbers = _root(in_numbers, spatial_variances(series)[i], chance_of_variances(series)[i])
+        numbers = _root_or_limit(
+            in_numbers, spatial_variances(series)[i], chance_of_variances(series)[i]
+        )
         quantities.append(numbers)
         if numbers.value is None or gain is None:
-            quantities.append(
-                in_electrons.untold(
-                    numbers.reason or "K is not told, so that no value in electrons is"
-                )
-            )
+            quantities.append(in_electrons.untold(numbers.reason or NO_GAIN))
         else:
             quantities.append(
                 in_electrons.told(numbers.value / gain, numbers.bound, numbers.reason)
@@ -205,7 +201,7 @@ def _dark(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
     return quantities
 
 
-def _lit(patterns: Nonuniformity) -> list[Quantity]:
+def _prnu(patterns: Nonuniformity) -> list[Quantity]:
     """Return PRNU1288 in percent, in total and of rows, columns and pixels, from the difference of
     the spatial variances of the lit and the dark series.
     """
@@ -226,7 +222,9 @@ def _lit(patterns: Nonuniformity) -> list[Quantity]:
     errors = zip(chance_of_variances(patterns.lit), chance_of_variances(patterns.dark), strict=True)
     rows_of_parts = zip(blanks, variances, errors, strict=True)
     return [
-        _root(blank, (lit - dark) * percent_squared, math.hypot(*part_errors) * percent_squared)
+        _root_or_limit(
+            blank, (lit - dark) * percent_squared, math.hypot(*part_errors) * percent_squared
+        )
         for blank, (lit, dark), part_errors in rows_of_parts
     ]
 
@@ -238,13 +236,13 @@ def _names(kind: str, pattern: str, name: str) -> tuple[str, str, str]:
     return f"{kind}1288_{pattern}", f"{kind}1288.{pattern}", f"{name}, {pattern}s"
 
 
-def _root(blank: Quantity, variance: float, error: float) -> Quantity:
+def _root_or_limit(blank: Quantity, variance: float, error: float) -> Quantity:
     """Return the root of a variance, or a limit if the variance is less than two of its standard
     errors.
     """
-    if variance >= _SURE * error and variance > 0:
+    if variance >= _VARIANCE_SIGMA * error and variance > 0:
         return blank.told(math.sqrt(variance))
-    limit = math.sqrt(max(variance, 0.0) + _SURE * error)
+    limit = math.sqrt(max(variance, 0.0) + _VARIANCE_SIGMA * error)
     return blank.told(limit, "<", "no more than what noise in time leaves in the averaged frames")
 
 
@@ -253,8 +251,8 @@ def _root(blank: Quantity, variance: float, error: float) -> Quantity:
 # Spectrograms, profiles and histograms of defect pixels of the EMVA 1288 sheet.
 
 
-_MOST = 256  #: classes of a histogram
-_BOX = 5  #: pixels, side of the box whose mean is subtracted against uneven light
+_HISTOGRAM_CLASSES = 256  #: classes of a histogram
+_BOX_SIDE = 5  #: pixels, side of the box whose mean is subtracted against uneven light
 
 
 class Spectrogram(NamedTuple):
@@ -317,9 +315,9 @@ def without_trend(total: NDArray[np.int64]) -> NDArray[np.int64]:
 
     Source: EMVA Standard 1288, release 4.0 Linear (highpass filtering of the lit frame).
     """
-    rim = _BOX // 2
-    windows = np.lib.stride_tricks.sliding_window_view(total, (_BOX, _BOX))
-    return np.asarray(_BOX**2 * total[rim:-rim, rim:-rim] - windows.sum((2, 3)))
+    rim = _BOX_SIDE // 2
+    windows = np.lib.stride_tricks.sliding_window_view(total, (_BOX_SIDE, _BOX_SIDE))
+    return np.asarray(_BOX_SIDE**2 * total[rim:-rim, rim:-rim] - windows.sum((2, 3)))
 
 
 def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
@@ -331,7 +329,7 @@ def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
     """
     low, high = int(total.min()), int(total.max())
     # whole numbers, so that each class holds as many of them
-    width = 1 if high - low < _MOST else (high - low) // _MOST + 1
+    width = 1 if high - low < _HISTOGRAM_CLASSES else (high - low) // _HISTOGRAM_CLASSES + 1
     class_index = (total - low) // width
     count = np.bincount(class_index.reshape(-1))
     class_starts = low + width * np.arange(len(count))
@@ -346,7 +344,9 @@ def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
             * np.exp(-(((centre - mean) / sigma) ** 2) / 2)
         )
     sorted_distances = np.sort(np.abs(total.reshape(-1) - mean))
-    distance = np.linspace(0.0, float(sorted_distances[-1]), min(_MOST, len(sorted_distances)))
+    distance = np.linspace(
+        0.0, float(sorted_distances[-1]), min(_HISTOGRAM_CLASSES, len(sorted_distances))
+    )
     beyond = np.asarray(
         100
         * (len(sorted_distances) - np.searchsorted(sorted_distances, distance, side="left"))

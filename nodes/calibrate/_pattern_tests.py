@@ -14,14 +14,14 @@ from neusee.nodes.calibrate._frame_pairs import (
     FrameTest,
     Hidden,
     Level,
-    bounded,
+    chance_of_no_fault,
     dark_and_lit,
+    levels_to_test,
     outcome,
-    probably_sound,
-    saturated,
-    strongest,
+    saturated_levels,
+    sized_outcome,
+    strongest_evidence,
     studentised,
-    tested,
     without_lines,
 )
 
@@ -31,13 +31,13 @@ from neusee.nodes.calibrate._frame_pairs import (
 # patterns that stay.
 
 
-_RARE = 4.5  #: standard deviations beyond which a pixel is defective, and left out
-_LEAST = 3  #: least levels in excess of the patterns that are fitted
-_CURVED = 6  #: lit levels from which a pattern may be a parabola of the signal
-_KEPT = 0.02  #: scale of the prior of the share of the variance that lag takes
+_OUTLIER_SIGMA = 4.5  #: standard deviations beyond which a pixel is defective, and left out
+_SPARE_LEVELS = 3  #: least levels in excess of the patterns that are fitted
+_CURVED_LEVELS = 6  #: lit levels from which a pattern may be a parabola of the signal
+_LAG_SCALE = 0.02  #: scale of the prior of the share of the variance that lag takes
 
 
-def lag(levels: Sequence[Level]) -> list[FrameTest]:
+def lag_test(levels: Sequence[Level]) -> list[FrameTest]:
     """Test if the noise of a frame persists in the next frame of the same light.
 
     The pattern of each pixel is fitted over the levels, separately for first and for second frames:
@@ -53,9 +53,9 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     Source: Janesick, Photon Transfer, SPIE Press 2007, chapter 8 (image lag); weighted least
             squares.
     """
-    comparable_levels = _comparable(levels)
-    patterns = _patterns(comparable_levels)
-    if len(comparable_levels) < patterns.shape[1] + _LEAST - 1:
+    comparable_levels = _comparable_levels(levels)
+    patterns = _pattern_parts(comparable_levels)
+    if len(comparable_levels) < patterns.shape[1] + _SPARE_LEVELS - 1:
         return []
     weight = torch.tensor(
         [max(level.variance, 1e-12) for level in comparable_levels], dtype=torch.float64
@@ -65,7 +65,7 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     counted_levels = torch.tensor([not level.dark for level in comparable_levels])
     # without light, all levels count
     counted_levels = counted_levels if bool(counted_levels.any()) else ~counted_levels
-    pairs = min(len(level.apart) for level in comparable_levels)
+    pairs = min(len(level.differences) for level in comparable_levels)
     first, second = (
         [level.first for level in comparable_levels],
         [level.second for level in comparable_levels],
@@ -78,7 +78,7 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
         products.append(product_of_pair)
         total_power += power
     product_of_all = torch.stack(products)
-    evidence = strongest([[studentised(product_of_all)]], sides=2)
+    evidence = strongest_evidence([[studentised(product_of_all)]], sides=2)
     share, error = (
         float(product_of_all.sum()) / total_power,
         math.sqrt(float(product_of_all.square().sum())) / total_power,
@@ -86,7 +86,7 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     limited_share = min(max(share, -0.9), 0.9)
     # the true variance over that of a pair, (1 + L) / (1 - L)^2, in logarithms
     log_variance_factor = math.log((1 + limited_share) / (1 - limited_share) ** 2)
-    sound = probably_sound(
+    sound = chance_of_no_fault(
         pairs * int(counted_levels.sum()) * comparable_levels[0].first[0].numel()
     )
     error_of_log = max(3 * error, 1e-9)
@@ -95,7 +95,7 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
             "lag",
             log_variance_factor,
             error_of_log,
-            _KEPT,
+            _LAG_SCALE,
             gain=1.0,
             noise=0.5,
             positive=True,
@@ -104,30 +104,34 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     ]
     sentence = f"{share:.1%} of the noise of a frame persists in the next frame, as by lag"
     passed = f"the noise of a frame does not persist in the next frame ({share:.2%} ± {error:.2%})"
-    return [bounded("no lag", evidence, hidden, sentence, passed)]
+    return [sized_outcome("no lag", evidence, hidden, sentence, passed)]
 
 
 def _noise_of_pair(frames: Sequence[Tensor], pair: int, weight: Tensor, basis: Tensor) -> Tensor:
     """Return what the patterns leave (level, y, x) of one frame of each level, that of the pair
     number ``pair``, in standard deviations.
     """
-    return _left(torch.stack([of_level[pair].double() for of_level in frames]), weight, basis)
+    return _without_patterns(
+        torch.stack([of_level[pair].double() for of_level in frames]), weight, basis
+    )
 
 
 def _product_and_power(u: Tensor, v: Tensor) -> tuple[Tensor, float]:
     """Return the product of the noise of two frames, summed over the levels, and its mean power,
     both without outliers.
     """
-    inliers = (u.abs() < _RARE * _width(u)) & (v.abs() < _RARE * _width(v))
+    inliers = (u.abs() < _OUTLIER_SIGMA * _robust_deviation(u)) & (
+        v.abs() < _OUTLIER_SIGMA * _robust_deviation(v)
+    )
     power = 0.5 * float(((u.square() + v.square()) * inliers).sum())
     return (u * v * inliers).sum(0), power
 
 
-def _comparable(levels: Sequence[Level]) -> list[Level]:
+def _comparable_levels(levels: Sequence[Level]) -> list[Level]:
     """Return the levels of frames of the most frequent shape, up to the level of the greatest
     variance.
     """
-    shapes = [level.apart.shape[1:] for level in levels]
+    shapes = [level.differences.shape[1:] for level in levels]
     common_shape = max(shapes, key=shapes.count)
     mean_at_peak = max(levels, key=lambda level: level.variance).mean
     candidates = zip(levels, shapes, strict=True)
@@ -138,7 +142,7 @@ def _comparable(levels: Sequence[Level]) -> list[Level]:
     ]
 
 
-def _patterns(levels: Sequence[Level]) -> Tensor:
+def _pattern_parts(levels: Sequence[Level]) -> Tensor:
     """Return the size (level, part) of each part of a pattern in each level, with as many parts as
     levels allow: an offset, the signal, its square, and the exposure.
     """
@@ -149,16 +153,16 @@ def _patterns(levels: Sequence[Level]) -> Tensor:
     parts = [torch.ones_like(signal)]
     if not bool(dark.all()):
         parts.append(signal / signal.max().clamp_min(1e-12))
-    if int((~dark).sum()) >= _CURVED:
+    if int((~dark).sum()) >= _CURVED_LEVELS:
         # a curved response needs several lit levels
         parts.append(parts[-1].square())
     exposures_in_dark = exposure[dark] if bool(dark.any()) else exposure
     if len(set(exposures_in_dark.tolist())) > 1:
         parts.append(exposure / exposure.max())
-    return torch.stack(parts[: max(1, len(levels) - _LEAST + 1)], 1)
+    return torch.stack(parts[: max(1, len(levels) - _SPARE_LEVELS + 1)], 1)
 
 
-def _left(frames: Tensor, weight: Tensor, basis: Tensor) -> Tensor:
+def _without_patterns(frames: Tensor, weight: Tensor, basis: Tensor) -> Tensor:
     """Return frames (level, y, x) over their standard deviations, without patterns and without
     means of lines.
     """
@@ -167,7 +171,7 @@ def _left(frames: Tensor, weight: Tensor, basis: Tensor) -> Tensor:
     return (scaled_frames - basis @ (basis.T @ scaled_frames)).view_as(frames)
 
 
-def _width(x: Tensor) -> Tensor:
+def _robust_deviation(x: Tensor) -> Tensor:
     """Return a robust standard deviation (level, 1, 1) of each level."""
     # a normal deviation over its median amount
     return 1.4826 * x.abs().flatten(1).median(1).values[:, None, None] + 1e-9
@@ -184,11 +188,12 @@ _PERIODS = {
     6: "6 x 6 pixels, as of X-Trans",
 }
 #: largest relative difference of the positions of a monochrome sensor with several readouts
-_UNLIKE = 0.05
-_CHANCE = 8.0  #: standard errors by which the brightest and the darkest position differ by chance
+_MONOCHROME_DIFFERENCE = 0.05
+#: standard errors by which the brightest and the darkest position differ by chance
+_POSITION_SIGMA = 8.0
 
 
-def mosaic(levels: Sequence[Level]) -> Iterator[FrameTest]:
+def mosaic_test(levels: Sequence[Level]) -> Iterator[FrameTest]:
     """Test if the light of pixels depends on their position in a small cell that repeats over the
     frame.
 
@@ -199,14 +204,14 @@ def mosaic(levels: Sequence[Level]) -> Iterator[FrameTest]:
     Source: Bayer, US patent 3971065 (1976), for the cell of 2 x 2 pixels.
     """
     dark = min((level.mean for level in levels if level.dark), default=math.inf)
-    brightest = max(tested(levels), key=lambda level: level.mean, default=None)
+    brightest = max(levels_to_test(levels), key=lambda level: level.mean, default=None)
     if brightest is None or brightest.dark or brightest.mean <= dark:
         return
     signal = brightest.mean - dark
     mean_picture = (brightest.first + brightest.second).double().mean(0) / 2
     for period, cell in _PERIODS.items():
-        relative_difference = _difference(mean_picture, period) / signal
-        if relative_difference > _UNLIKE:
+        relative_difference = _cell_contrast(mean_picture, period) / signal
+        if relative_difference > _MONOCHROME_DIFFERENCE:
             difference_text = (
                 f"the light of pixels differs by {relative_difference:.0%} over a cell of {cell}"
             )
@@ -216,23 +221,28 @@ def mosaic(levels: Sequence[Level]) -> Iterator[FrameTest]:
             )
             text += " one colour alone, such as every second pixel of every second row"
             yield FrameTest(
-                "one colour", relative_difference, _UNLIKE, "refused", text, explains_all=True
+                "one colour",
+                relative_difference,
+                _MONOCHROME_DIFFERENCE,
+                "refused",
+                text,
+                explains_all=True,
             )
             return
 
 
-def _difference(picture: Tensor, period: int) -> float:
+def _cell_contrast(picture: Tensor, period: int) -> float:
     """Return the difference of the brightest and the darkest position of a cell, DN; 0 if chance
     explains it.
     """
     if min(picture.shape) < 2 * period:
         return 0.0
-    means, error = _positions(picture, period)
+    means, error = _position_means(picture, period)
     difference = float(means.max() - means.min())
-    return difference if difference > _CHANCE * error else 0.0
+    return difference if difference > _POSITION_SIGMA * error else 0.0
 
 
-def _positions(picture: Tensor, period: int) -> tuple[Tensor, float]:
+def _position_means(picture: Tensor, period: int) -> tuple[Tensor, float]:
     """Return the mean of each position of a cell (y, x), and the standard error of a mean."""
     cell_rows, cell_columns = (n // period for n in picture.shape)
     # axes: cell along y, position along y, cell along x, position along x
@@ -252,15 +262,15 @@ def _positions(picture: Tensor, period: int) -> tuple[Tensor, float]:
 # between frames.
 
 
-_BLOCKS = 8  #: blocks of a frame on a side, whose means show how even the light is
+_BLOCKS_ON_SIDE = 8  #: blocks of a frame on a side, whose means show how even the light is
 #: difference of the largest and least irradiance that EMVA 1288 allows, relative to the mean
-_EVEN = 0.03
-_UNLIKE_PATTERN = 0.01  #: scale of the prior of the share of the variance that is of patterns
-_BENT = 0.1  #: largest relative bend of a response, by which uneven light shifts the gain
+_EVEN_LIGHT = 0.03
+_PATTERN_SCALE = 0.01  #: scale of the prior of the share of the variance that is of patterns
+_LARGEST_BEND = 0.1  #: largest relative bend of a response, by which uneven light shifts the gain
 _NEARLY_FULL = 0.95  #: share of the well above which a part of a frame is nearly full
-_SMALL = 5  #: pixels, over which uneven light is even
+_SMOOTH_PIXELS = 5  #: pixels, over which uneven light is even
 #: standard errors by which the means of the brightest and the darkest block differ by chance
-_NOISE = 8.0
+_BLOCK_SIGMA = 8.0
 
 
 def pattern_tests(levels: Sequence[Level]) -> list[FrameTest]:
@@ -276,20 +286,24 @@ def pattern_tests(levels: Sequence[Level]) -> list[FrameTest]:
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2.5 (non-uniformity) and 6.4
             (homogeneity).
     """
-    paired = tested(levels)
+    paired = levels_to_test(levels)
     if not paired:
         return []
-    return [_pattern(paired), *lag(paired), *_uneven(paired, saturated(levels))]
+    return [
+        _total_against_temporal(paired),
+        *lag_test(paired),
+        *_homogeneity(paired, saturated_levels(levels)),
+    ]
 
 
-def _pattern(levels: Sequence[Level]) -> FrameTest:
+def _total_against_temporal(levels: Sequence[Level]) -> FrameTest:
     """Test if the pixels of a level differ from each other in all frames, by DSNU and PRNU.
 
     The temporal variance leaves these differences out; the variance of all pixels and frames counts
     them as noise.
     """
     products = [level.first * level.second for level in levels]
-    evidence = strongest([[studentised(x) for x in products]])
+    evidence = strongest_evidence([[studentised(x) for x in products]])
     darkest = min((level.mean for level in levels if level.dark), default=0.0)
     dsnu, prnu = _dsnu_and_prnu(levels, [float(x.mean()) for x in products], darkest)
     sentence = (
@@ -308,7 +322,7 @@ def _pattern(levels: Sequence[Level]) -> FrameTest:
         ", which `scatter: all` counts as noise; use calibrate.camera with `scatter: steady`"
     )
     hidden = list(_counted_as_noise(levels, products))
-    return bounded("total against temporal variance", evidence, hidden, sentence, passed)
+    return sized_outcome("total against temporal variance", evidence, hidden, sentence, passed)
 
 
 def _dsnu_and_prnu(
@@ -366,7 +380,7 @@ def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> It
         design = torch.stack([torch.ones_like(mean), mean], 1) * weights[:, None]
         # weights of the levels in the slope of a weighted line through their variances
         slope_weights = torch.linalg.pinv(design)[1] * weights
-        yield _share(
+        yield _pattern_fault(
             float(slope_weights @ level_patterns),
             float((slope_weights * pattern_error).norm()),
             float(slope_weights @ total_variance),
@@ -378,10 +392,10 @@ def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> It
             pattern_error[~is_lit].norm() / int((~is_lit).sum()),
             total_variance[~is_lit].mean(),
         )
-        yield _share(float(dark_pattern), float(dark_error), float(dark_total), noise=-0.5)
+        yield _pattern_fault(float(dark_pattern), float(dark_error), float(dark_total), noise=-0.5)
 
 
-def _share(
+def _pattern_fault(
     pattern: float, error: float, total: float, gain: float = 0.0, noise: float = 0.0
 ) -> Hidden:
     """Return the fault of a part of the variance, ``pattern`` with its standard ``error``, that is
@@ -390,11 +404,11 @@ def _share(
     temporal_share = max(1 - pattern / max(total, 1e-12), 1e-3)
     error = max(error / max(total, 1e-12) / temporal_share, 1e-9)
     return Hidden(
-        "pattern", -math.log(temporal_share), error, _UNLIKE_PATTERN, gain, noise, positive=True
+        "pattern", -math.log(temporal_share), error, _PATTERN_SCALE, gain, noise, positive=True
     )
 
 
-def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTest]:
+def _homogeneity(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTest]:
     """Test if the light of the brightest level is even enough for the standard.
 
     Light that is uneven leaves the gain alone as long as the response is straight: mean and
@@ -403,7 +417,7 @@ def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTes
     """
     dark, lit = dark_and_lit(levels)
     brightest = max(lit, key=lambda level: level.mean, default=None)
-    if brightest is None or not dark or min(brightest.first.shape[1:]) < 2 * _BLOCKS:
+    if brightest is None or not dark or min(brightest.first.shape[1:]) < 2 * _BLOCKS_ON_SIDE:
         return
     nearest_dark = min(dark, key=lambda level: abs(level.exposure - brightest.exposure))
     signal = brightest.mean - nearest_dark.mean
@@ -412,19 +426,22 @@ def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTes
     means, variance_by_chance = _block_means(brightest)
     # less what chance explains
     relative_difference = (
-        max(0.0, float(means.max() - means.min()) - _NOISE * math.sqrt(variance_by_chance)) / signal
+        max(0.0, float(means.max() - means.min()) - _BLOCK_SIGMA * math.sqrt(variance_by_chance))
+        / signal
     )
     variation = max(0.0, float(means.var()) - variance_by_chance) / signal**2
     # a bent response, and parts of the frame that are nearly full
-    gain_shift = _BENT * variation + _filled(brightest, full, nearest_dark.mean)
+    gain_shift = _LARGEST_BEND * variation + _nearly_full_share(brightest, full, nearest_dark.mean)
     sentence = (
         f"the brightest and the darkest part of the light differ by {relative_difference:.1%}, not"
-        f" at most {_EVEN:.0%}"
+        f" at most {_EVEN_LIGHT:.0%}"
     )
-    passed = f"the parts of the light differ by less than the {_EVEN:.0%} that the standard allows"
+    passed = (
+        f"the parts of the light differ by less than the {_EVEN_LIGHT:.0%} that the standard allows"
+    )
     yield outcome(
         "homogeneity of the light",
-        Evidence(relative_difference, _EVEN),
+        Evidence(relative_difference, _EVEN_LIGHT),
         sentence,
         {"gain": gain_shift},
         passed,
@@ -436,14 +453,16 @@ def _block_means(level: Level) -> tuple[Tensor, float]:
     variance by chance, DN2.
     """
     mean_picture = (level.first + level.second).mean(0)[None, None] / 2
-    block_size = [n // _BLOCKS for n in mean_picture.shape[2:]]
-    without_light = mean_picture - avg_pool2d(mean_picture, _SMALL, stride=1, padding=_SMALL // 2)
+    block_size = [n // _BLOCKS_ON_SIDE for n in mean_picture.shape[2:]]
+    without_light = mean_picture - avg_pool2d(
+        mean_picture, _SMOOTH_PIXELS, stride=1, padding=_SMOOTH_PIXELS // 2
+    )
     return avg_pool2d(mean_picture, block_size)[0, 0], float(without_light.var()) / math.prod(
         block_size
     )
 
 
-def _filled(bright: Level, full: Sequence[Level], dark: float) -> float:
+def _nearly_full_share(bright: Level, full: Sequence[Level], dark: float) -> float:
     """Return the share of the light of the brightest level in parts of the frame that are nearly
     full; the well is that of the ``full`` levels, ``dark`` the mean in the dark, DN.
     """

@@ -60,7 +60,7 @@ class Prior(NamedTuple):
         return tuple(fault for fault, may in zip(FAULTS, self.hidden.tolist(), strict=True) if may)
 
 
-def believed(
+def prior_of_pairs(
     pairs: Mapping[str, Pair | None], linear: frozenset[str], **faults_known: Known
 ) -> Prior:
     """Build a prior from a pair of numbers for each free parameter, and None for each fixed
@@ -79,7 +79,7 @@ def believed(
     return Prior(centre, width, torch.tensor(hidden, dtype=torch.float64))
 
 
-def freed(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
+def free_names(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
     """Return the names of the parameters that have a prior; ``names`` are the names of all
     parameters.
     """
@@ -129,7 +129,7 @@ class Free:
         """Build sampler coordinates for the free parameters of a prior; others keep the
         ``nominal`` values.
         """
-        free = freed(cls.every, prior)
+        free = free_names(cls.every, prior)
         return cls(
             free, prior, {name: float(nominal[name]) for name in cls.every if name not in free}
         )
@@ -184,7 +184,7 @@ class Free:
 # The prior of a sensor's parameters, and the coordinates that frames constrain independently.
 
 
-_LINEAR = "offset"  #: the only parameter that may be 0 or negative
+_OFFSET = "offset"  #: the only parameter that may be 0 or negative
 
 
 @node()
@@ -216,9 +216,9 @@ def prior(
     Source: log-normal and normal distributions.
     """
     pairs = (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread)
-    return believed(
+    return prior_of_pairs(
         dict(zip(NAMES, pairs, strict=True)),
-        frozenset({_LINEAR}),
+        frozenset({_OFFSET}),
         mixing=mixing,
         lag=lag,
         pattern=pattern,
@@ -231,7 +231,7 @@ NAMES = tuple(n for n in inspect.signature(prior.fn).parameters if n not in FAUL
 
 @prior.check
 def _(result: Prior, **params: object) -> list[Check]:
-    free = freed(NAMES, result)
+    free = free_names(NAMES, result)
     return [Check(f"{len(free)} free: {', '.join(free)}")]
 
 
@@ -247,7 +247,7 @@ class Coordinates(Free):
     """
 
     every: ClassVar[tuple[str, ...]] = NAMES
-    linear: ClassVar[frozenset[str]] = frozenset({_LINEAR})
+    linear: ClassVar[frozenset[str]] = frozenset({_OFFSET})
     edged: ClassVar[frozenset[str]] = frozenset({"full_well"})
 
     @property
@@ -291,7 +291,7 @@ class Coordinates(Free):
         for name, coordinate in coordinates.items():
             if name == "gain":
                 parameters[name] = log_gain.exp()
-            elif name == _LINEAR:
+            elif name == _OFFSET:
                 # from DN to electrons
                 parameters[name] = coordinate * (-log_gain).exp()
             else:
@@ -302,7 +302,7 @@ class Coordinates(Free):
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the log prior density per unit of the sampler coordinates, up to a constant."""
         log_density = -0.5 * self.whitened(parameters).square().sum(-1)
-        if _LINEAR in self.names and "gain" in self.names:
+        if _OFFSET in self.names and "gain" in self.names:
             # Jacobian from offset in DN to electrons
             log_density = log_density - parameters["gain"].log()
         return log_density
@@ -313,7 +313,7 @@ class Coordinates(Free):
         """
         if name == "gain":
             return slope + 2.0 * full["spread"].log()
-        if name == _LINEAR:
+        if name == _OFFSET:
             return full[name] * slope.exp()
         return full[name].log() + (0.0 if name == "spread" else slope)
 
@@ -323,7 +323,7 @@ class Coordinates(Free):
 # The prior of a real camera's parameters, and the coordinates in which a sampler moves.
 
 
-_LINEAR_OF_CAMERA = frozenset({"dark_signal", "bend", "twist"})
+_LINEAR_CAMERA_NAMES = frozenset({"dark_signal", "bend", "twist"})
 
 
 @node()
@@ -358,8 +358,8 @@ def camera_prior(
     """
     dark = (dark_signal, temporal_dark_noise, dark_current)
     pairs = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
-    return believed(
-        dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR_OF_CAMERA, mixing=mixing, lag=lag
+    return prior_of_pairs(
+        dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR_CAMERA_NAMES, mixing=mixing, lag=lag
     )
 
 
@@ -369,7 +369,7 @@ CAMERA_NAMES = tuple(n for n in inspect.signature(camera_prior.fn).parameters if
 
 @camera_prior.check
 def _(result: Prior, **params: object) -> list[Check]:
-    free = freed(CAMERA_NAMES, result)
+    free = free_names(CAMERA_NAMES, result)
     return [Check(f"{len(free)} free: {', '.join(free)}")]
 
 
@@ -380,7 +380,7 @@ class CameraCoordinates(Free):
     """
 
     every: ClassVar[tuple[str, ...]] = CAMERA_NAMES
-    linear: ClassVar[frozenset[str]] = _LINEAR_OF_CAMERA
+    linear: ClassVar[frozenset[str]] = _LINEAR_CAMERA_NAMES
     widths: ClassVar[frozenset[str]] = frozenset({"scatter", "lamp", "drift"})
 
     @property
@@ -410,8 +410,8 @@ class CameraCoordinates(Free):
 # First guesses of the parameters of a sensor or camera, from measured light levels.
 
 
-_ABOVE = 1.3  #: factor on the brightest number, for a full well that no level reaches
-_LEAST = 1e-3  #: least dark current or read noise, relative to the believed value
+_WELL_FACTOR = 1.3  #: factor on the brightest number, for a full well that no level reaches
+_LEAST_SHARE = 1e-3  #: least dark current or read noise, relative to the believed value
 
 
 def guess(
@@ -432,7 +432,7 @@ def guess(
         # levels of mean and variance alone
         estimate = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
     except ValueError:
-        return values | {"full_well": _well(levels, values, params)}
+        return values | {"full_well": _guessed_well(levels, values, params)}
     gain = float(estimate.gain)
     # e-/s times the exposure in which the parameter counts electrons
     dark_electrons = float(estimate.dark_current) * params["dark_exposure"]
@@ -449,10 +449,14 @@ def guess(
         # index 0 of `ROUNDED` is the shift of the mean by rounding, DN
         "offset": (float(estimate.dark_signal) - ROUNDED[params["rounding"]][0]) / gain
         - dark_of_shortest,
-        "read_noise": max(float(estimate.temporal_dark_noise), _LEAST * believed["read_noise"]),
-        "dark_current": dark_electrons if dark_electrons > 0 else _LEAST * believed["dark_current"],
+        "read_noise": max(
+            float(estimate.temporal_dark_noise), _LEAST_SHARE * believed["read_noise"]
+        ),
+        "dark_current": dark_electrons
+        if dark_electrons > 0
+        else _LEAST_SHARE * believed["dark_current"],
     }
-    return values | {"full_well": _well(levels, values, params)}
+    return values | {"full_well": _guessed_well(levels, values, params)}
 
 
 def guess_camera(
@@ -488,7 +492,9 @@ def guess_camera(
     return {**believed, **usable_values}
 
 
-def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, Any]) -> float:
+def _guessed_well(
+    levels: Sufficient, values: Mapping[str, float], params: Mapping[str, Any]
+) -> float:
     """Return the full well at which numbers pile up, or, if none pile up, a full well above
     every number.
     """
@@ -511,4 +517,4 @@ def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, 
             / gain
         )
     # a well above the brightest number changes nothing
-    return max(values["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)
+    return max(values["full_well"], _WELL_FACTOR * min(brightest + 1, torch.inf) / gain)

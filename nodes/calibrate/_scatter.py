@@ -21,7 +21,15 @@ from torch.special import log_ndtr
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.calibrate._light_levels import refuse_unreadable, stack
-from neusee.nodes.calibrate._priors import Factor, Free, Positive, Prior, Ridge, believed, freed
+from neusee.nodes.calibrate._priors import (
+    Factor,
+    Free,
+    Positive,
+    Prior,
+    Ridge,
+    free_names,
+    prior_of_pairs,
+)
 from neusee.nodes.calibrate._sensor_likelihood import Likelihood, without_details
 from neusee.nodes.flare._stray_light import lobe, on_far_pixels, scattered_share
 from neusee.nodes.sensor._digitization import Bits
@@ -45,12 +53,13 @@ from neusee.nodes.units import (
 
 Place = Annotated[float, Field(ge=0, le=1e6)]  #: pixels, from the middle of the first pixel
 Numbers = NDArray[np.float64]
-_CUT = 0.95  #: share of saturation from which a number says only that the pixel holds more
-_BELOW = 5.0  #: standard deviations by which a ring must lie below this cut to be averaged
-_WIDER = 1.04  #: ratio of the radii of a ring, from the radius at which this is wider than a pixel
-_PARTS = 4  #: parts of a ring, each of which has a radius of its own
-_LEAST = 16.0  #: pixels from the source to the first ring, below which pixels are not small
-_RINGS = 6  #: least number of rings that can tell anything of the scatter
+_CUT_SHARE = 0.95  #: share of saturation from which a number says only that the pixel holds more
+_CUT_SIGMA = 5.0  #: standard deviations by which a ring must lie below this cut to be averaged
+#: ratio of the radii of a ring, from the radius at which this is wider than a pixel
+_RING_RATIO = 1.04
+_PARTS_OF_RING = 4  #: parts of a ring, each of which has a radius of its own
+_FIRST_RADIUS = 16.0  #: pixels from the source to the first ring, below which pixels are not small
+_LEAST_RINGS = 6  #: least number of rings that can tell anything of the scatter
 
 
 class Rings(NamedTuple):
@@ -68,7 +77,7 @@ class Rings(NamedTuple):
     centre: Tensor  #: (2,) float64, y and x of the source, from the middle of the first pixel
 
 
-class _Camera(NamedTuple):
+class PointCamera(NamedTuple):
     gain: float
     offset: float
     full_well: float
@@ -78,7 +87,7 @@ class _Camera(NamedTuple):
     @property
     def cut(self) -> float:
         """Return the digital number above which a pixel says only that it holds more."""
-        return _CUT * min(2.0**self.bits - 1, self.full_well * self.gain)
+        return _CUT_SHARE * min(2.0**self.bits - 1, self.full_well * self.gain)
 
 
 @node()
@@ -109,7 +118,7 @@ def point_source(
     Source: photon-transfer model of EMVA Standard 1288, release 4.0 Linear; Peterson, Proc. SPIE
             5178 (2004), 184.
     """
-    camera = _Camera(gain, offset, full_well, bits, read_noise)
+    camera = PointCamera(gain, offset, full_well, bits, read_noise)
     return reduce_rings(stack(files).astype(np.float64), camera, centre)
 
 
@@ -120,7 +129,7 @@ def _(*, files: Sequence[Path], centre: tuple[float, float] | None, **params: An
         params["full_well"], offset=params["offset"], read_noise=params["read_noise"]
     )
     refuse_without_steps(params["full_well"], gain=params["gain"], bits=params["bits"])
-    camera = _Camera(**{name: params[name] for name in _Camera._fields})
+    camera = PointCamera(**{name: params[name] for name in PointCamera._fields})
     try:
         reduce_rings(stack(files).astype(np.float64), camera, centre)
     except ValueError as error:
@@ -139,36 +148,34 @@ def _(result: Rings, *others: Any, **params: Any) -> list[Check]:
     return [Check(text, bool((result.pixels > 0).all()))]
 
 
-def reduce_rings(frames: Numbers, camera: _Camera, centre: tuple[float, float] | None) -> Rings:
+def reduce_rings(frames: Numbers, camera: PointCamera, centre: tuple[float, float] | None) -> Rings:
     """Return the rings of frames (frame, y, x) of digital numbers; raise ValueError for frames
     that tell nothing.
     """
     _refuse_numbers(frames, camera)
-    frame_shape = frames.shape[1:]
-    source_position = _middle(frames, camera) if centre is None else centre
-    if not all(-0.5 <= c <= n - 0.5 for c, n in zip(source_position, frame_shape, strict=True)):
+    height, width = frames.shape[1:]
+    source_y, source_x = _source_centre(frames, camera) if centre is None else centre
+    if not (-0.5 <= source_y <= height - 0.5 and -0.5 <= source_x <= width - 0.5):
         raise ValueError(
-            f"the source at ({source_position[0]:g}, {source_position[1]:g}) is not in the frame of"
-            f" {frame_shape[0]} x {frame_shape[1]} pixels: give `centre` as y and x, in pixels"
+            f"the source at ({source_y:g}, {source_x:g}) is not in the frame of"
+            f" {height} x {width} pixels: give `centre` as y and x, in pixels"
         )
-    y, x = np.ogrid[: frame_shape[0], : frame_shape[1]]
-    squared_distance = ((y - source_position[0]) ** 2 + (x - source_position[1]) ** 2).astype(
-        np.float64
-    )
-    sector = _part(squared_distance)
+    y, x = np.ogrid[:height, :width]
+    squared_distance = ((y - source_y) ** 2 + (x - source_x) ** 2).astype(np.float64)
+    sector = _part_numbers(squared_distance)
     signal = frames / camera.gain - camera.offset
     is_cut: NDArray[np.bool_] = np.asarray((frames >= camera.cut).any(0))
-    # `sector` numbers the parts of all rings: ring number = part number // _PARTS
-    first_ring = _first_ring(frames, sector // _PARTS, camera)
-    unsaturated = (sector >= first_ring * _PARTS) & ~is_cut
-    cut_squares = _cut_rings(squared_distance, sector // _PARTS, is_cut, first_ring)
+    # `sector` numbers the parts of all rings: ring number = part number // `_PARTS_OF_RING`
+    first_ring = _first_ring(frames, sector // _PARTS_OF_RING, camera)
+    unsaturated = (sector >= first_ring * _PARTS_OF_RING) & ~is_cut
+    cut_squares = _cut_rings(squared_distance, sector // _PARTS_OF_RING, is_cut, first_ring)
     # the last three fields of `Rings`
-    limits = (cut_squares, camera.cut / camera.gain - camera.offset, source_position)
-    rings = _averaged(signal, squared_distance, sector, unsaturated)
+    limits = (cut_squares, camera.cut / camera.gain - camera.offset, (source_y, source_x))
+    rings = _ring_averages(signal, squared_distance, sector, unsaturated)
     return Rings(*rings, *(torch.as_tensor(x, dtype=torch.float64) for x in limits))
 
 
-def _refuse_numbers(frames: Numbers, camera: _Camera) -> None:
+def _refuse_numbers(frames: Numbers, camera: PointCamera) -> None:
     """Raise ValueError for numbers that the converter cannot give, and for frames without a
     saturated pixel.
     """
@@ -181,11 +188,12 @@ def _refuse_numbers(frames: Numbers, camera: _Camera) -> None:
     if brightest < camera.cut:
         raise ValueError(
             f"no pixel is saturated: the brightest has {brightest:.0f} DN of"
-            f" {camera.cut / _CUT:.0f} DN: expose longer, or check `bits`, `full_well` and `gain`"
+            f" {camera.cut / _CUT_SHARE:.0f} DN: expose longer, or check `bits`, `full_well` and"
+            " `gain`"
         )
 
 
-def _middle(frames: Numbers, camera: _Camera) -> tuple[float, float]:
+def _source_centre(frames: Numbers, camera: PointCamera) -> tuple[float, float]:
     """Return the middle of the saturated pixels; a median first excludes lone pixels far from
     the source.
     """
@@ -199,27 +207,27 @@ def _middle(frames: Numbers, camera: _Camera) -> tuple[float, float]:
     return float(y[is_near].mean()), float(x[is_near].mean())
 
 
-def _part(square: Numbers) -> NDArray[np.int64]:
+def _part_numbers(square: Numbers) -> NDArray[np.int64]:
     """Return the number of the part of a ring to which each pixel belongs, from its squared
     distance.
 
-    Each ring has `_PARTS` parts. Rings are one pixel wide up to a radius, and grow by the ratio
-    `_WIDER` from there on.
+    Each ring has `_PARTS_OF_RING` parts. Rings are one pixel wide up to a radius, and grow by
+    the ratio `_RING_RATIO` from there on.
     """
     radius = np.sqrt(square)
-    first_wide_radius = 1 / (_WIDER - 1)  # below this radius rings are one pixel wide
+    first_wide_radius = 1 / (_RING_RATIO - 1)  # below this radius rings are one pixel wide
     ring_of_wide = first_wide_radius + np.log(
         np.maximum(radius, first_wide_radius) / first_wide_radius
-    ) / math.log(_WIDER)
+    ) / math.log(_RING_RATIO)
     part_number: NDArray[np.int64] = np.floor(
-        _PARTS * np.where(radius < first_wide_radius, radius, ring_of_wide)
+        _PARTS_OF_RING * np.where(radius < first_wide_radius, radius, ring_of_wide)
     ).astype(np.int64)
     return part_number
 
 
-def _first_ring(frames: Numbers, ring: NDArray[np.int64], camera: _Camera) -> int:
+def _first_ring(frames: Numbers, ring: NDArray[np.int64], camera: PointCamera) -> int:
     """Return the number of the first ring beyond which every ring lies clearly below saturation,
-    lone bright pixels aside, at least `_LEAST`.
+    lone bright pixels aside, at least `_FIRST_RADIUS`.
 
     ``ring`` has the number of each pixel's ring.
     """
@@ -229,8 +237,10 @@ def _first_ring(frames: Numbers, ring: NDArray[np.int64], camera: _Camera) -> in
     # DN: shot noise K mean above the offset, and read noise
     noise = np.sqrt(np.maximum(mean * camera.gain, 0) + (camera.read_noise * camera.gain) ** 2)
     many_cut = np.bincount(ring.ravel(), is_cut.ravel()) > 0.05 * pixel_count
-    is_bright = (mean + _BELOW * noise >= camera.cut) | many_cut
-    return max(int(np.flatnonzero(is_bright & (pixel_count > 0)).max(initial=-1)) + 1, int(_LEAST))
+    is_bright = (mean + _CUT_SIGMA * noise >= camera.cut) | many_cut
+    return max(
+        int(np.flatnonzero(is_bright & (pixel_count > 0)).max(initial=-1)) + 1, int(_FIRST_RADIUS)
+    )
 
 
 def _cut_rings(
@@ -245,7 +255,7 @@ def _cut_rings(
     ring_numbers = np.arange(len(pixel_count))
     all_cut = (
         (ring_numbers < first)
-        & (ring_numbers >= _LEAST)
+        & (ring_numbers >= _FIRST_RADIUS)
         & (pixel_count > 0)
         & (cut_count == pixel_count)
     )
@@ -253,7 +263,7 @@ def _cut_rings(
     return mean_squares
 
 
-def _averaged(
+def _ring_averages(
     signal: Numbers, square: Numbers, sector: NDArray[np.int64], unsaturated: NDArray[np.bool_]
 ) -> tuple[Tensor, ...]:
     """Return mean and number of pixels of each ring, and ring, mean squared distance and pixels
@@ -265,8 +275,8 @@ def _averaged(
         np.bincount(part_of_pixel, values[unsaturated]) / part_pixels
         for values in (square, signal.mean(0))
     )
-    ring_numbers, ring_of_part = np.unique(part_numbers // _PARTS, return_inverse=True)
-    if len(ring_numbers) < _RINGS:
+    ring_numbers, ring_of_part = np.unique(part_numbers // _PARTS_OF_RING, return_inverse=True)
+    if len(ring_numbers) < _LEAST_RINGS:
         raise ValueError(
             f"only {len(ring_numbers)} rings of pixels lie between the saturated pixels and the"
             " edge of the frame: expose less, or give a larger frame with the source in it"
@@ -291,7 +301,7 @@ def _averaged(
 
 Scattered = Annotated[float, Field(ge=0, le=100)]  #: a standard deviation; 0 for none
 #: relative: how well the mean wing of the core is that of a ring that is one pixel wide
-_FRINGES = 0.02
+_FRINGE_DEVIATION = 0.02
 
 
 @node()
@@ -348,7 +358,7 @@ def stray_light(
     # wavelength x f-number in pixels, and the direction cosine of a pixel
     lens_scales = (wavelength * focal_length / (diameter * pixel_pitch), pixel_pitch / focal_length)
     ring_mean = (
-        _averaged_rings(_light(parameters, rings.square, *lens_scales), rings)
+        _averaged_rings(_source_light(parameters, rings.square, *lens_scales), rings)
         + parameters["background"]
     )
     # e-^2: shot noise, read noise and rounding
@@ -358,14 +368,22 @@ def stray_light(
         + (parameters["scatter"] * (ring_mean - parameters["background"])).square()
     )
     residuals = (rings.mean - ring_mean) / variance.sqrt()
-    cut_signal = _light(parameters, rings.cut_square, *lens_scales) + parameters["background"]
+    cut_signal = (
+        _source_light(parameters, rings.cut_square, *lens_scales) + parameters["background"]
+    )
     # logarithm of the probability that a ring whose every pixel is cut lies above the cut
     log_above = log_ndtr(
-        (cut_signal - rings.cut) / (cut_signal * torch.hypot(parameters["scatter"], _ripple()))
+        (cut_signal - rings.cut)
+        / (
+            cut_signal
+            * torch.hypot(
+                parameters["scatter"], torch.tensor(_FRINGE_DEVIATION, dtype=torch.float64)
+            )
+        )
     )
     log_likelihood = -0.5 * (residuals.square() + variance.log()).sum(-1) + log_above.sum(-1)
     # a surface cannot scatter all light
-    checked_log = log_likelihood.where(_total(parameters)[..., 0] < 1, -torch.inf)
+    checked_log = log_likelihood.where(_total_scatter(parameters)[..., 0] < 1, -torch.inf)
     if not told:
         return without_details(checked_log)
     # squared derivatives of a residual and of its log width sum, on average, to the Fisher
@@ -388,17 +406,14 @@ def _(result: Likelihood, rings: Rings, **params: Any) -> list[Check]:
     return [Check(f"deviance {float(result.deviance.sum()):.4g} of {len(rings.mean)} rings")]
 
 
-def _ripple() -> Tensor:
-    """Return the relative deviation of a ring by diffraction fringes, as a tensor."""
-    return torch.tensor(_FRINGES, dtype=torch.float64)
-
-
-def _total(numbers: Mapping[str, Tensor]) -> Tensor:
+def _total_scatter(numbers: Mapping[str, Tensor]) -> Tensor:
     """Return the share of the light that the surface scatters (TIS)."""
     return scattered_share(numbers["b0"], numbers["l"], numbers["s"])
 
 
-def _light(numbers: dict[str, Tensor], square: Tensor, fringe: float, scale: float) -> Tensor:
+def _source_light(
+    numbers: dict[str, Tensor], square: Tensor, fringe: float, scale: float
+) -> Tensor:
     """Return the electrons of the source in pixels at squared distances; ``fringe`` is
     wavelength N in pixels.
     """
@@ -416,7 +431,7 @@ def share_of_light(
     """
     b0, l, s = (numbers[name] for name in ("b0", "l", "s"))  # noqa: E741
     veil = on_far_pixels(lobe(b0, l, s, torch.tensor(scale, dtype=torch.float64)), square)
-    return (1 - _total(numbers).clamp_max(1)) * numbers["core"] * diffraction_wing(
+    return (1 - _total_scatter(numbers).clamp_max(1)) * numbers["core"] * diffraction_wing(
         square, fringe
     ) + veil
 
@@ -502,9 +517,9 @@ def guess_scatter(
 
 # --- prior and coordinates ------------------------------------------------------------------------
 
-_FAR = 30.0  #: factor on l at which a fit is compared
-_MOST = 0.3  #: share of scattered light up to which a narrower lobe is compared
-_LINEAR = frozenset({"s", "background"})
+_WIDE_FACTOR = 30.0  #: factor on l at which a fit is compared
+_LARGEST_SCATTER = 0.3  #: share of scattered light up to which a narrower lobe is compared
+_LINEAR_NAMES = frozenset({"s", "background"})
 
 
 @node()
@@ -531,9 +546,9 @@ def stray_prior(
     Raises: ValueError where no parameter is free, or where a median or width is not positive.
     Source: log-normal and normal distributions.
     """
-    return believed(
+    return prior_of_pairs(
         dict(zip(SCATTER_NAMES, (b0, l, s, electrons, background, core, scatter), strict=True)),
-        _LINEAR,
+        _LINEAR_NAMES,
     )
 
 
@@ -543,7 +558,7 @@ SCATTER_NAMES = tuple(inspect.signature(stray_prior.fn).parameters)
 
 @stray_prior.check
 def _(result: Prior, **params: object) -> list[Check]:
-    free = freed(SCATTER_NAMES, result)
+    free = free_names(SCATTER_NAMES, result)
     return [Check(f"{len(free)} free: {', '.join(free)}")]
 
 
@@ -584,7 +599,7 @@ class ScatterCoordinates(Free):
     """
 
     every: ClassVar[tuple[str, ...]] = SCATTER_NAMES
-    linear: ClassVar[frozenset[str]] = _LINEAR
+    linear: ClassVar[frozenset[str]] = _LINEAR_NAMES
     bent: ClassVar[bool] = True
     sight: Sight | None = None
 
@@ -610,7 +625,7 @@ class ScatterCoordinates(Free):
         }
         columns = dict(zip(self.names, self.scaled(values).unbind(-1), strict=True))
         if self._joint:
-            squared_ratio = self._square(columns["l"])
+            squared_ratio = self._squared_ratio(columns["l"])
             # ln BSDF = ln b0 + s/2 ln(1 + q), with q = (beta / l)^2 between the rings
             columns["b0"] = columns["b0"] + values["s"] / 2 * torch.log1p(squared_ratio)
             # the slope of ln BSDF over ln beta is s q / (1 + q)
@@ -619,7 +634,7 @@ class ScatterCoordinates(Free):
             share_in_first, share_in_last = self._shares(self.sight, values)
             if "background" in columns:
                 columns["background"] = (
-                    columns["background"] + self._of("electrons", values) * share_in_last
+                    columns["background"] + self._value_of("electrons", values) * share_in_last
                 )
             if "electrons" in columns:
                 columns["electrons"] = columns["electrons"] + share_in_first.log()
@@ -629,7 +644,7 @@ class ScatterCoordinates(Free):
         """Convert sampler coordinates (..., free parameter) to parameters of the scatter."""
         columns = dict(zip(self.names, place.unbind(-1), strict=True))
         if self._joint:
-            squared_ratio = self._square(columns["l"])
+            squared_ratio = self._squared_ratio(columns["l"])
             # the inverse of `place`
             columns["s"] = -columns["s"].exp() * (1 + squared_ratio) / squared_ratio
             columns["b0"] = columns["b0"] - columns["s"] / 2 * torch.log1p(squared_ratio)
@@ -640,7 +655,7 @@ class ScatterCoordinates(Free):
                 values["electrons"] = values["electrons"] / share_in_first
             if "background" in values:
                 values["background"] = (
-                    values["background"] - self._of("electrons", values) * share_in_last
+                    values["background"] - self._value_of("electrons", values) * share_in_last
                 )
         return values
 
@@ -658,7 +673,7 @@ class ScatterCoordinates(Free):
         """Return True if b0, l and s are all free, so that their coordinates are mixed."""
         return {"b0", "l", "s"} <= set(self.names)
 
-    def _of(self, name: str, values: Mapping[str, Tensor]) -> Tensor:
+    def _value_of(self, name: str, values: Mapping[str, Tensor]) -> Tensor:
         """Return the value of a parameter, free or held."""
         return (
             values[name] if name in values else torch.tensor(self.held[name], dtype=torch.float64)
@@ -666,14 +681,16 @@ class ScatterCoordinates(Free):
 
     def _shares(self, sight: Sight, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return the shares of the light in a pixel of the first and of the last ring."""
-        parameters = {name: self._of(name, values)[..., None] for name in ("b0", "l", "s", "core")}
+        parameters = {
+            name: self._value_of(name, values)[..., None] for name in ("b0", "l", "s", "core")
+        }
         squared_radii = torch.tensor([sight.inner**2, sight.outer**2], dtype=torch.float64)
         share_in_first, share_in_last = share_of_light(
             parameters, squared_radii, sight.fringe, sight.scale
         ).unbind(-1)
         return share_in_first, share_in_last
 
-    def _square(self, log_l: Tensor) -> Tensor:
+    def _squared_ratio(self, log_l: Tensor) -> Tensor:
         """Return (beta / l)**2 at the direction cosine beta between the rings, or in the middle
         of the prior of l.
         """
@@ -701,15 +718,18 @@ class ScatterCoordinates(Free):
         l, s = lobe_values["l"], lobe_values["s"]  # noqa: E741
         ridges = [
             Ridge(
-                self._moved(lobe_values, 1.0, _FAR),
+                self._moved(lobe_values, 1.0, _WIDE_FACTOR),
                 {"l": "lower"},
                 "l: only a lower limit, beyond the frame",
             )
         ]
         # the narrowest lobe that still scatters a moderate share of the light
-        for factor in (_FAR, 10.0, 3.0):
+        for factor in (_WIDE_FACTOR, 10.0, 3.0):
             peak_factor = float(factor ** -float(s))
-            if float(scattered_share(lobe_values["b0"] * peak_factor, l / factor, s)) < _MOST:
+            if (
+                float(scattered_share(lobe_values["b0"] * peak_factor, l / factor, s))
+                < _LARGEST_SCATTER
+            ):
                 text = "b0 and l only as b0 l^(-s): l lies within the saturated pixels"
                 narrow_lobe = self._moved(lobe_values, peak_factor, 1 / factor)
                 return [*ridges, Ridge(narrow_lobe, {"l": "upper", "b0": "lower"}, text)]
@@ -724,7 +744,7 @@ class ScatterCoordinates(Free):
         unscattered_before, unscattered_after = (
             1 - scattered_share(*x) for x in ((lobe_values["b0"], lobe_values["l"], s), (b0, l, s))
         )
-        core_factor = unscattered_before / unscattered_after.clamp_min(1 - _MOST)
+        core_factor = unscattered_before / unscattered_after.clamp_min(1 - _LARGEST_SCATTER)
         if "core" in self.names:
             core = core * core_factor
         elif "electrons" in self.names:

@@ -11,6 +11,7 @@ from torch.special import log_ndtr, ndtr
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._emva_sheet import Share
+from neusee.nodes.calibrate._light_levels import COARSE_DEVIATION
 from neusee.nodes.sensor._digitization import Bits, Rounding
 from neusee.nodes.sensor._noise import Distribution, Spread
 from neusee.nodes.sensor._saturation import Well
@@ -22,8 +23,8 @@ from neusee.nodes.values import Levels
 # Sufficient statistics of the frames of each light level, for a sensor whose pixels are alike.
 
 
-_EDGE = 4  #: DN from either end that keep a histogram: a full well affects two or three numbers
-_COARSE = 0.8  #: DN, standard deviation below which mean and variance are not sufficient
+#: DN from either end that keep a histogram: a full well affects two or three numbers
+_EDGE_NUMBERS = 4
 
 
 class Sufficient(NamedTuple):
@@ -61,7 +62,7 @@ def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
     Raises: ValueError for a ``share`` without a lit level.
     Source: Fisher, Phil. Trans. R. Soc. A 222, 309 (1922), sufficiency.
     """
-    levels = levels if share is None else _below(levels, share)
+    levels = levels if share is None else _levels_below(levels, share)
     moments = torch.stack(
         [levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1
     )
@@ -70,7 +71,7 @@ def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
         cells_of_level = levels.cell_level == level
         deviation = math.sqrt(float(levels.variance[level]))
         # the middle becomes mean and variance; the cells near both ends stay
-        is_inner, moments[level] = _inner(
+        is_inner, moments[level] = _histogram_middle(
             levels.cell_value[cells_of_level], levels.cell_count[cells_of_level], deviation
         )
         keeps_cell[cells_of_level] = ~is_inner
@@ -91,7 +92,7 @@ def _(result: Sufficient, *inputs: Levels, **params: Any) -> list[Check]:
 
 @sufficient.reference
 def _(levels: Levels, *, share: float | None = None) -> Sufficient:
-    levels = levels if share is None else _below(levels, share)
+    levels = levels if share is None else _levels_below(levels, share)
     cells = list(
         zip(
             levels.cell_level.tolist(),
@@ -107,7 +108,7 @@ def _(levels: Levels, *, share: float | None = None) -> Sufficient:
     for level in range(len(moments)):
         cells_of_level = [(v, n) for cell_level, v, n in cells if cell_level == level]
         if cells_of_level:
-            moments[level], inside = _reference_inner(cells_of_level, moments[level][2])
+            moments[level], inside = _reference_middle(cells_of_level, moments[level][2])
             outer_cells += [(level, v, n) for v, n in cells_of_level if (v, n) not in inside]
     columns = torch.tensor(outer_cells, dtype=torch.float64).reshape(-1, 3).unbind(1)
     numbers, mean, variance, freedom = torch.tensor(moments, dtype=torch.float64).unbind(1)
@@ -123,14 +124,14 @@ def _(levels: Levels, *, share: float | None = None) -> Sufficient:
     )
 
 
-def _reference_inner(
+def _reference_middle(
     own: list[tuple[float, float]], variance: float
 ) -> tuple[list[float], list[tuple[float, float]]]:
     """Return number, mean, variance and degrees of freedom of the middle of a histogram of numbers
     and counts, and this middle; zeros and nothing if the middle is too narrow.
     """
-    lower_edge, upper_edge = own[0][0] + _EDGE, own[-1][0] - _EDGE
-    if not variance**0.5 >= _COARSE:  # or not a number
+    lower_edge, upper_edge = own[0][0] + _EDGE_NUMBERS, own[-1][0] - _EDGE_NUMBERS
+    if not variance**0.5 >= COARSE_DEVIATION:  # or not a number
         return [0.0, 0.0, 0.0, 0.0], []
     middle_cells = [(v, n) for v, n in own if lower_edge < v < upper_edge]
     count = math.fsum(n for _, n in middle_cells)
@@ -138,12 +139,12 @@ def _reference_inner(
         return [0.0, 0.0, 0.0, 0.0], []
     mean = math.fsum(v * n for v, n in middle_cells) / count
     sum_of_squares = math.fsum((v - mean) ** 2 * n for v, n in middle_cells)
-    if sum_of_squares < _COARSE**2 * (count - 1):
+    if sum_of_squares < COARSE_DEVIATION**2 * (count - 1):
         return [0.0, 0.0, 0.0, 0.0], []
     return [count, mean, sum_of_squares / (count - 1), count - 1], middle_cells
 
 
-def _below(levels: Levels, share: float) -> Levels:
+def _levels_below(levels: Levels, share: float) -> Levels:
     """Return the dark levels, and the lit levels up to a share of saturation."""
     is_lit = levels.photons > 0
     if not bool(is_lit.any()):
@@ -165,17 +166,17 @@ def _below(levels: Levels, share: float) -> Levels:
     return Levels._make([*columns, *cell_columns])
 
 
-def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
+def _histogram_middle(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
     """Return a mask of the digital numbers away from both ends of the range, and (number, mean,
     variance, degrees of freedom) of their pixels; nothing and zeros where they are too coarse.
     """
-    is_inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
+    is_inner = (value > value[0] + _EDGE_NUMBERS) & (value < value[-1] - _EDGE_NUMBERS)
     pixel_count = float(count[is_inner].sum())
     mean = (value[is_inner] * count[is_inner]).sum() / max(pixel_count, 1.0)
     variance = ((value[is_inner] - mean).square() * count[is_inner]).sum() / max(
         pixel_count - 1, 1.0
     )
-    if min(sd, math.sqrt(float(variance))) < _COARSE:
+    if min(sd, math.sqrt(float(variance))) < COARSE_DEVIATION:
         return torch.zeros_like(is_inner), torch.zeros(4, dtype=torch.float64)
     return is_inner, torch.stack(
         [
@@ -195,7 +196,7 @@ def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
 # Numbers are not treated as continuous, and no quantization variance is added.
 
 
-_LEAST = 1e-300  #: probability below which a probability counts as 0
+_LEAST_PROBABILITY = 1e-300  #: probability below which a probability counts as 0
 
 
 def log_cell(
@@ -215,18 +216,22 @@ def log_cell(
         # the numbers 0 and `top` hold all that is below and above; a full pixel ends the signal
         lower_edge = torch.where(value <= 0, -math.inf, value - 0.5)
         upper_edge = torch.where((value >= top) | (value + 0.5 >= well), math.inf, value + 0.5)
-        return torch.where(lower_edge < well, _between(lower_edge, upper_edge, mean, sd), -math.inf)
+        return torch.where(
+            lower_edge < well, _log_between(lower_edge, upper_edge, mean, sd), -math.inf
+        )
     if rounding == "truncation":
         lower_edge = torch.where(value <= 0, -math.inf, value)
         upper_edge = torch.where((value >= top) | (value + 1.0 > well), math.inf, value + 1.0)
         return torch.where(
-            lower_edge <= well, _between(lower_edge, upper_edge, mean, sd), -math.inf
+            lower_edge <= well, _log_between(lower_edge, upper_edge, mean, sd), -math.inf
         )
-    probability = _dithered(value, mean, sd, well, top)
-    return torch.where(probability > _LEAST, probability.clamp_min(_LEAST).log(), -math.inf)
+    probability = _dithered_probability(value, mean, sd, well, top)
+    return torch.where(
+        probability > _LEAST_PROBABILITY, probability.clamp_min(_LEAST_PROBABILITY).log(), -math.inf
+    )
 
 
-def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
+def _log_between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
     """Return log P(low < x < high) for a Gaussian x, computed in the tail where no digits
     cancel.
     """
@@ -240,12 +245,14 @@ def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
     log_far, log_near = log_ndtr(lower_z), log_ndtr(upper_z)
     # log(exp(near) - exp(far)) without cancellation
     log_probability: Tensor = log_near + torch.log(
-        -torch.expm1((log_far - log_near).clamp_max(-_LEAST))
+        -torch.expm1((log_far - log_near).clamp_max(-_LEAST_PROBABILITY))
     )
     return log_probability
 
 
-def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -> Tensor:
+def _dithered_probability(
+    value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int
+) -> Tensor:
     """Return P(floor(x + U(-1/2, 1/2)) = k): the density of x, weighted by a triangle from k - 1/2
     to k + 3/2.
 
@@ -263,7 +270,8 @@ def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -
     middle_corner = torch.minimum(middle, last_corner)
     is_above = middle > mean
     integral_first, integral_middle, integral_last = (
-        _integral(x, mean, sd, is_above) for x in (first_corner, middle_corner, last_corner)
+        _integrated_distribution(x, mean, sd, is_above)
+        for x in (first_corner, middle_corner, last_corner)
     )
     # height of the triangle where the well cuts it off
     at_well = torch.where(is_above, 0.0, (1.0 - (last_corner - middle).abs()))
@@ -283,7 +291,7 @@ def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -
     ).clamp_min(0.0)
 
 
-def _integral(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
+def _integrated_distribution(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
     """Return the integral of the Gaussian distribution function up to x, minus (x - mean) if
     ``above`` is True.
     """
@@ -307,9 +315,10 @@ ROUNDED: dict[str, tuple[float, float]] = {
     "truncation": (-0.5, 1.0 / 12.0),
     "dithered_floor": (-0.5, 1.0 / 6.0),
 }
-_FEW = 8.0  #: electrons; up to this mean, coarse levels sum over the number of electrons
-_GRAIN = 1e-3  #: share of the variance above which the discreteness of electrons matters
-_MOST = 40  #: electrons; with a mean of _FEW, only 1e-15 of all pixels hold more
+_FEW_ELECTRONS = 8.0  #: electrons; up to this mean, coarse levels sum over the number of electrons
+_GRAIN_SHARE = 1e-3  #: share of the variance above which the discreteness of electrons matters
+#: electrons; with a mean of `_FEW_ELECTRONS`, only 1e-15 of all pixels hold more
+_MOST_ELECTRONS = 40
 
 
 class Sensor(NamedTuple):
@@ -344,7 +353,7 @@ class Likelihood(NamedTuple):
     variance: Tensor  #: (..., level) DN2, as `mean`
 
 
-class _Expected(NamedTuple):
+class _ExpectedSignal(NamedTuple):
     mean: Tensor  #: (..., level) DN, before rounding
     variance: Tensor  #: (..., level) DN2, before rounding
 
@@ -358,7 +367,7 @@ def likelihood(
     Without ``with_details`` only the logarithm is computed, because a sampler needs no other field.
     """
     expected, (rounding_shift, rounding_variance), largest_number = (
-        _expected(levels, sensor),
+        _expected_signal(levels, sensor),
         ROUNDED[rounding],
         2**bits - 1,
     )
@@ -390,7 +399,7 @@ def likelihood(
     )
     rows = [_scaled(levels, mean, variance).where(has_moments.repeat(2), 0.0)]
     # Poisson counts: 2 sqrt(expected count) has the standard deviation 1
-    rows.append(2.0 * (_pixels(levels)[levels.cell_level] * log_cells.exp()).sqrt())
+    rows.append(2.0 * (_pixel_counts(levels)[levels.cell_level] * log_cells.exp()).sqrt())
     if rounding != "dithered_floor":  # the well lies anywhere within one number, 1 DN wide
         # standard deviation of an even distribution 1 DN wide: 1 / sqrt(12)
         rows.append(
@@ -399,11 +408,13 @@ def likelihood(
     return Likelihood(log_likelihood, deviance, freedom, torch.cat(rows, -1), mean, variance)
 
 
-def _cut_off(levels: Sufficient, signal: _Expected, sensor: Sensor, top: int) -> Tensor:
+def _cut_off(levels: Sufficient, signal: _ExpectedSignal, sensor: Sensor, top: int) -> Tensor:
     """Return a mask (..., 1) of the sensors whose full well clips numbers that the converter
     could still give.
     """
-    pixels_above = _pixels(levels) * ndtr((signal.mean - sensor.well) / signal.variance.sqrt())
+    pixels_above = _pixel_counts(levels) * ndtr(
+        (signal.mean - sensor.well) / signal.variance.sqrt()
+    )
     is_clipping: Tensor = (pixels_above.sum(-1, keepdim=True) > 1.0) & (sensor.well < top - 0.5)
     return is_clipping
 
@@ -427,13 +438,13 @@ def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
     )
 
 
-def _expected(levels: Sufficient, sensor: Sensor) -> _Expected:
+def _expected_signal(levels: Sufficient, sensor: Sensor) -> _ExpectedSignal:
     """Return mean and variance (..., level) of the numbers of each level before rounding: offset,
     dark signal and light, with read noise and the shot noise of both.
     """
     dark = sensor.dark * levels.exposure
     mean = sensor.offset + dark + sensor.response * levels.photons
-    return _Expected(
+    return _ExpectedSignal(
         mean, sensor.read.square() + sensor.gain * dark + sensor.noise * levels.photons
     )
 
@@ -443,7 +454,7 @@ def _has_cells(levels: Sufficient) -> Tensor:
     return torch.zeros_like(levels.pixels, dtype=torch.bool).index_fill_(0, levels.cell_level, True)
 
 
-def _pixels(levels: Sufficient) -> Tensor:
+def _pixel_counts(levels: Sufficient) -> Tensor:
     """Return the number of pixels of each light level, counted in mean and variance and in
     histogram bins.
     """
@@ -451,7 +462,7 @@ def _pixels(levels: Sufficient) -> Tensor:
 
 
 def _log_cells(
-    levels: Sufficient, signal: _Expected, sensor: Sensor, rounding: Rounding, top: int
+    levels: Sufficient, signal: _ExpectedSignal, sensor: Sensor, rounding: Rounding, top: int
 ) -> Tensor:
     """Return the logarithm of the probability of each histogram bin (..., bin).
 
@@ -469,20 +480,24 @@ def _log_cells(
         mean - sensor.offset if sensor.counted else sensor.dark * levels.exposure[cell_level]
     ) / sensor.gain
     has_few = (
-        is_coarse & (electrons <= _FEW) & (sensor.gain.square() * electrons > _GRAIN * variance)
+        is_coarse
+        & (electrons <= _FEW_ELECTRONS)
+        & (sensor.gain.square() * electrons > _GRAIN_SHARE * variance)
     )
     if not bool(has_few.any()):
         return gaussian
     return torch.where(
         has_few,
-        _counted_out(levels, signal, sensor, rounding, top, electrons.expand_as(gaussian)),
+        _log_cells_by_electrons(
+            levels, signal, sensor, rounding, top, electrons.expand_as(gaussian)
+        ),
         gaussian,
     )
 
 
-def _counted_out(
+def _log_cells_by_electrons(
     levels: Sufficient,
-    signal: _Expected,
+    signal: _ExpectedSignal,
     sensor: Sensor,
     rounding: Rounding,
     top: int,
@@ -492,7 +507,7 @@ def _counted_out(
     electrons.
     """
     cell_level = levels.cell_level
-    electron_count = torch.arange(_MOST + 1, dtype=torch.float64).view(
+    electron_count = torch.arange(_MOST_ELECTRONS + 1, dtype=torch.float64).view(
         -1, *(1 for _ in electrons.shape)
     )
     mean_electrons = electrons.clamp_min(1e-300)
@@ -519,7 +534,7 @@ def _deviance(
     that of the histogram, whose bins have the logarithmic probabilities ``cells``.
     """
     by_cells = levels.pixels == 0
-    count, pixels_of_level = levels.cell_count, _pixels(levels)[levels.cell_level]
+    count, pixels_of_level = levels.cell_count, _pixel_counts(levels)[levels.cell_level]
     # twice the log-likelihood below that of the measured shares
     cell_deviance = 2.0 * count * ((count / pixels_of_level).log() - cells)
     level_deviance = torch.zeros_like(moments).index_add(

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from neusee.nodes.calibrate._camera_likelihood import CAMERA_PARAMETERS, _Camera, _signal, _used
-from neusee.nodes.calibrate._emva_quantities import SENSITIVITY, Quantity
+from neusee.nodes.calibrate._camera_likelihood import (
+    CAMERA_PARAMETERS,
+    CameraValues,
+    camera_signal,
+    levels_to_fit,
+)
+from neusee.nodes.calibrate._emva_quantities import FITTED_SHARE, Quantity, lit_order
 from neusee.nodes.calibrate._emva_sheet import EmvaSheet, emva_sheet, without_histograms
 from neusee.nodes.calibrate._nonuniformity import chance_of_variances
 from neusee.nodes.calibrate._uncertainty_budget import (
@@ -52,12 +56,12 @@ def camera_sources(levels: Levels, params: Mapping[str, Any]) -> dict[str, Tenso
     Error:  exact for the model of `camera`.
     Source: the variance of a mean and of a log variance in `camera`, term by term.
     """
-    fitted_index, largest_signal, _ = _used(levels, params["share"])
+    fitted_index, largest_signal, _ = levels_to_fit(levels, params["share"])
     fitted_levels = without_histograms(levels, fitted_index)
-    camera = _Camera(
+    camera = CameraValues(
         *(torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS)
     )
-    signal = _signal(fitted_levels.mean - camera.signal, largest_signal, camera)
+    signal = camera_signal(fitted_levels.mean - camera.signal, largest_signal, camera)
     lamp_error = camera.lamp * camera.efficiency * fitted_levels.photons * signal.slope
     chance_variance, drift_variance = (
         fitted_levels.variance / fitted_levels.pixels,
@@ -85,7 +89,7 @@ def source_freedom(
     Units:  none.
     Source: JCGM 100:2008 (GUM), section 4.2.6 and G.3.3.
     """
-    fitted, _, _ = _used(levels, params["share"])
+    fitted, _, _ = levels_to_fit(levels, params["share"])
     lit_count = int((levels.photons[fitted] > 0).sum())
     response_is_free = [name in free for name in ("quantum_efficiency", "bend", "twist")]
     dark_is_free = [name in free for name in ("dark_signal", "dark_current")]
@@ -142,13 +146,14 @@ def _shares(parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 MODEL = "model of the response"
 SPACING = "spacing of the light levels"
-_STEP = 0.1  #: standard uncertainties of an input, half the step of a derivative
-_SCALE = 1e-4  #: half the step of a derivative by the photons, relative
-_NOTHING = 1e-6  #: share of a value below which a change is rounding
-_HALF = 0.5 * SENSITIVITY  #: share of saturation up to which the second model fits its lines
+_INPUT_STEP = 0.1  #: standard uncertainties of an input, half the step of a derivative
+_PHOTON_STEP = 1e-4  #: half the step of a derivative by the photons, relative
+_ROUNDING_SHARE = 1e-6  #: share of a value below which a change is rounding
+#: share of saturation up to which the second model fits its lines
+_SECOND_RANGE = 0.5 * FITTED_SHARE
 #: change of a slope from 70 % of saturation to no light, over that from 70 to 35 %, if it is
 #: proportional
-_BENT = 2.0
+_CHANGE_TO_NO_LIGHT = 2.0
 #: by key of the sheet: the parameter of `camera` whose temperature coefficient counts, and its sign
 _COEFFICIENTS = {
     "K": ("gain", 1.0),
@@ -161,8 +166,8 @@ _COEFFICIENTS = {
 }
 
 #: by key: dy/ds for a relative change s of the saturation, over y, or as it stands for a logarithm
-_SATURATION = {"mu_p_sat": 1.0, "mu_e_sat": 1.0, "SNR_max": 0.5, "DR": 1.0}
-_LOGARITHMS = {
+_SATURATION_EXPONENTS = {"mu_p_sat": 1.0, "mu_e_sat": 1.0, "SNR_max": 0.5, "DR": 1.0}
+_LOGARITHM_SLOPES = {
     "SNR_max_dB": 10 / math.log(10),
     "SNR_max_bit": 0.5 / math.log(2),
     "DR_dB": 20 / math.log(10),
@@ -207,7 +212,7 @@ class _Propagation:
             ):
                 if uncertainty > 0:
                     for key, slope in self._slopes(
-                        self._moved(name, i), _STEP * uncertainty
+                        self._field_step(name, i), _INPUT_STEP * uncertainty
                     ).items():
                         contributions.setdefault(key, []).append(
                             # only uncertainty, sensitivity and freedom count: the terms are
@@ -223,7 +228,7 @@ class _Propagation:
         """
         sums_of_squares: Values = {}
         for i in (self.levels.photons > 0).nonzero().squeeze(1).tolist():
-            for key, slope in self._slopes(self._lit(i), _SCALE).items():
+            for key, slope in self._slopes(self._lit_step(i), _PHOTON_STEP).items():
                 sums_of_squares[key] = sums_of_squares.get(key, 0.0) + slope**2
         return {key: math.sqrt(x) for key, x in sums_of_squares.items()}
 
@@ -231,7 +236,7 @@ class _Propagation:
     def photons(self) -> Values:
         """Return dy/ds for a relative change s of all numbers of photons."""
         return self._slopes(
-            lambda s: self.levels._replace(photons=self.levels.photons * (1 + s)), _SCALE
+            lambda s: self.levels._replace(photons=self.levels.photons * (1 + s)), _PHOTON_STEP
         )
 
     @cached_property
@@ -244,8 +249,8 @@ class _Propagation:
         # lines up to half of the usual range; levels beyond the range tell the saturation
         used_levels = (
             (levels.photons == 0)
-            | (signal <= _HALF * saturation_signal)
-            | (signal > SENSITIVITY * saturation_signal)
+            | (signal <= _SECOND_RANGE * saturation_signal)
+            | (signal > FITTED_SHARE * saturation_signal)
         )
         try:
             return self.values(without_histograms(levels, used_levels))
@@ -261,7 +266,8 @@ class _Propagation:
         if line is None:
             return math.nan, math.nan
         linear_levels = transfer.linear
-        order = _lit_order(self.levels)
+        # as the levels of `PhotonTransfer`
+        order = lit_order(self.levels.photons.numpy(), self.levels.exposure.numpy())
         chance_variance = (self.levels.variance / self.levels.pixels).numpy()[order][
             linear_levels
         ] / transfer.signal[linear_levels] ** 2
@@ -296,7 +302,7 @@ class _Propagation:
             for key in values_above.keys() & values_below.keys()
         }
 
-    def _moved(self, name: str, i: int) -> Callable[[float], Levels]:
+    def _field_step(self, name: str, i: int) -> Callable[[float], Levels]:
         """Return the levels as a function of a step of the field ``name`` of level ``i``."""
 
         def at(step: float) -> Levels:
@@ -304,7 +310,7 @@ class _Propagation:
 
         return at
 
-    def _lit(self, i: int) -> Callable[[float], Levels]:
+    def _lit_step(self, i: int) -> Callable[[float], Levels]:
         """Return the levels as a function of the relative light of level ``i``, which moves mean
         and variance.
         """
@@ -347,10 +353,10 @@ def sheet_budgets(
     gain = sheet["K"]
     of_measurement = {}
     for q in measured_quantities:
-        contributions = list(
-            _spatial(q, sheet, propagation) if _is_spatial(q) else _of_levels(q, propagation)
-        )
-        of_measurement[q.key] = contributions
+        if _is_of_series(q):
+            of_measurement[q.key] = list(_of_series(q, sheet, propagation))
+        else:
+            of_measurement[q.key] = list(_of_levels(q, propagation))
     return [
         _budget(q, of_measurement[q.key], propagation, laboratory, gain)
         for q in measured_quantities
@@ -372,7 +378,7 @@ def _budget(
     # a coefficient of the quantity itself comes before that of its parameter
     key = q.key if q.key in laboratory.coefficients else parameter
     photon_slope = moves.photons.get(q.key, 0.0)
-    photon_slope = photon_slope if abs(photon_slope) > _NOTHING * abs(q.value) else 0.0
+    photon_slope = photon_slope if abs(photon_slope) > _ROUNDING_SHARE * abs(q.value) else 0.0
     laboratory_terms = laboratory_contributions(key, sign * q.value, photon_slope, laboratory)
     return Budget(q.key, q.name, q.symbol, q.unit, q.value, (*own, *laboratory_terms))
 
@@ -385,23 +391,27 @@ def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
     contributions = moves.statistics.get(q.key, [])
     uncertainty = math.hypot(*(c.share or 0.0 for c in contributions), 0.0)
     freedom = welch_satterthwaite(contributions)
-    if uncertainty > _NOTHING * abs(q.value):
+    if uncertainty > _ROUNDING_SHARE * abs(q.value):
         yield Contribution(STATISTICS, "A", "normal", uncertainty, q.unit, 1.0, freedom)
     else:
         yield Contribution(STATISTICS, "A", reason=NOT_INVOLVED)
     yield _of_lamp(moves.light.get(q.key, 0.0), q.value, moves)
-    if sensitivity := _LOGARITHMS.get(q.key, _SATURATION.get(q.key, 0.0) * q.value):
+    if sensitivity := _LOGARITHM_SLOPES.get(q.key, _SATURATION_EXPONENTS.get(q.key, 0.0) * q.value):
         yield Contribution(SPACING, "B", "rectangular", moves.spacing, "relative", sensitivity)
     other_value = moves.other_model.get(q.key)
     if other_value is None:
         yield Contribution(
             MODEL, "B", reason=f"{NOT_STATED}: too few levels up to 35 % of saturation"
         )
-    elif abs(other_value - q.value) <= _NOTHING * abs(q.value):
+    elif abs(other_value - q.value) <= _ROUNDING_SHARE * abs(q.value):
         yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
     else:
         yield Contribution(
-            MODEL, "B", "rectangular", _BENT * abs(other_value - q.value) / math.sqrt(3), q.unit
+            MODEL,
+            "B",
+            "rectangular",
+            _CHANGE_TO_NO_LIGHT * abs(other_value - q.value) / math.sqrt(3),
+            q.unit,
         )
 
 
@@ -410,14 +420,14 @@ def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribut
     the relative light of its levels.
     """
     scatter, freedom = moves.lamp
-    if sensitivity <= _NOTHING * abs(value):
+    if sensitivity <= _ROUNDING_SHARE * abs(value):
         return Contribution(LAMP, "A", reason=NOT_INVOLVED)
     if not math.isfinite(scatter):
         return Contribution(LAMP, "A", reason=f"{NOT_STATED}: fewer than three levels on the line")
     return Contribution(LAMP, "A", "normal", scatter, "relative", sensitivity, freedom)
 
 
-def _is_spatial(q: Quantity) -> bool:
+def _is_of_series(q: Quantity) -> bool:
     """Return True for a quantity that series of frames give, not levels."""
     return q.key.startswith(("DSNU1288", "PRNU1288"))
 
@@ -439,7 +449,7 @@ def _chance_of_pattern(q: Quantity, sheet: EmvaSheet) -> float:
     return standard_error
 
 
-def _spatial(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Contribution]:
+def _of_series(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Contribution]:
     """Yield the contributions of a quantity of series of frames; one in electrons has those of
     the gain too.
     """
@@ -473,16 +483,7 @@ def _spatial(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Con
 
 def _scaled(c: Contribution, by: float) -> Contribution:
     """Return a contribution with its sensitivity multiplied by ``by``."""
-    return Contribution(
-        c.source,
-        c.kind,
-        c.distribution,
-        c.uncertainty,
-        c.unit,
-        c.sensitivity * by,
-        c.freedom,
-        c.reason,
-    )
+    return replace(c, sensitivity=c.sensitivity * by)
 
 
 def _added(values: Tensor, i: int, step: float) -> Tensor:
@@ -490,11 +491,3 @@ def _added(values: Tensor, i: int, step: float) -> Tensor:
     changed = values.clone()
     changed[i] += step
     return changed
-
-
-def _lit_order(levels: Levels) -> NDArray[np.int64]:
-    """Return the indices of the lit levels in the order of `PhotonTransfer`."""
-    photons, exposure = levels.photons.numpy(), levels.exposure.numpy()
-    lit = np.flatnonzero(photons > 0)
-    order: NDArray[np.int64] = lit[np.lexsort((exposure[lit], photons[lit]))]
-    return order

@@ -112,11 +112,9 @@ def coverage_factor(freedom: float, probability: float = COVERAGE) -> float:
     from scipy.stats import norm, t
 
     quantile = (1 + probability) / 2
-    return float(
-        t.ppf(quantile, max(1, math.floor(freedom)))
-        if math.isfinite(freedom)
-        else norm.ppf(quantile)
-    )
+    if not math.isfinite(freedom):
+        return float(norm.ppf(quantile))
+    return float(t.ppf(quantile, max(1, math.floor(freedom))))
 
 
 def _shares(contributions: Iterable[Contribution]) -> list[float]:
@@ -130,7 +128,7 @@ def _shares(contributions: Iterable[Contribution]) -> list[float]:
 
 
 _CELSIUS = re.compile(r"([-+]?\d+(?:\.\d+)?)\s*(°C|C|degC)?")
-_ZERO = 273.15  #: K
+_ZERO_CELSIUS = 273.15  #: K
 
 Relative = Annotated[float, Field(gt=0, lt=1)]  #: a standard uncertainty over its value
 Finite = Annotated[float, Field(ge=-100, le=100)]
@@ -143,7 +141,7 @@ def _temperature(value: Any) -> float:
     # a number without a unit
     if match and not match[2]:
         raise ValueError(f"needs a unit: write {value} °C or {value} K")
-    kelvin = float(match[1]) + _ZERO if match else read_quantity(value, "K")
+    kelvin = float(match[1]) + _ZERO_CELSIUS if match else read_quantity(value, "K")
     if not 0 < kelvin < math.inf:
         raise ValueError(f"{value} is not a temperature: write it as 25 °C or 298 K")
     return kelvin
@@ -198,7 +196,7 @@ class SensorTemperature(Statement):
     @property
     def text(self) -> str | None:
         """Return the temperature as text, such as ``25 °C``, or None."""
-        return None if self.value is None else f"{self.value - _ZERO:.4g} °C"
+        return None if self.value is None else f"{self.value - _ZERO_CELSIUS:.4g} °C"
 
 
 class Traceability(Statement):

@@ -44,7 +44,7 @@ def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
     return height + change.detach()  # without a tangent too
 
 
-def _refuse(
+def _refuse_impossible_limits(
     material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> None:
     """Raise ParameterError for limits that no mask can have: a depth below one wave, levels without
@@ -57,8 +57,8 @@ def _refuse(
     ):
         wave_text = f"{wave_height(material, wrap_at) * 1e6:.3f} um"
         text = (
-            f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {_name(material)}:"
-            f" needs at least {wave_text}"
+            f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in"
+            f" {_material_name(material)}: needs at least {wave_text}"
         )
         raise ParameterError("max_height", text)
     if levels is not None and wrap_at is None and max_height is None:
@@ -67,7 +67,7 @@ def _refuse(
         )
 
 
-def _name(material: AnyGlass) -> str:
+def _material_name(material: AnyGlass) -> str:
     return material if isinstance(material, str) else "this glass"
 
 
@@ -94,7 +94,7 @@ def fabricate(
             divide; ValueError for a height in half precision.
     Source: Swanson, MIT Lincoln Laboratory Technical Report 854 (1989), for multi-level elements.
     """
-    _refuse(material, wrap_at, levels, max_height)
+    _refuse_impossible_limits(material, wrap_at, levels, max_height)
     refuse_half(height=height)
     if wrap_at is not None:
         period = wave_height(material, wrap_at)
@@ -168,11 +168,10 @@ def _(
     fabricated = fabricate(
         extremes, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height
     )
-    deepest, phase = (
-        float(fabricated.abs().max()),
-        2 * math.pi * change / wave_height(material, nearest_known(material, _VIOLET)),
-    )
-    return max(phase, change / deepest if deepest > 0 else math.inf)
+    deepest = float(fabricated.abs().max())
+    phase = 2 * math.pi * change / wave_height(material, nearest_known(material, _VIOLET))
+    relative_change = change / deepest if deepest > 0 else math.inf
+    return max(phase, relative_change)
 
 
 def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
@@ -183,8 +182,9 @@ def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) 
     if not cyclic:
         # the limit in the precision of the height map
         top = float(torch.tensor(top, dtype=ends.dtype))
+        half_step = 0.0 if levels is None else top / (levels - 1) / 2
         # what is cut off above or below, or half a step between levels
-        return max(highest - top, -lowest, 0.0 if levels is None else top / (levels - 1) / 2)
+        return max(highest - top, -lowest, half_step)
     waves = max(abs(math.floor(lowest / top)), abs(math.floor(highest / top)))
     if levels is None:
         return top * waves
@@ -197,12 +197,9 @@ def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) 
 def _(
     *, material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> list[str]:
-    refuse_material(
-        "wrap_at",
-        material,
-        None if wrap_at is None else torch.tensor([wrap_at], dtype=torch.float64),
-    )
-    _refuse(material, wrap_at, levels, max_height)
+    wavelengths = None if wrap_at is None else torch.tensor([wrap_at], dtype=torch.float64)
+    refuse_material("wrap_at", material, wavelengths)
+    _refuse_impossible_limits(material, wrap_at, levels, max_height)
     if max_height is not None and wrap_at is None:
         return [
             f"heights above max_height {max_height * 1e6:.3g} um are cut flat: set wrap_at to wrap"
@@ -234,7 +231,7 @@ def _(
 # Smallest feature of a fabrication tool: the average of a height map over the spot of the tool.
 
 
-_REACH = 6.0  #: standard deviations beyond which the spot holds 1e-9 of its dose
+_SPOT_REACH = 6.0  #: standard deviations beyond which the spot holds 1e-9 of its dose
 
 
 @node(rtol=1e-5)
@@ -259,11 +256,11 @@ def smooth(height: Tensor, stop: Stop, *, feature: PupilPitch) -> Tensor:
     refuse_half(height=height)
     grid = grid_of(stop)
     refuse_other_grid(height, grid)
-    average = _average(grid.samples, feature / grid.pitch).to(height)
+    average = _averaging_matrix(grid.samples, feature / grid.pitch).to(height)
     return average @ height @ average.T
 
 
-def _average(samples: int, feature: float) -> Tensor:
+def _averaging_matrix(samples: int, feature: float) -> Tensor:
     """Return the float64 matrix that averages along one axis over a tool spot of ``feature``
     samples; each row sums to 1.
     """
@@ -271,7 +268,9 @@ def _average(samples: int, feature: float) -> Tensor:
     spot_deviation = feature / math.sqrt(8 * math.log(2))
     index = torch.arange(samples, dtype=torch.float64)
     weights = torch.exp(-((index[:, None] - index) ** 2) / (2 * spot_deviation**2))
-    weights = weights.where((index[:, None] - index).abs() <= _REACH * spot_deviation + 0.5, 0.0)
+    weights = weights.where(
+        (index[:, None] - index).abs() <= _SPOT_REACH * spot_deviation + 0.5, 0.0
+    )
     return weights / weights.sum(1, keepdim=True)
 
 
@@ -317,9 +316,9 @@ def _(result: Tensor, height: Tensor, *_: Any, feature: float, **__: Any) -> lis
 Rms = Annotated[Length, Field(ge=0, le=1e-3)]
 Scale = Annotated[float, Field(ge=0.01, le=1)]  #: share of the pupil's diameter
 Excess = Annotated[float, Field(gt=-1, le=1)]  #: share of the height
-_ROUNDING = 1.2e-7  #: of the height, float32
+_ROUNDING_SHARE = 1.2e-7  #: of the height, float32
 #: times its standard deviation, no sample of a smooth random field is larger; as for `flare.dirt`
-_LARGEST = 31
+_LARGEST_SIGMA = 31
 
 
 @node()
@@ -374,11 +373,10 @@ def _(height: TensorStats, *_: Any, rms: float, depth: float, **__: Any) -> floa
     deepest = max(abs(height.min), abs(height.max))
     if not (depth and deepest) and not rms:
         return 0.0
-    change = (abs(depth) + _ROUNDING) * deepest + _LARGEST * rms
-    return max(
-        2 * math.pi * change / _VIOLET,
-        change / (deepest - change) if deepest > change else math.inf,
-    )
+    change = (abs(depth) + _ROUNDING_SHARE) * deepest + _LARGEST_SIGMA * rms
+    phase = 2 * math.pi * change / _VIOLET
+    relative_change = change / (deepest - change) if deepest > change else math.inf
+    return max(phase, relative_change)
 
 
 @height_error.check

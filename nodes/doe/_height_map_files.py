@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 #: the level of white in each mode of a grey picture
-_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
-_WORDS = ("unit", "depth", "pitch")  #: what a file may state beside the heights
-_HALF = ("float16", "F16", "BF16")  #: names of types with 8 or 11 bits
-_SINGLE = 4  #: bytes of a height
+_WHITE_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
+_STATED_LENGTHS = ("unit", "depth", "pitch")  #: what a file may state beside the heights
+_HALF_TYPES = ("float16", "F16", "BF16")  #: names of types with 8 or 11 bits
+_BYTES_OF_HEIGHT = 4  #: bytes of a height
 _MAT_73 = b"MATLAB 7.3 MAT-file"
-_REAL_MAT = {
+_REAL_MAT_TYPES = {
     "double",
     "single",
     "int8",
@@ -95,37 +95,37 @@ def read_height_map(file: Path, depth: float, unit: float = 1.0) -> Tensor:
     """
     suffix = file.suffix.lower()
     if suffix == ".png":
-        with _levels(file) as picture:
+        with _grey_picture(file) as picture:
             levels = torch.from_numpy(np.asarray(picture, dtype=np.float64))
-            return (levels * (depth / _GREYS[picture.mode])).to(torch.float32)
-    values = _array(file, suffix)
+            return (levels * (depth / _WHITE_LEVELS[picture.mode])).to(torch.float32)
+    values = _numbers_of_file(file, suffix)
     return values.to(torch.float32) if unit == 1.0 else (values.double() * unit).to(torch.float32)
 
 
-def _array(file: Path, suffix: str) -> Tensor:
+def _numbers_of_file(file: Path, suffix: str) -> Tensor:
     """Return the numbers of a height map in a file other than .png, in the type of the file."""
     if suffix == ".safetensors":
         from safetensors.torch import load_file
 
         safetensors_need(file, 2.0)
         tensors = load_file(file)
-        return tensors[_name(file, list(tensors))]
+        return tensors[_height_name(file, list(tensors))]
     if suffix == ".exr":
         with exr_parts(file) as opened:
             channels = opened.channels()
-            return torch.from_numpy(np.array(channels[_name(file, list(channels))].pixels))
+            return torch.from_numpy(np.array(channels[_height_name(file, list(channels))].pixels))
     if suffix == ".mat":
         values = _mat_value(file, _mat_name(file))
     else:
-        npy_needs(file, 1.0, _SINGLE)
+        npy_needs(file, 1.0, _BYTES_OF_HEIGHT)
         values = np.load(file, allow_pickle=False)
-    return torch.from_numpy(np.ascontiguousarray(_native(values)))
+    return torch.from_numpy(np.ascontiguousarray(_as_torch_needs(values)))
 
 
-def _stated(file: Path, header: dict[str, Any]) -> dict[str, float]:
+def _stated_lengths(file: Path, header: dict[str, Any]) -> dict[str, float]:
     """Return the lengths, in m, that the header of a file states as texts with a unit."""
     lengths = {}
-    for word in _WORDS:
+    for word in _STATED_LENGTHS:
         if word in header:
             try:
                 lengths[word] = read_quantity(header[word], "m")
@@ -140,60 +140,72 @@ def _stated(file: Path, header: dict[str, Any]) -> dict[str, float]:
     return lengths
 
 
-def _npy(file: Path) -> MapHeader:
+def _npy_header(file: Path) -> MapHeader:
     """Return the header of a .npy file."""
-    npy_needs(file, 1.0, _SINGLE)
+    npy_needs(file, 1.0, _BYTES_OF_HEIGHT)
     header_array = np.load(file, mmap_mode="r", allow_pickle=False)
     _refuse_other_than_numbers(file, str(header_array.dtype), header_array.dtype.kind in "fiu")
     return MapHeader(tuple(header_array.shape), {})
 
 
-def _safetensors(file: Path) -> MapHeader:
+def _safetensors_header(file: Path) -> MapHeader:
     """Return the header of a .safetensors file."""
     from safetensors import safe_open
 
     safetensors_need(file, 2.0)
     with safe_open(file, framework="pt") as tensors:
-        heights = tensors.get_slice(_name(file, list(tensors.keys())))
+        heights = tensors.get_slice(_height_name(file, list(tensors.keys())))
         number_type = str(heights.get_dtype())
         _refuse_other_than_numbers(file, number_type, number_type.startswith(("F", "BF", "I", "U")))
-        return MapHeader(tuple(heights.get_shape()), _stated(file, tensors.metadata() or {}))
-
-
-def _png(file: Path) -> MapHeader:
-    """Return the header of a grey .png file, whose text chunks may state lengths."""
-    with _levels(file) as picture:
         return MapHeader(
-            (picture.height, picture.width),
-            _stated(file, {str(word): text for word, text in picture.info.items()}),
+            tuple(heights.get_shape()), _stated_lengths(file, tensors.metadata() or {})
         )
 
 
-def _exr(file: Path) -> MapHeader:
+def _png_header(file: Path) -> MapHeader:
+    """Return the header of a grey .png file, whose text chunks may state lengths."""
+    with _grey_picture(file) as picture:
+        return MapHeader(
+            (picture.height, picture.width),
+            _stated_lengths(file, {str(word): text for word, text in picture.info.items()}),
+        )
+
+
+def _exr_header(file: Path) -> MapHeader:
     """Return the header of an .exr file, whose numbers are read to learn their type."""
     header, _, size = exr_header(file)
     refuse_large_array(file, size)
     _refuse_other_than_numbers(
-        file, str(_array(file, ".exr").dtype).removeprefix("torch."), real=True
+        file, str(_numbers_of_file(file, ".exr").dtype).removeprefix("torch."), real=True
     )
-    return MapHeader(size, _stated(file, header))
+    return MapHeader(size, _stated_lengths(file, header))
 
 
-def _mat(file: Path) -> MapHeader:
+def _mat_header(file: Path) -> MapHeader:
     """Return the header of a .mat file."""
     name = _mat_name(file)
-    size, number_type = _mat_listed(file)[name]
-    _refuse_other_than_numbers(file, number_type, number_type in _REAL_MAT)
+    size, number_type = _mat_variables(file)[name]
+    _refuse_other_than_numbers(file, number_type, number_type in _REAL_MAT_TYPES)
     if np.iscomplexobj(_mat_value(file, name)):  # the header of a .mat file does not say
         _refuse_other_than_numbers(file, "complex", real=False)
-    words = {word: _mat_value(file, word) for word in _WORDS if word in _mat_listed(file)}
+    words = {
+        word: _mat_value(file, word) for word in _STATED_LENGTHS if word in _mat_variables(file)
+    }
     return MapHeader(
         size,
-        _stated(file, {word: " ".join(map(str, np.ravel(text))) for word, text in words.items()}),
+        _stated_lengths(
+            file, {word: " ".join(map(str, np.ravel(text))) for word, text in words.items()}
+        ),
     )
 
 
-_HEADERS = {".npy": _npy, ".safetensors": _safetensors, ".png": _png, ".exr": _exr, ".mat": _mat}
+_HEADERS = {
+    ".npy": _npy_header,
+    ".safetensors": _safetensors_header,
+    ".png": _png_header,
+    ".exr": _exr_header,
+    ".mat": _mat_header,
+}
 
 
 def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
@@ -203,7 +215,7 @@ def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
     if not real:
         text = f"{file.name} holds values of type {kind}: save the heights as real numbers, in m"
         raise ParameterError("file", text)
-    if kind in _HALF:
+    if kind in _HALF_TYPES:
         resolution_text = "which resolve 1/2000 of a height, and no height below 0.06 um in m"
         raise ParameterError(
             "file",
@@ -211,24 +223,26 @@ def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
         )
 
 
-def _levels(file: Path) -> "Image":
+def _grey_picture(file: Path) -> "Image":
     """Open a greyscale picture file; raise ParameterError for a picture that is not greyscale."""
     from PIL import Image
 
     refuse_other_than_file(file)
     picture = Image.open(file)
-    if picture.mode not in _GREYS:
+    if picture.mode not in _WHITE_LEVELS:
         picture.close()
         raise ParameterError(
             "file",
             f"{file.name} is {picture.mode}, not grey: store one grey level per sample, in 8 or 16"
             " bits",
         )
-    picture_needs(file, picture, 8 + 8 + _SINGLE)  # levels and heights in float64, and the result
+    picture_needs(
+        file, picture, 8 + 8 + _BYTES_OF_HEIGHT
+    )  # levels and heights in float64, and the result
     return picture
 
 
-def _name(file: Path, names: list[str]) -> str:
+def _height_name(file: Path, names: list[str]) -> str:
     """Return the name of the height map among the arrays of a file: `height`, or the only one there
     is.
     """
@@ -240,7 +254,7 @@ def _name(file: Path, names: list[str]) -> str:
     )
 
 
-def _mat_listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
+def _mat_variables(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
     """Return the shape and the type of each variable of a .mat file."""
     from scipy.io import whosmat
 
@@ -260,12 +274,12 @@ def _mat_listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
 
 def _mat_name(file: Path) -> str:
     """Return the name of the height map in a .mat file, other than texts that state lengths."""
-    return _name(
+    return _height_name(
         file,
         [
             name
-            for name, (_, kind) in _mat_listed(file).items()
-            if name not in _WORDS or kind != "char"
+            for name, (_, kind) in _mat_variables(file).items()
+            if name not in _STATED_LENGTHS or kind != "char"
         ],
     )
 
@@ -279,7 +293,7 @@ def _mat_value(file: Path, name: str) -> NDArray[Any]:
     return values
 
 
-def _native(values: NDArray[Any]) -> NDArray[Any]:
+def _as_torch_needs(values: NDArray[Any]) -> NDArray[Any]:
     """Return values in the byte order of this machine and of at most 64 bits, as torch needs."""
     if values.dtype.kind == "f" and values.dtype.itemsize > 8:
         return values.astype(np.float64)

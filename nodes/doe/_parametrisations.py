@@ -40,7 +40,7 @@ from neusee.nodes.values import Stop
 
 
 #: frequency of the first layer's sines: about four periods across the pupil at the start
-PITCH = 15.0
+_SINE_FREQUENCY = 15.0
 
 
 class HeightNet(nn.Module):
@@ -62,25 +62,27 @@ class HeightNet(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(3 * b, b, 3) for b in sizes[3:0:-1])
         self.last = nn.Conv2d(width, 1, 3)
 
-    def forward(self, coordinates: Tensor) -> Tensor:
+    def forward(self, pupil_coordinates: Tensor) -> Tensor:
         """Return the logits (y, x) at the coordinates (2, y, x)."""
-        level_outputs = [torch.sin(PITCH * self.down[0](_edged(coordinates[None])))]
+        level_outputs = [
+            torch.sin(_SINE_FREQUENCY * self.down[0](_with_repeated_edges(pupil_coordinates[None])))
+        ]
         for layer in self.down[1:]:
-            level_outputs.append(F.silu(layer(_edged(level_outputs[-1]))))
+            level_outputs.append(F.silu(layer(_with_repeated_edges(level_outputs[-1]))))
         features = level_outputs[-1]
         for layer, skip in zip(self.up, level_outputs[-2::-1], strict=True):
             features = F.silu(
                 layer(
-                    _edged(
+                    _with_repeated_edges(
                         torch.cat([enlarge(features, skip.shape[-2], skip.shape[-1]), skip], dim=1)
                     )
                 )
             )
-        logits: Tensor = self.last(_edged(features))[0, 0]
+        logits: Tensor = self.last(_with_repeated_edges(features))[0, 0]
         return logits
 
 
-def _edged(x: Tensor) -> Tensor:
+def _with_repeated_edges(x: Tensor) -> Tensor:
     """Pad a tensor with its outermost rows and columns, because zeros would add a frame to the
     height map.
     """
@@ -88,7 +90,7 @@ def _edged(x: Tensor) -> Tensor:
     return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
 
 
-def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
+def pupil_coordinates(grid: int, device: torch.device | None = None) -> Tensor:
     """Return the input (2, grid, grid) of the height network: u and v from -1 to 1 across the
     pupil grid.
     """
@@ -97,16 +99,16 @@ def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
     return torch.stack([u, v]).to(torch.float32)
 
 
-def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
+def network_height(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
     """Return the height map (samples, samples) of a network, 0 to ``max_height``, differentiable
     in the weights.
     """
     like = next(net.parameters())
-    logits = net(coordinates(min(grid, samples), like.device).to(like))
+    logits = net(pupil_coordinates(min(grid, samples), like.device).to(like))
     return max_height * torch.sigmoid(enlarge(logits, samples, samples))
 
 
-def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
+def new_network(width: int, grid: int, rng: torch.Generator) -> HeightNet:
     """Return a new height network with random orthogonal weights and zero biases.
 
     The last layer is scaled to logits of mean 0 and standard deviation 1, so that the height map is
@@ -119,7 +121,7 @@ def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
                 parameter.zero_()
             else:
                 nn.init.orthogonal_(parameter, gain=2**0.5, generator=rng)
-        logits = net(coordinates(grid, rng.device))
+        logits = net(pupil_coordinates(grid, rng.device))
         logit_deviation = logits.std(correction=0).clamp(min=1e-12)
         net.last.weight.div_(logit_deviation)
         net.last.bias = nn.Parameter((-logits.mean() / logit_deviation)[None])
@@ -150,11 +152,11 @@ def unet(
     """
     samples = int(stop.samples)
     net = (
-        fresh(width, min(grid, samples), rng)
+        new_network(width, min(grid, samples), rng)
         if weights is None
         else loaded(partial(HeightNet, width), weights)
     )
-    return height_of(net, samples, grid, max_height).detach()
+    return network_height(net, samples, grid, max_height).detach()
 
 
 @unet.preflight
@@ -181,13 +183,13 @@ unet.check(height_checks)
 # be evaluated on many samples.
 
 
-Make = Callable[[Stop], Tensor]
+HeightMapOf = Callable[[Stop], Tensor]
 #: from a stop and parameters of a node
 Start = Callable[[Stop, Mapping[str, Any], torch.Generator], nn.Module]
 #: share of the depth at both ends that a start avoids, because the sigmoid has almost no slope
 #: there
-_END = 0.01
-_ROOM = 0.05  #: share of a formula's depth that is free above and below its height map
+_LOGIT_MARGIN = 0.01
+_FREE_SHARE = 0.05  #: share of a formula's depth that is free above and below its height map
 
 
 class Pixels(nn.Module):
@@ -215,7 +217,7 @@ class Pixels(nn.Module):
             logits = 1.5 * screen(pupil_grid(grid, 1.0, float(grid)), scale, rng)
         else:
             share = enlarge(start.double() / max_height, grid, grid)
-            logits = torch.logit(share.clamp(_END, 1 - _END))
+            logits = torch.logit(share.clamp(_LOGIT_MARGIN, 1 - _LOGIT_MARGIN))
         self.logits = nn.Parameter(logits.to(torch.float32))
 
     def forward(self, stop: Stop) -> Tensor:
@@ -335,11 +337,15 @@ class Drawn(nn.Module):
         net: HeightNet | None = None,
     ) -> None:
         super().__init__()
-        self.grid, self.max_height, self.net = grid, max_height, net or fresh(width, grid, rng)
+        self.grid, self.max_height, self.net = (
+            grid,
+            max_height,
+            net or new_network(width, grid, rng),
+        )
 
     def forward(self, stop: Stop) -> Tensor:
         """Return the height map (v, u) on the pupil grid of ``stop``."""
-        return height_of(self.net, int(stop.samples), self.grid, self.max_height)
+        return network_height(self.net, int(stop.samples), self.grid, self.max_height)
 
 
 class Written(nn.Module):
@@ -347,7 +353,7 @@ class Written(nn.Module):
     fine for the tool.
     """
 
-    def __init__(self, shape: Make, feature: float) -> None:
+    def __init__(self, shape: HeightMapOf, feature: float) -> None:
         super().__init__()
         self.shape, self.feature = shape, feature
 
@@ -360,21 +366,21 @@ class Written(nn.Module):
 # --- the start, from a step -----------------------------------------------------------------------
 
 
-def _pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
+def _start_pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
     """Return pixels that start at the height map of `doe.pixelwise` with these parameters."""
     start: Tensor = pixelwise(stop, **params, rng=rng)
     highest = height_range(params["file"], params["depth"])
     return Pixels(int(stop.samples), highest, params["scale"], rng, start.to(rng.device))
 
 
-def _freed(mask: Callable[..., Tensor]) -> Start:
+def _pixels_from_formula(mask: Callable[..., Tensor]) -> Start:
     """Return a function that starts trainable pixels at a formula's height map, away from the
     ends of their sigmoid.
     """
 
     def start(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
         height = mask(stop, **params)
-        free_height = _ROOM * float(height.amax())
+        free_height = _FREE_SHARE * float(height.amax())
         return Pixels(
             int(stop.samples),
             float(height.amax()) + 2 * free_height,
@@ -386,7 +392,7 @@ def _freed(mask: Callable[..., Tensor]) -> Start:
     return start
 
 
-def _drawn(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
+def _start_network(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
     """Return a height network with the weights of a step of `doe.unet`, or with new ones."""
     width, grid, weights = (
         params["width"],
@@ -400,10 +406,10 @@ def _drawn(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Drawn
 #: For each node, a function that returns a trainable height map, started at the height map of the
 #: node. `doe.flat` is absent because the suppression has no gradient at a flat height map.
 PARAMETRISATIONS: dict[str, Start] = {
-    "doe.pixelwise": _pixels,
-    "doe.unet": _drawn,
+    "doe.pixelwise": _start_pixels,
+    "doe.unet": _start_network,
     **{
-        mask.path: _freed(mask)
+        mask.path: _pixels_from_formula(mask)
         for mask in (half_rings, axicon, spiral_axicon, vortex, cubic, zernike)
     },
 }

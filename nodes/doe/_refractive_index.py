@@ -33,7 +33,7 @@ from neusee.nodes.values import Bands
 
 # --- glass of the user ----------------------------------------------------------------------------
 
-_AREAS = {
+_UM2_PER_UNIT = {
     "um^2": 1.0,
     "um2": 1.0,
     "µm^2": 1.0,
@@ -43,11 +43,11 @@ _AREAS = {
     "nm^2": 1e-6,
     "nm2": 1e-6,
 }
-_COLUMNS = (
+_COLUMN_ADVICE = (
     "write a header such as wavelength (um),n (1) and two columns, or B (1),C (um^2),from (nm),to"
     " (nm) with one row for each term of the Sellmeier formula"
 )
-_FROM_AIR, _LARGEST = 1.0, 5.0  #: no glass has an index outside these
+_LEAST_INDEX, _LARGEST_INDEX = 1.0, 5.0  #: no glass has an index outside these
 _AREA = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
 
@@ -58,9 +58,9 @@ def _area(value: Any) -> float:
     match = _AREA.fullmatch(str(value).strip())
     if match is None or isinstance(value, bool):
         raise ValueError("is not a quantity: write a number and a unit, such as '0.0135 um^2'")
-    if match[2] not in _AREAS:
+    if match[2] not in _UM2_PER_UNIT:
         raise ValueError(f"needs the unit um^2: write '{match[1]} um^2', or nm^2")
-    return float(match[1]) * _AREAS[match[2]]
+    return float(match[1]) * _UM2_PER_UNIT[match[2]]
 
 
 Area = Annotated[float, BeforeValidator(_area, json_schema_input_type=str)]  #: um^2
@@ -107,19 +107,20 @@ def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:
         range_text = f"{low * 1e9:.5g} to {high * 1e9:.5g} nm"
         fix = "an index is not extrapolated: give a longer range, or other wavelengths"
         raise ValueError(
-            f"the index of {_name(glass)} is known from {range_text}, not at {outside_text}; {fix}"
+            f"the index of {_glass_name(glass)} is known from {range_text}, not at {outside_text};"
+            f" {fix}"
         )
-    index_data = _from_file(glass) if isinstance(glass, Path) else glass
+    index_data = _index_of_file(glass) if isinstance(glass, Path) else glass
     return (
-        _interpolated(index_data, wavelengths)
+        _interpolated_index(index_data, wavelengths)
         if isinstance(index_data, Table)
-        else _formula(index_data, wavelengths)
+        else _sellmeier_index(index_data, wavelengths)
     )
 
 
 def glass_range(glass: Path | Sellmeier) -> tuple[float, float]:
     """Return the wavelengths in m between which the index of a glass is known."""
-    index_data = _from_file(glass) if isinstance(glass, Path) else glass
+    index_data = _index_of_file(glass) if isinstance(glass, Path) else glass
     if isinstance(index_data, Table):
         return float(index_data.wavelengths[0]), float(index_data.wavelengths[-1])
     return index_data["range"]
@@ -129,23 +130,23 @@ def index_rows(file: Path) -> tuple[Tensor, Tensor] | None:
     """Return the wavelengths in m and the indices in the rows of a file, or None for a file of
     coefficients.
     """
-    index_data = _from_file(file)
+    index_data = _index_of_file(file)
     return (index_data.wavelengths, index_data.values[0]) if isinstance(index_data, Table) else None
 
 
 def refuse_glass(glass: Path | Sellmeier) -> None:
     """Raise ParameterError for a glass without a plausible index anywhere in its range."""
     try:
-        index_data = _from_file(glass) if isinstance(glass, Path) else glass
+        index_data = _index_of_file(glass) if isinstance(glass, Path) else glass
         if not isinstance(index_data, Table):
-            _refuse_coefficients(index_data, _name(glass))
+            _refuse_coefficients(index_data, _glass_name(glass))
     except (OSError, ValueError) as error:
         if isinstance(glass, Path):
-            raise refused("material", _COLUMNS, error) from None
+            raise refused("material", _COLUMN_ADVICE, error) from None
         raise ParameterError("material", str(error)) from None
 
 
-def _name(glass: Path | Sellmeier) -> str:
+def _glass_name(glass: Path | Sellmeier) -> str:
     return glass.name if isinstance(glass, Path) else "the own Sellmeier coefficients"
 
 
@@ -163,24 +164,25 @@ def _refuse_coefficients(glass: Sellmeier, name: str) -> None:
             f"the range {low * 1e9:g} to {high * 1e9:g} nm of {name} is empty: exchange the two"
             " wavelengths"
         )
-    index = _formula(glass, torch.linspace(low, high, 1001, dtype=torch.float64))
-    implausible = ~((index > _FROM_AIR) & (index < _LARGEST))
+    index = _sellmeier_index(glass, torch.linspace(low, high, 1001, dtype=torch.float64))
+    implausible = ~((index > _LEAST_INDEX) & (index < _LARGEST_INDEX))
     if implausible.any():
         first_bad = low + (high - low) * int(implausible.nonzero()[0]) / 1000
         fix = "give C in um^2 as in a data sheet, not its root, and a range without resonance"
         raise ValueError(
-            f"{name} give no index between 1 and {_LARGEST:g} at {first_bad * 1e9:.4g} nm: {fix}"
+            f"{name} give no index between 1 and {_LARGEST_INDEX:g} at {first_bad * 1e9:.4g} nm:"
+            f" {fix}"
         )
 
 
-def _formula(glass: Sellmeier, wavelengths: Tensor) -> Tensor:
+def _sellmeier_index(glass: Sellmeier, wavelengths: Tensor) -> Tensor:
     """Return the index by the Sellmeier formula, n^2 = 1 + sum of B w^2 / (w^2 - C), w in um."""
     squared_um = (wavelengths * 1e6).square()
     terms = [b * squared_um / (squared_um - c) for b, c in zip(glass["B"], glass["C"], strict=True)]
     return (1 + torch.stack(terms).sum(0)).sqrt()
 
 
-def _interpolated(table: Table, wavelengths: Tensor) -> Tensor:
+def _interpolated_index(table: Table, wavelengths: Tensor) -> Tensor:
     """Interpolate a table by the polynomial through the four nearest rows, or through all rows
     if there are fewer.
     """
@@ -202,7 +204,7 @@ def _interpolated(table: Table, wavelengths: Tensor) -> Tensor:
 
 
 @once_per_version
-def _from_file(file: Path) -> Table | Sellmeier:
+def _index_of_file(file: Path) -> Table | Sellmeier:
     """Read a glass from a CSV file; the header says if the file holds a table or coefficients."""
     rows = table_rows(file)
     if rows.columns[0].quantity.upper() == "B":
@@ -210,11 +212,12 @@ def _from_file(file: Path) -> Table | Sellmeier:
     index_curve = curves(file, ("1",))
     if len(index_curve.values) != 1:
         raise ValueError(f"{file.name} has {len(index_curve.values) + 1} columns in place of 2")
-    implausible = (index_curve.values <= _FROM_AIR) | (index_curve.values >= _LARGEST)
+    implausible = (index_curve.values <= _LEAST_INDEX) | (index_curve.values >= _LARGEST_INDEX)
     index_curve.refuse(
         implausible,
         lambda n: (
-            f"{n:g} is no refractive index: write n, between 1 and {_LARGEST:g}, and not n - 1"
+            f"{n:g} is no refractive index: write n, between 1 and {_LARGEST_INDEX:g}, and not"
+            " n - 1"
         ),
     )
     _refuse_gap(index_curve)
@@ -231,7 +234,7 @@ def _refuse_gap(index_curve: Curves) -> None:
     table = index_curve.table()
     wavelengths, values = table.wavelengths, table.values[0]
     middle = (wavelengths[1:] + wavelengths[:-1]) / 2
-    deviation = (_interpolated(table, middle) - (values[1:] + values[:-1]) / 2).abs()
+    deviation = (_interpolated_index(table, middle) - (values[1:] + values[:-1]) / 2).abs()
     steps = torch.nn.functional.pad(values.diff().abs(), (1, 1))
     wrong_gaps = (
         deviation > 1e-5 + torch.stack([steps[:-2], steps[1:-1], steps[2:]]).amax(0) / 2
@@ -248,7 +251,7 @@ def _refuse_gap(index_curve: Curves) -> None:
 
 def _coefficients(file: Path, rows: Rows) -> Sellmeier:
     """Return the glass of a table of Sellmeier coefficients, one term a row."""
-    um2_per_unit, from_unit, to_unit = _units(file, rows)
+    um2_per_unit, from_unit, to_unit = _column_units(file, rows)
     values = rows.values
     if len({tuple(row) for row in values[:, 2:]}) > 1:
         raise ValueError(
@@ -263,7 +266,7 @@ def _coefficients(file: Path, rows: Rows) -> Sellmeier:
     return glass
 
 
-def _units(file: Path, rows: Rows) -> tuple[float, float, float]:
+def _column_units(file: Path, rows: Rows) -> tuple[float, float, float]:
     """Return the factors that bring C to um^2, and from and to to m; raise ValueError for other
     columns.
     """
@@ -273,11 +276,11 @@ def _units(file: Path, rows: Rows) -> tuple[float, float, float]:
             f"{file.name} has the columns {', '.join(c.heading for c in rows.columns)}"
         )
     _, c, from_unit, to_unit = (column.unit for column in rows.columns)
-    if c not in _AREAS or from_unit not in LENGTHS or to_unit not in LENGTHS:
+    if c not in _UM2_PER_UNIT or from_unit not in LENGTHS or to_unit not in LENGTHS:
         raise ValueError(
             f"{file.name}: C needs a unit such as um^2, and from and to need a unit such as nm"
         )
-    return _AREAS[c], LENGTHS[from_unit], LENGTHS[to_unit]
+    return _UM2_PER_UNIT[c], LENGTHS[from_unit], LENGTHS[to_unit]
 
 
 # --- refractive index -----------------------------------------------------------------------------
@@ -347,7 +350,7 @@ def index_curve(glass: AnyGlass, count: int = 400) -> tuple[Tensor, Tensor]:
     """Return ``count`` wavelengths in m over the range in which a material is known, and its
     refractive index there.
     """
-    low, high = _name_and_range(glass)[1]
+    _, (low, high) = _name_and_range(glass)
     wavelengths = torch.linspace(low, high, count, dtype=torch.float64)
     return wavelengths, excess_index(glass, wavelengths) + 1
 
@@ -387,9 +390,8 @@ def material(bands: Bands, *, material: Glass = "fused silica") -> Tensor:
 
 @material.preflight
 def _(*, bands: Bands | None = None, material: AnyGlass = "fused silica") -> list[str]:
-    return refuse_material(
-        "material", material, None if bands is None or bands.centres.is_meta else bands.centres
-    )
+    wavelengths = None if bands is None or bands.centres.is_meta else bands.centres
+    return refuse_material("material", material, wavelengths)
 
 
 def refuse_material(parameter: str, material: AnyGlass, wavelengths: Tensor | None) -> list[str]:
@@ -418,10 +420,9 @@ def _(result: Tensor, bands: Bands, *, material: AnyGlass) -> list[Check]:
     if not isinstance(material, str):
         range_text = f"known from {shortest * 1e9:.0f} to {longest * 1e9:.0f} nm"
     is_covered = shortest <= float(bands.centres.min()) and float(bands.centres.max()) <= longest
-    return [
-        Check(text, bool((result > 0).all())),
-        Check(range_text if is_covered else f"{range_text}, used outside it", is_covered),
-    ]
+    if not is_covered:
+        range_text += ", used outside it"
+    return [Check(text, bool((result > 0).all())), Check(range_text, is_covered)]
 
 
 def _name_and_range(material: AnyGlass) -> tuple[str, tuple[float, float]]:

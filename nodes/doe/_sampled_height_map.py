@@ -23,7 +23,7 @@ from neusee.nodes.values import Stop
 # --- resampling -----------------------------------------------------------------------------------
 
 Between = Literal["linear", "nearest"]
-_JUMP = 0.5  #: share of the range of heights by which a sample may differ from its neighbour
+_JUMP_SHARE = 0.5  #: share of the range of heights by which a sample may differ from its neighbour
 
 
 def resampled(height: Tensor, pitch: float, grid: PupilGrid, between: Between = "linear") -> Tensor:
@@ -33,7 +33,7 @@ def resampled(height: Tensor, pitch: float, grid: PupilGrid, between: Between = 
     The centre of the height map lies on the axis. Beyond the last samples, within half a pitch,
     their heights continue.
     """
-    positions = [_positions(n, pitch, grid) for n in height.shape]
+    positions = [_map_positions(n, pitch, grid) for n in height.shape]
     if between == "nearest":
         rows, columns = (
             x.add(0.5).floor().long().clamp(0, n - 1)
@@ -48,14 +48,14 @@ def resampling_error(height: Tensor, pitch: float, grid: PupilGrid) -> float:
 
     The estimate is the difference from cubic interpolation, whose error is of a higher order.
     """
-    positions = [_positions(n, pitch, grid) for n in height.shape]
+    positions = [_map_positions(n, pitch, grid) for n in height.shape]
     difference = _interpolated(height, positions, cubic=True) - _interpolated(
         height, positions, cubic=False
     )
     return float(difference[inside(grid)].square().mean().sqrt())
 
 
-def too_small(shape: tuple[int, ...], pitch: float, grid: PupilGrid) -> str:
+def coverage_problem(shape: tuple[int, ...], pitch: float, grid: PupilGrid) -> str:
     """Return a message for a height map that does not cover the clear aperture, else an empty
     text.
     """
@@ -70,7 +70,7 @@ def too_small(shape: tuple[int, ...], pitch: float, grid: PupilGrid) -> str:
     )
 
 
-def jump(height: Tensor, pitch: float, grid: PupilGrid) -> str:
+def largest_jump(height: Tensor, pitch: float, grid: PupilGrid) -> str:
     """Return the place of the largest step between neighbours that linear interpolation would turn
     into a ramp.
 
@@ -93,14 +93,14 @@ def jump(height: Tensor, pitch: float, grid: PupilGrid) -> str:
                 f"from {name} {worst_step[axis]} to {worst_step[axis] + 1}, at"
                 f" {('column', 'row')[axis]} {worst_step[1 - axis]}"
             )
-    if tallest <= _JUMP * (highest - lowest):
+    if tallest <= _JUMP_SHARE * (highest - lowest):
         return ""
     return (
         f"the height jumps by {tallest * 1e6:.4g} um of {(highest - lowest) * 1e6:.4g} um {place}"
     )
 
 
-def _positions(count: int, pitch: float, grid: PupilGrid) -> Tensor:
+def _map_positions(count: int, pitch: float, grid: PupilGrid) -> Tensor:
     """Return the place of each sample of the pupil along one axis, in samples of the height map,
     float64.
     """
@@ -110,11 +110,13 @@ def _positions(count: int, pitch: float, grid: PupilGrid) -> Tensor:
 
 def _interpolated(height: Tensor, positions: list[Tensor], cubic: bool) -> Tensor:
     """Return a height map at positions along both axes, in samples of the map, float64."""
-    rows, columns = (_weights(x, n, cubic) for x, n in zip(positions, height.shape, strict=True))
+    rows, columns = (
+        _interpolation_matrix(x, n, cubic) for x, n in zip(positions, height.shape, strict=True)
+    )
     return rows @ height.double() @ columns.T
 
 
-def _weights(position: Tensor, count: int, cubic: bool) -> Tensor:
+def _interpolation_matrix(position: Tensor, count: int, cubic: bool) -> Tensor:
     """Return the matrix (position, sample) of linear interpolation, or of the cubic through four
     samples.
     """
@@ -131,7 +133,7 @@ def _weights(position: Tensor, count: int, cubic: bool) -> Tensor:
     return matrix
 
 
-def coarser(pitch: float, grid: PupilGrid) -> str:
+def lost_detail(pitch: float, grid: PupilGrid) -> str:
     """Return a note for a height map that is finer than the grid of the pupil, which loses its
     finest detail.
     """
@@ -145,13 +147,13 @@ def coarser(pitch: float, grid: PupilGrid) -> str:
     )
 
 
-Scale = Annotated[float, Field(gt=0, le=1)]  #: share of the pupil's diameter
 # --- map of a file, or a random map ---------------------------------------------------------------
 
-_DEPTH = 1.2e-6  #: m, height of white where neither the recipe nor the file says
-_ROUNDED = 1e-3  #: relative difference of a pitch that is written with four digits
-_SAME = 1e-6  #: relative difference of two pitches that counts as rounding
-_TALLEST = 0.01  #: m; a higher mask is a mistake of the unit
+Scale = Annotated[float, Field(gt=0, le=1)]  #: share of the pupil's diameter
+_DEFAULT_DEPTH = 1.2e-6  #: m, height of white where neither the recipe nor the file says
+_WRITTEN_PRECISION = 1e-3  #: relative difference of a pitch that is written with four digits
+_EQUAL_PITCH = 1e-6  #: relative difference of two pitches that counts as rounding
+_TALLEST_MASK = 0.01  #: m; a higher mask is a mistake of the unit
 
 
 @node()
@@ -195,9 +197,9 @@ def pixelwise(
         random_screen = screen(grid_of(stop), scale, rng)
         return (height_range(None, depth) * torch.sigmoid(1.5 * random_screen)).to(torch.float32)
     lengths = _lengths(file, depth, unit, pitch)
-    file_pitch = _fits(file, grid_of(stop), lengths["pitch"], pupil_pitch)
+    file_pitch = _interpolation_pitch(file, grid_of(stop), lengths["pitch"], pupil_pitch)
     height = read_height_map(file, lengths["depth"], lengths["unit"])
-    if problem := _wrong(file, height):
+    if problem := _height_problem(file, height):
         raise ValueError(problem)
     return height if file_pitch is None else resampled(height, file_pitch, grid_of(stop), between)
 
@@ -219,7 +221,7 @@ def height_range(file: Path | None, depth: float | None) -> float:
     um.
     """
     if file is None:
-        return _DEPTH if depth is None else depth
+        return _DEFAULT_DEPTH if depth is None else depth
     depth_in_file: float = _lengths(file, depth, None, None)["depth"]
     return depth_in_file
 
@@ -232,7 +234,7 @@ def _lengths(
     Raises ParameterError where recipe and header differ.
     """
     stated = map_header(file).stated
-    lengths: dict[str, Any] = {"depth": _DEPTH, "unit": 1.0, "pitch": None} | stated
+    lengths: dict[str, Any] = {"depth": _DEFAULT_DEPTH, "unit": 1.0, "pitch": None} | stated
     for name, value in (("depth", depth), ("unit", unit), ("pitch", pitch)):
         if value is None:
             continue
@@ -246,7 +248,7 @@ def _lengths(
     return lengths
 
 
-def _fits(
+def _interpolation_pitch(
     file: Path, grid: PupilGrid, pitch: float | None, pupil_pitch: float | None
 ) -> float | None:
     """Return the pitch from which a height map is interpolated, or None if it has the samples of
@@ -258,7 +260,7 @@ def _fits(
     has_pupil_samples = shape == (samples, samples)
     if has_pupil_samples and pitch is None:
         _refuse_unknown_size(file, grid, pupil_pitch)
-    if has_pupil_samples and (pitch is None or abs(pitch / grid.pitch - 1) <= _SAME):
+    if has_pupil_samples and (pitch is None or abs(pitch / grid.pitch - 1) <= _EQUAL_PITCH):
         return None
     if len(shape) != 2 or min(shape) < 2:
         raise ParameterError(
@@ -271,7 +273,7 @@ def _fits(
         raise ParameterError(
             "file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}): {fix}"
         )
-    if problem := too_small(shape, pitch, grid):
+    if problem := coverage_problem(shape, pitch, grid):
         raise ParameterError("pitch", f"{file.name}: {problem}")
     return pitch
 
@@ -292,20 +294,24 @@ def _(
         return []
     _refuse_unused(file, depth, unit)
     lengths = _lengths(file, depth, unit, pitch)
-    file_pitch = None if stop is None else _fits(file, grid_of(stop), lengths["pitch"], pupil_pitch)
-    if problem := _wrong_heights(file, lengths["depth"], lengths["unit"]):
+    file_pitch = (
+        None
+        if stop is None
+        else _interpolation_pitch(file, grid_of(stop), lengths["pitch"], pupil_pitch)
+    )
+    if problem := _file_problem(file, lengths["depth"], lengths["unit"]):
         raise ParameterError("file", problem)
     notes = _white_note(file, depth) + _size_note(file, stop, lengths["pitch"], pupil_pitch)
     if file_pitch is None or stop is None:
         return notes
     if between == "linear" and (
-        step := _jump(file, lengths["depth"], lengths["unit"], file_pitch, grid_of(stop))
+        step := _jump_in_file(file, lengths["depth"], lengths["unit"], file_pitch, grid_of(stop))
     ):
         fix = "unwrap a wrapped map, or set between: nearest to keep the steps"
         raise ParameterError(
             "file", f"{file.name}: {step}, which linear interpolation makes a ramp: {fix}"
         )
-    note = coarser(file_pitch, grid_of(stop))
+    note = lost_detail(file_pitch, grid_of(stop))
     return [*notes, *([f"{file.name}: {note}"] if note else [])]
 
 
@@ -313,7 +319,7 @@ def _refuse_unknown_size(file: Path, grid: PupilGrid, pupil_pitch: float | None)
     """Raise ParameterError for a file without a pitch where the pupil has another pitch than the
     recipe writes.
     """
-    if pupil_pitch is None or abs(pupil_pitch / grid.pitch - 1) <= _ROUNDED:
+    if pupil_pitch is None or abs(pupil_pitch / grid.pitch - 1) <= _WRITTEN_PRECISION:
         return
     setting_text = f"written as {pupil_pitch * 1e6:.4g} um"
     pitch_text = f"the samples of the pupil are {grid.pitch * 1e6:.4g} um apart and {setting_text}"
@@ -321,7 +327,7 @@ def _refuse_unknown_size(file: Path, grid: PupilGrid, pupil_pitch: float | None)
     raise ParameterError("pitch", f"{file.name} states no pitch, and {pitch_text}: {fix}")
 
 
-def _size(grid: PupilGrid) -> str:
+def _size_text(grid: PupilGrid) -> str:
     """Return the pitch and the width of a pupil grid as text."""
     return f"{grid.pitch * 1e6:.4g} um apart, {grid.samples * grid.pitch * 1e3:.4g} mm wide"
 
@@ -334,7 +340,7 @@ def _size_note(
         return []
     return [
         f"{file.name} states no pitch: its samples count as those of the pupil,"
-        f" {_size(grid_of(stop))}"
+        f" {_size_text(grid_of(stop))}"
     ]
 
 
@@ -343,8 +349,8 @@ def _white_note(file: Path, depth: float | None) -> list[str]:
     if file.suffix.lower() != ".png" or depth is not None or "depth" in map_header(file).stated:
         return []
     return [
-        f"{file.name}: white counts as {_DEPTH * 1e6:g} um high, because nothing states its height:"
-        " give depth"
+        f"{file.name}: white counts as {_DEFAULT_DEPTH * 1e6:g} um high, because nothing states"
+        " its height: give depth"
     ]
 
 
@@ -357,15 +363,15 @@ def _refuse_unused(file: Path, depth: float | None, unit: float | None) -> None:
 
 
 @once_per_version
-def _wrong_heights(file: Path, depth: float, unit: float) -> str:
+def _file_problem(file: Path, depth: float, unit: float) -> str:
     """Return a message for a file whose heights cannot be read or are wrong, else an empty text."""
     try:
-        return _wrong(file, read_height_map(file, depth, unit))
+        return _height_problem(file, read_height_map(file, depth, unit))
     except (OSError, ValueError, SyntaxError) as error:
         return f"{file.name} cannot be read as a height map: {error}"
 
 
-def _wrong(file: Path, height: Tensor) -> str:
+def _height_problem(file: Path, height: Tensor) -> str:
     """Return a message for heights that are not finite, negative, or higher than any mask, else
     an empty text.
     """
@@ -383,7 +389,7 @@ def _wrong(file: Path, height: Tensor) -> str:
             f"{file.name}: lowest height {low:.3g} m, but every height must be finite and at"
             " least 0"
         )
-    if high > _TALLEST:
+    if high > _TALLEST_MASK:
         return (
             f"{file.name}: highest height {high:.3g} m: state the unit of the file, such as unit:"
             " 1 um"
@@ -392,9 +398,9 @@ def _wrong(file: Path, height: Tensor) -> str:
 
 
 @once_per_version
-def _jump(file: Path, depth: float, unit: float, pitch: float, grid: PupilGrid) -> str:
+def _jump_in_file(file: Path, depth: float, unit: float, pitch: float, grid: PupilGrid) -> str:
     """Return where a file has a step that interpolation would make a ramp, or an empty text."""
-    return jump(read_height_map(file, depth, unit), pitch, grid)
+    return largest_jump(read_height_map(file, depth, unit), pitch, grid)
 
 
 @pixelwise.check
@@ -414,11 +420,11 @@ def _(
     if file is None:
         return checks
     lengths, grid = _lengths(file, depth, unit, pitch), grid_of(stop)
-    own = _fits(file, grid, lengths["pitch"], pupil_pitch)
+    own = _interpolation_pitch(file, grid, lengths["pitch"], pupil_pitch)
     if own is None:
         return [
             *checks,
-            Check(f"{file.name}: {grid.samples} x {grid.samples} samples, {_size(grid)}"),
+            Check(f"{file.name}: {grid.samples} x {grid.samples} samples, {_size_text(grid)}"),
         ]
     shape = map_header(file).shape
     height = read_height_map(file, lengths["depth"], lengths["unit"])

@@ -59,7 +59,7 @@ def _darken(
     ``places`` (v, u) are the points of its line in samples (one for a grain), ``size`` its width in
     samples. Where segments overlap, the larger share counts.
     """
-    window = _window(places, size / 2 + 1, amplitude.shape[-1])
+    window = _touched_samples(places, size / 2 + 1, amplitude.shape[-1])
     if window is None:
         return
     rows, columns = window
@@ -70,19 +70,21 @@ def _darken(
     cover = amplitude.new_zeros(len(y), x.shape[1])
     # a grain is one segment from its point to itself
     for start, end in zip(places, places[1:] or places, strict=False):
-        segment_window = _window([start, end], size / 2 + 1, amplitude.shape[-1])
+        segment_window = _touched_samples([start, end], size / 2 + 1, amplitude.shape[-1])
         if segment_window is None:
             continue
         v, u = (
             slice(inner.start - outer.start, inner.stop - outer.start)
             for inner, outer in zip(segment_window, window, strict=True)
         )
-        segment_cover = _cover(_distance(y[v], x[:, u], start, end), size, len(places) == 1)
+        segment_cover = _covered_share(
+            _distance_to_line(y[v], x[:, u], start, end), size, len(places) == 1
+        )
         cover[v, u] = torch.maximum(cover[v, u], segment_cover)
     amplitude[rows, columns] *= 1 - opacity * cover
 
 
-def _window(
+def _touched_samples(
     places: list[tuple[float, float]], margin: float, samples: int
 ) -> tuple[slice, slice] | None:
     """Return the rows and columns of samples within ``margin`` of the points that a grain or
@@ -98,24 +100,25 @@ def _window(
     return spans[0], spans[1]
 
 
-def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float, float]) -> Tensor:
+def _distance_to_line(
+    y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float, float]
+) -> Tensor:
     """Return the distance of each sample, in samples, from the line between two points."""
-    line_y, line_x = end[0] - start[0], end[1] - start[1]
+    (start_y, start_x), (end_y, end_x) = start, end
+    line_y, line_x = end_y - start_y, end_x - start_x
     squared_length = line_y**2 + line_x**2
-    line_share = (
-        ((y - start[0]) * line_y + (x - start[1]) * line_x) / squared_length
-        if squared_length > 0
-        else torch.zeros_like(y + x)
-    )
+    line_share = torch.zeros_like(y + x)
+    if squared_length > 0:
+        line_share = ((y - start_y) * line_y + (x - start_x) * line_x) / squared_length
     line_share = line_share.clamp(0, 1)
-    return torch.hypot(y - start[0] - line_share * line_y, x - start[1] - line_share * line_x)
+    return torch.hypot(y - start_y - line_share * line_y, x - start_x - line_share * line_x)
 
 
-def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
+def _covered_share(distance: Tensor, size: float, is_grain: bool) -> Tensor:
     """Return the covered share of each sample under a grain or scratch ``size`` samples wide; the
     shares sum to the area.
     """
-    if round_:
+    if is_grain:
         squared_radius = size**2 / 4
         # the sum over samples of a disc with a linear edge 1 wide is pi (r^2 + 1 / 12)
         edge_radius = math.sqrt(max(squared_radius - 1 / 12, 1 / 4))
@@ -174,28 +177,27 @@ def dirt(
         2011.12485), relative to their 6000 samples; grease, smudges and dents are ours.
     """
     grid = grid_of(stop)
-    grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _streams(5, rng)
+    grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _generators(5, rng)
     grains = _grains(dust, dust_radius, grains_rng)
     scratch_lines = _scratches(scratches, scratch_length, scratch_width, lines_rng)
-    film_factors, patch_factors = (
-        factors(grid, grease_scale, film_rng),
-        factors(grid, smudge_scale, patches_rng),
-    )
+    # each random field is the product of a factor along the rows and one along the columns
+    film_rows, film_columns = factors(grid, grease_scale, film_rng)
+    patch_rows, patch_columns = factors(grid, smudge_scale, patches_rng)
     dent_terms = _dents(WAVE * dents, dents_rng)
     amplitude, path = (torch.empty(grid.samples, grid.samples) for _ in range(2))
     for rows in stripes(grid):
-        amplitude[rows] = (
-            1 - smudges * torch.sigmoid(3 * (patch_factors[0][rows] @ patch_factors[1]))
-            if smudges
-            else 1.0
-        )
-        path[rows] = WAVE * grease * (film_factors[0][rows] @ film_factors[1]) if grease else 0.0
+        amplitude[rows] = 1.0
+        if smudges:
+            amplitude[rows] = 1 - smudges * torch.sigmoid(3 * (patch_rows[rows] @ patch_columns))
+        path[rows] = 0.0
+        if grease:
+            path[rows] = WAVE * grease * (film_rows[rows] @ film_columns)
         if dent_terms:
             path[rows] += surface(dent_terms, grid, rows=rows)
     return Dirt(stamp(amplitude, [*grains, *scratch_lines], grid), path)
 
 
-def _streams(count: int, rng: torch.Generator) -> list[torch.Generator]:
+def _generators(count: int, rng: torch.Generator) -> list[torch.Generator]:
     """Create one random generator for each kind of dirt, so that more dust leaves the scratches
     unchanged.
     """
@@ -210,7 +212,7 @@ def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float
     )
 
 
-def _about(mean: float, spread: float, rng: torch.Generator) -> float:
+def _normal_number(mean: float, spread: float, rng: torch.Generator) -> float:
     """Sample a normal distribution, and replace a negative number by 0."""
     return max(
         mean
@@ -223,7 +225,7 @@ def _grains(mean: float, radius: float, rng: torch.Generator) -> list[Grain]:
     """Return round dust grains at random positions: radii up to a largest one drawn about
     ``radius``, numbers drawn about ``mean``.
     """
-    largest = _about(radius, radius / 2, rng)
+    largest = _normal_number(radius, radius / 2, rng)
     return [
         Grain(
             _uniform(rng, -0.5, 0.5),
@@ -231,7 +233,7 @@ def _grains(mean: float, radius: float, rng: torch.Generator) -> list[Grain]:
             _uniform(rng) * largest,
             _uniform(rng, 0.5, 1.0),
         )
-        for _ in range(round(_about(mean, mean / 6, rng)))
+        for _ in range(round(_normal_number(mean, mean / 6, rng)))
     ]
 
 
@@ -239,7 +241,10 @@ def _scratches(mean: float, length: float, width: float, rng: torch.Generator) -
     """Return random scratches: a number drawn about ``mean``, with widths up to a widest one drawn
     about ``width``.
     """
-    number, widest = round(_about(mean, mean / 6, rng)), _about(width, width / 4, rng)
+    number, widest = (
+        round(_normal_number(mean, mean / 6, rng)),
+        _normal_number(width, width / 4, rng),
+    )
     return [_scratch(length, widest, rng) for _ in range(number)]
 
 
@@ -292,7 +297,7 @@ def _(
 
 @dirt.check
 def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
-    passed, rms = _effect(result, grid_of(stop))
+    passed, rms = _light_and_path(result, grid_of(stop))
     text = (
         f"dirt passes {passed:.4f} of the light, bends it by {rms:.3g} waves root mean square at"
         " 550 nm"
@@ -304,7 +309,7 @@ def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
     ]
 
 
-def _effect(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
+def _light_and_path(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
     """Return the share of the light that passes the dirt, and the standard deviation of the path
     in the dirt in waves at 550 nm, over the pupil.
     """

@@ -14,7 +14,7 @@ from neusee.nodes.precision import single
 from neusee.nodes.units import FocalLength, Fraction, PixelPitch, SensorLength
 from neusee.nodes.values import Bands
 
-_SMALLEST = 0.1  #: least radius of a ghost, relative to the largest
+_SMALLEST_RADIUS = 0.1  #: least radius of a ghost, relative to the largest
 
 
 class _Ghost(NamedTuple):
@@ -60,7 +60,7 @@ def ghosts(
             f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: "
             "the numbers of bands differ, so compute both from one `line` step"
         )
-    drawn_ghosts = _draw(count, spread, radius, rng)
+    drawn_ghosts = _random_ghosts(count, spread, radius, rng)
     spot = single(spot)
     # a float64 copy of the spot would be twice as large
     flux = spot.sum(-1).sum(-1, dtype=torch.float64)
@@ -68,10 +68,10 @@ def ghosts(
     y, x = (focal_length * n / pixel_pitch for n in direction.tolist())
     light_of_ghosts = torch.zeros_like(spot)
     for ghost, colour in zip(
-        drawn_ghosts, _colours(drawn_ghosts, bands.centres, flux), strict=True
+        drawn_ghosts, _gains_of_bands(drawn_ghosts, bands.centres, flux), strict=True
     ):
         centre = (ghost.magnification * y, ghost.magnification * x)
-        _add(
+        _add_disc(
             light_of_ghosts,
             (energy * colour * flux).to(spot.dtype),
             centre,
@@ -80,7 +80,7 @@ def ghosts(
     return light_of_ghosts
 
 
-def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> list[_Ghost]:
+def _random_ghosts(count: int, spread: float, radius: float, rng: torch.Generator) -> list[_Ghost]:
     """Draw ``count`` ghosts; sizes are normalised so that their shares of the energy add up to 1.
 
     Each ghost takes five random numbers: position, radius, energy and the wavelengths of two
@@ -89,34 +89,34 @@ def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> lis
     random_numbers = torch.rand(
         count, 5, generator=rng, device=rng.device, dtype=torch.float64
     ).tolist()
-    weights = [math.exp(2 * row[2]) for row in random_numbers]
+    weights = [math.exp(2 * energy) for _, _, energy, *_ in random_numbers]
     drawn = []
     # coatings are tuned to 400 to 700 nm
     for (position, r, _, *coating_draws), weight in zip(random_numbers, weights, strict=True):
         first, second = (400e-9 + 300e-9 * coating_draw for coating_draw in coating_draws)
         magnification, drawn_radius = (
             spread * (2 * position - 1),
-            radius * (_SMALLEST + (1 - _SMALLEST) * r),
+            radius * (_SMALLEST_RADIUS + (1 - _SMALLEST_RADIUS) * r),
         )
         drawn.append(_Ghost(magnification, drawn_radius, weight / sum(weights), (first, second)))
     return drawn
 
 
-def _reflected(wavelengths: Tensor, tuned: float) -> Tensor:
+def _reflectance(wavelengths: Tensor, tuned: float) -> Tensor:
     """Return the reflectance of a quarter-wave layer: 0.05 at the tuned wavelength, at most 1
     elsewhere.
     """
     return 0.05 + 0.95 * torch.cos(torch.pi / 2 * tuned / wavelengths).square()
 
 
-def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
+def _gains_of_bands(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
     """Return the gain of each ghost in each band, scaled so that all ghosts together carry the
     flux of the spot.
     """
-    gains = [
-        g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1])
-        for g in drawn
-    ]
+    gains = []
+    for ghost in drawn:
+        first, second = (_reflectance(wavelengths, tuned) for tuned in ghost.tuned)
+        gains.append(ghost.share * first * second)
     reflected_light = torch.stack(gains).sum(0).mul(flux).sum() if gains else flux.sum()
     no_light = reflected_light <= 0  # false for NaN, so that NaN reaches the result
     scale = torch.where(no_light, 0.0, flux.sum() / reflected_light.where(~no_light, 1.0))
@@ -130,17 +130,19 @@ def _in_pixels(radius: float, pixel_pitch: float) -> float:
     return max(radius / pixel_pitch, 0.5)
 
 
-def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: float) -> None:
+def _add_disc(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: float) -> None:
     """Add the part of a ghost's disc that lies inside the image to ``total``; the whole disc
     carries ``energy``.
     """
     height, width = total.shape[-2:]
     y, x = centre[0] + height // 2, centre[1] + width // 2
-    rows, columns = _reach(y, radius), _reach(x, radius)
+    rows, columns = _touched_pixels(y, radius), _touched_pixels(x, radius)
     # the edge is one pixel wide
     disc = (radius + 0.5 - torch.hypot((rows - y)[:, None], (columns - x)[None, :])).clamp(0, 1)
     # the whole disc has the sum 1, also where the image cuts it
-    visible_disc = (disc / disc.sum())[_part(rows, height), _part(columns, width)].to(total)
+    visible_disc = (disc / disc.sum())[
+        _inside_image(rows, height), _inside_image(columns, width)
+    ].to(total)
     if visible_disc.numel():
         top, left = max(int(rows[0]), 0), max(int(columns[0]), 0)
         total[:, top : top + visible_disc.shape[0], left : left + visible_disc.shape[1]] += (
@@ -148,7 +150,7 @@ def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: flo
         )
 
 
-def _reach(middle: float, radius: float) -> Tensor:
+def _touched_pixels(middle: float, radius: float) -> Tensor:
     """Return the pixel indices along one axis that a ghost's disc can touch, also outside the
     image, as float64.
     """
@@ -156,7 +158,7 @@ def _reach(middle: float, radius: float) -> Tensor:
     return torch.arange(first, last + 1, dtype=torch.float64)
 
 
-def _part(numbers: Tensor, samples: int) -> slice:
+def _inside_image(numbers: Tensor, samples: int) -> slice:
     """Return the slice of the pixel indices ``numbers`` that lies inside the image, or an empty
     slice.
     """
@@ -183,7 +185,7 @@ def _(
     if count == 0 or energy == 0:
         return 0.0
     # of the smallest ghost; 0.8 is on the safe side of 16 %
-    area = 0.8 * math.pi * (_in_pixels(_SMALLEST * radius, pixel_pitch) ** 2 + 1 / 12)
+    area = 0.8 * math.pi * (_in_pixels(_SMALLEST_RADIUS * radius, pixel_pitch) ** 2 + 1 / 12)
     return energy * spot.sum / area
 
 

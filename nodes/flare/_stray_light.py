@@ -35,12 +35,12 @@ from neusee.nodes.values import Psf, Pupil
 
 #: pixels about the source, along each axis and direction, over which the light is integrated
 #: exactly
-NEAR = 16
-_NODES = 96  #: Gauss-Legendre nodes of one edge: 1e-13 for any width of the scatter
+NEAR_PIXELS = 16
+_GAUSS_NODES = 96  #: Gauss-Legendre nodes of one edge: 1e-13 for any width of the scatter
 #: pixels between an edge of a pixel and the source; a smaller distance is replaced by this one
-_CLOSEST = 1e-6
+_LEAST_DISTANCE = 1e-6
 #: argument below which a series replaces (exp(z) - 1) / z, whose derivatives would cancel
-_SERIES = 1e-3
+_SERIES_LIMIT = 1e-3
 
 
 class Lobe(NamedTuple):
@@ -67,7 +67,7 @@ def scattered_share(b0: Tensor, l: Tensor, s: Tensor) -> Tensor:  # noqa: E741
     TIS = 2 pi b0 ((l**2 + 1)**((s + 2) / 2) - l**(s + 2)) / (l**s (s + 2)), and its limit pi b0
     l**2 ln(1 + l**-2) for s = -2; near s = -2 nothing cancels.
     """
-    return 2 * torch.pi * b0 * _enclosed(l, s, torch.ones_like(l))
+    return 2 * torch.pi * b0 * _enclosed_light(l, s, torch.ones_like(l))
 
 
 def surface_of(share: float, l: float = 0.01, s: float = -1.5) -> dict[str, float]:  # noqa: E741
@@ -83,7 +83,7 @@ def light_within(light: Lobe, radius: Tensor) -> Tensor:
     the source.
     """
     inside = torch.minimum(radius, light.end)
-    return 2 * torch.pi * light.peak * _enclosed(light.width, light.slope, inside)
+    return 2 * torch.pi * light.peak * _enclosed_light(light.width, light.slope, inside)
 
 
 def on_pixels(light: Lobe, centre: tuple[float, float], shape: tuple[int, int]) -> Tensor:
@@ -96,18 +96,24 @@ def on_pixels(light: Lobe, centre: tuple[float, float], shape: tuple[int, int]) 
     pixel.
     """
     y, x = (torch.arange(n, dtype=torch.float64) - c for n, c in zip(shape, centre, strict=True))
-    window = _far(light, y[:, None], x[None])
-    rows, columns = (_near(c, n) for c, n in zip(centre, shape, strict=True))
+    window = _light_of_far_pixels(light, y[:, None], x[None])
+    rows, columns = (_near_pixels(c, n) for c, n in zip(centre, shape, strict=True))
     if rows.stop > rows.start and columns.stop > columns.start:
         window = window.clone()
-        window[rows, columns] = _exact(light, _edges(rows, centre[0]), _edges(columns, centre[1]))
+        window[rows, columns] = _light_of_near_pixels(
+            light, _edges(rows, centre[0]), _edges(columns, centre[1])
+        )
     return window
 
 
-def _near(centre: float, size: int) -> slice:
-    """Return the pixels along one axis within ``NEAR`` of the source that lie inside the window."""
+def _near_pixels(centre: float, size: int) -> slice:
+    """Return the pixels along one axis within `NEAR_PIXELS` of the source that lie inside the
+    window.
+    """
     middle = round(centre)
-    return slice(min(max(middle - NEAR, 0), size), max(min(middle + NEAR + 1, size), 0))
+    return slice(
+        min(max(middle - NEAR_PIXELS, 0), size), max(min(middle + NEAR_PIXELS + 1, size), 0)
+    )
 
 
 def _edges(pixels: slice, centre: float) -> Tensor:
@@ -131,7 +137,7 @@ def on_far_pixels(light: Lobe, square: Tensor) -> Tensor:
     return light.peak * torch.exp(light.slope / 2 * torch.log1p(q)) * (1 + laplacian / 24)
 
 
-def _far(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
+def _light_of_far_pixels(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
     """Return the light of pixels at the distances ``y`` and ``x`` from the source along both axes,
     0 beyond the end of the light.
     """
@@ -143,44 +149,46 @@ def _far(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
     return light_of_pixels * (light.end - squared_distance.sqrt() + 0.5).clamp(0, 1)
 
 
-def _exact(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
+def _light_of_near_pixels(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
     """Return the light of each pixel between the edges ``y`` and ``x``: second differences of the
     light in the rectangles from the source to the corners.
     """
-    distance_y, distance_x = (edge.abs().clamp_min(_CLOSEST) for edge in (y, x))
+    distance_y, distance_x = (edge.abs().clamp_min(_LEAST_DISTANCE) for edge in (y, x))
     corner_y, corner_x = torch.meshgrid(distance_y, distance_x, indexing="ij")
     # two right triangles, on each side of the diagonal
-    rectangle = _triangle(light, corner_y, corner_x) + _triangle(light, corner_x, corner_y)
+    rectangle = _light_in_triangle(light, corner_y, corner_x) + _light_in_triangle(
+        light, corner_x, corner_y
+    )
     signed_rectangle = torch.sign(y)[:, None] * torch.sign(x)[None] * rectangle
     return signed_rectangle.diff(dim=0).diff(dim=1)
 
 
-def _triangle(light: Lobe, near: Tensor, across: Tensor) -> Tensor:
+def _light_in_triangle(light: Lobe, near: Tensor, across: Tensor) -> Tensor:
     """Return the light in the right triangle between the source, the foot of a perpendicular and a
     corner, with the legs ``near`` (to the foot) and ``across``.
 
     The light within the hypotenuse at the angle phi is integrated over phi. With tan(phi) = sinh(u)
     the integrand is smooth on the scale of 1, however narrow the scatter is.
     """
-    nodes, weights = _gauss()
+    nodes, weights = _gauss_nodes()
     largest_u = torch.asinh(across / near)[..., None]
     stretch = torch.cosh(largest_u * nodes)
     # light up to the far leg, at the distance near / cos(phi) = near cosh(u), per angle
-    enclosed = light.peak * _enclosed(light.width, light.slope, near[..., None] * stretch)
+    enclosed = light.peak * _enclosed_light(light.width, light.slope, near[..., None] * stretch)
     # dphi = du / cosh(u)
     return (weights * largest_u * enclosed / stretch).sum(-1)
 
 
 @cache
-def _gauss() -> tuple[Tensor, Tensor]:
+def _gauss_nodes() -> tuple[Tensor, Tensor]:
     """Return Gauss-Legendre nodes and weights on [0, 1]."""
     import numpy as np
 
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes, weights = np.polynomial.legendre.leggauss(_GAUSS_NODES)
     return torch.from_numpy((nodes + 1) / 2), torch.from_numpy(weights / 2)
 
 
-def _enclosed(width: Tensor, slope: Tensor, radius: Tensor) -> Tensor:
+def _enclosed_light(width: Tensor, slope: Tensor, radius: Tensor) -> Tensor:
     """Return the integral of r (1 + (r / width)**2)**(slope / 2) over r from 0 to ``radius``."""
     # with z = ln(1 + (r / width)^2): width^2 / 2 times the integral of exp((slope + 2) / 2 z) over
     # z
@@ -190,7 +198,7 @@ def _enclosed(width: Tensor, slope: Tensor, radius: Tensor) -> Tensor:
 
 def _growth(z: Tensor) -> Tensor:
     """Return (exp(z) - 1) / z, which is 1 at z = 0, with exact derivatives there."""
-    is_small = z.abs() < _SERIES
+    is_small = z.abs() < _SERIES_LIMIT
     safe_z = torch.where(is_small, 1.0, z)
     series = 1 + z / 2 * (1 + z / 3 * (1 + z / 4 * (1 + z / 5)))
     return torch.where(is_small, series, torch.expm1(safe_z) / safe_z)
@@ -214,7 +222,7 @@ class Surface(TypedDict):
     radius: NotRequired[BeamRadius | None]
 
 
-_ROUNDED = 1e-3  #: relative difference of two diameters that is rounding
+_DIAMETER_ROUNDING = 1e-3  #: relative difference of two diameters that is rounding
 Surfaces = Annotated[dict[str, Surface], Field(min_length=1)]
 
 
@@ -226,6 +234,14 @@ class StrayShares(NamedTuple):
     core: Tensor  #: (band,) float64, not scattered, inside and outside the window
     inside: Tensor  #: (band,) float64, scattered into the window
     outside: Tensor  #: (band,) float64, scattered to places outside the window
+
+
+class _ScatteredLight(NamedTuple):
+    """The light that one surface of a lens scatters."""
+
+    arriving: Tensor  #: share of the light that reaches the surface without being scattered
+    lobe: Lobe
+    share: Tensor  #: TIS, of the light that reaches the surface
 
 
 class _Lens(NamedTuple):
@@ -286,15 +302,15 @@ def stray_light(
     """
     _same_bands(psf, pupil)
     lens = _Lens(surfaces, focal_length, pixel_pitch, diameter, wavelength, scaling)
-    angle_y, angle_x = (
-        a + float(d)
-        for a, d in zip(angle, (0.0, 0.0) if direction is None else direction, strict=True)
-    )
-    window_shape = (psf.intensity.shape[-2], psf.intensity.shape[-1])
+    offset_y, offset_x = (0.0, 0.0) if direction is None else direction
+    tilt_y, tilt_x = angle
+    angle_y, angle_x = tilt_y + float(offset_y), tilt_x + float(offset_x)
+    height, width = psf.intensity.shape[-2:]
+    window_shape = (height, width)
     centre = (
         # pixels from the axis to the source: f x angle / pitch
-        window_shape[0] // 2 + focal_length * angle_y / pixel_pitch,
-        window_shape[1] // 2 + focal_length * angle_x / pixel_pitch,
+        height // 2 + focal_length * angle_y / pixel_pitch,
+        width // 2 + focal_length * angle_x / pixel_pitch,
     )
     transmitted, intensity, axis_peaks, veil = _transmitted(pupil), [], [], None
     for band, colour in enumerate(pupil.wavelengths.tolist()):
@@ -304,7 +320,7 @@ def stray_light(
             veil, axis_light, scattered = (
                 _veil(lobes, centre, window_shape),
                 _veil(lobes, (0.0, 0.0), (1, 1)),
-                _total(lobes),
+                _total_scatter(lobes),
             )
         unscattered = single(psf.intensity[band])
         intensity.append(
@@ -343,7 +359,9 @@ def stray_shares(
     """
     _same_bands(psf, pupil)
     lens = _Lens(surfaces, focal_length, pixel_pitch, diameter, wavelength, scaling)
-    scattered = torch.stack([_total(_lobes(lens, colour)) for colour in pupil.wavelengths.tolist()])
+    scattered = torch.stack(
+        [_total_scatter(_lobes(lens, colour)) for colour in pupil.wavelengths.tolist()]
+    )
     transmitted = _transmitted(pupil)
     light_with_veil, light_without_veil = (x.intensity.double().sum((-2, -1)) for x in (psf, core))
     inside = light_with_veil - (1 - scattered) * light_without_veil
@@ -365,7 +383,7 @@ def _(
     refuse_impossible_f_number(focal_length, diameter, "diameter")
     lens = _Lens(surfaces, focal_length, pixel_pitch, diameter, wavelength, scaling)
     try:
-        scattered = float(_total(_lobes(lens, wavelength)))
+        scattered = float(_total_scatter(_lobes(lens, wavelength)))
     except ValueError as error:
         raise ParameterError("surfaces", str(error)) from None
     notes = (
@@ -373,17 +391,17 @@ def _(
         if scattered > 0.1
         else []
     )
-    return [*notes, *_narrowed(pupil, diameter)]
+    return [*notes, *_note_of_wider_lens(pupil, diameter)]
 
 
-def _narrowed(pupil: Pupil | None, diameter: float) -> list[str]:
+def _note_of_wider_lens(pupil: Pupil | None, diameter: float) -> list[str]:
     """Return a note on a lens that scatters as a wider one than its pupil, which a reading of
     the aperture narrowed.
     """
     if pupil is None or pupil.pitch.is_meta:
         return []
     pupil_diameter = float(pupil.pitch) * pupil.aperture.shape[-1]
-    if diameter <= pupil_diameter * (1 + _ROUNDED):
+    if diameter <= pupil_diameter * (1 + _DIAMETER_ROUNDING):
         return []
     text = (
         f"the lens scatters as one of {diameter * 1e3:.4g} mm, and its pupil has"
@@ -414,7 +432,7 @@ def _(
         return math.inf
     sizes = {name: params[name] for name in ("focal_length", "pixel_pitch", "diameter")}
     lobes = _lobes(_Lens(surfaces, **sizes, wavelength=1.0, scaling="none"), 1.0)
-    scattered, axis_light = float(_total(lobes)), float(_veil(lobes, (0.0, 0.0), (1, 1)))
+    scattered, axis_light = float(_total_scatter(lobes)), float(_veil(lobes, (0.0, 0.0), (1, 1)))
     # light of a band in the window, 1 if it is not known
     light_in_window = psf.sum / psf.shape[0] if psf.shape else 1.0
     return (
@@ -442,21 +460,21 @@ def _(
     return [Check(text, inside >= -1e-6 and outside >= -1e-6)]
 
 
-def _lobes(lens: _Lens, colour: float) -> list[tuple[Tensor, Lobe, Tensor]]:
-    """Return for each surface (share of the light that reaches it, its lobe on the sensor, its
-    TIS), at the wavelength ``colour`` in m.
-    """
+def _lobes(lens: _Lens, colour: float) -> list[_ScatteredLight]:
+    """Return the light that each surface scatters at the wavelength ``colour`` in m."""
     scatterers, remaining = [], torch.ones((), dtype=torch.float64)
-    for name, (b0, l, s, radius) in _scaled(lens, colour):  # noqa: E741
+    for name, (b0, l, s, radius) in _surfaces_at(lens, colour):  # noqa: E741
         cosine_per_pixel = lens.diameter / (2 * lens.focal_length) * lens.pixel_pitch / radius
         surface_lobe, scattered = lobe(b0, l, s, cosine_per_pixel), scattered_share(b0, l, s)
-        _refuse(name, colour, float(scattered.detach()), float(surface_lobe.end.detach()), lens)
-        scatterers.append((remaining, surface_lobe, scattered))
+        _refuse_surface(
+            name, colour, float(scattered.detach()), float(surface_lobe.end.detach()), lens
+        )
+        scatterers.append(_ScatteredLight(remaining, surface_lobe, scattered))
         remaining = remaining * (1 - scattered)
     return scatterers
 
 
-def _scaled(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
+def _surfaces_at(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
     """Return b0, l, s and beam radius of each surface at the wavelength ``colour``, as float64
     scalars.
     """
@@ -469,7 +487,7 @@ def _scaled(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor, ...
         yield name, (b0 * ratio**4, l / ratio, s, radius)
 
 
-def _refuse(name: str, colour: float, share: float, end: float, lens: _Lens) -> None:
+def _refuse_surface(name: str, colour: float, share: float, end: float, lens: _Lens) -> None:
     """Raise ValueError for a surface that scatters all light at the wavelength ``colour`` in m,
     and for one whose light ends at ``end`` pixels, too near to the source.
     """
@@ -478,28 +496,29 @@ def _refuse(name: str, colour: float, share: float, end: float, lens: _Lens) -> 
             f"surface {name} scatters {share:.3g} of the light at {colour * 1e9:.4g} nm, and the"
             " limit is below 1: choose a smaller b0, or a steeper s"
         )
-    if not end > 2 * NEAR:
+    if not end > 2 * NEAR_PIXELS:
         size = end * lens.pixel_pitch
         raise ValueError(
             f"the light that surface {name} scatters ends {size * 1e6:.3g} um from the source,"
-            f" within {2 * NEAR} pixels: this surface lies on the sensor; choose a larger radius"
+            f" within {2 * NEAR_PIXELS} pixels: this surface lies on the sensor; choose a larger"
+            " radius"
         )
 
 
-def _total(lobes: list[tuple[Tensor, Lobe, Tensor]]) -> Tensor:
+def _total_scatter(lobes: list[_ScatteredLight]) -> Tensor:
     """Return the share of the light that all surfaces scatter, 1 - prod(1 - TIS)."""
-    reaching_last, _, scattered_by_last = lobes[-1]
-    return 1 - reaching_last * (1 - scattered_by_last)
+    last = lobes[-1]
+    return 1 - last.arriving * (1 - last.share)
 
 
 def _veil(
-    lobes: list[tuple[Tensor, Lobe, Tensor]], centre: tuple[float, float], size: tuple[int, int]
+    lobes: list[_ScatteredLight], centre: tuple[float, float], size: tuple[int, int]
 ) -> Tensor:
     """Return the light of all lobes in each pixel (y, x) of a window of ``size``, for a source at
     ``centre``.
     """
     return torch.stack(
-        [remaining * on_pixels(light, centre, size) for remaining, light, _ in lobes]
+        [light.arriving * on_pixels(light.lobe, centre, size) for light in lobes]
     ).sum(0)
 
 
@@ -545,8 +564,10 @@ def veil_at(
     Source: as `stray_light`.
     """
     lobes = _lobes(_Lens(surfaces, focal_length, pixel_pitch, diameter, 1.0, "none"), 1.0)
-    near_window = _veil(lobes, (float(NEAR), float(NEAR)), (2 * NEAR + 1, 2 * NEAR + 1)).flatten()
-    pixel_offsets = torch.arange(-NEAR, NEAR + 1, dtype=torch.float64)
+    near_window = _veil(
+        lobes, (float(NEAR_PIXELS), float(NEAR_PIXELS)), (2 * NEAR_PIXELS + 1, 2 * NEAR_PIXELS + 1)
+    ).flatten()
+    pixel_offsets = torch.arange(-NEAR_PIXELS, NEAR_PIXELS + 1, dtype=torch.float64)
     squared_distances = (pixel_offsets[:, None].square() + pixel_offsets.square()).flatten()
     squared_radius = radius.double().square()
     # near the source: mean over the pixels of equal distance, linear in the square of the distance
@@ -566,12 +587,13 @@ def veil_at(
         ring_mean[upper_index - 1] * (1 - fraction) + ring_mean[upper_index] * fraction
     ).reshape(squared_radius.shape)
     far_light = torch.stack(
-        [remaining * _beyond(light, squared_radius) for remaining, light, _ in lobes]
+        [light.arriving * _light_up_to_end(light.lobe, squared_radius) for light in lobes]
     ).sum(0)
-    return torch.where(squared_radius <= NEAR**2, near_light, far_light), _total(lobes)
+    veil = torch.where(squared_radius <= NEAR_PIXELS**2, near_light, far_light)
+    return veil, _total_scatter(lobes)
 
 
-def _beyond(light: Lobe, square: Tensor) -> Tensor:
+def _light_up_to_end(light: Lobe, square: Tensor) -> Tensor:
     """Return the light of a lobe at squared distances, which ends where the direction cosine is
     1.
     """

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from neusee.nodes import doe, flare, losses, metrics, optics, restore, sensor, spectra
-from neusee.nodes.doe._refractive_index import wave_height
 from neusee.nodes.optics._transform._scaled_transform import transform
 from neusee.nodes.precision import refuse_half, refuse_not_finite, single
 from neusee.nodes.values import Bands, Psf, Pupil
@@ -267,7 +266,7 @@ def test_a_deep_relief_wraps_as_in_float64(levels):
     height = 100e-6 * torch.rand(64, 64, generator=torch.Generator().manual_seed(1))
     how = {"material": "fused silica", "wrap_at": 550e-9, "levels": levels, "max_height": None}
     made, exact = doe.fabricate(height, **how), doe.fabricate.hooks.reference(height, **how)
-    wave = wave_height("fused silica", 550e-9)
+    wave = doe.wave_height("fused silica", 550e-9)
     assert float((made.double() - exact).abs().max()) <= 1e-7 * wave
 
 

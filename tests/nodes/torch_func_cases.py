@@ -11,10 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from neusee.nodes import calibrate, doe, optics, spectra
-from neusee.nodes.restore._networks._convolutional_networks import NAFNet, UNet
-from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._wiener_networks import Informed, Unrolled
+from neusee.nodes.restore import FFTMamba, Informed, NAFNet, UNet, Unrolled, start_network
 from neusee.nodes.values import (
     Channels,
     Dirt,

@@ -257,7 +257,7 @@ class _Generator(GenerateJsonSchema):
         parameter allows.
         """
         reader = schema["function"]["function"]
-        every_unit = itertools.chain.from_iterable(units._SCALE.values())
+        every_unit = itertools.chain.from_iterable(units.SCALES.values())
         # the reader of a quantity refuses the units of other quantities
         allowed_units = [unit for unit in every_unit if _takes(reader, unit)]
         if not allowed_units:

@@ -113,7 +113,7 @@ class _Quantity:
 def _quantity(value: Any) -> _Quantity | None:
     """Return a text such as ``450 nm`` as a quantity; None for anything else."""
     match = units._NUMBER.fullmatch(value.strip()) if isinstance(value, str) else None
-    for si_unit, scale in units._SCALE.items():
+    for si_unit, scale in units.SCALES.items():
         if match and match[2].strip() in scale:
             return _Quantity(
                 float(match[1]), match[2].strip(), units.read_quantity(value, si_unit), si_unit

@@ -22,8 +22,8 @@ from neusee.nodes.calibrate import (
     without_trend,
 )
 from neusee.nodes.calibrate import levels as joined
-from neusee.nodes.calibrate._emva_quantities import photon_transfer, saturation_point
-from neusee.nodes.calibrate._nonuniformity import nonuniformity, spatial_variances
+from neusee.nodes.calibrate._emva_quantities import saturation_point
+from neusee.nodes.calibrate._nonuniformity import spatial_variances
 from neusee.nodes.values import Levels
 
 DATA = Path(
@@ -326,6 +326,13 @@ def test_uneven_light_is_no_defect():
     assert np.unique(without_trend(slope)).tolist() == [-50, 0, 24 * 50]
 
 
+def dsnu_in_numbers(frames):
+    """DSNU1288 in DN of dark frames: in total, and of rows, columns and pixels."""
+    series = Nonuniformity(spatial_series(0.0, 1.0, frames), None)
+    quantities = emva_sheet(ideal([0, 1000, 2000]), series).quantities
+    return [q for q in quantities if q.key.startswith("DSNU1288") and q.unit == "DN"]
+
+
 def test_a_nonuniformity_within_chance_is_a_limit():
     rng = np.random.default_rng(11)
     stated, most = 0, 0.0
@@ -333,11 +340,7 @@ def test_a_nonuniformity_within_chance_is_a_limit():
         frames = torch.from_numpy(
             np.round(100 + 10 * rng.standard_normal((3, 24, 32))).astype(np.int64)
         )
-        found = [
-            q
-            for q in nonuniformity(Nonuniformity(spatial_series(0.0, 1.0, frames), None), 1.0)
-            if q.unit == "DN"
-        ]
+        found = dsnu_in_numbers(frames)
         stated += sum(q.bound == "" for q in found)
         most = max(most, *(q.value for q in found))
     assert stated <= 0.1 * 4 * 60  # two standard errors of a variance from few rows
@@ -350,11 +353,7 @@ def test_a_nonuniformity_beyond_chance_is_stated():
     frames = torch.from_numpy(
         np.round(image + 4 * rng.standard_normal((9, 24, 32))).astype(np.int64)
     )
-    total, _, _, pixel = (
-        q
-        for q in nonuniformity(Nonuniformity(spatial_series(0.0, 1.0, frames), None), 1.0)
-        if q.unit == "DN"
-    )
+    total, _, _, pixel = dsnu_in_numbers(frames)
     assert (total.bound, pixel.bound) == ("", "")
     assert (total.value, pixel.value) == (pytest.approx(5, rel=0.1), pytest.approx(5, rel=0.1))
 
@@ -377,11 +376,8 @@ def test_the_general_model_of_a_bent_camera_has_the_slope_at_each_level():
     photons = np.linspace(0, 17000, 41)
     levels = ideal(photons)
     bend = 0.4 / 17000  # the signal is lower by 40 % of the line at the end
-    found = general_model(
-        photon_transfer(
-            levels._replace(mean=OFFSET + (levels.mean - OFFSET) * (1 - bend * levels.photons))
-        )
-    )
+    bent = levels._replace(mean=OFFSET + (levels.mean - OFFSET) * (1 - bend * levels.photons))
+    found = general_model(emva_sheet(bent).transfer)
     slope = GAIN * EFFICIENCY * (1 - 2 * bend * photons)
     assert found.slope == pytest.approx(slope, rel=1e-9)
     assert found.ratio == pytest.approx(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neusee.nodes import ParameterError, calibrate
-from neusee.nodes.calibrate._scatter import _Camera, reduce_rings
+from neusee.nodes.calibrate._scatter import PointCamera, reduce_rings
 
 CAMERA = {"gain": 0.5, "offset": 100.0, "full_well": 20000.0, "read_noise": 5.0, "bits": 14}
 
@@ -17,7 +17,7 @@ def frame(size=96, centre=(47.5, 47.5), bright=6e7, seed=1):
 
 
 def rings(numbers, centre=None, **camera):
-    return reduce_rings(numbers[None].astype(float), _Camera(**CAMERA | camera), centre)
+    return reduce_rings(numbers[None].astype(float), PointCamera(**CAMERA | camera), centre)
 
 
 def test_rings_have_the_mean_signal_of_their_pixels():

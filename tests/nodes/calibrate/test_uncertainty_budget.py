@@ -14,10 +14,11 @@ from neusee.nodes.calibrate import (
     Laboratory,
     camera_sources,
     emva_sheet,
+    laboratory_contributions,
     sheet_budgets,
     variance_shares,
 )
-from neusee.nodes.calibrate._uncertainty_budget import coverage_factor, laboratory_contributions
+from neusee.nodes.calibrate._uncertainty_budget import coverage_factor
 from neusee.nodes.values import Levels
 
 K, ETA, NOISE, OFFSET, PIXELS = 0.25, 0.5, 12.0, 60.0, 4096

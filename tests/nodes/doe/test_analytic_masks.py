@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, doe, optics
-from neusee.nodes.doe._refractive_index import wave_height
 
 STOP = optics.stop(samples=48, pitch=10e-6, diameter=480e-6)
-WAVE = wave_height("fused silica", 550e-9)
+WAVE = doe.wave_height("fused silica", 550e-9)
 
 
 def plane(samples=48):
@@ -22,7 +21,7 @@ def plane(samples=48):
 
 
 def turns(height, material="fused silica", wavelength=550e-9):
-    return height.double() / wave_height(material, wavelength)
+    return height.double() / doe.wave_height(material, wavelength)
 
 
 FORMULAS = {

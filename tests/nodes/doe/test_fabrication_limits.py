@@ -10,9 +10,8 @@ from hypothesis.extra import numpy as arrays
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, TensorStats, doe
-from neusee.nodes.doe._refractive_index import wave_height
 
-WAVE = wave_height("fused silica", 550e-9)
+WAVE = doe.wave_height("fused silica", 550e-9)
 PLAIN = {"material": "fused silica", "wrap_at": None, "levels": None, "max_height": None}
 heights = arrays.arrays("float32", (3, 4), elements=st.floats(0, 0.0001220703125, width=32)).map(
     torch.from_numpy
@@ -137,7 +136,7 @@ def test_negligible_only_where_nothing_changes():
 
 def test_small_in_height_is_not_small_in_phase():
     facts = TensorStats.of(torch.tensor([[0.0, 0.9e-6]]))
-    step = 0.5e-6 / 255 / wave_height("fused silica", 400e-9)  # half a step, waves
+    step = 0.5e-6 / 255 / doe.wave_height("fused silica", 400e-9)  # half a step, waves
     bound = doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"max_height": 1e-6, "levels": 256})
     assert bound == pytest.approx(2 * math.pi * step, rel=1e-6)
 
@@ -145,7 +144,7 @@ def test_small_in_height_is_not_small_in_phase():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("wavelength", [540e-9, 549e-9, 551e-9, 552e-9])
 def test_the_bound_tells_a_relief_of_just_one_wave_as_it_is_made(wavelength, dtype):
-    wave = torch.tensor(wave_height("fused silica", wavelength), dtype=dtype)
+    wave = torch.tensor(doe.wave_height("fused silica", wavelength), dtype=dtype)
     for top in (
         wave,
         wave.nextafter(torch.zeros_like(wave)),

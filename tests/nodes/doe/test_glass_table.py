@@ -9,12 +9,11 @@ import pytest
 import torch
 
 from neusee.nodes import ParameterError, doe
-from neusee.nodes.doe._refractive_index import Sellmeier, excess_index
 from neusee.nodes.values import Bands
 
 #: Malitson, J. Opt. Soc. Am. 55, 1205 (1965): coefficients, and computed indices of his Table at
 #: wavelengths in um
-SILICA = Sellmeier(
+SILICA = dict(
     B=(0.6961663, 0.4079426, 0.8974794),
     C=(0.0684043**2, 0.1162414**2, 9.896161**2),
     range=(0.21e-6, 3.71e-6),
@@ -28,7 +27,7 @@ MALITSON = {
 }
 #: SCHOTT data sheet N-BK7 517642.251: constants of the dispersion formula, and refractive indices
 #: at spectral lines, nm
-CROWN = Sellmeier(
+CROWN = dict(
     B=(1.03961212, 0.231792344, 1.01046945),
     C=(0.00600069867, 0.0200179144, 103.560653),
     range=(0.3e-6, 2.5e-6),
@@ -116,7 +115,9 @@ def test_few_rows_are_interpolated_by_all_of_them(tmp_path, count):
 def test_the_index_of_a_table_has_a_gradient_by_the_wavelength(tmp_path):
     file = write(tmp_path, index_table(CROWN, 10))
     um = torch.tensor([0.4321, 0.5555, 1.0321], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda w: excess_index(file, w * 1e-6), (um,))
+    assert torch.autograd.gradcheck(
+        lambda w: doe.material(at(0.5)._replace(centres=w * 1e-6), material=file), (um,)
+    )
 
 
 @pytest.mark.parametrize("nm", [399, 1064.5])

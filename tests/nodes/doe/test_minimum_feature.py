@@ -6,9 +6,7 @@ import pytest
 import torch
 
 from neusee.nodes import optics
-from neusee.nodes.doe import smooth
-from neusee.nodes.doe._analytic_masks import half_rings, zernike
-from neusee.nodes.doe._parametrisations import Drawn, Modes, Pixels, Rings, Written
+from neusee.nodes.doe import Drawn, Modes, Pixels, Rings, Written, half_rings, smooth, zernike
 
 STOP = optics.stop(samples=24, pitch=2e-6, diameter=48e-6)
 

@@ -13,9 +13,9 @@ from neusee.nodes import ParameterError, doe, optics
 from neusee.nodes.doe._parametrisations import (
     PARAMETRISATIONS,
     HeightNet,
-    coordinates,
-    fresh,
-    height_of,
+    network_height,
+    new_network,
+    pupil_coordinates,
 )
 from neusee.nodes.resampling import enlarge
 
@@ -141,7 +141,7 @@ def test_unet_has_eight_convolutions_and_the_paper_inputs():
 
 
 def test_unet_starts_orthogonal_with_zero_biases():
-    net = fresh(4, 16, seeded())
+    net = new_network(4, 16, seeded())
     rows = net.down[2].weight.flatten(1)
     assert_close(rows @ rows.T, 2 * torch.eye(len(rows)), rtol=0, atol=1e-5)
     assert all(
@@ -164,12 +164,12 @@ def test_unet_works_at_any_sampling(samples):
 
 
 def test_unet_learns_through_the_resampling():
-    net = fresh(2, 6, seeded()).double()
+    net = new_network(2, 6, seeded()).double()
     weight = net.down[0].weight.detach().clone().requires_grad_()
 
     def relief(kernel):
         logits = torch.func.functional_call(
-            net, {"down.0.weight": kernel}, (coordinates(6).double(),)
+            net, {"down.0.weight": kernel}, (pupil_coordinates(6).double(),)
         )
         return torch.sigmoid(enlarge(logits, 11, 11))
 
@@ -177,11 +177,11 @@ def test_unet_learns_through_the_resampling():
 
 
 def test_unet_suppresses_after_a_few_steps():
-    net = fresh(4, 32, seeded())
+    net = new_network(4, 32, seeded())
     optimiser = torch.optim.Adam(net.parameters(), 3e-3)
     losses = []
     for _ in range(25):
-        loss = suppression(height_of(net, 64, 32, 2.4e-6))
+        loss = suppression(network_height(net, 64, 32, 2.4e-6))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -190,12 +190,12 @@ def test_unet_suppresses_after_a_few_steps():
 
 
 def test_unet_loads_its_own_weights_and_no_others(tmp_path):
-    net = fresh(4, 32, seeded(9))
+    net = new_network(4, 32, seeded(9))
     save_file(net.state_dict(), tmp_path / "net.safetensors")
     params = {"max_height": 1.2e-6, "grid": 32, "weights": tmp_path / "net.safetensors"}
     assert doe.unet.hooks.preflight(**params, width=4) == []
     loaded = doe.unet(STOP, **params, width=4, rng=seeded())
-    assert_close(loaded, height_of(net, 64, 32, 1.2e-6).detach(), rtol=0, atol=0)
+    assert_close(loaded, network_height(net, 64, 32, 1.2e-6).detach(), rtol=0, atol=0)
     with pytest.raises(ParameterError, match="width 8") as caught:
         doe.unet.hooks.preflight(**params, width=8)
     assert caught.value.parameter == "weights"
@@ -240,8 +240,8 @@ def test_every_sample_of_a_formula_can_be_freed(name, params):
 
 
 def test_a_network_in_double_precision_draws_in_double_precision():
-    net = fresh(4, 16, seeded(3))
-    single = height_of(net, 24, 16, 1.2e-6)
-    double = height_of(net.double(), 24, 16, 1.2e-6)
+    net = new_network(4, 16, seeded(3))
+    single = network_height(net, 24, 16, 1.2e-6)
+    double = network_height(net.double(), 24, 16, 1.2e-6)
     assert double.dtype == torch.float64
     assert_close(single.double(), double, rtol=1e-5, atol=1e-12)

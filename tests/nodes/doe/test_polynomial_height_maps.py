@@ -11,7 +11,8 @@ from numpy.polynomial.legendre import legval2d
 from scipy.special import eval_legendre
 
 from neusee.nodes import doe, optics
-from neusee.nodes.doe._parametrisations import LearntStop, Polynomials, Streak, legendre
+from neusee.nodes.doe import LearntStop, Polynomials, Streak
+from neusee.nodes.doe._parametrisations import legendre
 
 STOP = optics.stop(samples=64, pitch=5e-6, diameter=320e-6)
 LINE = (np.arange(64) - 31.5) / 32

@@ -14,10 +14,10 @@ from neusee.nodes.flare._dirt import (
     Grain,
     Scratch,
     _dents,
-    _distance,
+    _distance_to_line,
+    _generators,
     _grains,
     _scratches,
-    _streams,
     stamp,
 )
 from neusee.nodes.optics._pupil import screen, surface
@@ -215,13 +215,13 @@ def test_a_scratch_is_darkest_where_its_nearest_step_says():
     shade = 1 - stamp(torch.ones(200, 200), [Scratch(points, 3 / 200, 0.7)], grid)
     y, x = torch.meshgrid(torch.arange(200.0), torch.arange(200.0), indexing="ij")
     places = [(v * 200 + 99.5, u * 200 + 99.5) for v, u in points]
-    nearest = torch.stack([_distance(y, x, a, b) for a, b in pairwise(places)]).amin(0)
+    nearest = torch.stack([_distance_to_line(y, x, a, b) for a, b in pairwise(places)]).amin(0)
     assert_close(shade, 0.7 * (2.0 - nearest).clamp(0, 1), rtol=0, atol=1e-6)
 
 
 def test_dirt_is_made_by_stripes_that_fit_together():
     """A pupil of many stripes: each kind against its formula over the whole plane."""
-    stop, rngs = optics.stop(samples=401, pitch=1e-5, diameter=4.01e-3), _streams(5, seeded())
+    stop, rngs = optics.stop(samples=401, pitch=1e-5, diameter=4.01e-3), _generators(5, seeded())
     grid = grid_of(stop)
     film, patches = screen(grid, 0.05, rngs[2]), screen(grid, 0.15, rngs[3])
     found = flare.dirt(stop, grease=0.3, smudges=0.4, dents=0.5, rng=seeded())

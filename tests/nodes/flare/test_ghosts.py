@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import flare
-from neusee.nodes.flare._ghosts import _draw, _reflected
+from neusee.nodes.flare._ghosts import _random_ghosts, _reflectance
 from neusee.nodes.values import Bands
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
@@ -117,14 +117,15 @@ def coated(wavelengths, tuned, layer=1.38, glass=1.70):
 @pytest.mark.parametrize("tuned", [400e-9, 550e-9, 700e-9])
 def test_a_coating_reflects_as_a_quarter_wave_of_magnesium_fluoride(tuned):
     waves = torch.linspace(350e-9, 1100e-9, 151, dtype=torch.float64)
-    assert_close(_reflected(waves, tuned), coated(waves, tuned), rtol=0, atol=0.02)
+    assert_close(_reflectance(waves, tuned), coated(waves, tuned), rtol=0, atol=0.02)
 
 
 def test_coatings_are_tuned_to_all_of_the_visible_range():
     """That of a camera lens, 400 to 700 nm, and evenly."""
     tuned = (
         torch.tensor(
-            [ghost.tuned for ghost in _draw(1000, 2.0, 3e-4, seeded())], dtype=torch.float64
+            [ghost.tuned for ghost in _random_ghosts(1000, 2.0, 3e-4, seeded())],
+            dtype=torch.float64,
         )
         * 1e9
     )

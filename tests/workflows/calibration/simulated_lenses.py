@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import j1
 
 from neusee.nodes import calibrate
-from neusee.nodes.calibrate._scatter import _Camera, reduce_rings
+from neusee.nodes.calibrate._scatter import PointCamera, reduce_rings
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.recipe.loading import load
 
@@ -91,7 +91,7 @@ def picture(truth, draw, size=128, centre=None, lens=LENS, more=(), band=20e-9):
 
 
 def rings_of(frame, centre=None):
-    return reduce_rings(frame[None].astype(float), _Camera(**CAMERA), centre)
+    return reduce_rings(frame[None].astype(float), PointCamera(**CAMERA), centre)
 
 
 @cache

@@ -12,7 +12,7 @@ from PIL import Image
 from pydantic import ValidationError
 
 from neusee.nodes.calibrate import descriptor, descriptor_frames, descriptor_series, reduce
-from neusee.nodes.calibrate._measurement_files import _parsed
+from neusee.nodes.calibrate._measurement_files import parsed_descriptor
 from neusee.workflows.keys.cache_key import plain
 
 DATA = Path(
@@ -188,7 +188,7 @@ def test_descriptors_of_the_working_group_are_understood(name, levels, dark, ima
     file = DATA / f"EMVA1288_ReferenceSet_{name}_12Bit_descriptor.txt"
     if not file.is_file():
         pytest.skip(f"no {file.name} in {DATA}: set NEUSEE_EMVA1288")
-    said = _parsed(file)
+    said = parsed_descriptor(file)
     assert (said.bits, said.shape) == (12, (480, 640))
     assert (len(said.levels), sum(level.photons == 0 for level in said.levels)) == (levels, dark)
     assert sorted(len(level.images) for level in said.levels) == images

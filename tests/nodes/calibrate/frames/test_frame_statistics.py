@@ -102,7 +102,7 @@ def test_the_histogram_is_numpys(stack):
 def test_pieces_give_what_the_whole_gives(monkeypatch, scatter):
     frames = noise(3, 40, 50)
     whole = one(frames, scatter)
-    monkeypatch.setattr(_light_levels, "_PIECE", 100)
+    monkeypatch.setattr(_light_levels, "_BLOCK_NUMBERS", 100)
     for a, b in zip(one(frames, scatter), whole, strict=True):
         assert torch.allclose(a, b, rtol=1e-14, atol=0)
 

@@ -14,8 +14,7 @@ from PIL import Image
 from pydantic import ValidationError
 
 from neusee.nodes import ParameterError
-from neusee.nodes.calibrate import _frame_files as _damaged_frames
-from neusee.nodes.calibrate import frames
+from neusee.nodes.calibrate import _frame_files, frames
 
 NUMBERS = np.array([[0, 1, 255, 256], [32767, 32768, 65534, 65535]], np.uint16)
 
@@ -191,7 +190,7 @@ def test_numbers_of_a_type_that_only_counts_are_not_read_before_the_run(
 ):
     if write is fits:
         pytest.importorskip("astropy")
-    monkeypatch.setattr(_damaged_frames, "read", lambda file: pytest.fail(f"{file} is read"))
+    monkeypatch.setattr(_frame_files, "read_frames", lambda file: pytest.fail(f"{file} is read"))
     kind = {npy: "npy", tiff: "tif", fits: "fits"}[write]
     assert frames.hooks.preflight(files=(write(tmp_path / f"a.{kind}", NUMBERS),)) == []
 

@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from scipy.stats import cauchy, norm
 
 from neusee.nodes.calibrate import CLEAN_PAIRS, Hidden, Stack, inspect_frames, open_errors
-from neusee.nodes.calibrate._frame_pairs import probably_sound
+from neusee.nodes.calibrate._frame_pairs import chance_of_no_fault
 
 DATA = Path(
     os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[4] / "../shared/data/emva1288")
@@ -71,12 +71,12 @@ def test_independent_faults_add_as_errors_and_shift_nothing():
 
 def test_frames_of_few_pixels_leave_their_whole_error_open_and_many_almost_nothing():
     few, many = (
-        Hidden("mixing", 0.0, 0.004, 0.02, gain=1.0, sound=probably_sound(n))
+        Hidden("mixing", 0.0, 0.004, 0.02, gain=1.0, sound=chance_of_no_fault(n))
         for n in (1e4, CLEAN_PAIRS)
     )
     assert few.size() > 0.95 * 0.004
     assert many.size() < 0.2 * 0.004
-    seen = Hidden("mixing", 0.02, 0.004, 0.02, gain=1.0, sound=probably_sound(CLEAN_PAIRS))
+    seen = Hidden("mixing", 0.02, 0.004, 0.02, gain=1.0, sound=chance_of_no_fault(CLEAN_PAIRS))
     assert seen.size() == pytest.approx(0.02, rel=0.1)
 
 
