@@ -2558,9 +2558,9 @@ MUTANTS = (
         "workflows/store/eviction.py",
         within(
             "workflows/store",
-            "budget_eviction.py::test_all_bytes_but_receipts_are_divided_among_the_values",
+            "budget_eviction.py::test_all_bytes_but_receipts_are_those_of_the_values",
         ),
-        ("sizes.get(name, 0) / users_of_band[name] for", "sizes.get(name, 0) for"),
+        ("payload_bytes = sizes.get(", "payload_bytes = 2 * sizes.get("),
     ),
     *faults(
         "workflows/store/eviction.py",
@@ -2569,7 +2569,7 @@ MUTANTS = (
             "budget_eviction.py::test_a_value_that_this_program_does_not_read_saves_no_time_and_frees_its_record_too",
         ),
         ('payload_bytes + sizes.get(f"{key}.json", 0), 0.0', "payload_bytes, 0.0"),
-        ('f"{key}.json", 0), 0.0, frozenset()', 'f"{key}.json", 0), 1.0, frozenset()'),
+        ('f"{key}.json", 0), 0.0)', 'f"{key}.json", 0), 1.0)'),
     ),
     *faults(
         "workflows/store/eviction.py",

@@ -136,7 +136,7 @@ from neusee.workflows.engine.machine_resources import limited
 from neusee.workflows.keys.module_digest import read_memo, read_parts
 from neusee.workflows.recipe.distributions.joint_distribution import read_posterior
 from neusee.workflows.recipe.distributions.joint_distribution import read_columns
-from neusee.workflows.store.lease import _look as look
+from neusee.workflows.store.lease import _state_of_lease as look
 from neusee.workflows.training.resumable_loop import StateFile
 import PIL.Image, astropy.io.fits, kornia_rs, scipy.io, torch, torch.export
 

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 FOLDER, SUFFIX = "answers", ".answer"
 #: kinds of answers: with the files of a folder, and with what a run shows
 AS_KEPT, RUN = "as kept", "run"
-MOST = 32 << 20  #: bytes of the largest answer that is kept
+MOST_BYTES = 32 << 20  #: bytes of the largest answer that is kept
 _LABEL = re.compile(r"\w[\w.-]*")
 _FILE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")
 
@@ -84,7 +84,7 @@ def read_answer(disk: Disk, name: str) -> Answer | None:
     """
     path = answer_path(disk, name)
     try:
-        return unpacked(name, read_file(path, MOST))
+        return unpacked(name, read_file(path, MOST_BYTES))
     except NotRead:
         return None
     except OSError:
@@ -101,7 +101,7 @@ def write_answer(disk: Disk, name: str, answer: Answer) -> bool:
     Raises `OSError` if the folder cannot be written.
     """
     content, path = packed(name, answer), answer_path(disk, name)
-    if len(content) > MOST:
+    if len(content) > MOST_BYTES:
         return False
     with disk.temporary(f"{name[:8]}{SUFFIX}") as (temporary, file):
         file.write(content)

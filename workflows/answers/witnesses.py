@@ -305,11 +305,7 @@ def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
     """
     metadata_by_key, loaded = store.asked(), sorted(store.loaded())
     paths = {name: os.path.relpath(path, store.root) for name, path in taken.items()}
-    band_paths: list[str] = []
-    for key in loaded:
-        band_names = metadata.bands(metadata_by_key[key] or {})
-        band_paths += [f"bands/{name[:2]}/{name}" for name in band_names]
-    read_files = sorted({*paths.values(), *band_paths})
+    read_files = sorted(set(paths.values()))
     if foreign_paths := [path for path in read_files if not _FILE.fullmatch(path)]:
         raise Unsettled(f"{foreign_paths[0]} is not in the folders of a store")
     files = {path: _digest_of_results(f"{store.disk.folder}/{path}") for path in read_files}

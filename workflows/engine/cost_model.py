@@ -46,7 +46,7 @@ from neusee.workflows.recipe.step_checks import machine_memory
 
 
 #: bytes of a result whose shape is not known, in a recipe without any known shape
-_LEAST = float(1 << 26)
+_UNKNOWN_BYTES = float(1 << 26)
 
 
 class Size(NamedTuple):
@@ -189,12 +189,12 @@ def _equal(params: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
 
 
 _sized: dict[str, Sized] = {}  # by step
-_MOST_SIZED = 4096
+_MOST_REMEMBERED_SIZES = 4096
 
 
 def _remember(sized: Sized) -> None:
     """Keep the size of a step for the next recipe."""
-    if len(_sized) >= _MOST_SIZED:
+    if len(_sized) >= _MOST_REMEMBERED_SIZES:
         _sized.clear()
     _sized[sized.step.name] = sized
 
@@ -210,7 +210,7 @@ def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
     if all(size.known for size in sizes.values()):
         return sizes
     known_bytes = [size.result for size in sizes.values() if size.known and size.result < math.inf]
-    return _sizes(recipe, order, max(known_bytes, default=_LEAST))
+    return _sizes(recipe, order, max(known_bytes, default=_UNKNOWN_BYTES))
 
 
 def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, Size]:
@@ -325,11 +325,13 @@ def measured_size(
 
 _FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
-_MOST = 100  #: earlier results of a step or a node among which those of its size are searched
-_LEAST_COST = 1 << 25  #: bytes of a peak below which the memory of the process is mostly noise
+_MOST_RESULTS = (
+    100  #: earlier results of a step or a node among which those of its size are searched
+)
+_NOISE_BYTES = 1 << 25  #: bytes of a peak below which the memory of the process is mostly noise
 #: how much larger a step of a node without a law may be than the largest one that was measured
-_FARTHEST = 8
-_SHORT = 1e-3  #: s of a step below which its time is mostly overhead
+_LARGEST_EXTRAPOLATION = 8
+_OVERHEAD_SECONDS = 1e-3  #: s of a step below which its time is mostly overhead
 
 Row = Mapping[str, Any]  #: a line of the journal
 
@@ -475,7 +477,7 @@ class Costs:
             return self._repeated(runs_of_size[::-1], kinds, size, law)
         runs_with_size = [row for row in past_runs if _size_of_work(row)]
         # a run at a far smaller size says little about this one
-        if law is None and _FARTHEST * _largest_extent(runs_with_size) < _extent(size):
+        if law is None and _LARGEST_EXTRAPOLATION * _largest_extent(runs_with_size) < _extent(size):
             return self._guess(path, kinds, size, runs_with_size[-_NEWEST:])
         law_or_guess = law or guess()
         # how much more than the law the newest runs took here
@@ -562,10 +564,10 @@ class Costs:
 
 
 def _append(rows: list[Row], row: Row) -> None:
-    """Append a row to the newest ones, of which at most twice `_MOST` are there at any time."""
+    """Append a row to the newest ones, of which at most twice `_MOST_RESULTS` are there."""
     rows.append(row)
-    if len(rows) > 2 * _MOST:
-        del rows[:_MOST]
+    if len(rows) > 2 * _MOST_RESULTS:
+        del rows[:_MOST_RESULTS]
 
 
 def _loading(cost: Estimate, loads: Loading) -> Estimate:
@@ -602,9 +604,9 @@ def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:
     peak_ratios, time_ratios = [], []
     for row in rows:
         size = _size_of_work(row)
-        if row.get("peak") and law.peak(size) > _LEAST_COST and _kind(row) == "cpu":
+        if row.get("peak") and law.peak(size) > _NOISE_BYTES and _kind(row) == "cpu":
             peak_ratios.append(row["peak"] / law.peak(size))
-        if law.time(size) > _SHORT:
+        if law.time(size) > _OVERHEAD_SECONDS:
             time_ratios.append(row["seconds"] * faster(_kind(row)) / law.time(size))
     return (median(peak_ratios) if peak_ratios else 1.0), (
         median(time_ratios) if time_ratios else 1.0

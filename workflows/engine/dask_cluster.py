@@ -178,7 +178,9 @@ def slurm_cluster(count: int, options: SlurmOptions) -> Iterator[SlurmJobs]:
     cluster_class, job_class = _dask_jobqueue()
     jobs = SlurmJobs()
     try:
-        jobs.cluster = cluster_class(job_cls=_told(job_class, jobs), **_settings(options))
+        jobs.cluster = cluster_class(
+            job_cls=_with_job_reports(job_class, jobs), **_settings(options)
+        )
         jobs.cluster.scale(jobs=count)
         yield jobs
     finally:
@@ -235,7 +237,7 @@ def _dask_jobqueue() -> tuple[type[Any], type[Any]]:
     return SLURMCluster, SLURMJob
 
 
-def _told(job_class: type[Any], jobs: SlurmJobs) -> type[Any]:
+def _with_job_reports(job_class: type[Any], jobs: SlurmJobs) -> type[Any]:
     """Return a class of jobs that tell ``jobs`` their numbers and what sbatch refuses."""
 
     async def submit(self: Any, script: str) -> str:
@@ -290,8 +292,8 @@ def cluster(
 
     ``dask:4`` are four local workers, ``dask:here`` is this process, ``slurm:4`` are four jobs of
     SLURM with the options ``job``, such as ``queue=gpu``; anything else is the address of a
-    scheduler. ``say`` is told what is waited for, and ``warn`` of a scheduler that is silent.
-    Raises `ClusterLost` if no scheduler or no worker comes.
+    scheduler. ``say`` is called with what is waited for, and ``warn`` for a scheduler that is
+    silent. Raises `ClusterLost` if no scheduler or no worker comes.
     """
     silence_logs()
     kind, _, worker_count = where.partition(":")

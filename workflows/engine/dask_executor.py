@@ -21,7 +21,7 @@ from typing import Any, get_args, get_origin
 import torch
 
 from neusee.nodes.own_modules import own_modules
-from neusee.workflows.engine.machine_resources import FRESH, there_is
+from neusee.workflows.engine.machine_resources import FRESH_SECONDS, there_is
 from neusee.workflows.engine.step_job import (
     InputMissing,
     Lane,
@@ -114,7 +114,7 @@ class SchedulerLink:
         """Return the connected workers as soon as there is one."""
         while not (workers := self.workers()):
             self.renewed()
-            time.sleep(10 * FRESH)
+            time.sleep(10 * FRESH_SECONDS)
         return workers
 
     def close(self) -> None:
@@ -139,7 +139,7 @@ class SchedulerLink:
                 self.client = connected(self.address, _ATTEMPT)
                 self._workers_seen = time.monotonic()
                 return
-            time.sleep(10 * FRESH)
+            time.sleep(10 * FRESH_SECONDS)
         raise ClusterLost(f"the scheduler {self.address} has ended, or the network to it is cut")
 
 

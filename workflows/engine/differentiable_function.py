@@ -203,7 +203,7 @@ class _Function:
         try:
             return self._result(step, inputs, params, values, ledger, seed)
         except (RuntimeError, NotImplementedError, ValueError) as error:
-            raise _told(error, step, inputs, self.recipe.exact) from error
+            raise _named_transform_error(error, step, inputs, self.recipe.exact) from error
 
     def _result(
         self,
@@ -241,7 +241,9 @@ class _Function:
         return self._facts[name]
 
 
-def _told(error: Exception, step: Step, inputs: list[Any], exact: bool) -> Exception:
+def _named_transform_error(
+    error: Exception, step: Step, inputs: list[Any], exact: bool
+) -> Exception:
     """Return an error that names the step and the transform of `torch.func` that it does not
     pass, or ``error``.
     """

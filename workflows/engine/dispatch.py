@@ -13,7 +13,10 @@ from dataclasses import replace
 from neusee.workflows.engine.step_job import Executor, Outcome, StepJob
 from neusee.workflows.keys.cache_key import Key, device_kind
 
-_FIRST_LOOK, _LONGEST = 0.01, 0.5  #: s between attempts at a job that another process computes
+_FIRST_PAUSE, _LONGEST_PAUSE = (
+    0.01,
+    0.5,
+)  #: s between attempts at a job that another process computes
 
 Chain = tuple[StepJob, ...]  #: jobs of which each feeds only the next job
 #: a function that returns True if the memory suffices for one more step beside the running steps
@@ -82,7 +85,7 @@ class Loop:
         """Submit to every idle device or worker the first ready chain of jobs that may run
         there.
         """
-        self._look_again()
+        self._make_due_chains_ready()
         for lane, lane_state in self.executor.lanes.items():
             if lane in self.busy or not self._ready:
                 continue
@@ -115,7 +118,7 @@ class Loop:
                 return ready_index
         return None
 
-    def _look_again(self) -> None:
+    def _make_due_chains_ready(self) -> None:
         """Make the chains ready whose wait for another process is over."""
         present_time = time.monotonic()
         for chain_index in [
@@ -175,8 +178,8 @@ class Loop:
         computes.
         """
         chain = self._chains[i]
-        # the first pause is `_FIRST_LOOK`: twice the half of it
-        pause = min(_LONGEST, 2 * self._held.get(i, (0.0, _FIRST_LOOK / 2))[1])
+        # the first pause is `_FIRST_PAUSE`: twice the half of it
+        pause = min(_LONGEST_PAUSE, 2 * self._held.get(i, (0.0, _FIRST_PAUSE / 2))[1])
         self._held[i] = (time.monotonic() + pause, pause)
         # the jobs before this one are done
         self._chains[i] = chain[[job.key for job in chain].index(key) :]

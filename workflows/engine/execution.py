@@ -113,8 +113,8 @@ class ValuesInMemory(dict[Key, Any]):
         key = outcome.work.key
         self[key] = outcome.value
         self._unsure.pop(key, None)
-        if outcome.waits or not outcome.kept:
-            self._unsure[key] = outcome.waits
+        if outcome.is_written_later or not outcome.kept:
+            self._unsure[key] = outcome.is_written_later
 
     def free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
         """Delete the values that no later step needs; with ``keep``, only those of which the
@@ -181,7 +181,21 @@ def refuse_taints(outcome: Outcome) -> None:
 # computed once. A step that is left out has the key of its input.
 
 
-_QUICK = 1e-3  #: s below which two processes may both compute a step without a lease
+_UNLOCKED_SECONDS = 1e-3  #: s below which two processes may both compute a step without a lease
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What a run must give, and what computes and stores it."""
+
+    recipe: Recipe
+    outputs: tuple[str, ...]  #: steps whose values the run must give
+    store: Store
+    devices: list[str]  #: the preferred device first
+    memory: int | None  #: bytes that this process, and each GPU, may use; None for what is free
+    executor: Executor | None  #: None for this process
+    watch: Callable[[Event], None]  #: is called with what becomes of each step
+    show: Show  #: is called with each computed result
 
 
 class Execution:
@@ -191,31 +205,22 @@ class Execution:
 
     def __init__(
         self,
-        recipe: Recipe,
-        store: Store,
-        devices: list[str],
-        watch: Callable[[Event], None],
-        outputs: Iterable[str],
-        executor: Executor | None,
-        memory: int | None,
-        show: Show = lambda *_: None,
-        series: RunSeries | None = None,
-        carried: Mapping[str, Outcome] | None = None,
-        anew: Collection[str] = (),
+        request: RunRequest,
+        series: RunSeries,
+        carried: Mapping[str, Outcome],
+        anew: Collection[str],
     ) -> None:
-        self.recipe, self.store, self.devices, self.watch, self.show = (
-            recipe,
-            store,
-            devices,
-            watch,
-            show,
+        recipe, store = request.recipe, request.store
+        self.recipe, self.store, self.devices = recipe, store, request.devices
+        self.watch, self.show = request.watch, request.show
+        self.wanted = frozenset(request.outputs)
+        self.own = Local(
+            request.devices, store, self._fetch, request.memory, nodes_of(recipe, self.wanted)
         )
-        self.wanted = frozenset(outputs)
-        self.own = Local(devices, store, self._fetch, memory, nodes_of(recipe, self.wanted))
-        self.executor = executor or self.own
-        self.series = series or RunSeries.begun(store)
-        self.code, self.began = self.series.known_keys.code, time.time()
-        self._carried = carried or {}  # outcomes of an attempt before this one, by step
+        self.executor = request.executor or self.own
+        self.series = series
+        self.code, self.began = series.known_keys.code, time.time()
+        self._carried = carried  # outcomes of an attempt before this one, by step
         self._anew = set[Key]()  # of steps that are computed although the store has their results
         self._asked_anew = dependents(recipe, anew) if anew else frozenset[str]()
         self.keys: dict[str, Key] = {}
@@ -227,7 +232,7 @@ class Execution:
         self.took: dict[str, float] = {}  # the longest time of a step of each node, s
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
         # and of steps that did not run
-        self.done, self._asleep = dict[str, StepRecord](), dict[str, StepRecord]()
+        self.done, self._unneeded_records = dict[str, StepRecord](), dict[str, StepRecord]()
         self.receipts: dict[Key, dict[str, Any]] = {}  # metadata of values that were not kept
         self.costs: Costs | None = None
         # predicted costs of the steps that are being computed
@@ -332,7 +337,7 @@ class Execution:
             record_of_key = self.done.get(self.makers[key].name)
             # neither this step nor one with its key had to run
             if record_of_key is None or record_of_key.state == "not needed":
-                self._finish(self.asleep(name))
+                self._finish(self.record_of_unneeded(name))
             else:
                 self._finish(
                     replace(
@@ -345,26 +350,25 @@ class Execution:
                 )
         return {name: self.done[name] for name in order}
 
-    def asleep(self, name: str) -> StepRecord:
+    def record_of_unneeded(self, name: str) -> StepRecord:
         """Return the record of a step whose value no other step needed."""
-        if name not in self._asleep:
+        if name not in self._unneeded_records:
             key = self.keys[name]
             metadata = (
                 self.store.about(key)
                 if self.recipe.steps[name].node.hooks.approximation_error
                 else None
             )
-            self._asleep[name] = unneeded(name, key, metadata, self._bound(name))
-        return self._asleep[name]
+            self._unneeded_records[name] = unneeded(name, key, metadata, self._bound(name))
+        return self._unneeded_records[name]
 
     def missing(self, names: Iterable[str]) -> set[Key]:
         """Return the cache keys of all values that must be computed to obtain the results of the
         steps ``names``.
         """
+        upstream = Upstream(self.known, self.sources)
         # the walk asks `upstream` for every value, which notes the missing ones
-        in_order(
-            upstream := Upstream(self.known, self.sources), [self.keys[name] for name in names]
-        )
+        in_order(upstream, [self.keys[name] for name in names])
         return set(upstream.missing)
 
     def sources(self, key: Key) -> list[Key]:
@@ -526,7 +530,7 @@ class Execution:
             # a quick step needs no lease: to compute it twice costs less
             work,
             refetch_seconds=refetch,
-            unlocked=self._probable_seconds(work) < _QUICK,
+            unlocked=self._probable_seconds(work) < _UNLOCKED_SECONDS,
         )
 
     def _probable_seconds(self, work: StepJob) -> float:
@@ -534,7 +538,7 @@ class Execution:
         path, estimate = work.step.node.path, self.expected[work.key]
         if path in self.took:
             return self.took[path]
-        return estimate.seconds["cpu"] if estimate.known else _QUICK
+        return estimate.seconds["cpu"] if estimate.known else _UNLOCKED_SECONDS
 
     def _note(self, outcome: Outcome) -> None:
         """Record the outcome of a step, or raise the error in this outcome."""

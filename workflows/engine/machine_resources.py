@@ -1,5 +1,5 @@
-"""Memory and processors of this machine: what is in use, what is free, and
-the memory limit: a step or a report that takes the process above it is stopped.
+"""Memory and processors of this machine: what is in use, what is free, and the memory limit, above
+which a step or a report is stopped.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from neusee.nodes.input_files import Room, measured_by
-from neusee.nodes.input_files import free_memory as free_anywhere
 from neusee.workflows.store.cache_settings import format_size
+
+if TYPE_CHECKING:
+    from neusee.nodes.input_files import Room
 
 # --- processors -----------------------------------------------------------------------------------
 
@@ -63,11 +64,12 @@ def threads_for(processors: int, load: float) -> int:
 # Memory use: the peak memory of a step, and the memory of a device.
 
 
-_CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-_USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
+_LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+_USAGE_FILES = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
 _PAGE = os.sysconf("SC_PAGE_SIZE")  #: bytes
-FRESH = 0.02  #: s, the time between two looks of the watch over the memory
-_told = [-FRESH, 0.0]  # time of the newest look at the free memory in s, and what it found in bytes
+FRESH_SECONDS = 0.02  #: s, the time between two looks of the watch over the memory
+# time of the newest look at the free memory in s, and what it found in bytes
+_newest_free = [-FRESH_SECONDS, 0.0]
 _highest = 0  # peak memory of this process before the last reset of the counter of the system
 
 
@@ -181,13 +183,13 @@ def free_memory() -> int:
     """Return the bytes that this process can still use: free memory of the machine, or of its
     control group.
 
-    A number that is younger than `FRESH` seconds is told again, because short runs ask more often
+    A number that is younger than `FRESH_SECONDS` is given again, because short runs ask more often
     than it changes.
     """
     present_time = time.monotonic()
-    if not _told[0] <= present_time < _told[0] + FRESH:
-        _told[:] = [present_time, _free_memory()]
-    return int(_told[1])
+    if not _newest_free[0] <= present_time < _newest_free[0] + FRESH_SECONDS:
+        _newest_free[:] = [present_time, _free_memory()]
+    return int(_newest_free[1])
 
 
 def _free_memory() -> int:
@@ -200,7 +202,7 @@ def _free_memory() -> int:
             free,
             next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:")),
         )
-    for limit, usage_file in zip(_CGROUPS, _USED, strict=True):
+    for limit, usage_file in zip(_LIMIT_FILES, _USAGE_FILES, strict=True):
         with suppress(OSError, ValueError):
             used_bytes = int(Path(usage_file).read_text()) - _reclaimable(Path(usage_file).parent)
             free = min(free, int(Path(limit).read_text()) - used_bytes)
@@ -224,7 +226,7 @@ def there_is(device: str) -> int:
 
         return int(torch.cuda.get_device_properties(device).total_memory)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for path in _CGROUPS:
+    for path in _LIMIT_FILES:
         with suppress(OSError, ValueError):
             memory = min(memory, int(Path(path).read_text()))
     return memory
@@ -241,8 +243,10 @@ def there_is(device: str) -> int:
 # header of the file states.
 
 
-_PAUSE = 0.02  #: s between two looks
-_NEAR = 0.9  #: share of the limit from which memory that was freed is given back to the system
+_SECONDS_BETWEEN_LOOKS = 0.02  #: s between two looks
+_SHARE_TO_GIVE_BACK = (
+    0.9  #: share of the limit from which memory that was freed is given back to the system
+)
 _ADVICE = (
     "give more memory, or choose a smaller picture, pupil or number of bands; the steps that are"
     " finished stay in the cache"
@@ -264,13 +268,13 @@ class MemoryLimit(Exception):
     def _what(self) -> str:
         if self.args:
             return str(self.args[0])
-        limits = f", the limit is {format_size(int(_last[1]))}" if _last[1] else ""
-        return f"the process holds {format_size(int(_last[0]))}{limits}"
+        limits = f", the limit is {format_size(int(_at_last_stop[1]))}" if _at_last_stop[1] else ""
+        return f"the process holds {format_size(int(_at_last_stop[0]))}{limits}"
 
 
-_last = [0.0, 0.0]  # bytes of the process and the limit when a step was last stopped
+_at_last_stop = [0.0, 0.0]  # bytes of the process and the limit when a step was last stopped
 _limits: list[float] = []
-_inside: dict[int, bool] = {}  # threads that are watched; True if told to stop
+_watched_threads: dict[int, bool] = {}  # threads that are watched; True if told to stop
 _guard = threading.RLock()
 _wake = threading.Event()
 _thread: list[threading.Thread] = []
@@ -279,6 +283,10 @@ _thread: list[threading.Thread] = []
 @contextmanager
 def limited(limit: float) -> Iterator[None]:
     """Limit the memory of this process to ``limit`` bytes while the ``with`` block runs."""
+    # here, because `neusee --help` asks for the free processors alone, and nodes import slowly
+    from neusee.nodes import input_files
+
+    input_files.measured_by(_room)
     with _guard:
         _limits.append(limit)
     try:
@@ -297,14 +305,13 @@ def _room() -> Room:
     """Return the memory that the readers of input files may still use: what the limits leave, or
     what is free.
     """
-    room = free_anywhere()
+    from neusee.nodes import input_files
+
+    room = input_files.free_memory()
     if not _limits:
         return room
     limit = min(_limits)
-    return Room(min(limit - process_memory(), room.free), limit)
-
-
-measured_by(_room)
+    return input_files.Room(min(limit - process_memory(), room.free), limit)
 
 
 @contextmanager
@@ -313,38 +320,40 @@ def guarded() -> Iterator[None]:
     without a limit.
     """
     thread_id = threading.get_ident()
-    if not _limits or thread_id in _inside:  # the block outside is told
+    if not _limits or thread_id in _watched_threads:  # the block outside is stopped
         yield
         return
     with _guard:
-        _inside[thread_id] = False
+        _watched_threads[thread_id] = False
         if not _thread:
-            _thread.append(threading.Thread(target=_look, name="neusee memory", daemon=True))
+            _thread.append(
+                threading.Thread(target=_watch_memory, name="neusee memory", daemon=True)
+            )
             _thread[0].start()
         _wake.set()
     try:
         yield
     finally:
         try:
-            stopped = _leave(thread_id)
+            stopped = _stop_watching(thread_id)
         except MemoryLimit:  # told at the last moment, and delivered only now
-            stopped = _leave(thread_id)
+            stopped = _stop_watching(thread_id)
     if stopped:
         raise MemoryLimit
 
 
-def _leave(here: int) -> bool:
+def _stop_watching(here: int) -> bool:
     """Watch a thread no longer; return True if it was told to stop, with no exception left to be
     delivered.
     """
     with _guard:
-        stopped = _inside.pop(here, True)
+        stopped = _watched_threads.pop(here, True)
         if stopped:
-            _deliver(here)
+            _await_exception(here)
     return stopped
 
 
-def _deliver(here: int) -> None:
+def _await_exception(here: int) -> None:
     """Let the exception that this thread was told arrive here.
 
     To withdraw it is not enough: CPython 3.11 and 3.12 would go on to look for it at every call,
@@ -360,32 +369,32 @@ def _deliver(here: int) -> None:
         return
 
 
-def _look() -> None:
+def _watch_memory() -> None:
     """Watch the memory in an endless loop, in a thread of its own; stop the watched threads when
     it exceeds the limit.
     """
     while True:
         _wake.wait()
         with _guard:
-            if not _inside:
+            if not _watched_threads:
                 _wake.clear()
             limit = min(_limits, default=float("inf"))
-            if process_memory() > _NEAR * limit:
+            if process_memory() > _SHARE_TO_GIVE_BACK * limit:
                 # freed memory that the library of C still holds
                 give_back()
             if (held_bytes := process_memory()) > limit:
                 _stop(held_bytes, limit)
-        threading.Event().wait(_PAUSE)
+        threading.Event().wait(_SECONDS_BETWEEN_LOOKS)
 
 
 def _stop(now: float, limit: float) -> None:
     """Raise `MemoryLimit` in each watched thread that was not told yet; ``now`` and ``limit``
     are bytes.
     """
-    for thread, stopped in _inside.items():
+    for thread, stopped in _watched_threads.items():
         if not stopped:
-            _last[:] = [now, limit]
-            _inside[thread] = True
+            _at_last_stop[:] = [now, limit]
+            _watched_threads[thread] = True
             _raise_in(ctypes.c_ulong(thread), ctypes.py_object(MemoryLimit))
 
 
@@ -396,7 +405,7 @@ def _forked() -> None:
     global _guard, _wake
     _guard, _wake = threading.RLock(), threading.Event()
     _limits.clear()
-    _inside.clear()
+    _watched_threads.clear()
     _thread.clear()
 
 
@@ -418,7 +427,12 @@ os.register_at_fork(after_in_child=_forked)
 #: share of the limit from which allocations are refused; the rest to 1.3 is for what is mapped
 #: already
 SLACK = 1.2
-_WORDS = ("can't allocate memory", "cannot allocate memory", "std::bad_alloc", "not enough memory")
+_REFUSED_ALLOCATION_TEXTS = (
+    "can't allocate memory",
+    "cannot allocate memory",
+    "std::bad_alloc",
+    "not enough memory",
+)
 
 
 @contextmanager
@@ -458,4 +472,6 @@ def refusing_allocations(active: bool) -> Iterator[None]:
 
 def _is_refused(error: BaseException) -> bool:
     """Return True for the error of an allocation that the system refused."""
-    return isinstance(error, MemoryError) or any(word in str(error).lower() for word in _WORDS)
+    return isinstance(error, MemoryError) or any(
+        word in str(error).lower() for word in _REFUSED_ALLOCATION_TEXTS
+    )

@@ -1,26 +1,22 @@
-"""Call of the node of a step on its device, as a whole or band by band."""
+"""Call of the node of a step on its device, as a whole or in passes over its bands."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from math import ceil
 from typing import Any
 
 import torch
-import xxhash
 from torch import Tensor
 
 from neusee.nodes import Check, Node
 from neusee.nodes.values import BAND_FIELDS, band_names
 from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import Step
-from neusee.workflows.keys.cache_key import device_kind, digest, plain, stream_seed, written
-from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
+from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.store.serialization import (
     each_tensor,
     forget_attributes,
-    pack,
     settle,
     tensors_in,
 )
@@ -119,63 +115,45 @@ def to_device(value: Any, device: str) -> Any:
     return each_tensor(lambda x: x.to(device), value)
 
 
-# --- band results ---------------------------------------------------------------------------------
+# --- passes over the bands ------------------------------------------------------------------------
 
-# Results stored by wavelength band: if one of 31 bands has changed, only this band is computed and
-# written.
-#
 # A node that declares its bands computes each band to the same bits whatever the other bands are.
-# Each band therefore has its own key, a digest of this band of the inputs and of everything else
-# that determines the band. The store keeps the band of the result as a blob with this key as name.
-# Hashing the inputs is cheap, because every input is read only once.
+# A step that does not fit into the memory as a whole is therefore computed in several passes over
+# its bands.
 
 
-LEAST = 1 << 22  #: bytes; a smaller result is kept as one tensor
 _ALIGN = 64  #: bytes; a kernel may take another path at another alignment
-_TRIES = 3  #: attempts that may find damaged bands before all bands are computed
 
 Evaluate = Callable[[Sequence[Any]], Any]  #: a function from the inputs of a step to its result
 
 
-def call_by_band(
-    step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: str, blobs: Blobs, parts: int = 1
-) -> Any:
-    """Return the result of ``step``; compute only the wavelength bands that the store ``blobs``
-    does not contain.
-
-    ``code`` is the digest of the code of the node. More passes over the bands, ``parts``, need less
-    memory. Tensors that can be stored by band are returned as `Stacked`, which `plain_of` converts
-    to plain tensors.
+def call_in_parts(step: Step, inputs: Sequence[Any], evaluate: Evaluate, parts: int) -> Any:
+    """Return the result of ``step``, computed in ``parts`` passes over its bands, or in one call
+    where it has no bands of its own.
     """
     count = band_count(step, inputs)
     if count < 2:
         return evaluate(inputs)
-    keys = band_keys(step, inputs, code)
-    fields = range(_fields(step))
-    for _ in range(_TRIES):
-        missing_bands = [
-            i for i, key in enumerate(keys) if not all(blobs.has(f"{key}.{n}") for n in fields)
-        ]
-        # nothing to reuse: the whole result in one call
-        if len(missing_bands) == count and parts == 1:
-            break
-        try:
-            return _gathered(
-                step, inputs, evaluate, keys, missing_bands, ceil(count / parts), blobs
-            )
-        except Damaged:  # the next attempt finds the damaged band missing
-            continue
-    # bands were damaged again and again, or nothing is stored: all in one call
-    return _stacked(step, evaluate(inputs), keys)
+    assert step.node.bands is not None
+    axis = step.node.bands["return"]
+    bands_at_once = ceil(count / parts)
+    whole_tensors: list[Tensor] = []
+    for start in range(0, count, bands_at_once):
+        indices = list(range(start, min(start + bands_at_once, count)))
+        result = evaluate(taken(step, inputs, indices))
+        part_tensors = band_tensors(result)
+        if not whole_tensors:
+            whole_tensors = [_room_for(x, axis, count) for x in part_tensors]
+        for whole_tensor, part_tensor in zip(whole_tensors, part_tensors, strict=True):
+            whole_tensor.narrow(axis, start, len(indices)).copy_(part_tensor)
+    return with_band_tensors(result, whole_tensors)
 
 
-def plain_of(value: Any) -> Any:
-    """Return ``value`` with every `Stacked` tensor (stored by band) replaced by an ordinary
-    PyTorch tensor.
-    """
-    if isinstance(value, Stacked):
-        return value.tensor
-    return value._make(map(plain_of, value)) if type(value) in BAND_FIELDS else value
+def _room_for(x: Tensor, axis: int, count: int) -> Tensor:
+    """Return an empty tensor like ``x``, but with ``count`` bands along the axis."""
+    shape = list(x.shape)
+    shape[axis] = count
+    return x.new_empty(shape)
 
 
 def _is_cut_by_band(value: Any) -> bool:
@@ -210,43 +188,6 @@ def bands_in(node: Node, inputs: Sequence[Any]) -> int:
     return 1
 
 
-def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
-    """Return the cache key of each wavelength band: a digest of node, code, parameters and this
-    band of the inputs.
-    """
-    params = {name: plain(value) for name, value in step.params.items()}
-    shared_parts: list[Any] = [
-        "band",
-        step.node.path,
-        code,
-        params,
-        *([text_of_step] if (text_of_step := written(step)) else []),
-    ]
-    band_digests: list[list[str]] = []
-    for name, value in zip(step.node.inputs, inputs, strict=False):
-        axis = _axis(step, name, value)
-        # what does not belong to a single band decides about all bands
-        shared_parts.append([name, axis, content(value if axis is None else _without_bands(value))])
-        if axis is not None:
-            band_digests += [
-                [_hashed(band) for band in x.unbind(axis)] for x in band_tensors(value)
-            ]
-    # one digest of each input belongs to one band
-    return [digest(shared_parts, list(band)) for band in zip(*band_digests, strict=True)]
-
-
-def content(value: Any) -> list[Any]:
-    """Return a JSON value that identifies a result: its layout, and type, shape and digest of
-    each tensor.
-    """
-    layout, tensors = pack(value)
-    return [layout, [_hashed(x) for x in tensors]]
-
-
-def _hashed(x: Tensor) -> str:
-    return f"{x.dtype} {tuple(x.shape)} {xxhash.xxh3_128_hexdigest(bytes_of(x))}"
-
-
 def _axis(step: Step, name: str, value: Any) -> int | None:
     """Return the axis of the bands of an input, or None for an absent input or one without
     bands.
@@ -268,15 +209,6 @@ def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
     if isinstance(value, Tensor):
         return tensors[0]
     return value._replace(**dict(zip(band_names(value), tensors, strict=True)))
-
-
-def _without_bands(value: Any) -> Any:
-    """Return what of a value does not belong to single bands: None for a tensor."""
-    return (
-        None
-        if isinstance(value, Tensor)
-        else value._replace(**dict.fromkeys(BAND_FIELDS[type(value)]))
-    )
 
 
 def _has(x: Tensor, axis: int) -> bool:
@@ -306,104 +238,3 @@ def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
         if view.is_contiguous() and view.data_ptr() % _ALIGN == 0:
             return view
     return x.index_select(axis, torch.tensor(which, device=x.device))
-
-
-def _fields(step: Step) -> int:
-    """Return the number of tensors in the result of a step."""
-    kind = step.node.hints["return"]
-    return len(kind._fields) if kind in BAND_FIELDS else 1
-
-
-def _rebuilt(step: Step, items: list[Any]) -> Any:
-    """Return the result of a step from its tensors: a named tuple, or the tensor alone."""
-    kind = step.node.hints["return"]
-    return kind._make(items) if kind in BAND_FIELDS else items[0]
-
-
-def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
-    """Return a large result as `Stacked` tensors with a key for each band, and any other result
-    unchanged.
-    """
-    tensors = band_tensors(value)
-    is_band_first = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
-    if not is_band_first or sum(x.nbytes for x in tensors) < LEAST:
-        return value
-    items = [Stacked(x, tuple(f"{key}.{n}" for key in keys)) for n, x in enumerate(tensors)]
-    return _rebuilt(step, items)
-
-
-def _leads(step: Step, x: Tensor) -> bool:
-    """Return True if the bands are the first axis of a tensor, so that each band is contiguous
-    in memory.
-    """
-    assert step.node.bands is not None
-    return _has(x, step.node.bands["return"]) and step.node.bands["return"] % x.dim() == 0
-
-
-def _gathered(
-    step: Step,
-    inputs: Sequence[Any],
-    evaluate: Evaluate,
-    keys: list[str],
-    missing: list[int],
-    size: int,
-    blobs: Blobs,
-) -> Any:
-    """Compute missing bands of a result in groups of ``size`` bands, and assemble all bands.
-
-    Raises `Damaged` if a stored band is damaged.
-    """
-    assert step.node.bands is not None
-    axis = step.node.bands["return"]
-    # one for each tensor of the result
-    stacks = [_Stack(axis, [f"{key}.{n}" for key in keys], blobs) for n in range(_fields(step))]
-    # groups of `size` bands, for less memory
-    for start in range(0, len(missing), size):
-        band_indices = missing[start : start + size]
-        for stack, x in zip(
-            stacks, band_tensors(evaluate(taken(step, inputs, band_indices))), strict=True
-        ):
-            stack.add(band_indices, x)
-    return _rebuilt(step, [stack.whole() for stack in stacks])
-
-
-class _Stack:
-    """A tensor that is assembled from bands; computed bands go to the store, or to memory if
-    writing fails.
-    """
-
-    def __init__(self, axis: int, names: list[str], blobs: Blobs) -> None:
-        self.axis, self.names, self.blobs = axis, names, blobs
-        self.held: Tensor | None = None
-        self.inside: set[int] = set()  # indices of the bands in memory
-
-    def add(self, which: list[int], x: Tensor) -> None:
-        """Add the computed wavelength bands ``x`` with the indices ``which`` to the tensor."""
-        axis = self.axis % x.dim()
-        slices = x.unbind(axis)
-        # only then a band is contiguous, and can be a file
-        if axis == 0:
-            with suppress(OSError):
-                self.blobs.write_all([self.names[i] for i in which], slices)
-                return
-        if self.held is None:
-            # the whole tensor in memory, where no file could be written
-            self.held = x.new_empty(*x.shape[:axis], len(self.names), *x.shape[axis + 1 :])
-        for i, band in zip(which, slices, strict=True):
-            self.held.select(axis, i).copy_(band)
-        self.inside.update(which)
-
-    def whole(self) -> Tensor | Stacked:
-        """Return all wavelength bands as one tensor; raise `Damaged` if a stored band is
-        damaged.
-        """
-        first_blob = self.blobs.about(self.names[0]) if self.held is None else None
-        if first_blob is not None:
-            shape = (len(self.names), *first_blob.shape)
-            return Stacked(self.blobs.read(self.names, shape, first_blob.dtype), tuple(self.names))
-        assert self.held is not None
-        # bands that were in the store before
-        for i in set(range(len(self.names))) - self.inside:
-            band = self.held.select(self.axis, i)
-            band.copy_(self.blobs.read([self.names[i]], (1, *band.shape), band.dtype)[0])
-        return self.held

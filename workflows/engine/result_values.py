@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neusee.workflows.graph.recipe_graph import Recipe
 
-_MOST = 4096  #: elements, at most, of a result whose numbers become rows
+_MOST_ELEMENTS = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
@@ -30,7 +30,7 @@ def numbers_of(step: str, result: Any) -> list[list[Any]]:
     """
     rows: list[list[Any]] = []
     for field, tensor in tensor_fields(result):
-        if tensor.numel() <= _MOST and not tensor.is_complex():
+        if tensor.numel() <= _MOST_ELEMENTS and not tensor.is_complex():
             numbers = tensor.detach().double().flatten().tolist()
             # a single number has no index
             rows += [

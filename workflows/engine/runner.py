@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from neusee.workflows.engine.cost_model import sizes_of
-from neusee.workflows.engine.execution import Execution, RunSeries, TaintedRun
+from neusee.workflows.engine.execution import Execution, RunRequest, RunSeries, TaintedRun
 from neusee.workflows.engine.local_executor import check_devices, memory_limit
 from neusee.workflows.engine.machine_resources import give_back, limited, process_peak
 from neusee.workflows.engine.node_call import to_device
@@ -170,7 +170,7 @@ def run(
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this
     process. memory: bytes that this process, and each GPU, may use; if None, most of the memory
-    that is free. show: is told each computed result, while later steps wait. series: what earlier
+    that is free. show: is called with each result, while later steps wait. series: what earlier
     runs found that holds for this one as well. anew: steps that are computed, with all that follow
     from them, although their results are stored. Raises `RunError`, which names the step, and
     ValueError for a device that this machine does not have.
@@ -184,19 +184,17 @@ def run(
     series = series or RunSeries.begun(store)
     attempt_number, carried_outcomes = 1, dict[str, Outcome]()
     while True:
-        execution = Execution(
+        request = RunRequest(
             recipe,
+            names,
             store,
             device.split(","),
-            watch or (lambda event: None),
-            names,
-            executor,
             memory,
+            executor,
+            watch=watch or (lambda event: None),
             show=show or (lambda *_: None),
-            series=series,
-            carried=carried_outcomes,
-            anew=recomputed,
         )
+        execution = Execution(request, series, carried_outcomes, recomputed)
         try:
             with limited(memory_limit(memory)):
                 return replace(
@@ -253,7 +251,7 @@ def _futile(stricter: Recipe, work: Execution, outputs: tuple[str, ...]) -> bool
     share = skip_share(stricter)
 
     def at_best(name: str) -> StepRecord:
-        record = work.done.get(name) or work.asleep(name)
+        record = work.done.get(name) or work.record_of_unneeded(name)
         # with the smaller limit this step would run, without an error
         if record.state == "left out" and (record.bound or 0.0) > stricter.allowed(name) * share:
             return replace(record, state="run")
@@ -350,7 +348,7 @@ def _result_of(
 
 def _record_so_far(work: Execution, name: str) -> StepRecord:
     """Return the record of a step that has run or was left out, or of one that did not run yet."""
-    return work.done.get(name) or work.asleep(name)
+    return work.done.get(name) or work.record_of_unneeded(name)
 
 
 def _predicted_peak(work: Execution) -> float | None:

@@ -18,7 +18,7 @@ import torch
 from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.cost_model import measured_size
 from neusee.workflows.engine.machine_resources import PeakMemory, guarded, refusing_allocations
-from neusee.workflows.engine.node_call import call, call_by_band, examine, plain_of
+from neusee.workflows.engine.node_call import call, call_in_parts, examine
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork, may_fork
 from neusee.workflows.graph.errors import RunError
@@ -119,12 +119,12 @@ def _lower_priority() -> None:
 #: content of one input: one value, a list of values, or nothing
 Read = Key | tuple[Key, ...] | None
 Fetch = Callable[[Key], Any]
-#: function that is told each computed result: the recipe of the run, the keys known so far, the
-#: step and its value
+#: function that is called with each computed result: the recipe of the run, the keys known so far,
+#: the step and its value
 Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
 T = TypeVar("T")
-_STATS = tuple(field.name for field in fields(TensorStats))
-_WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
+_STATISTICS = tuple(field.name for field in fields(TensorStats))
+_WATCHED_BYTES = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
 class InputMissing(Exception):
@@ -185,7 +185,7 @@ class Outcome:
     size: list[float] | None = None  #: the size of the step: `cost_model.Size`
     kept: bool = False  #: True if the store has the value
     #: True if the value is written during the next steps; its lease is released afterwards
-    waits: bool = False
+    is_written_later: bool = False
     held: bool = False  #: True if another process computes this result
     found: bool = False  #: True if another process has already stored this result
     error: BaseException | None = None
@@ -255,7 +255,7 @@ def carry_out(
         outcome = _carried_out(work, fetch, store, later, lease)
         return outcome
     finally:
-        if not outcome.waits:
+        if not outcome.is_written_later:
             lease.release()
 
 
@@ -270,7 +270,7 @@ def _carried_out(
     except InputMissing as error:
         return Outcome(work, lost=error.args)
     try:
-        return _kept(_computed(work, inputs, store), store, later, lease)
+        return _kept(_computed(work, inputs), store, later, lease)
     except Exception as error:
         return Outcome(work, error=error)
 
@@ -284,7 +284,7 @@ def gathered(read: Read, fetch: Fetch) -> Any:
     return [fetch(key) for key in read]
 
 
-def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
+def _computed(work: StepJob, inputs: list[Any]) -> Outcome:
     """Compute a step and return its value with statistics, checks and costs."""
     step, hooks = work.step, work.step.node.hooks
     observations = _Seen()
@@ -292,31 +292,28 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     began, clock_start = time.time(), time.perf_counter()
     input_bytes = sum(t.nbytes for t in tensors_in(inputs))
     # a small and quick step is not worth the measurement
-    is_watched = input_bytes >= _WATCHED or not work.unlocked
+    is_watched = input_bytes >= _WATCHED_BYTES or not work.unlocked
     # own code in this process: only then the system limits its allocations
-    own_in_process = work.own is not None and work.device.startswith("cpu") and not _is_apart(work)
+    own_in_process = (
+        work.own is not None and work.device.startswith("cpu") and not _needs_own_process(work)
+    )
     with (
         PeakMemory(work.device, is_watched) as peak,
         torch.no_grad(),
         guarded(),
         refusing_allocations(own_in_process),
     ):
-        value = _value(work, inputs, store, observations)
-        plain_value = plain_of(value)
-        checks = (
-            _observing(examine, work, observations)(step, plain_value, inputs)
-            if hooks.check
-            else ()
-        )
+        value = _value(work, inputs, observations)
+        checks = _observing(examine, work, observations)(step, value, inputs) if hooks.check else ()
     seconds = time.perf_counter() - clock_start
     _refuse_changed_files(work, file_stamps_before)
     return Outcome(
         work,
         value,
-        bytes=sum(t.nbytes for t in tensors_in(plain_value)),
-        size=measured_size(step.node, inputs, step.params, plain_value),
-        deviation=hooks.approximation_error(plain_value) if hooks.approximation_error else None,
-        facts=TensorStats.of(plain_value),
+        bytes=sum(t.nbytes for t in tensors_in(value)),
+        size=measured_size(step.node, inputs, step.params, value),
+        deviation=hooks.approximation_error(value) if hooks.approximation_error else None,
+        facts=TensorStats.of(value),
         checks=checks,
         began=began,
         seconds=seconds,
@@ -326,17 +323,16 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     )
 
 
-def _value(work: StepJob, inputs: list[Any], store: Store, observations: _Seen) -> Any:
-    """Return the value of a step, computed band by band where its node and memory ask for it."""
+def _value(work: StepJob, inputs: list[Any], observations: _Seen) -> Any:
+    """Return the value of a step, computed in passes over its bands if the plan says so."""
     step = work.step
     evaluate = _observing(
         partial(call, step, params=step.params, seed=work.seed, device=work.device),
         work,
         observations,
     )
-    # on a GPU only where the memory asks for it
-    if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
-        return call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
+    if step.node.bands and work.parts > 1:
+        return call_in_parts(step, inputs, evaluate, work.parts)
     return evaluate(inputs)
 
 
@@ -369,7 +365,7 @@ def _observing(function: Callable[..., T], work: StepJob, observations: _Seen) -
     def watched(*args: Any, **named: Any) -> T:
         try:
             value, taints = _called_observed(
-                partial(function, *args, **named), own_code, _is_apart(work), observations
+                partial(function, *args, **named), own_code, _needs_own_process(work), observations
             )
         except ProcessEnded as error:
             raise RunError(work.step, [], error) from error
@@ -382,7 +378,7 @@ def _observing(function: Callable[..., T], work: StepJob, observations: _Seen) -
     return watched
 
 
-def _is_apart(work: StepJob) -> bool:
+def _needs_own_process(work: StepJob) -> bool:
     """Return True for code that may change what other code finds: it runs in a process of its
     own.
     """
@@ -395,13 +391,17 @@ def _is_apart(work: StepJob) -> bool:
 
 
 def _called_observed(
-    function: Callable[[], T], own: OwnCode, apart: bool, observations: _Seen
+    function: Callable[[], T], own: OwnCode, in_own_process: bool, observations: _Seen
 ) -> tuple[T, list[Taint]]:
-    """Call a function of own code, in a process of its own if ``apart`` and its value can be
-    sent.
+    """Call a function of own code, in a process of its own if ``in_own_process`` and its value can
+    be sent.
     """
     # None: no fork, or a value that cannot be sent
-    returned = call_in_fork(partial(call_observed, function, own), own.variables) if apart else None
+    returned = (
+        call_in_fork(partial(call_observed, function, own), own.variables)
+        if in_own_process
+        else None
+    )
     if returned is None:
         return call_observed(function, own)
     observations.peak = max(observations.peak, returned.peak or 0)
@@ -429,13 +429,11 @@ def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Leas
         or outcome.taints
         or (own_code and not may_be_stored(own_code.modules))
     ):
-        outcome.value = plain_of(outcome.value)
         return outcome
     try:
         _store(outcome, store, later, lease)
     except TypeError as error:
         raise RunError(outcome.work.step, [], error) from error
-    outcome.value = plain_of(outcome.value)
     return outcome
 
 
@@ -454,7 +452,7 @@ def _store(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lea
     elif later is not None and outcome.bytes >= LARGE:
         pack(value)  # a value that cannot be stored raises here, where the step is known
         later.add(job.key, outcome.bytes, lambda: _written(store, job.key, value, metadata, lease))
-        outcome.kept = outcome.waits = True
+        outcome.kept = outcome.is_written_later = True
     else:
         outcome.kept = store.put(job.key, value, metadata)
 
@@ -481,7 +479,7 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "step": job.step.name,
         "recipe": job.recipe,
         "origin": dict(job.origin),
-        "facts": outcome.facts and {name: getattr(outcome.facts, name) for name in _STATS},
+        "facts": outcome.facts and {name: getattr(outcome.facts, name) for name in _STATISTICS},
         "checks": [[check.text, check.ok] for check in outcome.checks],
         "seconds": outcome.seconds,
         "bytes": outcome.bytes,

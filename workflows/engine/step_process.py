@@ -123,8 +123,8 @@ def _is_a_file(stream: Any) -> bool:
 
 
 def _forked() -> int:
-    # or the fork would print what still waits here once more
     """Fork; return the number of the child, and 0 in the child."""
+    # or the fork would print what still waits here once more
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
             stream.flush()

@@ -413,8 +413,8 @@ def spoken(value: Any) -> str:
 
 
 Origin = Mapping[str, Any]  #: the parts of a key: node, code, params, inputs, stream
-_FEW = 4  #: steps of an input that a clause names
-_FAR = 100  #: steps upstream that are searched for an inserted step
+_MOST_NAMED_STEPS = 4  #: steps of an input that a clause names
+_MOST_SEARCHED_STEPS = 100  #: steps upstream that are searched for an inserted step
 
 
 class Pair(NamedTuple):
@@ -667,7 +667,7 @@ class Comparison:
         the key found.
         """
         passed: list[str] = []
-        for _ in range(_FAR):
+        for _ in range(_MOST_SEARCHED_STEPS):
             first_input = next(iter((self.origin(key) or {}).get("inputs", ())), None)
             if not isinstance(first_input, str):
                 break
@@ -719,8 +719,12 @@ class Comparison:
 
 def _few(names: list[str]) -> str:
     """Return the first names of a list as text, such as ``a, b and 4 more``."""
-    hidden = len(names) - _FEW
-    return ", ".join(names) if hidden <= 0 else f"{', '.join(names[:_FEW])} and {hidden} more"
+    hidden = len(names) - _MOST_NAMED_STEPS
+    return (
+        ", ".join(names)
+        if hidden <= 0
+        else f"{', '.join(names[:_MOST_NAMED_STEPS])} and {hidden} more"
+    )
 
 
 def _listed(value: Any) -> list[Any]:

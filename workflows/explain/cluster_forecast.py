@@ -14,7 +14,7 @@ from neusee.workflows.placement.machine_file import Machines
 from neusee.workflows.report.terminal_text import columns
 from neusee.workflows.store.cache_settings import format_size
 
-_SHOWN = 24  #: steps of the critical path
+_SHOWN_STEPS = 24  #: steps of the critical path
 
 
 def cluster_lines(
@@ -132,12 +132,12 @@ def _path(schedule: Schedule) -> list[str]:
         [slot.task, slot.device, _time(slot.start), _time(slot.end - slot.start)] for slot in path
     ]
     rows = [["critical path", "device", "at", "takes"], *row_of_slot]
-    if len(path) > _SHOWN:
-        half_count = _SHOWN // 2
+    if len(path) > _SHOWN_STEPS:
+        half_count = _SHOWN_STEPS // 2
         # one more at the front: the head of the table
         rows = [
             *rows[: half_count + 1],
-            [f"… {len(path) - _SHOWN} more …", "", "", ""],
+            [f"… {len(path) - _SHOWN_STEPS} more …", "", "", ""],
             *rows[-half_count:],
         ]
     return [*columns(rows), f"{_count(len(path), 'step')} on it, {_time(busy_seconds)}{wait_text}"]
@@ -148,8 +148,8 @@ def _guesses(estimates: Mapping[str, Estimate]) -> list[str]:
     names = [name for name, cost in estimates.items() if not cost.known]
     if not names:
         return []
-    remainder = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ["", f"guesses, never measured: {', '.join(names[:_SHOWN])}{remainder}"]
+    remainder = f" and {len(names) - _SHOWN_STEPS} more" if len(names) > _SHOWN_STEPS else ""
+    return ["", f"guesses, never measured: {', '.join(names[:_SHOWN_STEPS])}{remainder}"]
 
 
 def _time(seconds: float) -> str:

@@ -38,7 +38,10 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 
 Row = dict[str, Any]
-_SHORT, _SMALL = 0.01, 1e6  #: s and bytes below which a cost is not written out in the table
+_SHORT_SECONDS, _SMALL_BYTES = (
+    0.01,
+    1e6,
+)  #: s and bytes below which a cost is not written out in the table
 #: bytes of a peak below which its range is not written, because freed memory is used again
 _SURE = 1e7
 
@@ -134,15 +137,15 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 def seconds_text(cost: Mapping[str, float]) -> str:
     """Return a duration in s with its range as text, such as ``0.81 (0.7-1.2)``."""
-    if cost["expected"] < _SHORT:
-        return f"<{_SHORT}"
+    if cost["expected"] < _SHORT_SECONDS:
+        return f"<{_SHORT_SECONDS}"
     return f"{_figures(cost['expected'])}{_between(cost, 1.0)}"
 
 
 def memory_text(cost: Mapping[str, float]) -> str:
     """Return a number of bytes with its range as text, such as ``120 MB (98-140)``."""
-    if cost["expected"] < _SMALL:
-        return f"<{format_size(_SMALL)}"
+    if cost["expected"] < _SMALL_BYTES:
+        return f"<{format_size(_SMALL_BYTES)}"
     text = format_size(cost["expected"])
     # the range is in the unit of the text
     return text if cost["expected"] < _SURE else f"{text}{_between(cost, UNITS[text.split()[1]])}"

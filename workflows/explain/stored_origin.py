@@ -14,7 +14,7 @@ from neusee.workflows.store.result_store import Store
 
 _CANDIDATES = 200  #: earlier results of a step, the newest, that are compared
 _PAIRS = 20_000  #: comparisons after which no further earlier result is examined
-_SHOWN = 10  #: causes that are listed
+_SHOWN_CAUSES = 10  #: causes that are listed
 _LINKS = 6  #: steps of a chain that are named
 
 
@@ -75,10 +75,10 @@ def because(
         )
         return
     earlier_key, roots = key_and_roots
-    for text in list(roots.found)[:_SHOWN]:
+    for text in list(roots.found)[:_SHOWN_CAUSES]:
         yield f"  {_chain(roots.chain(text))}: {text}"
-    if len(roots.found) > _SHOWN:
-        yield f"  and {len(roots.found) - _SHOWN} more"
+    if len(roots.found) > _SHOWN_CAUSES:
+        yield f"  and {len(roots.found) - _SHOWN_CAUSES} more"
     compared_text = (
         "the earlier result"
         if len(earlier) == 1

@@ -17,8 +17,8 @@ from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-_AT_ONCE = 5  #: earlier results that a step is compared with during a run
-_SHOWN = 10  #: causes that are listed
+_COMPARED_RESULTS = 5  #: earlier results that a step is compared with during a run
+_SHOWN_CAUSES = 10  #: causes that are listed
 
 
 def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> list[str]:
@@ -84,7 +84,7 @@ def _step_lines(
     ]:
         lines.append(
             "  left out or not, depending on the values of the inputs:"
-            f" {', '.join(undecided[:_SHOWN])}"
+            f" {', '.join(undecided[:_SHOWN_CAUSES])}"
         )
     return [*lines, *because(comparison, step.name, key, metadata, maker)]
 
@@ -95,7 +95,7 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
         return "computed before, but its value is not stored"
     fewest_differences: list[str] = []
     # the newest first
-    for earlier_key in earlier[: -_AT_ONCE - 1 : -1]:
+    for earlier_key in earlier[: -_COMPARED_RESULTS - 1 : -1]:
         old_origin, new_origin = comparison.origin(earlier_key), comparison.origin(key)
         differences = (
             _direct(comparison, step, old_origin, new_origin) if old_origin and new_origin else []

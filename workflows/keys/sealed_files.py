@@ -163,7 +163,6 @@ Kind = Literal[
     "receipt at a URL",
     "journal",
     "speeds",
-    "band",
     "sources",
     "definitions",
     "answer",

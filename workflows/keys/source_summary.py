@@ -49,9 +49,9 @@ from neusee.workflows.keys.unfollowed_constructs import (
 PYTHON = (
     f"{'{}.{}'.format(*sys.version_info)}-{importlib.util.MAGIC_NUMBER.hex()}-{sys.flags.optimize}"
 )
-_MOST = 20_000  #: number of code objects whose digests are kept
+_MOST_DIGESTS = 20_000  #: number of code objects whose digests are kept
 _known: dict[int, tuple[CodeType, str]] = {}  #: code objects with their digests, by id
-_SHORT = 12  #: digits of the digest of a code object
+_CODE_DIGEST_DIGITS = 12  #: digits of the digest of a code object
 
 
 def functions_of(source: bytes) -> list[str]:
@@ -66,7 +66,7 @@ def function_code(code: CodeType) -> str:
     """
     digested = _known.get(id(code))
     if digested is None or digested[0] is not code:
-        if len(_known) > _MOST:
+        if len(_known) > _MOST_DIGESTS:
             _known.clear()
         digested = _known[id(code)] = code, _digest_of(code)
     return digested[1]
@@ -83,7 +83,7 @@ def _digest_of(code: CodeType) -> str:
     sizes = (code.co_flags, code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
     # format 2 has no references, which differ between equal objects
     marshalled = marshal.dumps((code.co_code, constants, names, sizes, code.co_exceptiontable), 2)
-    return xxhash.xxh3_64_hexdigest(marshalled)[:_SHORT]
+    return xxhash.xxh3_64_hexdigest(marshalled)[:_CODE_DIGEST_DIGITS]
 
 
 def _inner(code: CodeType) -> Iterator[CodeType]:
@@ -579,7 +579,7 @@ ROOT = "neusee.nodes"
 #: lock of the parser of Python 3.11, which miscounts the depth in two threads
 _parsing = threading.Lock()
 _READS = ("__doc__", "getdoc", "cleandoc", "getcomments")  #: names by which code reads docstrings
-_SHORT_DIGEST = 16  #: digits of the digest of a definition
+_DEFINITION_DIGEST_DIGITS = 16  #: digits of the digest of a definition
 #: packages of which no chain is noted
 _LARGE = frozenset({"torch", "numpy", "scipy", *sys.stdlib_module_names})
 
@@ -841,7 +841,9 @@ def _definitions(texts: Iterable[tuple[ast.stmt, str]]) -> dict[str, str]:
     for item, text in texts:
         for label in _labels(item):
             texts_by_label[label].append(text)
-    return {label: digest(parts)[:_SHORT_DIGEST] for label, parts in texts_by_label.items()}
+    return {
+        label: digest(parts)[:_DEFINITION_DIGEST_DIGITS] for label, parts in texts_by_label.items()
+    }
 
 
 def _labels(item: ast.stmt) -> Iterable[str]:

@@ -29,9 +29,9 @@ _COUNTED = ("OMP", "MKL", "OPENBLAS", "NUMEXPR")
 _OF_LOCALE = ("ALL", "CTYPE", "NUMERIC", "TIME", "COLLATE", "MESSAGES", "MONETARY")
 OF_THREADS = (*(f"{name}_NUM_THREADS" for name in _COUNTED), "VECLIB_MAXIMUM_THREADS")
 OF_LANGUAGES = ("LANG", "LANGUAGE", *(f"LC_{name}" for name in _OF_LOCALE))
-_WHO = ("HOME", "USER", "LOGNAME", "USERNAME")
-_PLACES = ("PATH", "VIRTUAL_ENV", "TMPDIR", "TZ", "TZDIR", "LOCPATH")
-_FEW = frozenset({*_PLACES, *OF_THREADS, *OF_LANGUAGES, *_WHO})
+_USER_VARIABLES = ("HOME", "USER", "LOGNAME", "USERNAME")
+_FOLDER_VARIABLES = ("PATH", "VIRTUAL_ENV", "TMPDIR", "TZ", "TZDIR", "LOCPATH")
+_KNOWN_NAMES = frozenset({*_FOLDER_VARIABLES, *OF_THREADS, *OF_LANGUAGES, *_USER_VARIABLES})
 _OF_PROGRAMS = (
     "LD_",
     "DYLD_",
@@ -52,7 +52,7 @@ OF_WINDOWS = frozenset({*_TERMINALS, "DISPLAY", "WAYLAND_DISPLAY", "MPLBACKEND"}
 
 def is_known(name: str) -> bool:
     """Return True for a variable that decides no result, or that keys count."""
-    return name in _FEW or name.startswith((*_OF_PROGRAMS, *_OF_DEVICES))
+    return name in _KNOWN_NAMES or name.startswith((*_OF_PROGRAMS, *_OF_DEVICES))
 
 
 # --- hidden variables -----------------------------------------------------------------------------

@@ -192,7 +192,11 @@ class PartialSchedule:
         largest_need = _most_memory(graph) if bounded else -math.inf
         self.rooms = [MemoryProfile(d.memory) if d.memory < largest_need else None for d in devices]
         # no delay to itself
-        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
+        self.links: list[list[Link]] = []
+        for sender in devices:
+            self.links.append(
+                [graph.cluster.link(sender.name, receiver.name) for receiver in devices]
+            )
         # bytes that a task needs at least: its result, and its work in as many parts as it allows
         self.least = [
             result_bytes + graph.work(i, graph.tasks[i].parts)

@@ -35,7 +35,7 @@ _KINDS = ("cpu", "cuda", "mps")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _RATES = {f"{unit}/s": scale for unit, scale in UNITS.items() if unit in ("MB", "GB", "TB")}
 _QUANTITY = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
-_MOST = 4096  #: largest number of devices in one file
+_MOST_DEVICES = 4096  #: largest number of devices in one file
 _Reader = Callable[[Value, "list[Diagnostic]"], Any]
 
 
@@ -81,8 +81,8 @@ def read_machines(path: Path | str) -> Machines:
     if diagnostics:
         raise RecipeError(diagnostics)
     devices = _devices(groups)
-    if len(devices) > _MOST:
-        message = f"must be {_MOST} devices or fewer, not {len(devices)}"
+    if len(devices) > _MOST_DEVICES:
+        message = f"must be {_MOST_DEVICES} devices or fewer, not {len(devices)}"
         raise RecipeError([_problem(document.root.items["devices"], message)])
     speeds = {device.name: group["speed"] for device, group in devices.items()}
     # by default that of `Cluster`
@@ -238,9 +238,11 @@ def _count(value: Value, diagnostics: list[Diagnostic]) -> int:
     if (
         isinstance(value.data, bool)
         or not isinstance(value.data, int)
-        or not 1 <= value.data <= _MOST
+        or not 1 <= value.data <= _MOST_DEVICES
     ):
-        diagnostics.append(_problem(value, f"must be a whole number of devices from 1 to {_MOST}"))
+        diagnostics.append(
+            _problem(value, f"must be a whole number of devices from 1 to {_MOST_DEVICES}")
+        )
         return 1
     return value.data
 

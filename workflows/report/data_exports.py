@@ -24,9 +24,8 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report import contents
 from neusee.workflows.report.figures.style import encoded
 from neusee.workflows.report.run_pictures import DerivedFile, files_of
-from neusee.workflows.store.band_files import bytes_of
 from neusee.workflows.store.derived_files import DerivedFiles
-from neusee.workflows.store.serialization import tensor_kind
+from neusee.workflows.store.serialization import bytes_of, tensor_kind
 
 _VERSION = 2  #: version of the file formats; to be increased when a file is written differently
 _COPIED = ("spectral", "safetensors")  #: formats without compression

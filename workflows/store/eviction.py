@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import time
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any, Protocol
 
-from neusee.workflows.keys.sealed_files import NotRead, checked_body
+from neusee.workflows.keys.sealed_files import NotRead
 from neusee.workflows.store import metadata
 from neusee.workflows.store.journal import Journal
-from neusee.workflows.store.metadata import UNREADABLE, Metadata, are_bands, is_kept
+from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
 from neusee.workflows.store.shared_folder import OLD, Disk, below, entries, read_file
 
 # --- budget eviction ------------------------------------------------------------------------------
@@ -32,7 +29,7 @@ from neusee.workflows.store.shared_folder import OLD, Disk, below, entries, read
 
 LOW = 0.9  #: fraction of the budget that remains after an eviction
 _HALF = 7 * 86400.0  #: s in which the weight of an unused value halves
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FULL_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +121,7 @@ class CacheBudget:
 
 
 def total(disk: Disk) -> int:
-    """Return the total bytes of all results of a store, with their derived files and bands."""
+    """Return the total bytes of all results of a store, with their derived files."""
     return sum(size for _, size, _ in files(disk))
 
 
@@ -134,32 +131,25 @@ def candidates(
     """Yield every stored value that may be evicted, with the number of bytes that its eviction
     frees.
 
-    The bytes of a band are divided among the values that use the band. A result that this program
-    does not read saves no time.
+    A result that this program does not read saves no time.
     """
     sizes, changes = dict[str, int](), dict[str, float]()
-    # by name without the folder, because names of keys and bands are unique
+    # by name without the folder, because the names of keys are unique
     for path, size, changed in files(disk):
         sizes[os.path.basename(path)], changes[os.path.basename(path)] = size, changed
-    values = [_stored_value(disk, key, sizes, read_seconds) for key in metadata.names(disk)]
-    stored = [value for value in values if value is not None]
-    # how many values share each band
-    users_of_band = Counter(chain.from_iterable(value.bands for value in stored))
-    for value in stored:
-        record = f"{value.key}.json"
-        if value.key not in pinned and record in changes:
-            band_bytes = int(sum(sizes.get(name, 0) / users_of_band[name] for name in value.bands))
-            yield Candidate(value.key, value.size + band_bytes, value.seconds, changes[record])
+    for key in metadata.names(disk):
+        value = _stored_value(disk, key, sizes, read_seconds)
+        record = f"{key}.json"
+        if value is not None and key not in pinned and record in changes:
+            yield Candidate(key, value.size, value.seconds, changes[record])
 
 
 @dataclass(frozen=True, slots=True)
 class _StoredValue:
-    """A value of a store, before the bytes of its bands are divided among their users."""
+    """What is known of a stored value."""
 
-    key: str
     size: int  #: bytes of its own files
     seconds: float  #: time in s for computing the value, minus the time for loading the value
-    bands: frozenset[str]  #: names of the files of its bands
 
 
 def _stored_value(
@@ -177,14 +167,9 @@ def _stored_value(
         inline_bytes = sum(len(tensor[-1]) for tensor in entry.get("tensors") or ())
         derived_bytes = sizes.get(entry.get("file") or "", 0)
         seconds = float(entry.get("seconds") or 0.0) - read_seconds(float(entry.get("bytes") or 0))
-        return _StoredValue(
-            key,
-            payload_bytes + inline_bytes + derived_bytes,
-            seconds,
-            frozenset(metadata.bands(entry)),
-        )
+        return _StoredValue(payload_bytes + inline_bytes + derived_bytes, seconds)
     except NotRead:
-        return _StoredValue(key, payload_bytes + sizes.get(f"{key}.json", 0), 0.0, frozenset())
+        return _StoredValue(payload_bytes + sizes.get(f"{key}.json", 0), 0.0)
     except UNREADABLE:
         return None
 
@@ -219,15 +204,13 @@ def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
     try:
         metadata.write(disk, key, metadata.receipt(about), over=True)
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in _FULL_DISK_ERRORS:
             raise
         disk.unlink(disk.path(key, "json"))
 
 
 def _delete_files(disk: Disk, key: str, about: Metadata) -> None:
-    """Delete the file of tensors and the derived file of a value; its bands may have other
-    users.
-    """
+    """Delete the file of tensors and the derived file of a value."""
     paths = [disk.path(key, "safetensors")] if about.get("payload") else []
     if name := about.get("file"):
         paths.append(f"{disk.folder}/files/{key[:2]}/{os.path.basename(name)}")
@@ -240,7 +223,7 @@ def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
     """Yield the path, size and time of last change of every file that counts against the size
     budget of a store.
     """
-    for base in (disk.folder, f"{disk.folder}/files", f"{disk.folder}/bands"):
+    for base in (disk.folder, f"{disk.folder}/files"):
         for entry in below(base):
             with suppress(OSError):
                 stat = entry.stat(follow_symlinks=False)
@@ -256,10 +239,8 @@ def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
 
 
 Find = Callable[[Disk], Iterator[os.DirEntry[str]]]
-_HAS_PAYLOAD, _HAS_BANDS = (
-    b'"payload":{',
-    b'"bands":{',
-)  #: no text in JSON contains a quotation mark without a backslash
+#: no text in JSON contains a quotation mark without a backslash
+_HAS_PAYLOAD = b'"payload":{'
 _WEEK = 7 * 86400.0  #: s for which a damaged entry is kept for inspection
 
 
@@ -271,7 +252,7 @@ def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
         return []
     # temporary files of dead processes
     swept_files = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
-    for find_orphans in (_not_read, _payloads, bands, _files, _damaged):
+    for find_orphans in (_not_read, _payloads, _bands, _files, _damaged):
         swept_files += removed(disk, find_orphans, dry)
     return swept_files
 
@@ -332,29 +313,13 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
                     yield entry
 
 
-def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield the band files that no stored value uses, or nothing if metadata of another user cannot
-    be read.
-
-    The bands of results of another format version count as used.
+def _bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
+    """Yield the files of single spectral bands that an earlier version wrote, a week after their
+    last change.
     """
-    band_entries, needed_names = list(below(f"{disk.folder}/bands")), set[str]()
-    for key in metadata.names(disk) if band_entries else ():
-        try:
-            metadata_bytes = _raw(disk, key)
-            if _HAS_BANDS in metadata_bytes:
-                # the body ends before its checksum and lacks the bracket
-                entry_fields = json.loads(checked_body(metadata_bytes)[0] + b"}")
-                needed_names.update(
-                    entry_fields["bands"]["names"]
-                    if are_bands(entry_fields["bands"]["names"])
-                    else ()
-                )
-        except PermissionError:
-            return
-        except UNREADABLE:
-            continue
-    yield from (entry for entry in band_entries if entry.name not in needed_names)
+    for entry in below(f"{disk.folder}/bands"):
+        if _age(entry) > _WEEK:
+            yield entry
 
 
 def _raw(disk: Disk, key: str) -> bytes:
@@ -423,7 +388,7 @@ class Checked:
 
 def _outside_budget(sizes: Mapping[str, int], folder: str) -> int:
     """Return the bytes of those files that do not count towards the budget of the store."""
-    uncounted = (f"{folder}/tmp/", f"{folder}/bad/")
+    uncounted = (f"{folder}/tmp/", f"{folder}/bad/", f"{folder}/bands/")
     return sum(size for path, size in sizes.items() if path.startswith(uncounted))
 
 
@@ -458,7 +423,7 @@ class Maintained(Protocol):
         deleted, refused = (
             self.make_room(bytes_after_sweep - budget, dry) if budget is not None else ([], [])
         )
-        # a dry run can only predict; bands of deleted values are counted from the files
+        # a dry run can only predict
         bytes_after = (
             bytes_after_sweep - sum(c.size for c in deleted)
             if dry or not deleted
@@ -487,7 +452,6 @@ class Maintained(Protocol):
             self.disk, candidates(self.disk, self.pinned(), self.read_seconds), excess, dry
         )
         if deleted and not dry:
-            removed(self.disk, bands, dry)
             for candidate in deleted:
                 self._known.pop(candidate.key, None)
         return deleted, refused

@@ -11,14 +11,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neusee.workflows.store import band_files as band_files
     from neusee.workflows.store import serialization as serialization
 
 #: modules below neusee
-_MODULES = (
-    "workflows.store.band_files",
-    "workflows.store.serialization",
-)
+_MODULES = ("workflows.store.serialization",)
 _BY_NAME = {module.rpartition(".")[2]: module for module in _MODULES}
 
 

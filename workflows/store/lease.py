@@ -88,7 +88,7 @@ class Leases:
         try:
             return self._taken(path)
         except FileExistsError:
-            lease_state = _look(path)
+            lease_state = _state_of_lease(path)
         if lease_state is not None and not self._dead(path, lease_state):
             return None
         try:
@@ -117,7 +117,7 @@ class Leases:
         """
         temporary = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
         with self._disk.lock():
-            state_now = _look(path)
+            state_now = _state_of_lease(path)
             # another content or inode: somebody else took it since the look
             if state_now is not None and (look is None or state_now[:2] != look[:2]):
                 raise FileExistsError(path)
@@ -162,7 +162,7 @@ class Leases:
         return state_before == look and present_time - unchanged_since > WINDOW
 
 
-def _look(path: str) -> tuple[object, ...] | None:
+def _state_of_lease(path: str) -> tuple[object, ...] | None:
     """Return the content, inode, size and change time of the file of a lease, or None if the
     file does not exist.
     """

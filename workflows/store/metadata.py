@@ -23,25 +23,21 @@ from neusee.workflows.store.shared_folder import Disk, entries, read_file
 
 # Check of the layout of a stored value, which is data that anybody may have written.
 #
-# A layout is a tree of small dicts, each with one kind: ``tensor``, ``bytes``, ``stacked``,
-# ``class``, ``tuple``, ``list``, ``dict`` or ``value``. The check knows no class and makes no
-# value.
+# A layout is a tree of small dicts, each with one kind: ``tensor``, ``bytes``, ``class``,
+# ``tuple``, ``list``, ``dict`` or ``value``. The check knows no class and makes no value.
 
 
 DEEPEST = 50  #: levels of a layout
-#: a name without a folder in it
-_BAND = re.compile(r"[0-9A-Za-z]{2}[0-9A-Za-z-]{0,100}(\.[0-9]{1,6})?")
 _DIGITS = re.compile(r"[0-9a-f]{32}")
-_KINDS = ("tensor", "bytes", "stacked", "class", "tuple", "list", "dict", "value")
+_KINDS = ("tensor", "bytes", "class", "tuple", "list", "dict", "value")
 
 
-def checked_layout(layout: Any) -> dict[str, str]:
-    """Return the checksum (xxh3) of every band file that a layout names, by the name of the band.
+def check_layout(layout: Any) -> None:
+    """Raise `OtherFormat` for a kind of layout that this program does not know, and `ValueError`
+    for any other mistake.
 
-    Raises `OtherFormat` for a kind of layout that this program does not know, and `ValueError` for
-    any other mistake.
+    An earlier version kept spectral bands in files of their own, with the kind ``stacked``.
     """
-    bands: dict[str, str] = {}
     layouts_left: list[tuple[Any, int]] = [(layout, 0)]
     while layouts_left:
         item, depth = layouts_left.pop()
@@ -53,14 +49,11 @@ def checked_layout(layout: Any) -> dict[str, str]:
             raise OtherFormat(
                 f"its layout has a kind that is not known: {', '.join(map(str, item))[:80]}"
             )
-        layouts_left += [
-            (inner_layout, depth + 1) for inner_layout in _inner(kinds[0], item, bands)
-        ]
-    return bands
+        layouts_left += [(inner_layout, depth + 1) for inner_layout in _inner(kinds[0], item)]
 
 
-def _inner(kind: str, item: dict[str, Any], bands: dict[str, str]) -> Iterable[Any]:
-    """Check one level of a layout, add its bands to ``bands``, and return the layouts in it."""
+def _inner(kind: str, item: dict[str, Any]) -> Iterable[Any]:
+    """Check one level of a layout, and return the layouts in it."""
     content = item[kind]
     if kind in ("tensor", "bytes"):
         _expect(is_count(content), kind)
@@ -69,9 +62,6 @@ def _inner(kind: str, item: dict[str, Any], bands: dict[str, str]) -> Iterable[A
     if kind == "value":
         _expect(content is None or isinstance(content, bool | int | float | str), kind)
         return ()
-    if kind == "stacked":
-        bands |= _stacked(content)
-        return ()
     if kind == "dict":
         _expect(isinstance(content, dict), kind)
         return list(content.values())
@@ -79,25 +69,6 @@ def _inner(kind: str, item: dict[str, Any], bands: dict[str, str]) -> Iterable[A
     _expect(isinstance(items, list) and (kind != "class" or isinstance(content, str)), kind)
     assert isinstance(items, list)
     return items
-
-
-def _stacked(body: Any) -> dict[str, str]:
-    """Check the part of a layout for a tensor that is stored by bands; return the checksum of
-    each band by name.
-    """
-    _expect(
-        isinstance(body, dict) and body.keys() == {"names", "xxh3", "dtype", "shape"}, "stacked"
-    )
-    names, checksums, shape = body["names"], body["xxh3"], body["shape"]
-    _expect(
-        isinstance(body["dtype"], str) and is_shape(shape) and isinstance(names, list), "stacked"
-    )
-    if wrong_names := [name for name in names if not is_band(name)]:
-        raise ValueError(f"{str(wrong_names[0])[:60]!r} is not the name of a band file")
-    _expect(isinstance(checksums, list) and all(map(is_checksum, checksums)), "stacked")
-    # one band for each index of the first axis
-    _expect(shape[:1] == [len(names)] and len(checksums) == len(names), "stacked")
-    return dict(zip(names, checksums, strict=True))
 
 
 def is_count(value: Any) -> bool:
@@ -113,16 +84,6 @@ def is_shape(value: Any) -> TypeGuard[list[int]]:
 def is_checksum(value: Any) -> TypeGuard[str]:
     """Return True for the 32 hexadecimal digits of a checksum."""
     return isinstance(value, str) and _DIGITS.fullmatch(value) is not None
-
-
-def is_band(value: Any) -> bool:
-    """Return True for the name of a band file, which names no folder."""
-    return isinstance(value, str) and _BAND.fullmatch(value) is not None
-
-
-def are_bands(value: Any) -> TypeGuard[list[str]]:
-    """Return True for a list of names of band files."""
-    return isinstance(value, list) and all(map(is_band, value))
 
 
 def _expect(condition: bool, kind: str) -> None:
@@ -193,12 +154,6 @@ def _is_tensor(value: Any) -> bool:
     )
 
 
-def _is_bands(value: Any) -> bool:
-    return (
-        isinstance(value, dict) and are_bands(value.get("names")) and is_count(value.get("newest"))
-    )
-
-
 def _is_origin(value: Any) -> bool:
     return isinstance(value, dict) and all(
         value.get(name) is None or is_text(value[name]) for name in ("node", "code")
@@ -251,7 +206,6 @@ FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "file": _is_file,
     "payload": _is_payload,
     "tensors": _is_inline,
-    "bands": _is_bands,
 }
 
 
@@ -271,13 +225,10 @@ def checked_fields(about: dict[str, Any], key: str) -> dict[str, Any]:
             raise ValueError(
                 f"the field {name} of the metadata is not what was written: {str(value)[:60]!r}"
             )
-    # a value: all files of its layout must be named
+    # a value: its layout must be known, and its file of tensors named
     if about.get("kept", True):
-        bands_of_layout, listed_bands = (
-            checked_layout(about.get("layout")),
-            (about.get("bands") or {}).get("names", []),
-        )
-        if bands_of_layout.keys() != set(listed_bands) or "payload" not in about:
+        check_layout(about.get("layout"))
+        if "payload" not in about:
             raise ValueError(
                 "the metadata do not name the files that the layout of the value needs"
             )
@@ -301,9 +252,9 @@ UNREADABLE = (
     ArithmeticError,
     MemoryError,
 )
-_USED = 3600.0  #: smallest time in s between two records of the use of a value
-_TOP = re.compile("[0-9a-f]{2}")
-_OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
+_USE_RECORD_SECONDS = 3600.0  #: smallest time in s between two records of the use of a value
+_RESULT_FOLDER = re.compile("[0-9a-f]{2}")
+_OF_THE_VALUE = ("layout", "payload", "tensors")
 
 
 def read(disk: Disk, key: str) -> Metadata:
@@ -394,7 +345,7 @@ def record_use(disk: Disk, key: str) -> None:
     """Record the use of a value as the modification time of its JSON file, at most once an hour."""
     path = disk.path(key, "json")
     with suppress(OSError):
-        if abs(time.time() - os.stat(path).st_mtime) > _USED:
+        if abs(time.time() - os.stat(path).st_mtime) > _USE_RECORD_SECONDS:
             os.utime(path)
 
 
@@ -403,11 +354,6 @@ def is_kept(about: Metadata | None) -> TypeGuard[Metadata]:
     value.
     """
     return about is not None and bool(about.get("kept", True))
-
-
-def bands(about: Metadata) -> list[str]:
-    """Return the names of the spectral bands of a stored value that have band files."""
-    return list((about.get("bands") or {}).get("names", []))
 
 
 def receipt(about: Metadata) -> Metadata:
@@ -430,7 +376,9 @@ def _folders(disk: Disk) -> list[os.DirEntry[str]]:
     """Return the folders of a store that hold results, whose names are two hexadecimal digits,
     in order.
     """
-    named_folders = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
+    named_folders = [
+        entry for entry in entries(disk.folder) if _RESULT_FOLDER.fullmatch(entry.name)
+    ]
     return sorted(
         (entry for entry in named_folders if entry.is_dir(follow_symlinks=False)),
         key=lambda entry: entry.name,

@@ -1,4 +1,4 @@
-"""Values of results, written to and read from files, receipts and lines of small results."""
+"""Values of results, written to and read from files and lines of small results."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import random
 import stat
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from stat import S_ISREG
 from typing import IO, TYPE_CHECKING, Any
@@ -15,13 +15,11 @@ from typing import IO, TYPE_CHECKING, Any
 from neusee.workflows.keys.sealed_files import seal_record, secrets
 from neusee.workflows.store import lazy_imports as lazy
 from neusee.workflows.store import metadata
-from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata, checked_layout, is_kept
+from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata
 from neusee.workflows.store.shared_folder import Disk, append, open_now
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from neusee.workflows.store.band_files import Blobs
 
 
 # --- payload --------------------------------------------------------------------------------------
@@ -35,31 +33,24 @@ _SAMPLED = 1 / 20
 _draw = random.Random()
 
 
-def described(
-    key: str, value: Any, about: Metadata, blobs: Blobs | None = None
-) -> tuple[Metadata, list[Tensor], dict[str, str]]:
-    """Return the metadata of a new value, the tensors that need a file, and the checksums of its
-    bands by name.
+def described(key: str, value: Any, about: Metadata) -> tuple[Metadata, list[Tensor]]:
+    """Return the metadata of a new value, and the tensors that need a file.
 
     Small tensors are part of the metadata.
     """
-    layout, tensors = lazy.serialization.pack(value, blobs)
-    value_bytes = tensor_bytes = sum(t.nbytes for t in tensors)
-    bands = checked_layout(layout)
-    # packed bands are not among the tensors; who computed the value knows its size
-    if bands:
-        value_bytes = max(tensor_bytes, about.get("bytes") or 0)
+    layout, tensors = lazy.serialization.pack(value)
+    tensor_bytes = sum(t.nbytes for t in tensors)
     entry = {
         "key": key,
         **about,
         "layout": layout,
-        "bytes": value_bytes,
+        "bytes": tensor_bytes,
         "payload": None,
         "kept": True,
     }
     if tensor_bytes <= INLINE:
         entry["tensors"], tensors = [lazy.serialization.to_text(t) for t in tensors], []
-    return entry, tensors, bands
+    return entry, tensors
 
 
 def written(file: IO[bytes], tensors: list[Tensor]) -> Metadata:
@@ -74,9 +65,7 @@ def written(file: IO[bytes], tensors: list[Tensor]) -> Metadata:
     )
 
 
-def load(
-    disk: Disk, about: Metadata, verify: str, blobs: Blobs, typed: bool = True
-) -> tuple[Any, int]:
+def load(disk: Disk, about: Metadata, verify: str, typed: bool = True) -> tuple[Any, int]:
     """Return the value that the metadata ``about`` describe, and the number of bytes compared with
     the checksum.
 
@@ -84,7 +73,6 @@ def load(
 
     Raises one of the errors in `UNREADABLE` if the value is missing or damaged.
     """
-    bands = about.get("bands")
     compares = verify == "always" or (verify == "sampled" and _draw.random() < _SAMPLED)
     tensors, bytes_compared = (
         [lazy.serialization.from_text(*t) for t in about.get("tensors") or ()],
@@ -92,12 +80,7 @@ def load(
     )
     if about["payload"]:
         tensors, bytes_compared = _tensors_of_file(disk, about, verify, compares)
-    # a band file that was touched since the value was written
-    if bands and verify == "sampled" and not compares:
-        compares = newest(blobs, bands["names"]) > bands["newest"]
-    return lazy.serialization.unpack(
-        about["layout"], tensors, blobs, compares, typed
-    ), bytes_compared
+    return lazy.serialization.unpack(about["layout"], tensors, typed), bytes_compared
 
 
 def _tensors_of_file(
@@ -143,46 +126,6 @@ def stamp_of(path: str) -> list[int]:
     ]
 
 
-def newest(blobs: Blobs, names: Iterable[str]) -> int:
-    """Return the time in ns of the last change of any of the band files ``names``."""
-    stats = [os.stat(blobs.path(name)) for name in names]
-    return max((max(stat.st_mtime_ns, stat.st_ctime_ns) for stat in stats), default=0)
-
-
-# --- receipts -------------------------------------------------------------------------------------
-
-# Receipts of one store, the metadata of results without a value: a file is read again only after it
-# has changed.
-
-
-class Receipts:
-    """The metadata files of one store, of which those of receipts are remembered with the stamp
-    of their file.
-    """
-
-    def __init__(self, disk: Disk) -> None:
-        self._disk = disk
-        # stamp of the file, and its metadata
-        self._read: dict[str, tuple[list[int], Metadata]] = {}
-
-    def find(self, key: str) -> Metadata | None:
-        """Return the metadata of ``key``, with or without a value, as `metadata.find` does.
-
-        Raises an error in `UNREADABLE` for damaged metadata.
-        """
-        try:
-            file_stamp = stamp_of(self._disk.path(key, "json"))
-        except (OSError, ValueError):
-            # which tells what is wrong with the file, or that there is none
-            return metadata.find(self._disk, key)
-        if key in self._read and self._read[key][0] == file_stamp:
-            return self._read[key][1]
-        entry = metadata.find(self._disk, key)
-        if entry is not None and not is_kept(entry):
-            self._read[key] = file_stamp, entry
-        return entry
-
-
 # --- small results --------------------------------------------------------------------------------
 
 # Small results as lines of one common file, for results that are computed faster than a file is
@@ -193,9 +136,9 @@ class Receipts:
 # look-up of a key that is not known reads the lines added since the last look-up.
 
 
-MOST = 64 << 20  #: bytes of the file above which the older half is dropped
-_HEAD = b'{"key":"'
-_KEY = slice(len(_HEAD), len(_HEAD) + 32)
+MOST_BYTES = 64 << 20  #: bytes of the file above which the older half is dropped
+_LINE_START = b'{"key":"'
+_KEY_OF_LINE = slice(len(_LINE_START), len(_LINE_START) + 32)
 
 
 class SmallResults:
@@ -254,13 +197,13 @@ class SmallResults:
         """Rewrite the file of small results with only its newest lines; lines added meanwhile may
         be lost.
 
-        The new file has at most half of `MOST` bytes.
+        The new file has at most half of `MOST_BYTES` bytes.
         """
         self._read_new_lines()
         newest_lines, total_bytes = list[bytes](), 0
         for line in reversed(self._lines.values()):
             total_bytes += len(line) + 1
-            if total_bytes > MOST // 2:
+            if total_bytes > MOST_BYTES // 2:
                 break
             newest_lines.append(line)
         with suppress(OSError):
@@ -277,8 +220,8 @@ class SmallResults:
 
     def _add(self, line: bytes) -> None:
         """Keep a line of the file, as the newest of its key, unless it is no line of a result."""
-        if line.startswith(_HEAD):
-            key = line[_KEY].decode(errors="replace")
+        if line.startswith(_LINE_START):
+            key = line[_KEY_OF_LINE].decode(errors="replace")
             if key.isalnum():  # it may be a part of a path
                 self._lines.pop(key, None)
                 self._lines[key] = line
@@ -311,5 +254,5 @@ class SmallResults:
                 os.fstat(file.fileno()).st_ino,
                 self._offset + max(0, end_of_lines),
             )
-        if self._offset > MOST:
+        if self._offset > MOST_BYTES:
             self.compact()

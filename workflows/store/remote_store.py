@@ -12,9 +12,8 @@ import uuid
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from functools import partial
-from itertools import starmap
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -37,13 +36,12 @@ from neusee.workflows.store.cache_settings import Verify
 from neusee.workflows.store.metadata import (
     UNREADABLE,
     Metadata,
-    checked_layout,
     is_kept,
     read,
     receipt,
     unseal_of,
 )
-from neusee.workflows.store.payload import newest, stamp_of
+from neusee.workflows.store.payload import stamp_of
 from neusee.workflows.store.result_store import Store
 
 # --- folder at url --------------------------------------------------------------------------------
@@ -141,18 +139,22 @@ class FolderAtUrl:
 T = TypeVar("T")
 Direction = Literal["down", "up"]
 _DIRECTIONS: tuple[Direction, ...] = ("down", "up")
-_FRESH = 20.0  #: s for which a listing counts as valid
-_FEW = 3  #: number of folders that are listed one by one; the next request lists all folders
-_PAUSE = 60.0  #: s for which a URL is not used after a failure; doubled at each failure
+_LISTING_VALID_SECONDS = 20.0  #: s for which a listing counts as valid
+_MOST_FOLDERS_ONE_BY_ONE = (
+    3  #: number of folders that are listed one by one; the next request lists all folders
+)
+_PAUSE_AFTER_FAILURE = (
+    60.0  #: s for which a URL is not used after a failure; doubled at each failure
+)
 #: bytes from which a transfer updates the rate; a smaller transfer updates the latency
-_LEARN = 1_000_000
-_ORPHAN = 86400.0  #: s after which a half-written file counts as abandoned
+_RATE_BYTES = 1_000_000
+_ABANDONED_SECONDS = 86400.0  #: s after which a half-written file counts as abandoned
 _FOLDERS = tuple(f"{i:02x}" for i in range(256))
 #: show half-written files, but can rename files
-_RENAMES = frozenset({"file", "local", "sftp", "ssh"})
-_NEAR = frozenset({"file", "local", "memory"})
+_RENAMING_PROTOCOLS = frozenset({"file", "local", "sftp", "ssh"})
+_LOCAL_PROTOCOLS = frozenset({"file", "local", "memory"})
 #: what is there is a link in a circle or a folder
-_NO_FILE = (errno.ELOOP, errno.ENXIO, errno.EISDIR, errno.ENOTDIR)
+_NOT_A_FILE_ERRORS = (errno.ELOOP, errno.ENXIO, errno.EISDIR, errno.ENOTDIR)
 
 
 class RemoteFiles:
@@ -164,14 +166,17 @@ class RemoteFiles:
         protocols = (
             {self._fs.protocol} if isinstance(self._fs.protocol, str) else set(self._fs.protocol)
         )
-        self._renames, is_near = bool(protocols & _RENAMES), bool(protocols & _NEAR)
+        self._renames, is_near = (
+            bool(protocols & _RENAMING_PROTOCOLS),
+            bool(protocols & _LOCAL_PROTOCOLS),
+        )
         # s for each transfer, and bytes / s: guesses until transfers are measured
         self._latency = dict.fromkeys(_DIRECTIONS, 5e-4 if is_near else 0.05)
         self._rate = dict.fromkeys(_DIRECTIONS, 4e8 if is_near else 5e7)
         # time before which the URL is not used in a direction
         self._resume = dict.fromkeys(_DIRECTIONS, 0.0)
         # s of the next pause after a failure
-        self._pause = dict.fromkeys(_DIRECTIONS, _PAUSE)
+        self._pause = dict.fromkeys(_DIRECTIONS, _PAUSE_AFTER_FAILURE)
         self._warned = False
         # by folder: time of the listing (s), and names
         self._listed: dict[str, tuple[float, set[str]]] = {}
@@ -191,7 +196,7 @@ class RemoteFiles:
         with self._lock:
             if not self._fresh(name[:2]):
                 # with few fresh listings, one folder; then all at once, in parallel
-                lists_one = sum(map(self._fresh, self._listed)) < _FEW
+                lists_one = sum(map(self._fresh, self._listed)) < _MOST_FOLDERS_ONE_BY_ONE
                 self._list_folders([name[:2]] if lists_one else _FOLDERS)
             return name in self._listed[name[:2]][1]
 
@@ -263,8 +268,11 @@ class RemoteFiles:
         return f"{self._root}/{name[:2]}/{name}"
 
     def _fresh(self, folder: str) -> bool:
-        """Return True if a folder was listed within the last `_FRESH` seconds."""
-        return folder in self._listed and time.monotonic() - self._listed[folder][0] < _FRESH
+        """Return True if a folder was listed within the last `_LISTING_VALID_SECONDS` seconds."""
+        return (
+            folder in self._listed
+            and time.monotonic() - self._listed[folder][0] < _LISTING_VALID_SECONDS
+        )
 
     def _list_folders(self, folders: Sequence[str]) -> None:
         """List the files of ``folders`` at the URL in parallel; skip a folder that was listed a
@@ -323,7 +331,7 @@ class RemoteFiles:
         """
         with suppress(OSError, LookupError, TypeError):
             for entry in self._fs.ls(path, detail=True):
-                if time.time() - entry["mtime"] > _ORPHAN:
+                if time.time() - entry["mtime"] > _ABANDONED_SECONDS:
                     self._fs.rm_file(entry["name"])
 
     def _attempt(
@@ -346,7 +354,7 @@ class RemoteFiles:
                 self._failed(direction, error)
             return None
         # a success ends the doubling of pauses
-        self._pause[direction] = _PAUSE
+        self._pause[direction] = _PAUSE_AFTER_FAILURE
         if size is not None:
             self._update_speed(direction, size(result), time.perf_counter() - began)
         return result
@@ -376,7 +384,7 @@ class RemoteFiles:
         """Change the predicted latency or rate of transfers by a third of the difference from
         the measured value.
         """
-        if size < _LEARN:
+        if size < _RATE_BYTES:
             # a small transfer takes little but the latency
             self._latency[direction] += (seconds - self._latency[direction]) / 3
         else:
@@ -388,7 +396,7 @@ def _counts_as_missing(error: Exception) -> bool:
     """Return True for the error of one name at a URL, which says nothing of the others."""
     if isinstance(error, FileNotFoundError | NotRegular):
         return True
-    return isinstance(error, OSError) and error.errno in _NO_FILE
+    return isinstance(error, OSError) and error.errno in _NOT_A_FILE_ERRORS
 
 
 def _file_system(url: str) -> tuple[Any, str]:
@@ -604,51 +612,17 @@ class RemoteStore(Store):
         """Copy a value from the URL into the local folder after a check of every byte; return
         False if a copy fails.
         """
-        payload, bands = about["payload"], checked_layout(about["layout"])
-        missing_bands = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
-        with ExitStack() as open_files:
-            # temporary files: one for the tensors, then one for each missing band
-            payload_copy, *band_copies = (
-                self._part(open_files, name) for name in (key, *missing_bands)
-            )
-            if payload and not self._fetched(
-                _payload_name(key, payload["xxh3"]), payload_copy, payload
-            ):
+        payload = about["payload"]
+        with self.disk.temporary(key) as (copied, file):
+            file.close()
+            if payload and not self._fetched(_payload_name(key, payload["xxh3"]), copied, payload):
                 return False
-            with ThreadPoolExecutor(16) as pool:
-                if not all(
-                    pool.map(
-                        self._remote.fetch, starmap(_band_name, missing_bands.items()), band_copies
-                    )
-                ):
-                    return False
             with self.disk.lock():
                 # another process may have fetched the value meanwhile
                 if not self._is_local(key):
-                    self._named(dict(zip(missing_bands, band_copies, strict=True)), bands)
-                    self._described(key, about, payload_copy)
+                    self._described(key, about, copied)
         self.journal.append(key, about)
         return True
-
-    def _part(self, files: ExitStack, name: str) -> str:
-        """Return the path of a new temporary file, which goes with ``files`` unless it was
-        renamed.
-        """
-        path, file = files.enter_context(self.disk.temporary(name))
-        file.close()
-        return path
-
-    def _named(self, parts: dict[str, str], bands: dict[str, str]) -> None:
-        """Give band files that were copied from the URL their final names; raise `ValueError`
-        for a wrong checksum.
-        """
-        for name, copied in parts.items():
-            self.disk.make_folder(str(self.blobs.root))
-            self.disk.link(copied, self.blobs.path(name))
-        for name, xxh3 in bands.items():
-            blob = self.blobs.about(name)
-            # compares every byte with the checksum
-            self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
 
     def _described(self, key: Key, about: Metadata, copied: str) -> None:
         """Give the copied file of tensors of a value its final name, and write the metadata with
@@ -659,8 +633,6 @@ class RemoteStore(Store):
             path = self.disk.path(key, "safetensors")
             self.disk.rename(copied, path)
             about["payload"] = {**about["payload"], "stamp": stamp_of(path)}
-        if names := about.get("bands", {}).get("names"):
-            about["bands"] = {"names": names, "newest": newest(self.blobs, names)}
         self._write_about(key, about)
         self._lost.discard(key)
 
@@ -695,33 +667,17 @@ class RemoteStore(Store):
             return
         try:
             metadata = read(self.disk, key)
-            local_paths = self._files(key, metadata)
+            payload = metadata["payload"]
         except UNREADABLE:
             return
-        with ThreadPoolExecutor(16) as pool:
-            # band files may be at the URL already
-            results = pool.map(
-                lambda to: (
-                    (not replaces and self._remote.exists(to))
-                    or self._remote.send(local_paths[to], to)
-                ),
-                local_paths,
-            )
-            if not all(results):
+        if payload:
+            file_name = _payload_name(key, payload["xxh3"])
+            is_there = not replaces and self._remote.exists(file_name)
+            path = self.disk.path(key, "safetensors")
+            if not is_there and not self._remote.send(path, file_name):
                 return
         if self._remote.write(name, seal_record("result at a URL", metadata), replaces):
             self._broken.discard(key)
-
-    def _files(self, key: Key, about: Metadata) -> dict[str, str]:
-        """Return the local paths of the payload and band files of a value, by the name of each
-        file at the URL.
-        """
-        paths = {}
-        if payload := about["payload"]:
-            paths[_payload_name(key, payload["xxh3"])] = self.disk.path(key, "safetensors")
-        for name, xxh3 in checked_layout(about["layout"]).items():
-            paths[_band_name(name, xxh3)] = self.blobs.path(name)
-        return paths
 
     def _give_up(self, key: Key) -> None:
         """Use the copy of a key at the URL no more."""
@@ -742,7 +698,3 @@ def _receipt_name(key: Key) -> str:
 
 def _payload_name(key: Key, xxh3: str) -> str:
     return f"{key}-{xxh3}.safetensors"
-
-
-def _band_name(name: str, xxh3: str) -> str:
-    return f"{name}-{xxh3}.band"

@@ -10,25 +10,22 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from datetime import UTC, datetime
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 from neusee.workflows.keys.sealed_files import NotRead, Unsigned, seal_record, unseal_record
-from neusee.workflows.store import lazy_imports as lazy
 from neusee.workflows.store import metadata, payload
 from neusee.workflows.store.cache_settings import Verify, budget_bytes, default_root, verify_mode
 from neusee.workflows.store.eviction import LOW, CacheBudget, Maintained
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.lease import Lease, Leases
 from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata, is_kept, record_use
-from neusee.workflows.store.payload import Receipts, SmallResults
+from neusee.workflows.store.payload import SmallResults
 from neusee.workflows.store.shared_folder import Disk, read_file
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from neusee.workflows.store.band_files import Blobs
 
 
 # --- bandwidth ------------------------------------------------------------------------------------
@@ -38,14 +35,18 @@ if TYPE_CHECKING:
 
 
 Direction = Literal["read", "write"]
-_FILE = "speeds.json"
+_SPEEDS_FILE = "speeds.json"
 LARGE = 1_000_000  #: bytes from which a transfer updates the speed
 _USUAL: dict[Direction, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
 #: s for each transfer, whatever its size; to write is to make a file, which takes 0.5 to 2 ms
-_SETUP: dict[Direction, float] = {"read": 5e-5, "write": 1e-3}
-_SYNC = 3e-3  #: s until the disk has a file, for each result that is written to a file of its own
-_LEARN = 0.3  #: weight of the newest transfer
-_NEWS = 1.25  #: factor by which a speed must differ from the stored speed to be written to the file
+_SETUP_SECONDS: dict[Direction, float] = {"read": 5e-5, "write": 1e-3}
+_SYNC_SECONDS = (
+    3e-3  #: s until the disk has a file, for each result that is written to a file of its own
+)
+_NEWEST_WEIGHT = 0.3  #: weight of the newest transfer
+_SAVED_CHANGE = (
+    1.25  #: factor by which a speed must differ from the stored speed to be written to the file
+)
 
 
 class Speeds:
@@ -70,13 +71,13 @@ class Speeds:
             return
         measured_speed = size / max(seconds - _setup(way, size), 1e-6)
         # a weighted geometric mean, because speeds differ by factors
-        self._now[way] = self._speed(way) ** (1 - _LEARN) * measured_speed**_LEARN
+        self._now[way] = self._speed(way) ** (1 - _NEWEST_WEIGHT) * measured_speed**_NEWEST_WEIGHT
         saved_speed = self._written.get(way, _USUAL[way])
-        if not saved_speed / _NEWS < self._now[way] < saved_speed * _NEWS:
+        if not saved_speed / _SAVED_CHANGE < self._now[way] < saved_speed * _SAVED_CHANGE:
             self._written = dict(self._now)
             with suppress(OSError):
                 self._disk.replace(
-                    _FILE,
+                    _SPEEDS_FILE,
                     seal_record("speeds", {str(way): speed for way, speed in self._now.items()}),
                 )
 
@@ -92,7 +93,7 @@ class Speeds:
     def _stored(self) -> dict[Direction, float]:
         """Return the speeds that the file of the store says; none if it is missing or wrong."""
         try:
-            speeds = unseal_record("speeds", read_file(f"{self._disk.folder}/{_FILE}"))
+            speeds = unseal_record("speeds", read_file(f"{self._disk.folder}/{_SPEEDS_FILE}"))
             # bytes / s that a disk may have
             return {
                 direction: float(speeds[direction])
@@ -105,7 +106,7 @@ class Speeds:
 
 def _setup(way: Direction, size: float) -> float:
     """Return the time (s) that a transfer takes beside that of its bytes."""
-    return _SETUP[way] + (_SYNC if way == "write" and size > INLINE else 0.0)
+    return _SETUP_SECONDS[way] + (_SYNC_SECONDS if way == "write" and size > INLINE else 0.0)
 
 
 # --- store warnings -------------------------------------------------------------------------------
@@ -126,7 +127,7 @@ class Warned:
     #: the warnings of all stores of this process, for the reports of studies
     failures: ClassVar[list[str]] = []
     failure = ""  #: the warning after the first write that failed
-    _told = False
+    _has_warned = False
 
     def report_failure(self, error: Exception, use: str = "written") -> None:
         """Warn that the folder cannot be written or read, once for each store; `failure` keeps
@@ -148,7 +149,7 @@ class Warned:
         """Issue one warning for all results that are left alone, because they are of another
         format or unsigned.
         """
-        if not self._told:
+        if not self._has_warned:
             reason = (
                 "without a signature by NEUSEE_CACHE_SECRET"
                 if isinstance(error, Unsigned)
@@ -158,7 +159,7 @@ class Warned:
             warnings.warn(
                 f"{text}: `neusee cache gc` removes those that nobody used for a week", stacklevel=4
             )
-        self._told = True
+        self._has_warned = True
 
 
 # --- result store ---------------------------------------------------------------------------------
@@ -205,7 +206,6 @@ class Store(Warned, Maintained):
         self._room = None if self.budget is None else CacheBudget(self.disk, self.budget)
         self._speeds = Speeds(self.disk)
         self._known: dict[str, Metadata] = {}  # metadata that were read or written
-        self._receipts = Receipts(self.disk)
         self._lost: set[str] = set()  # damaged results that the user may have no permission to move
         self._used: set[str] = set()  # keys of values that were loaded
         self._missed: set[str] = set()  # keys that were asked for in vain
@@ -213,11 +213,6 @@ class Store(Warned, Maintained):
     # another process receives the path and opens the store
     def __reduce__(self) -> tuple[Any, ...]:
         return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
-
-    @cached_property
-    def blobs(self) -> Blobs:
-        """Return the folder of the band files of the store, which hold one spectral band each."""
-        return lazy.band_files.Blobs(self.root / "bands")
 
     def has(self, key: str) -> bool:
         """Return True if the value of ``key`` is stored, without reading the value."""
@@ -237,7 +232,7 @@ class Store(Warned, Maintained):
         if not is_kept(entry):
             try:
                 # a receipt among the small results counts only if there is no file
-                entry = self._receipts.find(key) or entry
+                entry = metadata.find(self.disk, key) or entry
             except NotRead as error:
                 self.leave(error)
             except UNREADABLE as error:
@@ -359,7 +354,7 @@ class Store(Warned, Maintained):
         be known.
         """
         began = time.perf_counter()
-        value, size = payload.load(self.disk, about, verify, self.blobs, kind is not None)
+        value, size = payload.load(self.disk, about, verify, kind is not None)
         if kind is not None and kind is not Any:
             payload.check_kind(value, kind)
         self._speeds.learn("read", size, time.perf_counter() - began)
@@ -393,13 +388,13 @@ class Store(Warned, Maintained):
         the budget.
         """
         began = time.perf_counter()
-        metadata_entry, tensors, band_checksums = payload.described(key, value, about, self.blobs)
+        metadata_entry, tensors = payload.described(key, value, about)
         # larger than what an eviction leaves of the budget
         if self._room and metadata_entry["bytes"] > LOW * self._room.budget:
             self._write_receipt(key, metadata_entry)
             return False
-        if tensors or band_checksums:
-            self._write_parts(key, metadata_entry, tensors, value if band_checksums else None)
+        if tensors:
+            self._write_tensors(key, metadata_entry, tensors)
             self._speeds.learn("write", sum(t.nbytes for t in tensors), time.perf_counter() - began)
         else:
             self._write_about(key, metadata_entry)
@@ -412,7 +407,7 @@ class Store(Warned, Maintained):
         """Write a value into the file of small results; only its metadata, and False, if it is
         too large for a line.
         """
-        entry, tensors, _ = payload.described(key, value, about)
+        entry, tensors = payload.described(key, value, about)
         # they do not fit into the metadata
         if tensors:
             entry = metadata.receipt(entry)
@@ -422,28 +417,20 @@ class Store(Warned, Maintained):
         self.journal.append(key, entry)
         return is_kept(entry)
 
-    def _write_parts(self, key: str, entry: Metadata, tensors: list[Tensor], banded: Any) -> None:
-        """Write the large files of a value, then the metadata that name the files; keep a value
+    def _write_tensors(self, key: str, entry: Metadata, tensors: list[Tensor]) -> None:
+        """Write the file of tensors of a value, then the metadata that name it; keep a value
         stored earlier.
         """
         with self.disk.temporary(key) as (temporary, file):
-            if tensors:
-                entry["payload"] = payload.written(file, tensors)
+            entry["payload"] = payload.written(file, tensors)
             with self.disk.lock():
                 if key not in self._lost and metadata.has_value(self.disk, key):
                     # the value that is stored stays
                     return
-                if banded is not None:  # a sweep may have removed bands that no value names yet
-                    band_names = list(payload.described(key, banded, {}, self.blobs)[2])
-                    entry["bands"] = {
-                        "names": band_names,
-                        "newest": payload.newest(self.blobs, band_names),
-                    }
-                if tensors:
-                    path = self.disk.path(key, "safetensors")
-                    # the file has its name before the metadata that name it
-                    self.disk.rename(temporary, path)
-                    entry["payload"]["stamp"] = payload.stamp_of(path)
+                path = self.disk.path(key, "safetensors")
+                # the file has its name before the metadata that name it
+                self.disk.rename(temporary, path)
+                entry["payload"]["stamp"] = payload.stamp_of(path)
                 self._write_about(key, entry)
 
     def _write_about(self, key: str, entry: Metadata) -> None:

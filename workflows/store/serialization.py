@@ -21,8 +21,7 @@ from torch import Tensor
 
 from neusee.nodes import Node, registered_nodes, values
 from neusee.workflows.keys.sealed_files import may_change
-from neusee.workflows.store.band_files import Blobs, Stacked, bytes_of, dtype_of
-from neusee.workflows.store.metadata import checked_layout, is_count, is_shape
+from neusee.workflows.store.metadata import check_layout, is_count, is_shape
 from neusee.workflows.store.shared_folder import open_now
 
 # --- stored types ---------------------------------------------------------------------------------
@@ -197,7 +196,7 @@ def _hints(kind: type) -> dict[str, Any]:
 # The file is written from the memory of the tensors and read through a memory map, so that neither
 # writing nor reading makes a copy. Each tensor begins at a multiple of 64 bytes like a newly
 # allocated tensor, so that a kernel uses the same code path for a stored value and a computed
-# value. The layout of a `Stacked` tensor names one band file for each slice.
+# value.
 
 
 _PIECE = 1 << 18  #: bytes of a file that are read at once
@@ -316,27 +315,23 @@ class _Listed:
         return self._known[identity]
 
 
-def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
-    """Return the JSON layout of ``value`` and its tensors; write `Stacked` tensors to the folder
-    ``blobs`` if given.
+def pack(value: Any) -> tuple[Any, list[Tensor]]:
+    """Return the JSON layout of ``value`` and its tensors.
 
-    Raises `TypeError` for a value that cannot be stored, and `OSError` if ``blobs`` cannot be
-    written.
+    Raises `TypeError` for a value that cannot be stored.
     """
     listed = _Listed()
-    return _layout(value, listed, blobs), listed.tensors
+    return _layout(value, listed), listed.tensors
 
 
-def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
+def _layout(item: Any, listed: _Listed) -> dict[str, Any]:
     """Return the layout of a value, and add its tensors to ``listed``."""
-    if isinstance(item, Stacked):
-        return _layout(item.tensor, listed, None) if blobs is None else _stack_layout(item, blobs)
     if isinstance(item, Tensor):
         return {"tensor": listed.add(item)}
     if isinstance(item, bytes):
         return {"bytes": listed.add(_tensor_of_bytes(item))}
     if isinstance(item, tuple | list | dict):
-        return _collection_layout(item, listed, blobs)
+        return _collection_layout(item, listed)
     if item is None or isinstance(item, bool | int | float | str):
         return {"value": item}
     raise _cannot_be_stored(item)
@@ -355,57 +350,33 @@ def _tensor_of_bytes(text: bytes) -> Tensor:
 
 
 def _collection_layout(
-    item: tuple[Any, ...] | list[Any] | dict[Any, Any], listed: _Listed, blobs: Blobs | None
+    item: tuple[Any, ...] | list[Any] | dict[Any, Any], listed: _Listed
 ) -> dict[str, Any]:
     """Return the layout of a dict, list, tuple or named tuple."""
     if isinstance(item, dict):
         if not all(isinstance(key, str) for key in item):
             raise _cannot_be_stored(item)
-        return {"dict": {key: _layout(value, listed, blobs) for key, value in item.items()}}
-    items = [_layout(i, listed, blobs) for i in item]
+        return {"dict": {key: _layout(value, listed) for key, value in item.items()}}
+    items = [_layout(i, listed) for i in item]
     if isinstance(item, list):
         return {"list": items}
     return {"tuple": items} if type(item) is tuple else {"class": _class_name(item), "items": items}
 
 
-def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
-    """Write the bands of a tensor to their files; return the layout with their names and
-    checksums.
-    """
-    checksums = blobs.write_all(item.names, item.tensor.unbind())
-    dtype_name = str(item.tensor.dtype).removeprefix("torch.")
-    return {
-        "stacked": {
-            "names": list(item.names),
-            "xxh3": checksums,
-            "dtype": dtype_name,
-            "shape": list(item.tensor.shape),
-        }
-    }
-
-
-def unpack(
-    layout: Any,
-    tensors: list[Tensor],
-    blobs: Blobs | None = None,
-    verify: bool = True,
-    typed: bool = True,
-) -> Any:
+def unpack(layout: Any, tensors: list[Tensor], typed: bool = True) -> Any:
     """Return the value that `pack` turned into ``layout`` and ``tensors``; ``typed=False`` gives
     plain tuples.
 
     Raises `UnknownType` for a named tuple that is not in the registry of `serialization`, and
-    `ValueError` for a layout that `pack` did not write or a damaged band.
+    `ValueError` for a layout that `pack` did not write.
     """
-    checked_layout(layout)
-    return _unpacked(layout, tensors, blobs, verify, typed)
+    check_layout(layout)
+    return _unpacked(layout, tensors, typed)
 
 
-def _unpacked(
-    layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None, verify: bool, typed: bool
-) -> Any:
+def _unpacked(layout: dict[str, Any], tensors: list[Tensor], typed: bool) -> Any:
     """Return the value of a layout; see `unpack`."""
-    unpack_item = partial(_unpacked, tensors=tensors, blobs=blobs, verify=verify, typed=typed)
+    unpack_item = partial(_unpacked, tensors=tensors, typed=typed)
     if "class" in layout:
         items = list(map(unpack_item, layout["items"]))
         return made(stored_type(layout["class"]), items) if typed else tuple(items)
@@ -413,8 +384,6 @@ def _unpacked(
     ((kind, body),) = layout.items()
     if kind in ("tensor", "bytes"):
         return _stored_tensor(kind, body, tensors)
-    if kind == "stacked":
-        return _stacked_bands(body, blobs, verify)
     if kind in ("tuple", "list"):
         items = list(map(unpack_item, body))
         return tuple(items) if kind == "tuple" else items
@@ -430,11 +399,14 @@ def _stored_tensor(kind: str, number: int, tensors: list[Tensor]) -> Tensor | by
     return tensors[number] if kind == "tensor" else _bytes(tensors[number])
 
 
-def _stacked_bands(body: dict[str, Any], blobs: Blobs | None, verify: bool) -> Tensor:
-    """Return a tensor from its band files, as the layout names them."""
-    if blobs is None:
-        raise ValueError("the value has band files: give the folder of the band files as ``blobs``")
-    return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
+def bytes_of(x: Tensor) -> memoryview:
+    """Return the bytes of a tensor, without a copy if the tensor is contiguous and on the CPU."""
+    # torch may only note that a tensor is conjugated or negative
+    flat = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
+    # a single element is contiguous whatever its stride, but cannot be viewed as bytes
+    if flat.stride() != (1,):
+        flat = flat.clone(memory_format=torch.contiguous_format)
+    return flat.view(torch.uint8).numpy().data
 
 
 def _bytes(x: Tensor) -> bytes:

@@ -136,7 +136,7 @@ def _signalled(pid: int) -> State:
 MOST_READ = 64 << 20  #: bytes of metadata that are read at once
 OLD = 3600.0  #: s after which a temporary file of another machine counts as abandoned
 #: s to wait for the lock; its owner may be stopped, and a run without the lock may only repeat work
-_PATIENCE = 10.0
+_LOCK_PATIENCE = 10.0
 #: errors of a file system without hard links
 _LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 _count = itertools.count()
@@ -243,12 +243,12 @@ class Disk:
         """Hold the lock of the store during a ``with`` block.
 
         The block runs without the lock if the file system has no locks or the wait exceeds
-        `_PATIENCE` seconds.
+        `_LOCK_PATIENCE` seconds.
         """
         self.prepare()
         lock_file = self._lock_file()
         try:
-            deadline = time.monotonic() + _PATIENCE
+            deadline = time.monotonic() + _LOCK_PATIENCE
             while not _locked(lock_file) and time.monotonic() < deadline:
                 time.sleep(0.001)
             yield

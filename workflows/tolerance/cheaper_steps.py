@@ -35,12 +35,12 @@ ESTIMATED = 0.22  #: share of the tolerance for the estimated error of PSFs of f
 #: `CHANNELS`
 BESIDE = 0.08
 #: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
-_LEAST = 2e-5
+_SMALLEST_TOLERANCE = 2e-5
 #: tolerance scale after a failure, or one that is expected, relative to the largest that would
 #: suffice
 _SAFE = 0.8
-_USED = 0.5  #: share of its limit that the error of a cheaper step is expected to be
-_TRIES = 4  #: plans with ever smaller limits
+_EXPECTED_SHARE = 0.5  #: share of its limit that the error of a cheaper step is expected to be
+_MOST_PLANS = 4  #: plans with ever smaller limits
 #: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom
 #: changes
 _MIXTURE = 0.1
@@ -64,10 +64,10 @@ def with_substitutions(
         any(substitution.within for substitution in recipe.substitutions),
     )
     # a recipe that has cheaper steps already stays as it is
-    for _ in range(0 if has_substitutions else _TRIES):
+    for _ in range(0 if has_substitutions else _MOST_PLANS):
         if not any(substitution.within for substitution in plan.substitutions):
             break
-        if (excess := expected_excess(plan, sorted(outputs), _USED)) <= 1.0:
+        if (excess := expected_excess(plan, sorted(outputs), _EXPECTED_SHARE)) <= 1.0:
             break
         tolerance_scale = plan.tolerance_scale * _SAFE / excess if math.isfinite(excess) else 0.0
         plan = _substituted(
@@ -115,7 +115,7 @@ def _substituted(recipe: Recipe, outputs: frozenset[str], pinned: Collection[str
         for name in order
         if recipe.steps[name].node.channel_sum_form is not None and name not in outputs
     ]
-    if not images or recipe.tolerance * recipe.tolerance_scale <= _LEAST:
+    if not images or recipe.tolerance * recipe.tolerance_scale <= _SMALLEST_TOLERANCE:
         return recipe
     pinned_and_later = _dependent(recipe, order, pinned)
     cheaper = _Draft(recipe, outputs, _readers(recipe, order), frozenset(pinned_and_later))

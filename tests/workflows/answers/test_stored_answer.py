@@ -195,7 +195,7 @@ def test_what_is_no_file_in_place_of_an_answer_is_missing(disk, stored, kind, mo
     if kind == "folder":
         stored.mkdir()
     elif kind == "large":
-        monkeypatch.setattr(stored_answer, "MOST", 10)
+        monkeypatch.setattr(stored_answer, "MOST_BYTES", 10)
         stored.write_bytes(bytes(20))
     else:
         pipe = stored.with_name("pipe")
@@ -215,7 +215,7 @@ def test_a_link_in_place_of_an_answer_is_replaced_and_not_followed(disk, stored,
 
 
 def test_an_answer_that_is_too_large_is_not_kept(disk, monkeypatch):
-    monkeypatch.setattr(stored_answer, "MOST", 100)
+    monkeypatch.setattr(stored_answer, "MOST_BYTES", 100)
     assert not write_answer(disk, NAME, ANSWER)
     assert not (disk.root / "answers").exists()
 

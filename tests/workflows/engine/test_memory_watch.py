@@ -122,7 +122,7 @@ def step():
 try:
     with limited(1e15), guarded():
         here = threading.get_ident()
-        machine_resources._inside[here] = True  # told to stop when the step has ended
+        machine_resources._watched_threads[here] = True  # told to stop when the step has ended
 except MemoryLimit:
     sys.settrace(lambda *_: None)
     step()
@@ -158,9 +158,9 @@ def test_runs_that_follow_at_once_look_at_the_free_memory_once(monkeypatch):
     looks, now = [], [100.0]
     monkeypatch.setattr(machine_resources, "_free_memory", lambda: looks.append(1) or len(looks))
     monkeypatch.setattr(machine_resources.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(machine_resources, "_told", [-1.0, 0.0])
+    monkeypatch.setattr(machine_resources, "_newest_free", [-1.0, 0.0])
     assert [free_memory(), free_memory()] == [1, 1]
-    now[0] += 1.01 * machine_resources.FRESH
+    now[0] += 1.01 * machine_resources.FRESH_SECONDS
     assert free_memory() == 2
     now[0] = 1.0  # a clock of another boot
     assert free_memory() == 3

@@ -490,7 +490,7 @@ class warnings_of:
 
 def test_all_of_a_store_damaged_at_once_is_computed_again(store, monkeypatch):
     # each has a file of its own, however quick it was
-    monkeypatch.setattr(execution, "_QUICK", 0.0)
+    monkeypatch.setattr(execution, "_UNLOCKED_SECONDS", 0.0)
     first = run(diamond(count=BIG), store)
     for path in [*store.root.rglob("*.safetensors"), *store.root.glob("??/*.json")]:
         data = bytearray(path.read_bytes())

@@ -9,8 +9,8 @@ from neusee.workflows.engine.execution import ValuesInMemory
 from neusee.workflows.engine.step_job import Outcome
 
 
-def outcome(key, kept=False, waits=False):
-    return Outcome(SimpleNamespace(key=key), value=key.upper(), kept=kept, waits=waits)
+def outcome(key, kept=False, later=False):
+    return Outcome(SimpleNamespace(key=key), value=key.upper(), kept=kept, is_written_later=later)
 
 
 def test_values_go_when_unused_unless_they_are_only_here():
@@ -20,11 +20,11 @@ def test_values_go_when_unused_unless_they_are_only_here():
     for each in (
         outcome("alone"),
         outcome("kept", kept=True),
-        outcome("pending", kept=True, waits=True),
+        outcome("pending", kept=True, later=True),
     ):
         values.add(each)
     for key in ("written", "unwritten"):  # of two writes in the background, the second failed
-        values.add(outcome(key, kept=True, waits=True))
+        values.add(outcome(key, kept=True, later=True))
     values.free(list(values), Counter({"kept": 1}), keep=True)
     assert set(values) == {"alone", "kept", "pending", "unwritten"}
     values.free(list(values), Counter(), keep=True)

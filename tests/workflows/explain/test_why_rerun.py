@@ -558,7 +558,7 @@ def test_a_run_compares_few_results(trial, monkeypatch):
         trial.told("sensor.gain=50", "sensor.read_noise=50 e-")["raw"]
         == "sensor.gain 11 -> 50 (argument 2)"
     )
-    assert seen.count("raw") == why_rerun._AT_ONCE
+    assert seen.count("raw") == why_rerun._COMPARED_RESULTS
 
 
 def test_what_went_into_a_key(trial):

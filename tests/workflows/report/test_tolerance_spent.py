@@ -168,7 +168,9 @@ def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(cheaper_steps, "_LEAST", 0.0)  # so fine a tolerance would not even be tried
+    monkeypatch.setattr(
+        cheaper_steps, "_SMALLEST_TOLERANCE", 0.0
+    )  # so fine a tolerance would not even be tried
     words = [
         "run",
         "first_light",

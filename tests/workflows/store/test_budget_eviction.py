@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from neusee.workflows.store import eviction as budget_eviction
 from neusee.workflows.store import shared_folder
-from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.cache_settings import parse_size
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.eviction import Candidate, chosen
@@ -342,43 +341,22 @@ def test_users_who_make_room_at_once_do_no_harm(tmp_path):
 # what belongs to no result
 
 
-def banded(names):
-    return Stacked(
-        torch.stack([torch.full((2000,), float(n)) for n in names]),
-        tuple(f"{n:032x}" for n in names),
-    )
-
-
-def bands(root):
-    return {int(path.name, 16) for path in (root / "bands").glob("[0-9a-f][0-9a-f]/*")}
-
-
-def test_bands_go_with_the_last_value_that_has_them(tmp_path):
-    store = Store(tmp_path)
-    store.put(key_of(1), banded([1, 2, 3]), {"seconds": 5.0})
-    store.put(key_of(2), banded([3, 4]), {"seconds": 1.0})
-    store.gc()
-    assert bands(tmp_path) == {1, 2, 3, 4}
-    assert Store(tmp_path).gc(budget=30_000).evicted == (key_of(2),)
-    assert bands(tmp_path) == {1, 2, 3}
-    assert torch.equal(Store(tmp_path).get(key_of(1)), banded([1, 2, 3]).tensor)
-    Store(tmp_path).gc(budget=0)
-    assert bands(tmp_path) == set()
-
-
-def test_bands_that_are_swept_before_their_value_is_named_are_written_again(tmp_path, monkeypatch):
-    store, lock = Store(tmp_path), shared_folder.Disk.lock
-
-    def sweeping(self):
-        monkeypatch.setattr(shared_folder.Disk, "lock", lock)
-        assert bands(tmp_path) == {1, 2}
-        Store(tmp_path).gc()
-        assert bands(tmp_path) == set()
-        return lock(self)
-
-    monkeypatch.setattr(shared_folder.Disk, "lock", sweeping)
-    store.put(key_of(1), banded([1, 2]), {})
-    assert torch.equal(Store(tmp_path).get(key_of(1)), banded([1, 2]).tensor)
+def test_band_files_of_an_earlier_version_count_for_no_budget_and_go_after_a_week(
+    tmp_path, monkeypatch
+):
+    """Results that name them are of another version: they are not read, and computed again."""
+    put(Store(tmp_path), 1)
+    size_before = budget_eviction.total(Store(tmp_path).disk)
+    band = tmp_path / "bands" / "ab" / "ab.0"
+    band.parent.mkdir(parents=True)
+    band.write_bytes(b"x" * 5000)
+    assert budget_eviction.total(Store(tmp_path).disk) == size_before
+    assert Store(tmp_path).gc().orphans == 0
+    monkeypatch.setattr(budget_eviction, "_WEEK", -1.0)
+    swept = Store(tmp_path).gc()
+    assert (swept.orphans, swept.freed) == (1, 5000)
+    assert not band.exists()
+    assert payloads(tmp_path) == {1}
 
 
 def test_what_belongs_to_no_result_goes(tmp_path):
@@ -386,12 +364,10 @@ def test_what_belongs_to_no_result_goes(tmp_path):
     for i in range(3):
         put(store, i)
     (tmp_path / "00" / f"{key_of(0)}.json").unlink()
-    store.blobs.write("f" * 32, torch.zeros(4))
     swept = Store(tmp_path).gc()
-    assert swept.orphans == 2
+    assert swept.orphans == 1
     assert swept.freed > SIZE
     assert payloads(tmp_path) == {1, 2}
-    assert bands(tmp_path) == set()
     assert Store(tmp_path).gc().orphans == 0
 
 
@@ -524,15 +500,14 @@ def test_a_value_saves_its_time_without_that_of_reading_it(tmp_path):
     assert SIZE <= one.size < SIZE + 1000
 
 
-def test_all_bytes_but_receipts_are_divided_among_the_values(tmp_path):
-    """A band that two values use is counted once, and one that is not there not at all."""
+def test_all_bytes_but_receipts_are_those_of_the_values(tmp_path):
     store = Store(tmp_path)
-    store.put(key_of(1), banded([1, 2, 3]), {"seconds": 5.0})
-    store.put(key_of(2), banded([3, 4]), {"seconds": 1.0})
+    store.put(key_of(1), torch.rand(3, 2000), {"seconds": 5.0})
+    store.put(key_of(2), torch.rand(2, 2000), {"seconds": 1.0})
     records = sum(path.stat().st_size for path in tmp_path.glob("[0-9a-f][0-9a-f]/*.json"))
     sizes = {c.key: c.size for c in budget_eviction.candidates(store.disk, (), lambda size: 0.0)}
     assert sum(sizes.values()) == pytest.approx(budget_eviction.total(store.disk) - records, abs=2)
-    assert sizes[key_of(1)] == pytest.approx(2.5 / 4 * sum(sizes.values()), rel=0.05)
+    assert sizes[key_of(1)] == pytest.approx(3 / 5 * sum(sizes.values()), rel=0.05)
 
 
 def test_a_value_that_this_program_does_not_read_saves_no_time_and_frees_its_record_too(

@@ -119,7 +119,9 @@ def test_many_threads_one_holder(tmp_path):
 def test_of_two_who_find_that_a_holder_has_gone_one_is_first(tmp_path, monkeypatch):
     first, second = Store(tmp_path), Store(tmp_path)
     lease = first.claim(KEY)
-    monkeypatch.setattr(lease_module, "_look", lambda path: None)  # as it was a moment ago
+    monkeypatch.setattr(
+        lease_module, "_state_of_lease", lambda path: None
+    )  # as it was a moment ago
     assert second.claim(KEY) is None
     monkeypatch.undo()
     with lease:
@@ -363,7 +365,7 @@ def test_a_disk_that_fails_gives_leases_that_do_nothing(tmp_path, monkeypatch, n
 def test_two_who_see_the_same_dead_holder_do_not_both_take_over(tmp_path):
     one, two = Store(tmp_path), Store(tmp_path)
     path = held_by(tmp_path, f"{process_owner.host()}-{os.getpid()}-1 nonce\n")
-    found = lease_module._look(path)
+    found = lease_module._state_of_lease(path)
     lease = one._leases._taken_over(KEY, str(path), found)
     with pytest.raises(FileExistsError):
         two._leases._taken_over(KEY, str(path), found)

@@ -16,10 +16,7 @@ import pytest
 import torch
 from fsspec.implementations.memory import MemoryFileSystem
 
-from neusee.workflows.keys.sealed_files import seal_record as seal
-from neusee.workflows.keys.sealed_files import unseal_record as unseal
 from neusee.workflows.store import remote_store as remote_files
-from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.remote_store import RemoteStore, local_layer, open_store
 from neusee.workflows.store.result_store import Store
 
@@ -208,7 +205,7 @@ def test_a_listing_grows_old(bad, monkeypatch):
     one, two = bad("one"), bad("two")
     assert not two.has(KEY)
     one.put(KEY, BIG, ABOUT)
-    monkeypatch.setattr(remote_files, "_FRESH", 0.0)
+    monkeypatch.setattr(remote_files, "_LISTING_VALID_SECONDS", 0.0)
     assert two.has(KEY)
 
 
@@ -236,73 +233,6 @@ def test_writers_at_once_leave_one_whole_value(store, url):
     assert torch.equal(first - first[0], BIG)
     assert [name for name in there(url).values() if name.endswith(".json")] == [f"{KEY}.json"]
     assert not [path for path in there(url) if "/there/tmp/" in path]
-
-
-BANDS = torch.arange(3 * 4096, dtype=torch.float32).reshape(3, 64, 64)
-NAMES = tuple(f"{i:02x}" + "b" * 30 for i in range(4))
-
-
-def stacked(*which):
-    """A stack of some of the bands, each of which is stored once however many results have it."""
-    return Stacked(torch.stack([BANDS[i % 3] for i in which]), tuple(NAMES[i] for i in which))
-
-
-def test_bands_travel_one_by_one_and_once(bad):
-    one, other = bad("one"), "ab" + "1" * 30
-    one.put(KEY, [stacked(0, 1), BIG], ABOUT)
-    one.put(other, [stacked(0, 1, 2)], ABOUT)
-    assert Weather.asked.count("put") == 1 + 3
-    two = bad("two")
-    loaded, big = two.get(KEY)
-    assert torch.equal(loaded, BANDS[:2])
-    assert torch.equal(big, BIG)
-    assert torch.equal(two.get(other)[0], BANDS)
-    assert Weather.asked.count("get") == 1 + 3
-    assert torch.equal(Store(two.root).get(other)[0], BANDS)
-
-
-@pytest.mark.parametrize(
-    "damage", [lambda raw: raw[:-3], lambda raw: b"", lambda raw: b"\xff" + raw[1:]]
-)
-def test_a_damaged_band_there_is_seen_and_mended(store, url, damage):
-    store("one").put(KEY, stacked(0, 1, 2), ABOUT)
-    fs, _ = fsspec.core.url_to_fs(url)
-    path = sorted(path for path in there(url) if path.endswith(".band"))[1]
-    fs.pipe_file(path, damage(fs.cat_file(path)))
-    two = store("two")
-    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
-        two.get(KEY)
-    assert not two.has(KEY)
-    assert two.put(KEY, stacked(0, 1, 2), ABOUT)
-    assert torch.equal(two.get(KEY), BANDS)
-    assert torch.equal(store("three").get(KEY), BANDS)
-
-
-def test_a_band_of_the_same_name_and_another_content_is_not_mixed_in(store):
-    """What another device computed may differ in its last bits; no value is of both."""
-    store("one").put(KEY, stacked(0, 1), ABOUT)
-    two, other = store("two"), "ab" + "1" * 30
-    two.put(other, Stacked(BANDS[:1] + 1, NAMES[:1]), ABOUT)
-    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
-        two.get(KEY)
-    assert torch.equal(store("three").get(KEY), BANDS[:2])
-    assert torch.equal(store("four").get(other), BANDS[:1] + 1)
-
-
-def test_a_name_that_leads_elsewhere_is_refused(store, url, tmp_path):
-    store("one").put(KEY, stacked(0, 1), ABOUT)
-    fs, _ = fsspec.core.url_to_fs(url)
-    (path,) = (path for path in there(url) if path.endswith(".json"))
-    about = unseal("result at a URL", fs.cat_file(path))
-    fs.pipe_file(path, seal("result at a URL", {**about, "layout": layout("../../../evil")}))
-    with pytest.warns(UserWarning, match="is not the name of a band"), pytest.raises(KeyError):
-        store("two").get(KEY)
-
-
-def layout(name):
-    return {
-        "stacked": {"names": [name], "xxh3": ["0" * 32], "dtype": "float32", "shape": [1, 64, 64]}
-    }
 
 
 # faults

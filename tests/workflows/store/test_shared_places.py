@@ -42,7 +42,7 @@ def of_folder(folder, own):
 
 def of_url(folder, own):
     store = RemoteStore(f"file://{folder}", own)
-    keys = {f"value {kind} 1": key_of(kind, 1) for kind in ("payload", "inline", "bands")}
+    keys = {f"value {kind} 1": key_of(kind, 1) for kind in ("payload", "inline")}
     said = {name: bytes_in(got(store, key)) for name, key in keys.items()}
     list(store.entries())
     for kind, value in values_of(1, 0).items():

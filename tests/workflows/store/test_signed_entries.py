@@ -9,18 +9,15 @@ import pytest
 import torch
 
 from neusee.workflows.keys.sealed_files import OtherFormat, Unsigned, seal_record, unseal_record
-from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.remote_store import RemoteStore
 from neusee.workflows.store.result_store import Store
 
 KEY = "ab" + "0" * 30
 BIG = torch.arange(3000, dtype=torch.float64)
-BANDS = torch.rand(2, 2000)
 VALUES = {
     "payload": BIG,
     "inline": BIG[:4].clone(),
-    "bands": Stacked(BANDS, ("ab" + "0" * 30 + ".0", "cd" + "0" * 30 + ".0")),
 }
 ABOUT = {"step": "s", "seconds": 2.0, "bytes": 32000}
 
@@ -28,10 +25,6 @@ ABOUT = {"step": "s", "seconds": 2.0, "bytes": 32000}
 @pytest.fixture
 def secret(monkeypatch):
     return lambda text: monkeypatch.setenv("NEUSEE_CACHE_SECRET", text)
-
-
-def plain(value):
-    return value.tensor if isinstance(value, Stacked) else value
 
 
 def read(store):
@@ -89,8 +82,8 @@ def test_who_reads_what_whom_wrote(place, secret, value, writes, reads, is_read)
         assert read(store) is None
         assert store.put(KEY, value, ABOUT)
         found = store.get(KEY)
-    assert torch.equal(found, plain(value))
-    assert torch.equal(read(place()), plain(value))
+    assert torch.equal(found, value)
+    assert torch.equal(read(place()), value)
 
 
 def test_what_is_unsigned_is_told_of_once_and_left_alone(tmp_path, secret):
@@ -150,25 +143,6 @@ def test_a_payload_that_was_exchanged_is_not_read(tmp_path, secret, verify):
     raw[-100] ^= 1
     path.write_bytes(raw)
     assert read(Store(tmp_path, verify=verify)) is None
-
-
-def test_bands_that_were_exchanged_are_not_read(tmp_path, secret):
-    """The forger writes a band under the right name, of the right size, with the right checksum."""
-    Store(tmp_path / "other").put(KEY, Stacked(BANDS + 1, VALUES["bands"].names), ABOUT)
-    secret("one")
-    Store(tmp_path / "own").put(KEY, VALUES["bands"], ABOUT)
-    name = VALUES["bands"].names[0]
-    for root in ("own", "other"):
-        assert (tmp_path / root / "bands" / name[:2] / name).exists()
-    forged = (tmp_path / "other" / "bands" / name[:2] / name).read_bytes()
-    (tmp_path / "own" / "bands" / name[:2] / name).write_bytes(forged)
-    store = Store(tmp_path / "own", verify="never")
-    assert read(store) is None
-    store.put(KEY, VALUES["bands"], ABOUT)
-    assert torch.equal(store.get(KEY), BANDS)
-    (tmp_path / "own" / "bands" / name[:2] / name).write_bytes(forged)
-    with pytest.raises(ValueError, match="damaged or missing"):
-        Store(tmp_path / "own").blobs.read([name], (1, 2000), torch.float32)
 
 
 def test_the_journal_and_small_results_are_signed_too(tmp_path, secret):

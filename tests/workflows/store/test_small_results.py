@@ -101,7 +101,7 @@ def test_where_no_line_can_be_written_there_is_one_warning(tmp_path, monkeypatch
 
 
 def test_the_older_half_goes_when_there_is_too_much(tmp_path, monkeypatch):
-    monkeypatch.setattr(small_results, "MOST", 4000)
+    monkeypatch.setattr(small_results, "MOST_BYTES", 4000)
     jotted(tmp_path, 40)
     Store(tmp_path).has(key(99))
     brief = SmallResults(Disk(tmp_path))

@@ -11,11 +11,10 @@ import torch
 from neusee.workflows.answers.stored_answer import Answer, read_answer, write_answer
 from neusee.workflows.answers.witnesses import Witnesses
 from neusee.workflows.keys.module_digest import read_memo, read_parts, write_memo, write_parts
-from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Speeds, Store
 
-KINDS = ("payload", "inline", "bands", "small", "receipt", "picture")
+KINDS = ("payload", "inline", "small", "receipt", "picture")
 ABOUT = {
     "step": "s",
     "recipe": "r",
@@ -33,11 +32,9 @@ def key_of(kind, number):
 def values_of(number, version):
     """The values of one set of keys; another version has other numbers of the same size."""
     numbers = torch.arange(2048, dtype=torch.float64) + 10 * number + 1000 * version
-    names = tuple(f"{key_of('bands', number)}.{band}" for band in range(2))
     return {
         "payload": numbers,
         "inline": numbers[:4].clone(),
-        "bands": Stacked(numbers.reshape(2, 1024).clone(), names),
     }
 
 
