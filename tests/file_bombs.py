@@ -184,15 +184,17 @@ def chain(path):
     from neusee.workflows.calibration import emcee_sampler
 
     part = path.with_suffix(".part")
-    with h5py.File(part, "w", userblock_size=emcee_sampler._SEAL) as file:
+    with h5py.File(part, "w", userblock_size=emcee_sampler._SEAL_BYTES) as file:
         group = file.create_group("ensemble0")
         chunks = {"chunks": (1000, 64, 8), "compression": "gzip"}
         group.create_dataset("chain", (1_000_000, 64, 8), "f8", **chunks)
         group.create_dataset("log_prob", (1_000_000, 64), "f8", chunks=(1000, 64))
         group.create_dataset("accepted", (64,), "f8")
         group.attrs.update({"iteration": 1_000_000, "nwalkers": 64, "ndim": 8, "has_blobs": False})
-    content = part.read_bytes()[emcee_sampler._SEAL :]
-    seal = emcee_sampler.seal_file("draws", path.stem, content).ljust(emcee_sampler._SEAL, b"\0")
+    content = part.read_bytes()[emcee_sampler._SEAL_BYTES :]
+    seal = emcee_sampler.seal_file("draws", path.stem, content).ljust(
+        emcee_sampler._SEAL_BYTES, b"\0"
+    )
     path.write_bytes(seal + content)
 
 

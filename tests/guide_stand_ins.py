@@ -131,7 +131,7 @@ def without_walk(problem: Any, mode: Any, seed: int, *_: Any, **how: Any) -> Any
 SAFETY = ("safety.draws=100", "optics.samples=128", "optics.window=[128, 128]")
 #: spots behind an arm and behind a clear lens, irradiances of a curve, stops and exposures tried
 FEW_SPOTS = {
-    "safety.laser_spots:_MOST": 7,
+    "safety.laser_spots:_MOST_SPOTS": 7,
     "safety.dazzled_area:_STEP": 1.5,
     "safety.dazzled_area:_WAVES": 2.0,
     "safety.safety_estimate:_SAMPLES": 60,
@@ -157,7 +157,7 @@ CLUSTER = "tcp://scheduler:8786"
 TWO_LASERS = ("~lasers.blue", "~lasers.cyan", "~lasers.yellow", "~lasers.red")
 FEW_DRAWS = ("--draws", "100", "--walkers", "16")
 #: steps; the command says that its chains are cut, by exit code 3
-CUT = {"calibration.emcee_sampler:_FIRST": 80, "calibration.emcee_sampler:_LONGEST": 80}
+CUT = {"calibration.emcee_sampler:_FIRST_STEPS": 80, "calibration.emcee_sampler:_MOST_STEPS": 80}
 LABORATORY = "calibrate my/lab --sensor lab"
 DRAWN = {"calibration.emcee_sampler:sample": drawn_chains}
 ONE_PLOT = {"calibration.emva_figures:PICTURES": {"photon_transfer": PICTURES["photon_transfer"]}}
@@ -186,10 +186,10 @@ TWO_OF_SIX = {
 }
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {
-    "studies.accuracy_study:_FEWER": (1e-1,),
+    "studies.accuracy_study:_QUICK_TOLERANCES": (1e-1,),
     "studies.accuracy_study:TIMES": 1,
-    "studies.recipe_knobs:_FEWER": (1 / 3,),
-    "studies.recipe_knobs:_FEWER_SCALES": (0.75,),
+    "studies.recipe_knobs:_QUICK_FACTORS": (1 / 3,),
+    "studies.recipe_knobs:_QUICK_SCALES": (0.75,),
     "studies.work_precision:_CALLS": 1,
 }
 FEW_STOPS = {
@@ -272,7 +272,7 @@ STAND_INS = {
     "study accuracy first_light --quick": StandIn("minutes", more=(
         "laser=none", "outputs=[raw,lsr]", "--seeds", "1"), constants=FEW_POINTS),
     "study stability first_light": StandIn("minutes: the first two of the extreme cases", constants={
-        "studies.stability_study:study": partial(stability_study.study, cases=CASES[:2])}),
+        "studies.stability_study:StabilityOptions": partial(stability_study.StabilityOptions, cases=CASES[:2])}),
     "study uncertainty my/uncertain.yaml --error 0.1 --points sobol": StandIn(
         "a thousand draws", instead={"0.1": "0.9"}, more=("--most", "64", "outputs=[restored_quality]")),
     'study uncertainty first_light sensor.read_noise="normal(10.5 e-, 0.5 e-)"': StandIn(

@@ -1927,7 +1927,10 @@ MUTANTS = (
             "return self.safety.settings.lens.diameter",
         ),
         ("fill = fill_at(beam, diameter, distance)", "fill = fill_at(beam, diameter, rungs[-1])"),
-        ("waves = _SOFT * math.sinh(nominal_bend + bend_of_point)", "waves = 0.0 * bend_of_point"),
+        (
+            "waves = _IN_FOCUS_WAVES * math.sinh(nominal_bend + bend_of_point)",
+            "waves = 0.0 * bend_of_point",
+        ),
     ),
     *faults(
         "workflows/safety/dazzled_area.py",
@@ -2318,8 +2321,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/safety/what_helps.py",
-        "_SAFE = 0.95",
-        "_SAFE = 0.5",
+        "_SAFE_SHARE = 0.95",
+        "_SAFE_SHARE = 0.5",
         within(
             "workflows/safety",
             "what_helps.py::test_the_safe_density_is_that_of_the_weakest_twentieth_of_the_devices",
@@ -2589,8 +2592,11 @@ MUTANTS = (
             "workflows/safety",
             "what_helps.py::test_a_limit_is_met_at_the_nominal_values_and_in_nineteen_of_twenty_draws",
         ),
-        ("ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE", "ratio[0] <= 1"),
-        ("ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE", "(ratio[1:] <= 1).mean() >= _SAFE"),
+        ("ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE_SHARE", "ratio[0] <= 1"),
+        (
+            "ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE_SHARE",
+            "(ratio[1:] <= 1).mean() >= _SAFE_SHARE",
+        ),
     ),
     *faults(
         "workflows/safety/what_helps.py",
@@ -2598,7 +2604,7 @@ MUTANTS = (
             "workflows/safety",
             "what_helps.py::test_a_slow_lens_is_stopped_down_to_half_its_diameter",
         ),
-        ("min(0.5, f_number / _SLOWEST)", "f_number / _SLOWEST"),
+        ("min(0.5, f_number / _SLOWEST_F_NUMBER)", "f_number / _SLOWEST_F_NUMBER"),
     ),
     *faults(
         "workflows/safety/what_helps.py",
@@ -2606,7 +2612,7 @@ MUTANTS = (
             "workflows/safety",
             "what_helps.py::test_the_density_and_the_stop_against_damage_are_those_of_the_closed_form",
         ),
-        ("min(0.5, f_number / _SLOWEST)", "max(0.5, f_number / _SLOWEST)"),
+        ("min(0.5, f_number / _SLOWEST_F_NUMBER)", "max(0.5, f_number / _SLOWEST_F_NUMBER)"),
     ),
     *faults(
         "workflows/safety/what_helps.py",
@@ -2620,8 +2626,8 @@ MUTANTS = (
             "what_helps.py::test_a_longer_exposure_helps_contrast_that_noise_limits",
         ),
         ("sensor.full_well * min(1.0, scene)", "sensor.full_well * scene"),
-        ("_STEPS = 60", "_STEPS = 2"),
-        ("_AGREE = 1e-7", "_AGREE = 1e-2"),
+        ("_SEARCH_STEPS = 60", "_SEARCH_STEPS = 2"),
+        ("_AGREED_LOG = 1e-7", "_AGREED_LOG = 1e-2"),
     ),
     *faults(
         "workflows/safety/what_helps.py",
@@ -2671,8 +2677,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/safety/what_helps.py",
-        "_SLOWEST = 64.0",
-        "_SLOWEST = 32.0",
+        "_SLOWEST_F_NUMBER = 64.0",
+        "_SLOWEST_F_NUMBER = 32.0",
         within("workflows/safety", "what_helps.py::test_a_fast_lens_is_stopped_down_to_f_64"),
     ),
 )

@@ -181,7 +181,9 @@ def ours(problem):
     best = search_mode(problem)
     law = importance_samples(problem, best, 7)
     with tempfile.TemporaryDirectory() as folder:
-        chains = emcee_sampler.sample(problem, best, Path(folder) / "c.h5", seed=7, guide=law.guide)
+        chains = emcee_sampler.sample(
+            problem, best, Path(folder) / "c.h5", emcee_sampler.Sampling(seed=7), guide=law.guide
+        )
     seconds = time.process_time() - began
     walkers = chains.draws.transpose(0, 2, 1, 3)
     return walkers.reshape(-1, *walkers.shape[2:]), seconds, chains

@@ -45,6 +45,7 @@ from neusee.workflows.calibration.posterior_checks import (
     importance_samples,
 )
 from neusee.workflows.calibration.run_calibration import (
+    CalibrationOptions,
     CalibrationRefused,
     FramesRefused,
     find_posterior,
@@ -249,7 +250,7 @@ def calibrated(mode, row, seed, quick):
                 result = sampled(recipe, store)
             else:
                 result = find_posterior(
-                    recipe, store, lambda text: None, walkers=64, move="de", draws=1000
+                    recipe, store, lambda text: None, CalibrationOptions(64, "de", 1000)
                 )
         except FramesRefused as refused:
             line |= {"exit": 3, "wrong": [t.name for t in refused.tests if t.verdict == "refused"]}

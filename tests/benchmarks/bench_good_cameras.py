@@ -55,7 +55,10 @@ def calibrated(number):
         began = time.process_time()
         try:
             found = run_calibration.find_posterior(
-                recipe, Store(Path(folder) / "s"), lambda _: None, walkers=64, move="de", draws=1000
+                recipe,
+                Store(Path(folder) / "s"),
+                lambda _: None,
+                run_calibration.CalibrationOptions(64, "de", 1000),
             )
         except ValueError as error:
             return {"number": number, "kind": kind, "refused": str(error)}

@@ -43,7 +43,11 @@ sys.path.insert(0, str(ROOT))
 from neusee.nodes.calibrate import CLEAN_PAIRS, STATISTICS  # noqa: E402
 from neusee.nodes.calibrate._sheet_budget import SOURCES  # noqa: E402
 from neusee.workflows.calibration import emcee_sampler  # noqa: E402
-from neusee.workflows.calibration.run_calibration import CalibrationRefused, find_posterior  # noqa: E402
+from neusee.workflows.calibration.run_calibration import (  # noqa: E402
+    CalibrationOptions,
+    CalibrationRefused,
+    find_posterior,
+)
 from neusee.workflows.frames.folder_recipe import recipe_of_folder  # noqa: E402
 from neusee.workflows.store.result_store import Store  # noqa: E402
 from tests.drawn_chains import drawn_chains  # noqa: E402
@@ -125,7 +129,7 @@ def in_process(camera):
         try:
             recipe = recipe_of_folder(folder / "lab", store)
             result = find_posterior(
-                recipe, store, lambda _: None, walkers=64, move="de", draws=1000
+                recipe, store, lambda _: None, CalibrationOptions(64, "de", 1000)
             )
         except (CalibrationRefused, ValueError) as error:
             return {"exit": 3, "failed": [str(error)[:160]]}

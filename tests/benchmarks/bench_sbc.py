@@ -107,9 +107,13 @@ def simulated(mode, number, move):
         best = search_mode(problem)
         if GUIDED[move]:
             guide = draw_guide(problem, best, np.random.default_rng(number))
-            emcee_sampler._FIRST = emcee_sampler._LONGEST = STEPS
+            emcee_sampler._FIRST_STEPS = emcee_sampler._MOST_STEPS = STEPS
             chains = emcee_sampler.sample(
-                problem, best, folder / "c.h5", seed=number, move_name=move, guide=guide
+                problem,
+                best,
+                folder / "c.h5",
+                emcee_sampler.Sampling(seed=number, move=move),
+                guide=guide,
             )
             rng = np.random.default_rng([number, 3])
             flat = chains.flat[rng.choice(len(chains.flat), DRAWS, replace=False)]

@@ -25,7 +25,7 @@ from neusee.workflows.report.run_folder import writable_folder
 from neusee.workflows.report.study_report import Progress, silent
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.studies import run_study
-from neusee.workflows.sweeps.sweep_run import Sweep
+from neusee.workflows.sweeps.sweep_run import Sweep, SweepOptions
 from neusee.workflows.sweeps.sweep_run import sweep as run_sweep
 
 if TYPE_CHECKING:
@@ -90,7 +90,11 @@ def sweep(
             first failed point.
     """
     return run_sweep(
-        _name(recipe, "sweep"), axes, _arguments(changes), zip, store, on_error, device
+        _name(recipe, "sweep"),
+        axes,
+        _arguments(changes),
+        store,
+        SweepOptions(paired=zip, on_error=on_error, device=device),
     )
 
 
@@ -214,9 +218,9 @@ def calibrate(
     likelihood.
     """
     recipe, store = _read(recipe, changes), store or open_store()
-    options: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
+    options = lazy.run_calibration.CalibrationOptions(walkers, move, draws)
     return lazy.run_calibration.calibrate(
-        recipe, store, writable_folder(out), command, progress, **options
+        recipe, store, writable_folder(out), command, progress, options
     )
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # the ends and the middle of a band of 90 %
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: most points of a chain in the picture
-_LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
+_LEAST_DRAWN_VARIANCE = 0.1  #: DN², the variance at which a level without scatter is drawn
 _CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none"}
 COUNTED = "clipped or coarse: numbers counted one by one; variance at most as drawn"
 
@@ -75,7 +75,9 @@ def transfer(
     curve_panel.plot(mean, variance_median, color=BLUE, linewidth=1.2, label="predicted, median")
     # the axis is logarithmic: variances of 0 are drawn at its lower end
     lowest_drawn_variance = max(
-        _LEAST, 0.5 * float(min([*measured[1, unclipped], *variance_median], default=_LEAST))
+        _LEAST_DRAWN_VARIANCE,
+        0.5
+        * float(min([*measured[1, unclipped], *variance_median], default=_LEAST_DRAWN_VARIANCE)),
     )
     for is_drawn, marker_style in (
         (unclipped, {"marker": "o", "color": BLACK, "label": "measured"}),

@@ -56,7 +56,7 @@ QUANTITIES = {
 }
 #: combined standard deviations between the posterior and its least squares, above which it is
 #: refused
-_APART = 3.0
+_MOST_COMBINED_SD = 3.0
 _TEXT = """The fit of the standard, of lines through the origin up to 70 % of saturation, on the
     same frames. Its error is that of the noise alone. It knows neither a bent response nor the
     uncertainty of the lamp, so that the two need not agree. The column of the posterior's own line
@@ -108,7 +108,7 @@ def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
         f"{label}: least squares {worst.value:.5g}, by the posterior {worst.predicted:.5g},"
         f" {worst.apart:+.1f} sd"
     )
-    agrees = abs(worst.apart) <= _APART
+    agrees = abs(worst.apart) <= _MOST_COMBINED_SD
     if not agrees:
         text += ": refused, one of them is wrong, and the frames do not say which"
     mark: Mark = "pass" if agrees else "fail"
@@ -116,7 +116,7 @@ def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
         Check(
             "the posterior agrees with its least squares",
             text,
-            f"within {_APART:.0f} combined sd",
+            f"within {_MOST_COMBINED_SD:.0f} combined sd",
             mark,
         )
     ]

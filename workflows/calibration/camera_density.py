@@ -104,10 +104,12 @@ class CameraDensity:
 # drift makes the dark signal uncertain.
 
 
-_TAIL = 20.0  #: degrees of freedom of the other parameters, given the widths
+_FREEDOM = 20.0  #: degrees of freedom of the other parameters, given the widths
 #: changes of the logarithm of a width, so that it counts for nothing, or for all
-_NONE, _MORE = -20.0, 5.0
-_FARTHEST = 60.0  #: largest logarithm of a ratio of variances, so that a precision stays a number
+_NO_WIDTH, _ENLARGED_WIDTH = -20.0, 5.0
+_MOST_LOG_RATIO = (
+    60.0  #: largest logarithm of a ratio of variances, so that a precision stays a number
+)
 
 
 class GivenWidths:
@@ -152,7 +154,9 @@ class GivenWidths:
         """Return slope (draw, other) of the log density at the mode, and precision (draw, other,
         other).
         """
-        width_variances = np.exp((2 * (widths - self.theta[self.at])).clip(-_FARTHEST, _FARTHEST))
+        width_variances = np.exp(
+            (2 * (widths - self.theta[self.at])).clip(-_MOST_LOG_RATIO, _MOST_LOG_RATIO)
+        )
         # 1 over the variance of each residual, which is linear in the squares of the widths
         residual_weights = 1 / (self._noise + width_variances @ self._shares)
         other_count = self._pull.shape[1]
@@ -168,10 +172,10 @@ class GivenWidths:
 
         The variance is that at the mode, 1, and is linear in the square of each width.
         """
-        log_width_change = np.full((2 + self.at.sum(), self.at.sum()), _NONE)
+        log_width_change = np.full((2 + self.at.sum(), self.at.sum()), _NO_WIDTH)
         # row 0 is the mode, row 1 has no width, and each further row has one width alone, enlarged
         log_width_change[0] = 0.0
-        np.fill_diagonal(log_width_change[2:], _MORE)
+        np.fill_diagonal(log_width_change[2:], _ENLARGED_WIDTH)
         coordinates = np.repeat(self.theta[None], len(log_width_change), 0)
         coordinates[:, self.at] += log_width_change
         log_sd = _parts(problem.likelihood(coordinates).scaled.numpy())[1]
@@ -179,7 +183,7 @@ class GivenWidths:
         # divided by the square of the factor exp(5) by which a width was enlarged
         return relative_variance[1], (relative_variance[2:] - relative_variance[1]).clip(
             0
-        ) * np.exp(-2 * _MORE)
+        ) * np.exp(-2 * _ENLARGED_WIDTH)
 
     def draw(self, widths: FloatArray, law: Law, rng: Random) -> FloatArray:
         """Return samples (draw, free) with the given ``widths`` and their ``law``."""
@@ -207,7 +211,7 @@ def draw_student(root: FloatArray, rng: Random) -> FloatArray:
     """
     # a normal draw over the root of chi² / degrees of freedom has Student's distribution
     student_draws = rng.standard_normal(root.shape[:2]) / np.sqrt(
-        rng.chisquare(_TAIL, (len(root), 1)) / _TAIL
+        rng.chisquare(_FREEDOM, (len(root), 1)) / _FREEDOM
     )
     distance: FloatArray = np.linalg.solve(np.swapaxes(root, 1, 2), student_draws[..., None])[
         ..., 0
@@ -219,17 +223,17 @@ def student_density(away: FloatArray, root: FloatArray) -> FloatArray:
     """Return the log density at distances from the mean, up to the constant that `Mixture`
     leaves out too.
     """
-    half_freedom, dimension = 0.5 * _TAIL, away.shape[1]
+    half_freedom, dimension = 0.5 * _FREEDOM, away.shape[1]
     squared_distance = (np.einsum("nij,ni->nj", root, away) ** 2).sum(1)
     # log density of a Student distribution: its peak, less the decay with the squared distance
     log_peak = (
         math.lgamma(half_freedom + 0.5 * dimension)
         - math.lgamma(half_freedom)
-        - 0.5 * dimension * math.log(_TAIL)
+        - 0.5 * dimension * math.log(_FREEDOM)
     )
     log_peak += np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
     log_density: FloatArray = log_peak - (half_freedom + 0.5 * dimension) * np.log1p(
-        squared_distance / _TAIL
+        squared_distance / _FREEDOM
     )
     return log_density
 
@@ -259,11 +263,11 @@ def _parts(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 #: cells of the grid, and its reach about the middle of the prior, in its deviations
-_CELLS, _REACH = 240, 8.0
-_SAFE, _POWER = 0.15, 0.4  #: share and power of the part with wider tails
+_GRID_CELLS, _GRID_REACH = 240, 8.0
+_WIDE_SHARE, _WIDE_POWER = 0.15, 0.4  #: share and power of the part with wider tails
 #: largest change of the logarithm, so that the square of the parameter stays a number
 _FARTHEST_NEAR_ZERO = 300.0
-_BARE = 1e-300  #: a density of which a logarithm can be taken
+_SMALLEST_DENSITY = 1e-300  #: a density of which a logarithm can be taken
 
 
 class NearZero:
@@ -280,9 +284,11 @@ class NearZero:
         self._middle = float(others.middle[self._own][0])
         grid_scale = abs(spread / self._unit)
         # points are equal steps of asinh: dense about the mode, sparse far from it
-        grid_start, grid_end = np.arcsinh((np.array([-_REACH, _REACH]) - self._middle) / grid_scale)
+        grid_start, grid_end = np.arcsinh(
+            (np.array([-_GRID_REACH, _GRID_REACH]) - self._middle) / grid_scale
+        )
         #: from the mode, in units of the prior
-        self._points = grid_scale * np.sinh(np.linspace(grid_start, grid_end, _CELLS + 1))
+        self._points = grid_scale * np.sinh(np.linspace(grid_start, grid_end, _GRID_CELLS + 1))
         self._sizes = np.diff(self._points)
         #: of the trapezoidal rule
         self._counts = 0.5 * (np.append(self._sizes, 0.0) + np.append(0.0, self._sizes))
@@ -320,9 +326,9 @@ class NearZero:
             + self._prior
         )
         log_density -= log_density.max(1, keepdims=True)
-        density = (1 - _SAFE) * self._normalised(np.exp(log_density)) + _SAFE * self._normalised(
-            np.exp(_POWER * log_density)
-        )
+        density = (1 - _WIDE_SHARE) * self._normalised(
+            np.exp(log_density)
+        ) + _WIDE_SHARE * self._normalised(np.exp(_WIDE_POWER * log_density))
         return density, steps, -coupling, precision_root.astype(np.float64)
 
     def draw(self, widths: FloatArray, law: Law, rng: Random) -> FloatArray:
@@ -353,7 +359,9 @@ class NearZero:
         # as `Mixture`
         # the constant is the one that `Mixture` leaves out too
         own_log_density = np.log(
-            np.where((cell_fraction >= 0) & (cell_fraction <= 1), own_density, 0.0).clip(_BARE)
+            np.where((cell_fraction >= 0) & (cell_fraction <= 1), own_density, 0.0).clip(
+                _SMALLEST_DENSITY
+            )
         ) + math.lgamma(0.5)
         distance = (
             (samples[:, self._rest] - self._theta[self._rest]) / self._units
@@ -381,7 +389,7 @@ class NearZero:
 
     def _cell(self, place: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
         """Return the cell of each place, and the share of the cell that lies below the place."""
-        cell = np.searchsorted(self._points, place).clip(1, _CELLS) - 1
+        cell = np.searchsorted(self._points, place).clip(1, _GRID_CELLS) - 1
         return cell, (place - self._points[cell]) / self._sizes[cell]
 
     def _place(self, density: FloatArray, chance: FloatArray) -> FloatArray:
@@ -394,7 +402,7 @@ class NearZero:
         # trapezoidal rule, cell by cell
         cumulative = np.cumsum(0.5 * (density[:, 1:] + density[:, :-1]) * cell_sizes, 1)
         # the number of cells that lie wholly below
-        cell = (cumulative < (chance * cumulative[:, -1])[:, None]).sum(1).clip(max=_CELLS - 1)
+        cell = (cumulative < (chance * cumulative[:, -1])[:, None]).sum(1).clip(max=_GRID_CELLS - 1)
         draw_number = np.arange(len(chance))
         remainder = chance * cumulative[:, -1] - np.where(
             cell > 0, cumulative[draw_number, cell - 1], 0.0
@@ -411,7 +419,7 @@ class NearZero:
                 + np.sqrt(
                     (left_density**2 + 2 * (right_density - left_density) * mean_height).clip(0)
                 )
-            ).clip(_BARE)
+            ).clip(_SMALLEST_DENSITY)
         )
         position: FloatArray = self._points[cell] + cell_fraction.clip(0, 1) * cell_sizes[cell]
         return position
@@ -427,10 +435,13 @@ class NearZero:
 
 
 #: least deviation of a logarithm whose lower tail counts: 0 is then eight deviations away
-_DOUBT = 0.12
-_LEAST, _STEPS = 0.03, 20  #: least share of a part, and steps in which the shares are found
+_DOUBTFUL_SD = 0.12
+_LEAST_PART_SHARE, _SHARE_STEPS = (
+    0.03,
+    20,
+)  #: least share of a part, and steps in which the shares are found
 #: share of the parts, their distance below the mode, and degrees of freedom
-_SHARE, _TAIL_REACH, _TAIL_SHARE = 0.05, 2.5, 6.0
+_TAIL_SHARE_OF_DENSITY, _TAIL_REACH, _TAIL_FREEDOM = 0.05, 2.5, 6.0
 
 
 @dataclass(frozen=True)
@@ -444,7 +455,7 @@ class TailDensity(Density):
 
     def draw(self, count: int, rng: Random) -> FloatArray:
         """Draw samples (count, free)."""
-        from_tails = uniform(count, rng) < _SHARE
+        from_tails = uniform(count, rng) < _TAIL_SHARE_OF_DENSITY
         samples: FloatArray = np.where(
             from_tails[:, None], self.tails.draw(count, rng), self.body.draw(count, rng)
         )
@@ -453,10 +464,20 @@ class TailDensity(Density):
     def log_density(self, samples: FloatArray) -> FloatArray:
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
         body_log, tail_log = self.body.log_density(samples), self.tails.log_density(samples)
-        return log_sum(np.stack([body_log + np.log1p(-_SHARE), tail_log + np.log(_SHARE)], -1))
+        return log_sum(
+            np.stack(
+                [
+                    body_log + np.log1p(-_TAIL_SHARE_OF_DENSITY),
+                    tail_log + np.log(_TAIL_SHARE_OF_DENSITY),
+                ],
+                -1,
+            )
+        )
 
 
-def hardly_told(problem: SensorPosterior, mode: LaplaceFit, doubt: float = _DOUBT) -> list[int]:
+def hardly_told(
+    problem: SensorPosterior, mode: LaplaceFit, doubt: float = _DOUBTFUL_SD
+) -> list[int]:
     """Return the numbers of the positive parameters that are hardly told from 0, the least certain
     one first.
 
@@ -482,9 +503,11 @@ def with_tails(body: Density, numbers: Sequence[int], mode: LaplaceFit) -> Densi
     """
     if not numbers:
         return body
-    centres, roots = zip(*(_tail(mode.theta, mode.covariance, i) for i in numbers), strict=True)
+    centres, roots = zip(
+        *(_tail_part(mode.theta, mode.covariance, i) for i in numbers), strict=True
+    )
     shares = np.full(len(numbers), 1 / len(numbers))
-    return TailDensity(body, Mixture(shares, np.stack(centres), np.stack(roots), _TAIL_SHARE))
+    return TailDensity(body, Mixture(shares, np.stack(centres), np.stack(roots), _TAIL_FREEDOM))
 
 
 def with_prior_tails(
@@ -516,9 +539,9 @@ def with_prior_tails(
     for i, unit in enumerate(prior_sd):
         # the middle of the prior of this width
         centres[i, i] = mode.theta[is_width][i] - mode_in_prior_sd[is_width][i] * unit
-        roots.append(_root(_given(covariance, i), i, unit))
+        roots.append(_root(_covariance_given(covariance, i), i, unit))
     width_tails = [
-        Mixture(np.ones(1), centre[None], root[None], _TAIL_SHARE)
+        Mixture(np.ones(1), centre[None], root[None], _TAIL_FREEDOM)
         for centre, root in zip(centres, roots, strict=True)
     ]
     # the shares with which all parts together are most like the samples
@@ -528,34 +551,36 @@ def with_prior_tails(
         np.concatenate([body_share * body.shares, tail_shares]),
         np.concatenate([body.centres, centres]),
         np.concatenate([body.roots, np.stack(roots)]),
-        np.concatenate([body_freedom, np.full(len(tail_shares), _TAIL_SHARE)]),
+        np.concatenate([body_freedom, np.full(len(tail_shares), _TAIL_FREEDOM)]),
     )
 
 
 def _shares(parts: Sequence[Mixture], samples: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the share of each part with which a density is most like weighted samples.
 
-    Each share is at least `_LEAST` before the shares are normalised. Steps of expectation
+    Each share is at least `_LEAST_PART_SHARE` before shares are normalised. Steps of expectation
     maximisation: the share of a part is the mean probability that a sample belongs to it.
     """
     log_densities = np.stack([mixture.log_density(samples) for mixture in parts], -1)
     part_shares = np.full(len(parts), 1 / len(parts))
-    for _ in range(_STEPS):
+    for _ in range(_SHARE_STEPS):
         log_joint = log_densities + np.log(part_shares)
-        part_shares = np.maximum(weight @ np.exp(log_joint - log_sum(log_joint)[:, None]), _LEAST)
+        part_shares = np.maximum(
+            weight @ np.exp(log_joint - log_sum(log_joint)[:, None]), _LEAST_PART_SHARE
+        )
         part_shares /= part_shares.sum()
     return part_shares
 
 
-def _tail(theta: FloatArray, covariance: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
+def _tail_part(theta: FloatArray, covariance: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
     """Return centre (free,) and root (free, free) of the part for the tail of the logarithm `i`."""
     # the other parameters follow their regression on `i`
     tail_centre = theta - covariance[:, i] / covariance[i, i]
     tail_centre[i] = theta[i] - _TAIL_REACH
-    return tail_centre, _root(_given(covariance, i), i, _TAIL_REACH / np.sqrt(2))
+    return tail_centre, _root(_covariance_given(covariance, i), i, _TAIL_REACH / np.sqrt(2))
 
 
-def _given(covariance: FloatArray, i: int) -> FloatArray:
+def _covariance_given(covariance: FloatArray, i: int) -> FloatArray:
     """Return the covariance of all others for a known value of ``i``."""
     conditional: FloatArray = (
         covariance - np.outer(covariance[:, i], covariance[i]) / covariance[i, i]

@@ -155,7 +155,7 @@ def _together(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
 # walkers' own places.
 
 
-_SHARE = 0.8  #: of the proposals that come from the density
+_GUIDED_SHARE = 0.8  #: of the proposals that come from the density
 
 
 class GuidedMove:
@@ -182,7 +182,7 @@ class GuidedMove:
         """
         proposed, factors = self.move.get_proposal(own, others, random)
         from_density, density_factors = self.density.propose(own, random)
-        takes_density = random.random_sample(len(own)) < _SHARE
+        takes_density = random.random_sample(len(own)) < _GUIDED_SHARE
         return np.where(takes_density[:, None], from_density, proposed), np.where(
             takes_density, density_factors, factors
         )
@@ -193,7 +193,7 @@ class GuidedMove:
 # Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long
 # enough.
 #
-# Only this file and `emcee_sampler` import emcee. After each round all draws are written in emcee's
+# Only this file imports emcee. After each round all draws are written in emcee's
 # HDF5 format, behind a seal in the first bytes, which HDF5 leaves to its users. A killed run
 # continues from the last round and gives the same draws, to the last bit, as a run that never
 # stopped. Chains whose file has no right seal start anew.
@@ -202,14 +202,24 @@ class GuidedMove:
 ENSEMBLES = 4
 STRANDED = 20.0  #: nats by which the median of a stranded walker lies below that of all walkers
 #: steps of the first round; growth by round; most steps
-_FIRST, _GROWTH, _LONGEST = 250, 1.25, 32_000
+_FIRST_STEPS, _GROWTH, _MOST_STEPS = 250, 1.25, 32_000
 #: least length of a chain in tau, and the largest change of tau in its last round
-_TAUS, _CHANGE = 50.0, 0.01
-_SURELY = 100.0  #: length of a chain in tau at which any change of tau is allowed
-_BESIDE = 5.0  #: nats for each parameter by which a starting point may lie below the mode
-_SEAL = 512  #: bytes of the seal in front of the draws
-_BURN = 10.0  #: autocorrelation times that are discarded
+_LEAST_TAUS, _SETTLED_CHANGE = 50.0, 0.01
+_SURE_TAUS = 100.0  #: length of a chain in tau at which any change of tau is allowed
+_START_NATS = 5.0  #: nats for each parameter by which a starting point may lie below the mode
+_SEAL_BYTES = 512  #: bytes of the seal in front of the draws
+_DISCARDED_TAUS = 10.0  #: autocorrelation times that are discarded
 _MOVES = {"de": emcee.moves.DEMove, "stretch": emcee.moves.StretchMove}
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The random stream and the move of the walkers, and how many draws they make."""
+
+    seed: int
+    walkers: int = 64  #: of each ensemble
+    move: str = "de"  #: of emcee, as `move` names it
+    effective_size: int = 1000  #: least effective sample size of all ensembles together
 
 
 @dataclass(frozen=True)
@@ -247,24 +257,18 @@ def sample(
     problem: SensorPosterior,
     mode: LaplaceFit,
     file: Path,
-    *,
-    seed: int,
-    walkers: int = 64,
-    move_name: str = "de",
-    effective_size: int = 1000,
+    sampling: Sampling,
     progress: Progress = silent,
     guide: Guide | None = None,
 ) -> Chains:
     """Sample until each chain is 50 autocorrelation times long and the effective sample size is at
-    least ``effective_size``.
+    least that of ``sampling``.
 
     ``file`` keeps the draws; if the file exists, the chains continue from its last step. With a
     ``guide`` the walkers start at its samples, and most of their proposals are from its density.
     """
-    moves = GuidedMove(move(move_name), guide.density) if guide else move(move_name)
     runs = [
-        start_ensemble(problem, mode, file, index, seed, walkers, moves, guide)
-        for index in range(ENSEMBLES)
+        start_ensemble(problem, mode, file, index, sampling, guide) for index in range(ENSEMBLES)
     ]
     # a run that continues stops at the same steps as one without interruption
     steps_before, round_end = _round(min(run.iteration for run in runs))
@@ -277,16 +281,19 @@ def sample(
         tau = _longest_time(runs)
         chains = _gathered(runs, tau, round_end, _are_long(round_end, tau, tau_before))
         effective = chains.flat.shape[0] / tau
-        is_finished = _are_enough(chains, effective, effective_size)
+        is_finished = _are_enough(chains, effective, sampling.effective_size)
         # for the message: this round, or what the present rates ask for
         needed = (
             round_end
             if is_finished
             else max(
-                int(_GROWTH * round_end), _steps_needed(round_end, tau, effective, effective_size)
+                int(_GROWTH * round_end),
+                _steps_needed(round_end, tau, effective, sampling.effective_size),
             )
         )
-        progress_text = f"{round_end} of about {needed} steps of {ENSEMBLES} x {walkers} walkers"
+        progress_text = (
+            f"{round_end} of about {needed} steps of {ENSEMBLES} x {sampling.walkers} walkers"
+        )
         progress(f"{progress_text}: tau {tau:.1f}, effective sample size {effective:.0f}")
         if is_finished:
             return chains
@@ -296,21 +303,24 @@ def sample(
 def _are_long(steps: int, tau: float, tau_before: float) -> bool:
     """Return True if the chains are many autocorrelation times long, and this time is settled."""
     relative_change = abs(tau - tau_before) / tau
-    return steps >= (_TAUS + _BURN) * tau and (
-        relative_change < _CHANGE or steps >= (_SURELY + _BURN) * tau
+    return steps >= (_LEAST_TAUS + _DISCARDED_TAUS) * tau and (
+        relative_change < _SETTLED_CHANGE or steps >= (_SURE_TAUS + _DISCARDED_TAUS) * tau
     )
 
 
 def _are_enough(chains: Chains, size: float, effective_size: int) -> bool:
     """Return True if the sampling ends: chains are long and draws many, or nothing helps."""
-    return (chains.long and size >= effective_size) or chains.steps >= _LONGEST
+    return (chains.long and size >= effective_size) or chains.steps >= _MOST_STEPS
 
 
 def _steps_needed(steps: int, tau: float, size: float, effective_size: int) -> int:
     """Return how many steps the chains need in all, if autocorrelation time and rate of draws
     stay as they are.
     """
-    return min(int(max((_TAUS + _BURN) * tau, steps * effective_size / max(size, 1.0))), _LONGEST)
+    return min(
+        int(max((_LEAST_TAUS + _DISCARDED_TAUS) * tau, steps * effective_size / max(size, 1.0))),
+        _MOST_STEPS,
+    )
 
 
 def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
@@ -322,7 +332,7 @@ def _round(iteration: int) -> tuple[int, int]:
     """Return the numbers of steps at which two successive rounds of sampling end, before and
     after ``iteration``.
     """
-    steps_before, steps = 0, _FIRST
+    steps_before, steps = 0, _FIRST_STEPS
     while steps < iteration:
         steps_before, steps = steps, int(_GROWTH * steps)
     return steps_before, steps
@@ -333,27 +343,27 @@ def start_ensemble(
     mode: LaplaceFit,
     file: Path,
     index: int,
-    seed: int,
-    walkers: int,
-    moves: Any,
+    sampling: Sampling,
     guide: Guide | None = None,
 ) -> Walk:
     """Return an ensemble that continues the draws in ``file``, or starts near the mode or at
     samples of the guide.
     """
-    dimensions = len(problem.names)
+    walkers, dimensions = sampling.walkers, len(problem.names)
+    own_move = move(sampling.move)
+    walker_move = GuidedMove(own_move, guide.density) if guide else own_move
     backend = _read(file, index)
     if backend is not None and backend.shape == (walkers, dimensions):
         random = np.random.RandomState()
         random.set_state(backend.random_state)
-        return Walk(backend, moves, random, None)
-    rng = np.random.default_rng([seed, index])
+        return Walk(backend, walker_move, random, None)
+    rng = np.random.default_rng([sampling.seed, index])
     # emcee needs the old kind of generator
     random = np.random.RandomState(rng.integers(1 << 32, size=8, dtype=np.uint32))
     backend = emcee.backends.Backend()
     backend.reset(walkers, dimensions)
     start = guide.starts(walkers, rng) if guide else _alive(problem, mode, walkers, rng)
-    return Walk(backend, moves, random, start)
+    return Walk(backend, walker_move, random, start)
 
 
 def _alive(
@@ -366,7 +376,9 @@ def _alive(
     # each round keeps the likely ones of four times as many candidates
     for _ in range(50):
         candidates = mode.draw(4 * walkers, rng)
-        is_likely = problem.log_posterior(candidates) > mode.log - _BESIDE * (1 + len(mode.theta))
+        is_likely = problem.log_posterior(candidates) > mode.log - _START_NATS * (
+            1 + len(mode.theta)
+        )
         likely_points = np.concatenate([likely_points, candidates[is_likely]])
         if len(likely_points) >= walkers:
             return likely_points[:walkers]
@@ -398,7 +410,7 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 
     `tau` is the longest autocorrelation time, `steps` the length and `long` if that is enough.
     """
-    discarded_steps = min(int(_BURN * tau) + 1, steps // 2)
+    discarded_steps = min(int(_DISCARDED_TAUS * tau) + 1, steps // 2)
     draws = np.stack([run.backend.get_chain(discard=discarded_steps) for run in runs])
     log = np.stack([run.backend.get_log_prob(discard=discarded_steps) for run in runs])
     accepted = float(np.mean([run.backend.accepted / run.iteration for run in runs]))
@@ -413,7 +425,7 @@ def _read(file: Path, index: int) -> Any:
     """
     try:
         content = bytes_of(file)
-        unseal_file("draws", file.stem, content[:_SEAL].rstrip(b"\0"), content[_SEAL:])
+        unseal_file("draws", file.stem, content[:_SEAL_BYTES].rstrip(b"\0"), content[_SEAL_BYTES:])
         with TemporaryDirectory(prefix="neusee-") as folder:
             copy = Path(folder) / "draws.h5"
             copy.write_bytes(content)
@@ -478,10 +490,11 @@ def _write(file: Path, backends: Sequence[Any]) -> None:
             draws_file = Path(folder) / "draws.h5"
             _write_draws(draws_file, backends)
             # the first bytes are kept free for the seal, which is computed of the rest
-            draws_content = draws_file.read_bytes()[_SEAL:]
+            draws_content = draws_file.read_bytes()[_SEAL_BYTES:]
         with open(temporary, "wb") as temporary_file:
             temporary_file.write(
-                seal_file("draws", file.stem, draws_content).ljust(_SEAL, b"\0") + draws_content
+                seal_file("draws", file.stem, draws_content).ljust(_SEAL_BYTES, b"\0")
+                + draws_content
             )
             temporary_file.flush()
             os.fsync(temporary_file.fileno())
@@ -495,7 +508,7 @@ def _write_draws(path: Path, backends: Sequence[Any]) -> None:
     import h5py
 
     # HDF5 leaves a block of this size before its own content
-    with h5py.File(path, "w", userblock_size=_SEAL):
+    with h5py.File(path, "w", userblock_size=_SEAL_BYTES):
         pass
     for index, memory in enumerate(backends):
         backend = emcee.backends.HDFBackend(str(path), name=f"ensemble{index}")

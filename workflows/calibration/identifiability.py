@@ -19,12 +19,14 @@ if TYPE_CHECKING:
 
 #: ratio of the prior's standard deviation to that of the levels; below, the prior constrains more
 WEAK = 3.0
-_PART = 0.1  #: least component with which a parameter counts as part of a direction of length 1
+_LEAST_COMPONENT = (
+    0.1  #: least component with which a parameter counts as part of a direction of length 1
+)
 _ALONE = 0.97  #: least component with which a direction counts as that of one parameter alone
 #: largest factor by which doubled priors may widen the posterior of a determined parameter
-_WIDER = 1.25
+_MOST_WIDENING = 1.25
 #: distance from the prior's middle, in standard deviations, at which the likelihood is compared
-_FAR = 3.0
+_FAR_PRIOR_SD = 3.0
 #: standard deviations of the prior by which a limit must lie inside that of the prior alone
 _TELLS = 0.5
 _ENDS = (0.05, 0.95)
@@ -109,7 +111,7 @@ def _weak_direction(
     large_components = [
         (parameter, component)
         for parameter, component in zip(problem.names, direction, strict=True)
-        if abs(component) >= _PART
+        if abs(component) >= _LEAST_COMPONENT
     ]
     if (
         len(large_components) > 1
@@ -243,7 +245,9 @@ def _own(s: FloatArray, v: FloatArray) -> FloatArray:
     posterior_sd, sd_of_doubled = (
         (v.T**2 / (s**2 + prior_width**-2)).sum(1) ** 0.5 for prior_width in (1.0, 2.0)
     )
-    is_determined: FloatArray = (posterior_sd < 1 / WEAK) & (sd_of_doubled < _WIDER * posterior_sd)
+    is_determined: FloatArray = (posterior_sd < 1 / WEAK) & (
+        sd_of_doubled < _MOST_WIDENING * posterior_sd
+    )
     return is_determined
 
 
@@ -268,7 +272,7 @@ def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
     index = problem.names.index(name)
     whitened_points = np.repeat(problem.whitened(mode.theta)[None], 2, 0)
     # row 0 far above the middle of the prior, row 1 far below it
-    whitened_points[:, index] = _FAR, -_FAR
+    whitened_points[:, index] = _FAR_PRIOR_SD, -_FAR_PRIOR_SD
     samples = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(whitened_points)))
     likelihood = problem.likelihood(np.concatenate([samples, mode.theta[None]]))
     log_above, log_below, log_mode = likelihood.log.nan_to_num(nan=-np.inf, neginf=-np.inf).tolist()

@@ -44,17 +44,17 @@ if TYPE_CHECKING:
 # round draws about the mode.
 
 
-_TRIED = 3000  #: samples of each round
+_ROUND_SAMPLES = 3000  #: samples of each round
 #: most and fewest rounds; effective sample fraction at which the last one ends
-_ROUNDS, _LEAST, _ENOUGH = 8, 3, 0.6
+_MOST_ROUNDS, _LEAST_ROUNDS, _ENOUGH_FRACTION = 8, 3, 0.6
 #: components of a fit, its steps, and the share of samples added to each
-_PARTS, _STEPS, _BORROWED = 6, 8, 0.1
-_START = 6.0  #: degrees of freedom about the mode
-_TAIL = 30.0  #: degrees of freedom of the components that are like the posterior
+_COMPONENTS, _FIT_STEPS, _BORROWED_SHARE = 6, 8, 0.1
+_MODE_FREEDOM = 6.0  #: degrees of freedom about the mode
+_FREEDOM = 30.0  #: degrees of freedom of the components that are like the posterior
 #: least deviation of a logarithm at the mode, which is many times larger where the widths are
-_DOUBT = 0.05
+_DOUBTFUL_SD = 0.05
 #: share, power of the posterior, and degrees of freedom of the wide part
-_SAFE, _POWER, _SAFE_TAIL = 0.2, 0.5, 10.0
+_WIDE_SHARE, _WIDE_POWER, _WIDE_FREEDOM = 0.2, 0.5, 10.0
 
 
 def fit_about_mode(
@@ -84,15 +84,15 @@ def fit_about_mode(
         np.ones(1),
         mode.theta[None, in_mixture],
         _root(mode.covariance[in_mixture][:, in_mixture])[None],
-        np.array([_START]),
+        np.array([_MODE_FREEDOM]),
     )
     mixtures: list[Mixture] = []
     samples: list[FloatArray] = []
     log_densities: list[FloatArray] = []
     best_fraction, best_mixture = -1.0, mixture
-    for number in range(1, _ROUNDS + 1):
+    for number in range(1, _MOST_ROUNDS + 1):
         proposal: Density = CameraDensity(mixture, law_of_others) if law_of_others else mixture
-        new_samples, log_weights = weighed(problem, proposal, _TRIED, rng)
+        new_samples, log_weights = weighed(problem, proposal, _ROUND_SAMPLES, rng)
         mixtures.append(mixture)
         samples.append(new_samples[:, in_mixture])
         # weight times density: the log density of the posterior, for any later mixture
@@ -100,14 +100,20 @@ def fit_about_mode(
         fraction = effective(log_weights)
         if fraction > best_fraction:
             best_fraction, best_mixture = fraction, mixture
-        if number >= _LEAST and best_fraction >= _ENOUGH:
+        if number >= _LEAST_ROUNDS and best_fraction >= _ENOUGH_FRACTION:
             break
         # fitted to the samples of all rounds so far
-        mixture = _next(mixtures, np.concatenate(samples), np.concatenate(log_densities), rng)
+        mixture = _next_mixture(
+            mixtures, np.concatenate(samples), np.concatenate(log_densities), rng
+        )
     if law_of_others:
         weighted_widths = (
             np.concatenate(samples),
-            normalised(_logs(mixtures, np.concatenate(samples), np.concatenate(log_densities))),
+            normalised(
+                _pooled_log_weights(
+                    mixtures, np.concatenate(samples), np.concatenate(log_densities)
+                )
+            ),
         )
         width_density = with_prior_tails(best_mixture, problem, mode, in_mixture, weighted_widths)
         # `others` has the tail of the first one itself
@@ -121,7 +127,7 @@ def _given_widths(problem: SensorPosterior, mode: LaplaceFit) -> Others:
     """Return the distribution of all others given the widths, with a long lower tail of the
     least certain one.
     """
-    linear_law, near_zero = GivenWidths(problem, mode), hardly_told(problem, mode, _DOUBT)
+    linear_law, near_zero = GivenWidths(problem, mode), hardly_told(problem, mode, _DOUBTFUL_SD)
     return (
         NearZero(
             linear_law, near_zero[0], float(mode.covariance[near_zero[0], near_zero[0]] ** 0.5)
@@ -131,7 +137,7 @@ def _given_widths(problem: SensorPosterior, mode: LaplaceFit) -> Others:
     )
 
 
-def _next(
+def _next_mixture(
     mixtures: list[Mixture], samples: FloatArray, log: FloatArray, rng: np.random.Generator
 ) -> Mixture:
     """Return the mixture for the next round from the ``samples`` of all rounds and their log
@@ -139,19 +145,23 @@ def _next(
     """
     # one mixture like the posterior, one like its square root, which has wider tails
     same_shape, wider_tails = (
-        _fitted(samples, normalised(softened(_logs(mixtures, samples, power * log))), rng)
-        for power in (1.0, _POWER)
+        _fitted(
+            samples, normalised(softened(_pooled_log_weights(mixtures, samples, power * log))), rng
+        )
+        for power in (1.0, _WIDE_POWER)
     )
     # both mixtures as one
     return Mixture(
-        np.concatenate([(1 - _SAFE) * same_shape.shares, _SAFE * wider_tails.shares]),
+        np.concatenate([(1 - _WIDE_SHARE) * same_shape.shares, _WIDE_SHARE * wider_tails.shares]),
         np.concatenate([same_shape.centres, wider_tails.centres]),
         np.concatenate([same_shape.roots, wider_tails.roots]),
-        np.repeat([_TAIL, _SAFE_TAIL], _PARTS),
+        np.repeat([_FREEDOM, _WIDE_FREEDOM], _COMPONENTS),
     )
 
 
-def _logs(mixtures: list[Mixture], samples: FloatArray, log: FloatArray) -> FloatArray:
+def _pooled_log_weights(
+    mixtures: list[Mixture], samples: FloatArray, log: FloatArray
+) -> FloatArray:
     """Return the log weights of samples that were drawn from all `mixtures` together.
 
     `log` is the log density that they shall represent.
@@ -164,16 +174,16 @@ def _logs(mixtures: list[Mixture], samples: FloatArray, log: FloatArray) -> Floa
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
     """Return the normal mixture that expectation and maximisation find for weighted samples."""
     _, covariance = moments(samples, weight)
-    start_numbers = rng.choice(len(samples), size=_PARTS, p=weight)
+    start_numbers = rng.choice(len(samples), size=_COMPONENTS, p=weight)
     mixture = Mixture(
-        np.full(_PARTS, 1 / _PARTS),
+        np.full(_COMPONENTS, 1 / _COMPONENTS),
         samples[start_numbers],
         # narrower than all samples, so that the components can separate
-        np.repeat(0.7 * _root(covariance)[None], _PARTS, 0),
+        np.repeat(0.7 * _root(covariance)[None], _COMPONENTS, 0),
     )
-    for _ in range(_STEPS):
+    for _ in range(_FIT_STEPS):
         mixture = maximised(
-            samples, weight[:, None] * mixture.normal_shares(samples), covariance, _BORROWED
+            samples, weight[:, None] * mixture.normal_shares(samples), covariance, _BORROWED_SHARE
         )
     return mixture
 
@@ -190,7 +200,7 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 
 DRAWS = 4000
-_LEAST_SAMPLES = 0.02  #: least effective sample fraction
+_LEAST_FRACTION = 0.02  #: least effective sample fraction
 
 
 class Guide(NamedTuple):
@@ -241,7 +251,7 @@ def draw_guide(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Genera
 
 def _refuse_few(problem: SensorPosterior, fraction: float) -> None:
     """Raise ValueError if the effective fraction of the draws is too small for a posterior."""
-    if fraction < _LEAST_SAMPLES:
+    if fraction < _LEAST_FRACTION:
         raise ValueError(
             f"{DRAWS} draws of {', '.join(problem.names)} have an effective sample size of"
             f" {fraction * DRAWS:.0f}: hold the parameters that the levels do not determine at"

@@ -190,7 +190,7 @@ _WIDEST = 1e3
 _EDGE = 1e3  #: nats: a step of a difference that costs more crosses an edge
 _NARROWER = 0.5 ** np.arange(1, 12)  #: shares of the way from the middle of the prior to the guess
 #: draws of the prior, the best to start from, nats that count as higher
-_TRIED, _BEST, _HIGHER = 1000, 2, 1.0
+_PRIOR_DRAWS, _START_POINTS, _HIGHER_NATS = 1000, 2, 1.0
 #: step before any standard deviation is known: levels may determine a well to a part in a million
 _SHORT = 1e-7
 
@@ -273,11 +273,11 @@ def search_mode(problem: SensorPosterior) -> LaplaceFit:
     Raises: `ValueError` if no search settles.
     """
     fits = [find_mode(problem, initial_theta(problem))]
-    for starts in (_TRIED, 4 * _TRIED):
+    for starts in (_PRIOR_DRAWS, 4 * _PRIOR_DRAWS):
         fits += [find_mode(problem, theta) for theta in _best_draws(problem, starts)]
         settled = [fit for fit in fits if fit.settled]
         # unless a search that stopped on the way is much higher: then more starts are tried
-        if settled and _highest(fits).log <= _highest(settled).log + _HIGHER:
+        if settled and _highest(fits).log <= _highest(settled).log + _HIGHER_NATS:
             return _highest(settled)
     if problem.coordinates.bent:
         return _highest(fits)
@@ -296,7 +296,7 @@ def _best_draws(problem: SensorPosterior, starts: int) -> list[FloatArray]:
     log_posteriors = problem.log_posterior(draws)
     return [
         draws[row]
-        for row in np.argsort(-log_posteriors)[:_BEST]
+        for row in np.argsort(-log_posteriors)[:_START_POINTS]
         if np.isfinite(log_posteriors[row])
     ]
 

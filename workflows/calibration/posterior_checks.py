@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 ALARM = 1e-3  #: probability with which chance alone fails a test
 _DRAWS = 500  #: of the posterior, for the prediction of a level left out
 _SLOW = 6  #: slowest waves over the levels
-_LEAST = 10  #: lit levels, with fewer of which their order says too little
+_LEAST_LIT_LEVELS = 10  #: lit levels, with fewer of which their order says too little
 #: largest standard deviations, relative, of the light and of the variances beyond which the model
 #: does not hold
 BOUNDS = {"lamp": 0.1, "scatter": 0.05}
@@ -82,7 +82,7 @@ def misfits(
     """
     deviations = left_out(problem, samples, weights)
     yield _prediction(deviations)
-    if deviations.lit.sum() >= _LEAST:
+    if deviations.lit.sum() >= _LEAST_LIT_LEVELS:
         for name, deviation in (
             ("variances", deviations.variance[deviations.lit]),
             ("means", deviations.mean[deviations.lit]),
@@ -259,7 +259,7 @@ def _limit(probability: float) -> float:
 
 Mark = Literal["pass", "warn", "fail"]
 MISFIT = 1e-3  #: probability below which chance does not explain a deviance
-_NEVER = -1e6  #: log weight of an impossible sample
+_IMPOSSIBLE_LOG_WEIGHT = -1e6  #: log weight of an impossible sample
 # R-hat; effective sample size; shares of accepted moves
 _RHAT, _INDEPENDENT, _ACCEPTED = 1.01, 1000.0, (0.1, 0.7)
 # k-hat; relative difference of widths; of means in sd; nats of the best draw below the mode
@@ -348,7 +348,9 @@ def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) ->
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         smoothed, tail = arviz().psislw(
-            np.where(np.isfinite(log_weights), log_weights - log_weights.max(), _NEVER)
+            np.where(
+                np.isfinite(log_weights), log_weights - log_weights.max(), _IMPOSSIBLE_LOG_WEIGHT
+            )
         )
     return ImportanceSamples(guide.samples, normalised(smoothed), float(tail), guide)
 

@@ -24,17 +24,21 @@ if TYPE_CHECKING:
 # of the posterior themselves.
 
 
-_KEPT = 0.5  #: effective sample fraction that a larger power leaves
+_KEPT_FRACTION = 0.5  #: effective sample fraction that a larger power leaves
 #: most sweeps at one power; accepted moves of each particle at which the power grows
-_SWEEPS, _MOVED = 12, 1.5
-_POWERS = 200  #: most powers
+_MOST_SWEEPS, _ENOUGH_MOVES = 12, 1.5
+_MOST_POWERS = 200  #: most powers
 # 2.38 / sqrt(2 free) suits a normal distribution
-_SHARES = (1.0, 0.5, 0.2)  #: lengths of a move in units of that which suits a normal distribution
-_LEAP = 0.1  #: share of moves by a whole difference, from mode to mode
+_MOVE_LENGTHS = (
+    1.0,
+    0.5,
+    0.2,
+)  #: lengths of a move in units of that which suits a normal distribution
+_LEAP_SHARE = 0.1  #: share of moves by a whole difference, from mode to mode
 _BLUR = 1e-5  #: coordinates, added to each move
 #: draws of the prior for each particle, because lenses that scatter more than all light are
 #: impossible
-_SPARE = 4
+_PRIOR_DRAWS_PER_PARTICLE = 4
 
 
 @dataclass
@@ -60,7 +64,7 @@ def follow_posterior(
     """
     # from the prior (power 0) to the posterior (power 1) of prior times likelihood ** power
     particles, power = _from_prior(problem, count, rng), 0.0
-    for _ in range(_POWERS):
+    for _ in range(_MOST_POWERS):
         log_likelihood = particles.log - particles.prior
         power_before, power = power, _next_power(log_likelihood, power)
         weights = np.exp((power - power_before) * (log_likelihood - log_likelihood.max()))
@@ -72,9 +76,9 @@ def follow_posterior(
         ).clip(0, len(log_likelihood) - 1)
         particles.take(rng.permutation(resampled))
         moves_per_particle = 0.0
-        for _ in range(_SWEEPS):
+        for _ in range(_MOST_SWEEPS):
             moves_per_particle += _sweep(problem, particles, power, rng)
-            if moves_per_particle > _MOVED:
+            if moves_per_particle > _ENOUGH_MOVES:
                 break
         if power == 1.0:
             break
@@ -83,7 +87,9 @@ def follow_posterior(
 
 def _from_prior(problem: SensorPosterior, count: int, rng: np.random.Generator) -> _Particles:
     """Return up to ``count`` draws of the prior at which the posterior is not zero."""
-    prior_draws = torch.from_numpy(rng.standard_normal((_SPARE * count, len(problem.names))))
+    prior_draws = torch.from_numpy(
+        rng.standard_normal((_PRIOR_DRAWS_PER_PARTICLE * count, len(problem.names)))
+    )
     coordinates = problem.theta(problem.coordinates.from_whitened(prior_draws))
     coordinates = coordinates[np.isfinite(coordinates).all(1)]
     prior, log = _logs(problem, coordinates)
@@ -116,14 +122,16 @@ def _next_power(gain: FloatArray, power: float) -> float:
         # effective sample fraction: (sum of weights)² over sum of squared weights
         return float(weights.sum() ** 2 / (weights**2).sum() / len(weights))
 
-    if left(1.0 - power) >= _KEPT:
+    if left(1.0 - power) >= _KEPT_FRACTION:
         return 1.0
     # bisection of the logarithm of the step
     low_step, high_step = 1e-12, 1.0 - power
     for _ in range(40):
         middle_step = (low_step * high_step) ** 0.5
         low_step, high_step = (
-            (middle_step, high_step) if left(middle_step) >= _KEPT else (low_step, middle_step)
+            (middle_step, high_step)
+            if left(middle_step) >= _KEPT_FRACTION
+            else (low_step, middle_step)
         )
     return power + low_step
 
@@ -144,9 +152,9 @@ def _sweep(
         )
         # 2.38 / sqrt(2 d) is the best length of such moves for a normal distribution of d
         # coordinates
-        scale = rng.choice(_SHARES, size=len(moved_half)) * 2.38 / (2 * dimension) ** 0.5
+        scale = rng.choice(_MOVE_LENGTHS, size=len(moved_half)) * 2.38 / (2 * dimension) ** 0.5
         # a whole difference leads from one mode to another
-        scale = np.where(rng.random(len(moved_half)) < _LEAP, 1.0, scale)
+        scale = np.where(rng.random(len(moved_half)) < _LEAP_SHARE, 1.0, scale)
         proposals = particles.place[moved_half] + scale[:, None] * (one_end - other_end)
         proposals = proposals + _BLUR * rng.standard_normal(proposals.shape)
         prior, log = _logs(problem, proposals)
@@ -179,16 +187,26 @@ def _sweep(
 # A mixture of densities like a posterior that may be long, bent, or in several parts.
 
 
-_PARTICLES, _BESIDE = 1000, 200  #: particles, and draws about the mode
-_FAR = 40.0  #: nats below the best point at which a particle is lost in a mode that does not count
-_PARTS = 14  #: components that are fitted
-_TAIL = 6.0  #: degrees of freedom of each component, where the mixture has no others
+_PARTICLES, _DRAWS_ABOUT_MODE = 1000, 200  #: particles, and draws about the mode
+_LOST_NATS = (
+    40.0  #: nats below the best point at which a particle is lost in a mode that does not count
+)
+_COMPONENTS = 14  #: components that are fitted
+_FREEDOM = 6.0  #: degrees of freedom of each component, where the mixture has no others
 #: most fits, steps of each fit, samples on which a fit is tried
-_ROUNDS, _STEPS, _TRIED = 16, 8, 2000
-_SOFT, _ENOUGH = 0.3, 0.4  #: effective sample fractions: to fit the next mixture, to stop
-_BROAD, _WIDER = 0.05, 2.0  #: share and width of one broad component, which bounds the weights
-_BORROWED = 0.03  #: share of samples whose covariance in all is added to that of the components
-_NEVER = -1e300  #: log density of an impossible sample
+_MOST_FITS, _FIT_STEPS, _TRIAL_SAMPLES = 16, 8, 2000
+_SOFT_FRACTION, _ENOUGH_FRACTION = (
+    0.3,
+    0.4,
+)  #: effective sample fractions: to fit the next mixture, to stop
+_BROAD_SHARE, _BROAD_WIDTH = (
+    0.05,
+    2.0,
+)  #: share and width of one broad component, which bounds the weights
+_BORROWED_SHARE = (
+    0.03  #: share of samples whose covariance in all is added to that of the components
+)
+_IMPOSSIBLE_LOG = -1e300  #: log density of an impossible sample
 
 
 Random = np.random.Generator | np.random.RandomState
@@ -218,7 +236,7 @@ class Mixture(Density):
     shares: FloatArray  #: (component,) sum 1
     centres: FloatArray  #: (component, free)
     roots: FloatArray  #: (component, free, free) lower triangular roots of the scale matrices
-    tails: FloatArray | float = _TAIL  #: (component,) degrees of freedom
+    tails: FloatArray | float = _FREEDOM  #: (component,) degrees of freedom
 
     def draw(self, count: int, rng: Random) -> FloatArray:
         """Draw samples (count, free)."""
@@ -301,12 +319,12 @@ def fit_mixture(
         start_points, np.full(len(start_points), 1 / len(start_points)), rng
     )
     best_fraction = -1.0
-    for _ in range(_ROUNDS):
-        samples, log_weights = weighed(problem, mixture, _TRIED, rng)
+    for _ in range(_MOST_FITS):
+        samples, log_weights = weighed(problem, mixture, _TRIAL_SAMPLES, rng)
         fraction = effective(log_weights)
         if fraction > best_fraction:
             best_fraction, best_mixture = fraction, mixture
-        if fraction >= _ENOUGH:
+        if fraction >= _ENOUGH_FRACTION:
             break
         # the first mixture stays half of every next one
         mixture = _joined(first_mixture, _fitted(samples, normalised(softened(log_weights)), rng))
@@ -334,10 +352,10 @@ def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator)
     below the best.
     """
     points, log_posteriors = follow_posterior(problem, _PARTICLES, rng)
-    near_mode = mode.draw(_BESIDE, rng)
+    near_mode = mode.draw(_DRAWS_ABOUT_MODE, rng)
     points = np.concatenate([points, near_mode])
     log_posteriors = np.concatenate([log_posteriors, problem.log_posterior(near_mode)])
-    return points[log_posteriors > max(float(log_posteriors.max()), mode.log) - _FAR]
+    return points[log_posteriors > max(float(log_posteriors.max()), mode.log) - _LOST_NATS]
 
 
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
@@ -346,24 +364,26 @@ def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -
     """
     centre, covariance = moments(samples, weight)
     overall_root = np.linalg.cholesky(firm(covariance))
-    start_numbers = _apart(np.linalg.solve(overall_root, (samples - centre).T).T, weight, rng)
+    start_numbers = _distant_starts(
+        np.linalg.solve(overall_root, (samples - centre).T).T, weight, rng
+    )
     mixture = Mixture(
         # narrower than all samples, so that the components can separate
-        np.full(_PARTS, 1 / _PARTS),
+        np.full(_COMPONENTS, 1 / _COMPONENTS),
         samples[start_numbers],
-        np.repeat(0.5 * overall_root[None], _PARTS, 0),
+        np.repeat(0.5 * overall_root[None], _COMPONENTS, 0),
     )
-    for _ in range(_STEPS):
+    for _ in range(_FIT_STEPS):
         weighted_shares = weight[:, None] * mixture.normal_shares(samples)
         mixture = maximised(samples, weighted_shares, covariance)
     return Mixture(
-        np.append((1 - _BROAD) * mixture.shares, _BROAD),
+        np.append((1 - _BROAD_SHARE) * mixture.shares, _BROAD_SHARE),
         np.concatenate([mixture.centres, centre[None]]),
-        np.concatenate([mixture.roots, _WIDER * overall_root[None]]),
+        np.concatenate([mixture.roots, _BROAD_WIDTH * overall_root[None]]),
     )
 
 
-def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> list[int]:
+def _distant_starts(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> list[int]:
     """Return the numbers of the samples at which the components start.
 
     Every second one is drawn by its squared distance from those before, as in k-means++, the others
@@ -372,7 +392,7 @@ def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> 
     # drawn by weight, so that a uniform choice of the pool is one by weight
     pool = rng.choice(len(places), size=4 * _PARTICLES // 10, p=weight)
     starts, squared_distance = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
-    for number in range(1, _PARTS):
+    for number in range(1, _COMPONENTS):
         takes_far = number % 2 and squared_distance.sum() > 0
         chances = squared_distance / squared_distance.sum() if takes_far else None
         starts.append(int(rng.choice(pool, p=chances)))
@@ -384,7 +404,7 @@ def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> 
 
 
 def maximised(
-    samples: FloatArray, parts: FloatArray, overall: FloatArray, borrowed: float = _BORROWED
+    samples: FloatArray, parts: FloatArray, overall: FloatArray, borrowed: float = _BORROWED_SHARE
 ) -> Mixture:
     """Return the mixture of normal components with the moments of samples, by their shares
     ``parts``.
@@ -429,7 +449,7 @@ def softened(log: FloatArray) -> FloatArray:
     """Return ``log`` times the largest factor, up to 1, whose weights leave enough effective
     samples for a fit.
     """
-    if effective(log) >= _SOFT:
+    if effective(log) >= _SOFT_FRACTION:
         return log
     # bisection of the logarithm of the factor
     low_factor, high_factor = 1e-12, 1.0
@@ -437,7 +457,7 @@ def softened(log: FloatArray) -> FloatArray:
         middle_factor = (low_factor * high_factor) ** 0.5
         low_factor, high_factor = (
             (middle_factor, high_factor)
-            if effective(middle_factor * log) >= _SOFT
+            if effective(middle_factor * log) >= _SOFT_FRACTION
             else (low_factor, middle_factor)
         )
     return low_factor * log
@@ -459,7 +479,7 @@ def normalised(log: FloatArray) -> FloatArray:
 
 def finite(log: FloatArray) -> FloatArray:
     """Return logarithms with a very small number in place of minus infinity and NaN."""
-    return np.nan_to_num(log, nan=_NEVER, neginf=_NEVER)
+    return np.nan_to_num(log, nan=_IMPOSSIBLE_LOG, neginf=_IMPOSSIBLE_LOG)
 
 
 def log_sum(logs: FloatArray) -> FloatArray:

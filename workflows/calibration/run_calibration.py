@@ -8,7 +8,7 @@ import io
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ from neusee.workflows.report.study_report import (
 )
 from neusee.workflows.store.result_store import Store
 
-_KEPT = 4000  #: draws in the file ``draws.npz``
+_STORED_DRAWS = 4000  #: draws in the file ``draws.npz``
 
 
 class CalibrationRefused(ValueError):
@@ -94,16 +94,22 @@ class FramesRefused(CalibrationRefused):
         )
 
 
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """How many draws a calibration makes, and with which walkers."""
+
+    walkers: int = 64  #: in each of the four ensembles
+    move: str = "de"  #: ``"de"`` or ``"stretch"``
+    draws: int = 1000  #: least number of independent draws
+
+
 def calibrate(
     recipe: Recipe,
     store: Store,
     runs: Path,
     command: Sequence[str] = (),
     progress: Progress = silent,
-    *,
-    walkers: int = 64,
-    move: str = "de",
-    draws: int = 1000,
+    options: CalibrationOptions | None = None,
 ) -> Path:
     """Draw from the posterior of the sensor of ``recipe``, and return the folder with the results.
 
@@ -114,7 +120,7 @@ def calibrate(
     """
     study_run = StudyRun("calibrate", recipe, command)
     try:
-        result = find_posterior(recipe, store, progress, walkers=walkers, move=move, draws=draws)
+        result = find_posterior(recipe, store, progress, options or CalibrationOptions())
     except FramesRefused as refused:
         document = study_run.document(_refused_document(refused))
         return study_run.write(
@@ -131,14 +137,14 @@ def calibrate(
 
 
 def find_posterior(
-    recipe: Recipe, store: Store, progress: Progress, *, walkers: int, move: str, draws: int
+    recipe: Recipe, store: Store, progress: Progress, options: CalibrationOptions
 ) -> CalibrationResult:
     """Compute the posterior of a recipe's sensor, with identifiability, checks and models of the
     response.
     """
     from neusee.workflows.calibration import emcee_sampler
 
-    emcee_sampler.move(move)  # raises for a wrong name before anything is computed
+    emcee_sampler.move(options.move)  # raises for a wrong name before anything is computed
     # raises before anything is computed where ArviZ is missing
     arviz()
     laboratory = laboratory_of(recipe)
@@ -159,13 +165,10 @@ def find_posterior(
     chains = emcee_sampler.sample(
         problem,
         mode,
-        _draws_file(store, problem, walkers, move),
-        seed=recipe.seed,
-        walkers=walkers,
-        move_name=move,
-        effective_size=draws,
-        progress=progress,
-        guide=samples.guide,
+        _draws_file(store, problem, options),
+        emcee_sampler.Sampling(recipe.seed, options.walkers, options.move, options.draws),
+        progress,
+        samples.guide,
     )
     models = _models_of_response(recipe, store, problem)
     all_checks = [
@@ -190,11 +193,11 @@ def _models_of_response(
     return compare_models(recipe, store, recipe.seed)
 
 
-def _draws_file(store: Store, problem: SensorPosterior, walkers: int, move: str) -> Path:
+def _draws_file(store: Store, problem: SensorPosterior, options: CalibrationOptions) -> Path:
     """Return the file of the store that keeps the chains of a posterior."""
     seed = problem.recipe.seed
     code = engine("calibration.emcee_sampler")
-    key = digest("posterior", code, problem.key, walkers, move, seed)
+    key = digest("posterior", code, problem.key, options.walkers, options.move, seed)
     return store.root / "posterior" / f"{key}.h5"
 
 
@@ -336,7 +339,7 @@ def _draws(result: CalibrationResult) -> bytes:
     """Return the bytes of an npz file with posterior draws of each parameter that the frames
     tell, evenly from all.
     """
-    stride = max(1, result.chains.flat.shape[0] // _KEPT)
+    stride = max(1, result.chains.flat.shape[0] // _STORED_DRAWS)
     npz_file = io.BytesIO()
     draws: dict[str, Any] = {
         name: result.draws[name].reshape(-1)[::stride] for name in result.identifiability.told

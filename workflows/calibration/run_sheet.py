@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +45,21 @@ _PLUS = (
     "U is the expanded uncertainty; + says that a source of it is not stated, which budget.json"
     " names."
 )
-_MORE = " The files `budget.json` and `budget.csv` have the budgets of all quantities with a value."
+_FURTHER_BUDGETS = (
+    " The files `budget.json` and `budget.csv` have the budgets of all quantities with a value."
+)
 _COLUMNS = ("section", "key", "symbol", "quantity", "bound", "value", "unit", "reason")
 _TRANSFER = ("photons", "exposure", "mean", "variance", "mean_dark", "variance_dark")
+
+
+@dataclass(frozen=True)
+class SheetStatements:
+    """What is told of the frames of a sheet beside the recipe."""
+
+    #: whose variance in time is taken; None for that of the descriptor, otherwise release 4
+    release: Release | None = None
+    relative: bool = False  #: the photons of the recipe are known up to a factor
+    state: Sequence[str] = ()  #: of the operating point, such as ``temperature=25 °C``
 
 
 def write_sheet(
@@ -55,31 +67,26 @@ def write_sheet(
     store: Store,
     runs: Path,
     command: Sequence[str] = (),
-    *,
-    release: Release | None = None,
-    relative: bool = False,
-    state: Sequence[str] = (),
+    statements: SheetStatements | None = None,
 ) -> Path:
     """Write the EMVA 1288 sheet of the frames of a recipe: page, PDF, JSON, CSV and pictures;
     return the folder.
 
-    ``release`` says whose variance in time is taken; by default that which the descriptor states,
-    otherwise release 4. With ``relative`` the photons of the recipe are known up to a factor, and
-    nothing in photons is stated. ``state`` has what is told of the operating point, such as
-    ``temperature=25 °C``.
+    Nothing in photons is stated where they are known up to a factor only.
     Raises: ValueError for a recipe without frames, without dark frames or without two lit levels,
-            and for a wrong
-    statement.
+    and for a wrong statement.
     """
-    study_run = StudyRun("sheet", recipe, command)
-    statements = operating_point(state, stated(recipe))
+    study_run, statements = StudyRun("sheet", recipe, command), statements or SheetStatements()
+    operating_facts = operating_point(statements.state, stated(recipe))
     laboratory = laboratory_of(recipe)
-    photons_told = not (relative or is_relative(recipe))
-    frames = frames_of_recipe(recipe, store, release)
+    photons_told = not (statements.relative or is_relative(recipe))
+    frames = frames_of_recipe(recipe, store, statements.release)
     sheet = emva_sheet(frames.levels, frames.spatial, photons_told=photons_told)
     budgets = sheet_budgets(frames.levels, sheet, laboratory, photons_told)
-    document = study_run.document(_document(sheet, frames, statements, release is not None))
-    report = _report(recipe, sheet, frames, statements, document, budgets)
+    document = study_run.document(
+        _document(sheet, frames, operating_facts, statements.release is not None)
+    )
+    report = _report(recipe, sheet, frames, operating_facts, document, budgets)
     return study_run.write(runs, digest(document["quantities"]), document, report, "emva1288")
 
 
@@ -118,7 +125,7 @@ def _report(
     ]
     budget_pictures = {"budget": budget_picture(main_budgets)} if main_budgets else {}
     uncertainty_sections = budget_sections(
-        main_budgets, stated(recipe), budget_pictures.get("budget"), _MORE
+        main_budgets, stated(recipe), budget_pictures.get("budget"), _FURTHER_BUDGETS
     )
     pdf_lines = [
         f"{name}: {'not stated' if statements[key] is None else statements[key]}"

@@ -245,7 +245,7 @@ BUDGETED = (
     "DSNU1288",
     "PRNU1288",
 )
-_LEAST = 1e-4  #: share of a variance below which a source is not drawn
+_LEAST_DRAWN_SHARE = 1e-4  #: share of a variance below which a source is not drawn
 _TEXT = f"""By the Guide to the expression of uncertainty in measurement (JCGM 100). The combined
     standard uncertainty u_c has all sources that are stated. The expanded uncertainty U is k u_c
     and holds the value with {COVERAGE:.0%}; the coverage factor k is that of Student's t
@@ -541,7 +541,7 @@ def _percentages(budget: Budget) -> Iterator[tuple[str, float]]:
     """Yield each source that is wide enough to be drawn, with its share of the variance in %."""
     for c in budget.contributions:
         percent = 100 * ((c.share or 0.0) / budget.combined) ** 2 if budget.combined else 0.0
-        if percent > 100 * _LEAST:
+        if percent > 100 * _LEAST_DRAWN_SHARE:
             yield c.source, percent
 
 

@@ -243,15 +243,8 @@ def sheet(
     for fact in stated_facts:
         command += ["--state", fact]
     with failing(lazy.errors.RunError, code=FAILED), failing(ValueError):
-        folder = lazy.run_sheet.write_sheet(
-            recipe,
-            the_store(),
-            out,
-            command,
-            release=edition,
-            relative=relative,
-            state=stated_facts,
-        )
+        statements = lazy.run_sheet.SheetStatements(edition, relative, stated_facts)
+        folder = lazy.run_sheet.write_sheet(recipe, the_store(), out, command, statements)
     document = json.loads(text_of(folder / "emva1288.json"))
     if not quiet and not as_json:
         say(

@@ -161,9 +161,7 @@ def _run_points(
     Ctrl-C or a failure.
     """
     table = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
-    running_points = outcomes(
-        work.plan, work.store, on_error, work.device, table.started, table.watch, workers
-    )
+    running_points = outcomes(work.plan, work.store, on_error, table.started, table.watch, workers)
     try:
         with table, closing(running_points):
             for outcome in running_points:

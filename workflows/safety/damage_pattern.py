@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 OPTIONS = {"plain": "plain lens", "mask": "mask"}
 #: of the peak; a picture ends where the spot is fainter everywhere, by how strong it is
 _FAINT, _DIM = 1e-4, 0.03
-_LEAST = 12  #: samples from the peak to each edge of a picture, at least
+_LEAST_HALF_SAMPLES = 12  #: samples from the peak to each edge of a picture, at least
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def _cut(light: FloatArray, faint: float) -> FloatArray:
     """
     middle = np.array(light.shape) // 2
     bright = np.argwhere(light >= faint)
-    half_side = int(np.clip(np.abs(bright - middle).max(), _LEAST, min(middle) - 1))
+    half_side = int(np.clip(np.abs(bright - middle).max(), _LEAST_HALF_SAMPLES, min(middle) - 1))
     row, column = middle
     return light[row - half_side : row + half_side + 1, column - half_side : column + half_side + 1]
 
@@ -160,7 +160,10 @@ def _cut(light: FloatArray, faint: float) -> FloatArray:
 # frames.
 
 
-_HALF, _MOST = 24, 200  #: pixels from the spot to each edge of a picture, at least and at most
+_LEAST_HALF_PIXELS, _MOST_HALF_PIXELS = (
+    24,
+    200,
+)  #: pixels from the spot to each edge of a picture, at least and at most
 _WHITE, _GREY = 1000, 400  #: DN of a white pixel and of the evenly grey scene in the drawn frame
 
 
@@ -226,7 +229,7 @@ def _half_width(hit: Sequence[tuple[str, FloatArray]]) -> int:
     """Return the pixels from the spot to each edge of a picture that holds all damaged places."""
     farthest = max((np.abs(places).max() for _, places in hit), default=0)
     # half as far again, within the limits of a picture
-    return int(np.clip(farthest * 3 // 2, _HALF, _MOST))
+    return int(np.clip(farthest * 3 // 2, _LEAST_HALF_PIXELS, _MOST_HALF_PIXELS))
 
 
 def _reached(damage: Sequence[Finding], exposures: Exposures) -> set[int]:

@@ -29,8 +29,8 @@ from neusee.workflows.safety.laser_spots import Grid, Levels, Ranked, Veil, leve
 
 _RANKS = 80  #: numbers of pixels at which levels are computed
 _STEP, _WAVES = 0.3, 0.25  #: of the ladder of a clear round lens
-_MIDDLE = 16.0  #: pixels of a wide spot that turn bright and dark together with its middle
-_SOFT = 0.1  #: waves below which a change of the defocus does not change the spot
+_MIDDLE_PIXELS = 16.0  #: pixels of a wide spot that turn bright and dark together with its middle
+_IN_FOCUS_WAVES = 0.1  #: waves below which a change of the defocus does not change the spot
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
@@ -183,8 +183,8 @@ def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _Roun
     log_distance = np.log(as_wide(beam, beam_radii))
     nominal_defocus = _defocus(area.safety, beam, diameter)
     # asinh(defocus / soft): linear near focus and logarithmic far from it
-    bend_offset = np.arcsinh(exposures.waves[option_name] / _SOFT) - np.arcsinh(
-        nominal_defocus(np.exp(log_distance)) / _SOFT
+    bend_offset = np.arcsinh(exposures.waves[option_name] / _IN_FOCUS_WAVES) - np.arcsinh(
+        nominal_defocus(np.exp(log_distance)) / _IN_FOCUS_WAVES
     )
     log_spread = np.log(_spreads(area.safety, draws, diameter))
     # points for each unit of asinh and of the logarithm
@@ -194,11 +194,11 @@ def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _Roun
     groups = []
     for distance in rungs.tolist():
         fill = fill_at(beam, diameter, distance)
-        nominal_bend = math.asinh(float(nominal_defocus(np.array([distance]))[0]) / _SOFT)
+        nominal_bend = math.asinh(float(nominal_defocus(np.array([distance]))[0]) / _IN_FOCUS_WAVES)
         for bend_of_point, log_size in itertools.product(
             bend_grid.points.tolist(), spread_grid.points.tolist()
         ):
-            waves = _SOFT * math.sinh(nominal_bend + bend_of_point)
+            waves = _IN_FOCUS_WAVES * math.sinh(nominal_bend + bend_of_point)
             feature = dazzle.feature if dazzle else 1.0
             phases = [
                 round_pixels(fill, phase_waves, math.exp(log_size), sensor.shape, feature)
@@ -275,7 +275,9 @@ def _of_clear(
         return (
             # the few brightest pixels turn with the phase: the brightest of all phases counts
             np.where(
-                area.ranks <= _MIDDLE, np.max([value for value, _ in phase_levels], axis=0), values
+                area.ranks <= _MIDDLE_PIXELS,
+                np.max([value for value, _ in phase_levels], axis=0),
+                values,
             ),
             beyond,
         )

@@ -358,7 +358,7 @@ _CLOSE = 0.02  #: error of the interpolation of a peak or a level at which no sp
 _MOST_PEAKS = 25  #: peaks behind a mask
 _CLOSE_PEAKS = 0.005  #: error of a peak at which none is added
 _WIDENINGS = 2  #: doublings of the window of a spot that lacks light
-_MOST = 17  #: spots behind one arm
+_MOST_SPOTS = 17  #: spots behind one arm
 _FINEST = 1.3  #: factor of the distance between two spots, at least
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 #: largest phase step of the wavefront between two samples of the pupil, in turns; the mask adds its
@@ -603,7 +603,7 @@ def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
         # a plane wave: one spot for all distances
         level(safety.laser.distance)
         return Ranked(arm, (safety.laser.distance,), (pixels_at[safety.laser.distance],), math.inf)
-    refined = _refined(_first(safety, recipe, step), level, _MOST)
+    refined = _refined(_first(safety, recipe, step), level, _MOST_SPOTS)
     error = max(refined.misses, default=0.0)
     return Ranked(
         arm,

@@ -280,7 +280,7 @@ def state_of_finding(finding: Finding) -> State:
 
 
 _ARMS = {"plain": "plain lens", "mask": "mask"}
-_MORE = "more optics.samples, and a step laser.wavefront, carry a nearer one"
+_REMEDY = "more optics.samples, and a step laser.wavefront, carry a nearer one"
 
 
 def scatter_text(veil: Veil | None) -> str:
@@ -380,7 +380,7 @@ def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> 
     if peaks and peaks.along[0][0] > asked:
         yield (
             f"Nearer than {peaks.along[0][0]:.3g} m the beam in front of the mask is not computed"
-            f" ({_MORE}): its peak counts as that of the clear lens in focus there, which no mask"
+            f" ({_REMEDY}): its peak counts as that of the clear lens in focus there, which no mask"
             " exceeds."
         )
     if peaks and peaks.outside:
@@ -398,7 +398,7 @@ def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> 
         if math.isfinite(spot.error) and spot.distances[0] > asked:
             yield (
                 f"Nearer than {spot.distances[0]:.3g} m the pixels behind the {_ARMS[spot.arm]} are"
-                f" not computed ({_MORE}): all light counts in the pixels that may be lost, the"
+                f" not computed ({_REMEDY}): all light counts in the pixels that may be lost, the"
                 " most that there can be."
             )
 

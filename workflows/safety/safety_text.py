@@ -28,8 +28,8 @@ from neusee.workflows.safety.what_helps import MET, PictureCost, Remedy
 
 _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 _PER_CM2 = 1e-4  #: of a quantity per m2
-_SAME = 0.01  #: relative width of an interval that is not written
-_NEVER = 1e-4  #: smallest share that is written as a number
+_LEAST_RELATIVE_WIDTH = 0.01  #: relative width of an interval that is not written
+_LEAST_SHARE = 1e-4  #: smallest share that is written as a number
 UNITS = {"irradiance": "W", "fluence": "J"}
 
 LIMIT_COLUMNS = (
@@ -72,7 +72,7 @@ def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
     uncertain.
     """
     nominal_text = scaled(factor * spread.value, unit)
-    if math.isclose(spread.low, spread.high, rel_tol=_SAME):
+    if math.isclose(spread.low, spread.high, rel_tol=_LEAST_RELATIVE_WIDTH):
         return nominal_text
     number, _, prefixed = nominal_text.partition(" ")
     prefix_value = factor * spread.value / float(number)
@@ -94,7 +94,7 @@ def metres(distance: float) -> str:
 
 def end(spread: Spread) -> str:
     """Return a distance with the interval of its draws."""
-    if math.isclose(spread.low, spread.high, rel_tol=_SAME):
+    if math.isclose(spread.low, spread.high, rel_tol=_LEAST_RELATIVE_WIDTH):
         return metres(spread.value)
     return f"{metres(spread.value)} ({metres(spread.low)} to {metres(spread.high)})"
 
@@ -121,9 +121,9 @@ def share(value: float) -> str:
     """Return a probability as a percentage with two digits, and nothing more exact than 0.01 %."""
     if value in (0.0, 1.0):
         return f"{100 * value:.0f} %"
-    if value < _NEVER:
+    if value < _LEAST_SHARE:
         return "< 0.01 %"
-    if value > 1 - _NEVER:
+    if value > 1 - _LEAST_SHARE:
         return "> 99.99 %"
     return f"{100 * value:.2g} %" if value < 0.995 else f"{100 * value:.2f} %"
 
@@ -399,7 +399,7 @@ def times(finding: Finding) -> str:
     spread = finding.ratios
     if spread is not None and finding.limit.open_below:
         return f"at least {plain(f'{spread.low:.3g}')} times"
-    if spread is None or spread.high <= spread.low * (1 + _SAME):
+    if spread is None or spread.high <= spread.low * (1 + _LEAST_RELATIVE_WIDTH):
         return f"{plain(f'{finding.ratio:.3g}')} times"
     ratio, low, high = (
         plain(text) for text in (f"{finding.ratio:.3g}", f"{spread.low:.2g}", f"{spread.high:.2g}")

@@ -37,16 +37,16 @@ Ratios = Mapping[str, FloatArray]
 
 #: transmittances that are tried, from none to the strongest
 _FILTERS = tuple(10.0**-x for x in (0, 1, 2, 4, 8, 12))
-_SLOWEST = 64.0  #: f-number of the smallest stop
-#: diameter of a stop over that of the next larger one that is tried, at least
+_SLOWEST_F_NUMBER = 64.0  #: f-number of the smallest stop
+#: half a stop, as a ratio of diameters: two stops that are tried are two of it apart at most
 _HALF_STOP = 2.0**-0.25
 _SHORTER = tuple(10.0**-x for x in (0, 0.5, 1, 2, 3, 4, 5, 6))  #: exposures over that of the recipe
 _LONGER = tuple(10.0 ** (x / 4) for x in range(13))
-_SAFE = 0.95  #: share of the draws in which a safe value holds
-_STEPS = 60  #: of the search for a nominal value
-_AGREE = 1e-7  #: of the logarithm of a nominal ratio
-_REFINED = 3  #: rounds in which a safe value is put back and tried again
-_UNCHANGED = 1e-6  #: relative difference of ratios that count as equal
+_SAFE_SHARE = 0.95  #: share of the draws in which a safe value holds
+_SEARCH_STEPS = 60  #: of the search for a nominal value
+_AGREED_LOG = 1e-7  #: of the logarithm of a nominal ratio
+_REFINING_ROUNDS = 3  #: rounds in which a safe value is put back and tried again
+_UNCHANGED_RATIO = 1e-6  #: relative difference of ratios that count as equal
 _FLOOR, _CEILING = 1e-300, 1e300
 
 MET = "not needed"
@@ -298,7 +298,7 @@ def _stops(f_number: float) -> tuple[float, ...]:
     """Return diameters over that of a lens, from 1 down to f/64, or to half for a lens slower
     than f/32.
     """
-    smallest = min(0.5, f_number / _SLOWEST)
+    smallest = min(0.5, f_number / _SLOWEST_F_NUMBER)
     # diameters in equal ratios, of two half stops at most
     step_count = max(4, math.ceil(math.log(smallest) / math.log(_HALF_STOP) / 2))
     return tuple(smallest ** (x / step_count) for x in range(step_count + 1))
@@ -394,7 +394,7 @@ def _solved(limit: str, way: _Way, factors: FloatArray) -> Remedy:
 def _is_met(ratio: FloatArray) -> bool:
     """Return True if a limit is met at the nominal values and in 95 % of the draws."""
     return (
-        bool(ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE)
+        bool(ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE_SHARE)
         if len(ratio) > 1
         else bool(ratio[0] <= 1)
     )
@@ -447,9 +447,9 @@ def _refined(limit: str, way: _Way, factor: float) -> float:
     bracket = [math.log(way.factors[index - 1]), math.log(way.factors[index])]
     heights = [_height(limit, way, end) for end in bracket]
     log_factor, last_side = math.log(factor), 0
-    for _ in range(_STEPS):
+    for _ in range(_SEARCH_STEPS):
         height = _height(limit, way, log_factor)
-        if abs(height) < _AGREE:
+        if abs(height) < _AGREED_LOG:
             break
         # end 0 has a ratio above 1
         side = 0 if height > 0 else 1
@@ -476,16 +476,18 @@ def _safe(limit: str, way: _Way, factors: FloatArray) -> tuple[float | None, flo
         direction * np.where(np.isnan(factors), direction * math.inf, factors)
     )
     safe = direction * float(
-        ordered_factors[min(len(ordered_factors) - 1, math.ceil(_SAFE * len(ordered_factors)))]
+        ordered_factors[
+            min(len(ordered_factors) - 1, math.ceil(_SAFE_SHARE * len(ordered_factors)))
+        ]
     )
-    for _ in range(_REFINED):
+    for _ in range(_REFINING_ROUNDS):
         if not math.isfinite(safe) or safe <= 0:
             return None, None
         ratio = way.ratio(limit, safe)
         covered_share = 0.0 if ratio is None else float((ratio[1:] <= 1).mean())
-        if covered_share >= _SAFE or ratio is None:
+        if covered_share >= _SAFE_SHARE or ratio is None:
             return safe, covered_share
-        ratio_at_quantile = float(np.quantile(ratio[1:], _SAFE, method="higher"))
+        ratio_at_quantile = float(np.quantile(ratio[1:], _SAFE_SHARE, method="higher"))
         # the ratio goes with a transmittance; of a stop or an exposure with up to its square
         safe *= ratio_at_quantile ** (-1.0 if way.unit is None else 0.5 * direction)
     return None, None
@@ -494,7 +496,7 @@ def _safe(limit: str, way: _Way, factors: FloatArray) -> tuple[float | None, flo
 def _why_not(problem: Problem, means: Means, table: FloatArray) -> str:
     """Return why a means does not help against a limit."""
     # nominal ratio at the strongest factor over that at the present one
-    changes_ratio = bool(np.abs(table[-1, 0] / table[0, 0] - 1) > _UNCHANGED)
+    changes_ratio = bool(np.abs(table[-1, 0] / table[0, 0] - 1) > _UNCHANGED_RATIO)
     if problem == "damage" and means == "exposure" and not changes_ratio:
         return "the exposure never changes damage"
     if means == "exposure" and not changes_ratio:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from neusee.workflows.graph.errors import RecipeError
@@ -36,49 +36,52 @@ from neusee.workflows.studies.work_precision import (
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-_FEWER = (1e-1, 1e-2, 1e-3, 1e-4)
+_QUICK_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
 #: s that the reference of a step may take; the second value is for ``quick``
 _PATIENCE, _LITTLE = 4.0, 1.0
 _LEFT = "not measured within the budget: run the study again to continue"
 
 
-def study(
-    recipe: Recipe,
-    store: Store,
-    progress: Progress,
-    *,
-    seeds: int = 3,
-    quick: bool = False,
-    budget: float | None = None,
-    device: str = "cpu",
-) -> StudyOutcome:
-    """Measure error against run time.
+@dataclass(frozen=True)
+class AccuracyOptions:
+    """How much the study measures."""
 
-    Args: seeds: number of seeds of the noise, which give the range of each error. quick: measures
-            fewer settings.
-    budget: seconds after which the study measures no further setting of a parameter; the page names
-    the settings that are left, and the next study measures them. Raises: `ValueError` if ``seeds``
-    is less than 1.
-    """
-    if seeds < 1:
+    seeds: int = 3  #: of the noise, which give the range of each error
+    quick: bool = False  #: True for fewer settings
+    #: seconds after which no further setting of a parameter is measured; the page names the
+    #: settings that are left, and the next study measures them
+    budget: float | None = None
+    device: str = "cpu"
+
+
+def study(
+    recipe: Recipe, store: Store, progress: Progress, options: AccuracyOptions
+) -> StudyOutcome:
+    """Measure error against run time; raise `ValueError` for less than one seed."""
+    if options.seeds < 1:
         raise ValueError(
-            f"seeds={seeds}: the accuracy study needs at least one random seed, such as seeds=3"
+            f"seeds={options.seeds}: the accuracy study needs at least one random seed,"
+            " such as seeds=3"
         )
-    cache = PointCache(finest(recipe), store, seeds, device)
-    result = _measure(
-        recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget
-    )
+    cache = PointCache(finest(recipe), store, options.seeds, options.device)
+    end_time = math.inf if options.budget is None else time.monotonic() + options.budget
+    result = _measure(recipe, cache, progress, options.quick, end_time)
     key = digest(
-        "accuracy", cache.key(recipe), [[p.trial.line, p.trial.label] for p in result.points], quick
+        "accuracy",
+        cache.key(recipe),
+        [[p.trial.line, p.trial.label] for p in result.points],
+        options.quick,
     )
-    return StudyOutcome(key, _document(result, cache, quick), _report(result))
+    return StudyOutcome(key, _document(result, cache, options.quick), _report(result))
 
 
 def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
     """Yield the settings to measure: each tolerance, the full computation, and each value of
     each varied parameter.
     """
-    tolerances = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
+    tolerances = sorted(
+        {*(_QUICK_TOLERANCES if quick else TOLERANCES), recipe.tolerance}, reverse=True
+    )
     for tolerance in tolerances:
         with_tolerance = replace(recipe, tolerance=tolerance, exact=False)
         is_own_setting = tolerance == recipe.tolerance and not recipe.exact

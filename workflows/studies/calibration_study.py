@@ -40,7 +40,7 @@ from neusee.workflows.studies.posterior_tests import (
 )
 
 PIXELS = 128
-_EVERY = 20  #: simulations for each line of progress
+_SIMULATIONS_A_LINE = 20  #: simulations for each line of progress
 _WEIGHED = 1000  #: draws for the sensitivity
 _COLUMNS = (
     "parameter",
@@ -101,26 +101,25 @@ class CalibrationStudyResult:
         )
 
 
-def study(
-    recipe: Recipe,
-    store: Store,
-    progress: Progress,
-    simulations: int = 200,
-    move: str = "de",
-    pixels: int = PIXELS,
-    sampler: Sampler | None = None,
-) -> StudyOutcome:
-    """Simulate and calibrate sensors.
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """Which sensors are simulated, and how their posterior is sampled."""
 
-    The posterior is sampled by ``sampler``, or by walkers with the move ``move`` if there is no
-    ``sampler``.
-    """
+    simulations: int = 200
+    move: str = "de"  #: of the walkers
+    pixels: int = PIXELS
+    sampler: Sampler | None = None  #: in place of the walkers
+
+
+def study(
+    recipe: Recipe, store: Store, progress: Progress, options: CalibrationOptions
+) -> StudyOutcome:
+    """Simulate and calibrate sensors."""
     with one_thread():
-        simulator = SensorSimulator(
-            recipe, store, pixels, sampler or partial(walk_draws, move_name=move), move
-        )
-        simulations_done = list(_simulate_all(simulator, simulations, progress))
-        sensitivity_to_prior, reason = _sensitivity(recipe, move)
+        sampler = options.sampler or partial(walk_draws, move_name=options.move)
+        simulator = SensorSimulator(recipe, store, options.pixels, sampler, options.move)
+        simulations_done = list(_simulate_all(simulator, options.simulations, progress))
+        sensitivity_to_prior, reason = _sensitivity(recipe, options.move)
     result = CalibrationStudyResult(
         simulations_done,
         rank_tests(simulations_done),
@@ -129,7 +128,9 @@ def study(
         reason,
     )
     content = _document(result)
-    return StudyOutcome(digest(content["verdicts"]), content, _report(recipe, result, pixels))
+    return StudyOutcome(
+        digest(content["verdicts"]), content, _report(recipe, result, options.pixels)
+    )
 
 
 def _simulate_all(
@@ -141,7 +142,7 @@ def _simulate_all(
         if simulation.refused:
             progress(f"simulation {number}: {simulation.refused}")
         yield simulation
-        if (number + 1) % _EVERY == 0 or number + 1 == count:
+        if (number + 1) % _SIMULATIONS_A_LINE == 0 or number + 1 == count:
             progress(f"{number + 1} of {count} simulations")
 
 

@@ -39,7 +39,7 @@ from neusee.workflows.studies.run_study import key_parts, run_cold
 
 
 _TIMES = 3  #: cold runs of a scene; the median of their times counts
-_QUICK = 5.0  #: s; a scene that takes longer is run once
+_QUICK_SECONDS = 5.0  #: s; a scene that takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
 #: works even with one band
 _LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"
@@ -189,7 +189,7 @@ def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
 def _median_run(recipe: Recipe, store: Store) -> Result:
     """Return the run of median time; a quick one is repeated."""
     results = [run_cold(recipe, store)]
-    while max(measured.seconds for measured in results) < _QUICK and len(results) < _TIMES:
+    while max(measured.seconds for measured in results) < _QUICK_SECONDS and len(results) < _TIMES:
         results.append(run_cold(recipe, store))
     return sorted(results, key=lambda r: r.seconds)[len(results) // 2]
 
@@ -214,7 +214,7 @@ _COLUMNS = (
     "seconds",
     "holds",
 )
-_HOW = {"handed on": "left out", "not added": "not added", "stands in": "summed"}
+_KIND_TEXT = {"handed on": "left out", "not added": "not added", "stands in": "summed"}
 _HELD = {True: Marked("holds", "pass"), False: Marked("fails", "fail")}
 
 
@@ -236,15 +236,17 @@ class LeaveOutResult:
         )
 
 
+@dataclass(frozen=True)
+class LeaveOutOptions:
+    """What the study measures beside the errors of steps that are left out."""
+
+    contents: bool = True  #: True for the run times of simpler scenes too
+
+
 def study(
-    recipe: Recipe,
-    store: Store,
-    progress: Progress,
-    contents: bool = True,
+    recipe: Recipe, store: Store, progress: Progress, options: LeaveOutOptions
 ) -> StudyOutcome:
-    """Measure the errors of a recipe with steps left out, and with ``contents`` the run times
-    for simpler scenes.
-    """
+    """Measure the errors of a recipe with steps left out, and the run times of simpler scenes."""
     comparison = OmissionComparison(recipe, store)
     output_errors, rows = comparison.output_errors(), []
     failure = {True: "", False: ": does not hold"}
@@ -256,9 +258,8 @@ def study(
         rows.append(row)
         error = f"{row.rms:.2g}, stated at most {row.bound:.2g}{failure[row.holds]}"
         progress(f"{row.name} {row.kind}: {error} ({len(rows)} of {len(comparison.found)})")
-    result = LeaveOutResult(
-        output_errors, rows, list(measure_scenes(recipe, store, progress)) if contents else []
-    )
+    costs = list(measure_scenes(recipe, store, progress)) if options.contents else []
+    result = LeaveOutResult(output_errors, rows, costs)
     rows_and_costs = _document(result)
     content = {"tolerance": recipe.tolerance, "failed": result.failed, **rows_and_costs}
     return StudyOutcome(digest(content["rows"]), content, _report(recipe, result))
@@ -389,7 +390,10 @@ def _omissions(result: LeaveOutResult) -> Section:
         "holds",
     )
     cells = [(_cells(row), row) for row in result.rows]
-    rows = [(name, _HOW[kind], *numbers, _HELD[row.holds]) for (name, kind, *numbers), row in cells]
+    rows = [
+        (name, _KIND_TEXT[kind], *numbers, _HELD[row.holds])
+        for (name, kind, *numbers), row in cells
+    ]
     return Section("Each omission", text, columns, rows)
 
 

@@ -244,7 +244,7 @@ def _top(facts: TensorStats | None) -> float:
 
 
 _SURE = 4.0  #: standard errors by which a mean over pixels may differ from the mean over all noise
-_ABOUT = {"step": "study leave-out"}
+_STORED_AS = {"step": "study leave-out"}
 _ROUNDING = 2e-7  #: rounding error of a sum in float32, relative to its largest element
 
 
@@ -328,7 +328,7 @@ class OmissionComparison:
                 self._key(omission, with_omission),
                 partial(self._row, omission, with_omission),
             )
-            yield compute_once(self.store, key, OmissionRow, compute, _ABOUT)
+            yield compute_once(self.store, key, OmissionRow, compute, _STORED_AS)
 
     def _row(self, omission: Omission, alone: Recipe) -> OmissionRow:
         """Compare the recipe with one omission alone with the full computation, and return the

@@ -209,7 +209,7 @@ def _text(problem: Diagnostic) -> str:
 Numbers = dict[str, list[float]]  #: elements of each quantity, such as ``restored_quality.psnr``
 #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
 _ARENAS, _MAPPED, _TRIM = -8, -4, -1
-_ABOUT = {"step": "study uncertainty"}
+_STORED_AS = {"step": "study uncertainty"}
 _NARROW = 8  #: a tensor of two axes counts as a picture if both are longer
 
 
@@ -281,7 +281,7 @@ class OutputDraws:
             return {}
         moments: dict[str, tuple[Tensor, Tensor]]
         moments = compute_once(
-            self.store, pictures_key, dict, lambda: self._sums(keys, values), _ABOUT
+            self.store, pictures_key, dict, lambda: self._sums(keys, values), _STORED_AS
         )
         return moments
 
@@ -347,7 +347,7 @@ class OutputDraws:
         numbers = quantities(result)
         picture_names = [name for name, value in result.items() if _is_picture(value)]
         description = {
-            **_ABOUT,
+            **_STORED_AS,
             "seconds": self.seconds / max(1, self.computed),
             "date": timestamp(),
         }

@@ -42,8 +42,8 @@ from neusee.workflows.store.result_store import Store, compute_once
 FloatArray = NDArray[np.float64]
 WALKERS, DRAWS = 64, 99
 #: steps of the first round, growth for each round, and most steps
-_FIRST, _GROWTH, _LONGEST = 320, 1.5, 4000
-_APART = 6.0  #: least length of a chain in autocorrelation times; its first half is discarded
+_FIRST_STEPS, _GROWTH, _MOST_STEPS = 320, 1.5, 4000
+_LEAST_TAUS = 6.0  #: least length of a chain in autocorrelation times; its first half is discarded
 #: ratio of two standard deviations that chance rarely exceeds, for 64 walkers and three tau each
 _ALIKE = 1.25
 #: a file that never exists, because a simulation is too short to be resumed
@@ -70,9 +70,9 @@ def walk_draws(
     needs few draws.
     """
     run = emcee_sampler.start_ensemble(
-        problem, mode, _NOT_KEPT, 0, seed, WALKERS, emcee_sampler.move(move_name)
+        problem, mode, _NOT_KEPT, 0, emcee_sampler.Sampling(seed, WALKERS, move_name)
     )
-    steps = _FIRST
+    steps = _FIRST_STEPS
     while True:
         walk_until([run], steps, problem.log_posterior)
         chain = run.backend.get_chain(discard=steps // 2)
@@ -80,11 +80,11 @@ def walk_draws(
         thinning = max(1, round(min(autocorrelation_time, len(chain))))
         draws = chain[::thinning].reshape(-1, chain.shape[-1])
         is_long_enough = (
-            len(chain) >= _APART * autocorrelation_time
+            len(chain) >= _LEAST_TAUS * autocorrelation_time
             and len(draws) >= 2 * count
             and _steady(chain)
         )
-        if is_long_enough or steps >= _LONGEST:
+        if is_long_enough or steps >= _MOST_STEPS:
             break
         steps = int(_GROWTH * steps)
     rng = np.random.default_rng([seed, 2])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -58,8 +58,8 @@ _LOOKS: Mapping[str, tuple[str, str]] = {
     "mask and stop": (ORANGE, "-."),
 }
 _LIGHT = "scene light (e- a pixel)"
-_FINE = 121  #: values along each side of the maps
-_MOST = 8.0  #: dB, at which the colours of the maps end
+_MAP_VALUES = 121  #: values along each side of the maps
+_COLOUR_LIMIT = 8.0  #: dB, at which the colours of the maps end
 
 
 @drawn
@@ -70,7 +70,8 @@ def winning_region(result: ProtectionResult) -> Any:
     figure, axes = canvas(11.6, 4.1, 1, len(DRAWN), sharey=True)
     levels = sorted({result.own, *LEVELS})
     light_axis, level = (
-        np.geomspace(min(axis_values), max(axis_values), _FINE) for axis_values in (LIGHTS, levels)
+        np.geomspace(min(axis_values), max(axis_values), _MAP_VALUES)
+        for axis_values in (LIGHTS, levels)
     )
     for ax, measure in zip(axes[0], DRAWN, strict=True):
         gain = _between(
@@ -84,10 +85,10 @@ def winning_region(result: ProtectionResult) -> Any:
             light_axis,
             level,
             # beyond the colours
-            gain.clip(-_MOST, _MOST),
+            gain.clip(-_COLOUR_LIMIT, _COLOUR_LIMIT),
             cmap="RdBu",
-            vmin=-_MOST,
-            vmax=_MOST,
+            vmin=-_COLOUR_LIMIT,
+            vmax=_COLOUR_LIMIT,
             shading="gouraud",
             rasterized=True,
         )
@@ -119,7 +120,7 @@ def _between(levels: Sequence[float], gain: Sequence[Sequence[float]]) -> Any:
     level and light.
     """
     log_light, log_level = (
-        np.linspace(np.log(min(axis_values)), np.log(max(axis_values)), _FINE)
+        np.linspace(np.log(min(axis_values)), np.log(max(axis_values)), _MAP_VALUES)
         for axis_values in (LIGHTS, levels)
     )
     # first along the light, then along the level
@@ -472,31 +473,29 @@ def _rivals(result: ProtectionResult) -> Section:
 
 _COLUMNS = ("protection", "scene light", "measure", "gain", "5 %", "95 %")
 #: contrast of a natural scene; highest frequency of the mean log NEQ, cycles per pixel
-_VARIANCE, _LOW = 0.1, 0.12
+_VARIANCE, _LOW_FREQUENCIES = 0.1, 0.12
 _CONTINUOUS = 0.1  #: s, dwell time of continuous light
 _LAWS = UnknownLaws()
 
 
-def study(
-    recipe: Recipe,
-    store: Store,
-    progress: Progress,
-    draws: int = 12,
-    bands: int = 7,
-    light: str = "pulse",
-    size: float = 14.0,
-    prnu: float = 0.01,
-    residual: float = 0.02,
-) -> StudyOutcome:
-    """Compare the mask of a recipe with filters and stops of equal protection.
+@dataclass(frozen=True)
+class ProtectionOptions:
+    """What is unknown, which light shines, and what the sensor and its restoration leave."""
 
-    Args: draws: of the unknown conditions. bands: wavelengths of the scene; the laser may have each
-            of the recipe.
-    light: `pulse`, whose peak does harm, or `continuous`, whose heat does. size: height of the
-    targets in pixels. prnu: relative spread of the sensitivity of pixels. residual: share of the
-    glare that is subtracted wrongly.
-    """
-    camera = ProtectionCamera.of(recipe, store, bands)
+    draws: int = 12  #: of the unknown conditions
+    bands: int = 7  #: wavelengths of the scene; the laser may have each of the recipe
+    light: str = "pulse"  #: whose peak does harm; or ``"continuous"``, whose heat does
+    size: float = 14.0  #: pixels, height of the targets
+    prnu: float = 0.01  #: relative spread of the sensitivity of pixels
+    residual: float = 0.02  #: share of the glare that is subtracted wrongly
+
+
+def study(
+    recipe: Recipe, store: Store, progress: Progress, options: ProtectionOptions
+) -> StudyOutcome:
+    """Compare the mask of a recipe with filters and stops of equal protection."""
+    light, size = options.light, options.size
+    camera = ProtectionCamera.of(recipe, store, options.bands)
     side = min(int(pixels) for pixels in camera.lens["shape"])
     # the four letters of the text are nearly four times as wide as high
     if 4 * size > side:
@@ -505,15 +504,21 @@ def study(
             " --size"
         )
     dwell = None if light == "pulse" else _CONTINUOUS
-    settings = FrontSettings(_VARIANCE, _LOW, size, (side, 2 * side, 4 * side), dwell)
+    settings = FrontSettings(_VARIANCE, _LOW_FREQUENCIES, size, (side, 2 * side, 4 * side), dwell)
     bench = FrontBench(camera, store, settings)
-    conditions = draw_conditions(draws, recipe.seed, _LAWS)
-    result = measure_protection(bench, conditions, camera.pixel(prnu, residual), progress)
+    conditions = draw_conditions(options.draws, recipe.seed, _LAWS)
+    pixel = camera.pixel(options.prnu, options.residual)
+    result = measure_protection(bench, conditions, pixel, progress)
     paragraph = quotable(result, recipe.name, light)
     content = {"light": light, "paragraph": paragraph, **_document(result, conditions)}
-    options = {"light": light, "size": size, "prnu": prnu, "residual": residual}
-    report = _report(recipe, result, paragraph, _notes(camera, options))
-    return StudyOutcome(digest(content["gain"], content["lost"], options), content, report)
+    camera_options = {
+        "light": light,
+        "size": size,
+        "prnu": options.prnu,
+        "residual": options.residual,
+    }
+    report = _report(recipe, result, paragraph, _notes(camera, camera_options))
+    return StudyOutcome(digest(content["gain"], content["lost"], camera_options), content, report)
 
 
 def _document(result: ProtectionResult, conditions: Sequence[Condition]) -> dict[str, Any]:

@@ -21,10 +21,10 @@ from neusee.workflows.recipe.loading import changed
 _REFERENCE = re.compile(r"\$\{([\w.-]+)\??\}")
 _ONE_BY_ONE = ("item", "each")  #: first names of paths whose value differs from item to item
 _FACTORS = (0.2, 1 / 3, 0.5, 2.0)  #: factors on the number of intervals between bands
-_FEWER = (1 / 3, 2.0)
+_QUICK_FACTORS = (1 / 3, 2.0)
 #: factors on the number of samples, and on the side of a window
 _SCALES = (0.5, 0.75, 0.9, 1.5, 2.0)
-_FEWER_SCALES = (0.75, 1.5)
+_QUICK_SCALES = (0.75, 1.5)
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def _bands(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
         # `count` bands have `count - 1` intervals between them, which the factors scale
         counts = {
             1 + round((own_count - 1) * factor)
-            for factor in (1.0, *(_FEWER if quick else _FACTORS))
+            for factor in (1.0, *(_QUICK_FACTORS if quick else _FACTORS))
         }
         yield _knob(
             place.path,
@@ -161,7 +161,7 @@ def _sizes(own: int, quick: bool) -> list[int]:
     """Return the numbers of pupil samples that a study tries, the recipe's own among them."""
     # a pupil has two samples at least
     return sorted(
-        {max(2, round(own * factor)) for factor in (1.0, *(_FEWER_SCALES if quick else _SCALES))}
+        {max(2, round(own * factor)) for factor in (1.0, *(_QUICK_SCALES if quick else _SCALES))}
     )
 
 
@@ -176,7 +176,7 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
         if other_steps := _others(recipe, "shape", place):
             yield f"{place.path} is also a parameter of the step {other_steps[0]}"
             continue
-        own_shape, scales = tuple(place.value), (1.0, *(_FEWER_SCALES if quick else _SCALES))
+        own_shape, scales = tuple(place.value), (1.0, *(_QUICK_SCALES if quick else _SCALES))
         sizes = sorted(
             {tuple(max(1, round(side * factor)) for side in own_shape) for factor in scales}
         )

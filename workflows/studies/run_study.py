@@ -60,8 +60,9 @@ def study_recipe(
     of study.
     """
     module = import_module(f"neusee.workflows.studies.{kind.replace('-', '_')}_study")
+    study_options = getattr(module, f"{kind.title().replace('-', '')}Options")(**options)
     study_run = StudyRun(kind, recipe, command)
-    outcome: StudyOutcome = module.study(recipe, store or open_store(), progress, **options)
+    outcome: StudyOutcome = module.study(recipe, store or open_store(), progress, study_options)
     document = study_run.document(outcome.content)
     return study_run.write(runs, outcome.key, document, outcome.report)
 

@@ -170,7 +170,7 @@ _COLUMNS = (
     "gradient bound",
     "note",
 )
-_HOW = """Each step has the inputs of the recipe, at a small size, with one change: a parameter of
+_GUIDE = """Each step has the inputs of the recipe, at a small size, with one change: a parameter of
 the recipe, the result of an earlier step, or the pictures among the inputs of the step. A random
 height map of the same depth takes the place of a mask from a file, whose samples do not fit the
 small pupil. The result is compared with the node's own reference, or with the same function on the
@@ -206,15 +206,19 @@ class GridCell:
         return ("pass", "warn", "fail").index(cell.mark), max(error_over_bound, default=-1.0)
 
 
+@dataclass(frozen=True)
+class StabilityOptions:
+    """Which extreme cases are tested."""
+
+    cases: Sequence[Case] = CASES
+
+
 def study(
-    recipe: Recipe,
-    store: Store,
-    progress: Progress,
-    cases: Sequence[Case] = CASES,
+    recipe: Recipe, store: Store, progress: Progress, options: StabilityOptions
 ) -> StudyOutcome:
     """Test every step of ``recipe`` and its losses in every extreme case."""
     with one_thread():
-        rows = list(_rows(recipe, store, cases, progress))
+        rows = list(_rows(recipe, store, options.cases, progress))
     content = _document(rows)
     key = digest([repr(_line(row)) for row in rows])
     return StudyOutcome(key, content, _report(recipe, rows, content))
@@ -311,7 +315,7 @@ def _report(recipe: Recipe, rows: Sequence[GridCell], content: Mapping[str, Any]
     return StudyReport(
         f"Stability of {recipe.name}",
         lead,
-        [Section("How to read it", _HOW, picture=picture), *_tables(rows)],
+        [Section("How to read it", _GUIDE, picture=picture), *_tables(rows)],
         {"stability": picture},
         tables={"table.csv": (_COLUMNS, map(_line, rows))},
         shown=None,

@@ -48,8 +48,10 @@ _COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
 _WIDE = 30.0
 _BINS = 24
 _TICKS = 4  #: numbers below a diagram of a number, at most
-_LONGEST = 8  #: characters of such a number without its sign
-_APART = 0.1  #: inches around each diagram, so that a title does not touch the numbers above it
+_MOST_CHARACTERS = 8  #: characters of such a number without its sign
+_DIAGRAM_MARGIN = (
+    0.1  #: inches around each diagram, so that a title does not touch the numbers above it
+)
 _SLIGHT = 1e-6  #: share of a curve's largest element; no ratio to a smaller median is drawn
 _ALONG = 200  #: signals of a photon-transfer curve
 #: share of the predicted standard deviation below which flat fields are clipped, and not drawn
@@ -65,7 +67,7 @@ def tornado(
     """
     most_bars = max(map(len, swings.values()))
     figure, axes = panels(len(swings), 2, 6.6, 0.34 * most_bars + 1.3)
-    figure.get_layout_engine().set(h_pad=_APART)
+    figure.get_layout_engine().set(h_pad=_DIAGRAM_MARGIN)
     for ax, (name, bars) in zip(axes, swings.items(), strict=True):
         # a bar is (input, value at its 5 %, value at its 95 %)
         _bars(ax, sorted(bars, key=lambda bar: abs(bar[2] - bar[1])), middles[name])
@@ -111,7 +113,7 @@ def _few_numbers(ax: Any) -> None:
     least, greatest = ax.get_xlim()
     # as many as a step between two numbers needs
     decimals = max(0, math.ceil(-math.log10((greatest - least) / _TICKS)))
-    if len(f"{max(abs(least), abs(greatest)):.{decimals}f}") > _LONGEST:
+    if len(f"{max(abs(least), abs(greatest)):.{decimals}f}") > _MOST_CHARACTERS:
         ax.ticklabel_format(axis="x", style="sci", scilimits=(-2, 4), useOffset=True)
     else:
         ax.ticklabel_format(axis="x", useOffset=False)
@@ -128,7 +130,7 @@ def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axi
     figure, axes = canvas(
         5.6 * len(curves), 5.4, 2, len(curves), sharex="col", height_ratios=[2, 1]
     )
-    figure.get_layout_engine().set(h_pad=_APART)
+    figure.get_layout_engine().set(h_pad=_DIAGRAM_MARGIN)
     for (ax, relative_axis), (family, (abscissa, curves_by_name)) in zip(
         axes.T, curves.items(), strict=True
     ):
@@ -233,7 +235,7 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
     inputs.
     """
     figure, axes = panels(len(draws), 3, 3.6, 2.6, below=0.3)
-    figure.get_layout_engine().set(h_pad=_APART)
+    figure.get_layout_engine().set(h_pad=_DIAGRAM_MARGIN)
     for ax, (name, values) in zip(axes, draws.items(), strict=True):
         ax.hist(values, _BINS, color=BLUE, alpha=0.8)
         ax.axvline(
@@ -292,7 +294,7 @@ def pictures(moments: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
 # The result of the uncertainty study, and the page that shows the result.
 
 
-_MOST = 12  #: numbers in the pictures and in the lead
+_MOST_NUMBERS = 12  #: numbers in the pictures and in the lead
 _LITTLE = 0.01  #: share of a variance; inputs with a smaller share have no row
 _TOO_LITTLE = 0.5  #: share of a variance that a polynomial must predict for a row of indices
 _TRANSFER = "sensor.photon_transfer"
@@ -378,7 +380,7 @@ def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
     bytes.
     """
     pictures_by_name = {}
-    numbers = result.numbers[:_MOST]
+    numbers = result.numbers[:_MOST_NUMBERS]
     if numbers:
         median_values = {name: result.middle[name][0] for name in numbers}
         pictures_by_name["tornado"] = tornado(
@@ -445,7 +447,7 @@ def lead(result: UncertaintyResult) -> str:
         len(result.points.z),
         "Sobol points" if result.sequences else "independent draws",
     )
-    numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
+    numbers = {name: result.scatter[name] for name in result.numbers[:_MOST_NUMBERS]}
     # numbers have one element
     values = [
         f"{name} {with_uncertainty(float(scattered.mean[0]), float(scattered.sd[0]))}"

@@ -48,35 +48,36 @@ _RARE = 3.09  #: normal score of the quantile at 99.9 %
 _ROUND = 16  #: independent draws in each further round
 #: draws for the mean and standard deviation of pictures; the deviation is known to 13 %
 PICTURED = 32
-_KEPT = ("mean", "sd")  #: of each picture
+_PICTURE_STATISTICS = ("mean", "sd")  #: of each picture
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
 
 
-def study(
-    recipe: Recipe,
-    store: Store,
-    progress: Progress,
-    error: float = 0.05,
-    most: int = 1000,
-    points: str = "draws",
-    workers: int = 0,
-    device: str = "cpu",
-    until: Sequence[str] = (),
-) -> StudyOutcome:
-    """Sample inputs, up to ``most`` times, until all output standard deviations are known to the
-    relative ``error``.
+@dataclass(frozen=True)
+class UncertaintyOptions:
+    """When the study ends, and how it draws."""
 
-    With ``until``, names of outputs or of single quantities, only their deviations decide. On the
-    CPU, ``workers`` processes compute draws; 0 means one for each free processor.
-    """
+    error: float = 0.05  #: relative error of each standard deviation
+    most: int = 1000  #: draws
+    points: str = "draws"  #: or ``"sobol"``
+    workers: int = 0  #: processes that draw on the CPU; 0 means one for each free processor
+    device: str = "cpu"
+    until: Sequence[str] = ()  #: outputs or quantities whose deviations decide; empty for all
+
+
+def study(
+    recipe: Recipe, store: Store, progress: Progress, options: UncertaintyOptions
+) -> StudyOutcome:
+    """Sample the inputs until all standard deviations of outputs are known well enough."""
     inputs = _inputs(recipe)
-    _chosen([name.partition(".")[0] for name in until], inputs.recipe.outputs)
-    sequences = SCRAMBLES if points == "sobol" else 0
-    allowed = AllowedDraws(inputs, _points(inputs, recipe.seed, most, points), sequences)
+    _chosen([name.partition(".")[0] for name in options.until], inputs.recipe.outputs)
+    sequences = SCRAMBLES if options.points == "sobol" else 0
+    points = _points(inputs, recipe.seed, options.most, options.points)
+    allowed = AllowedDraws(inputs, points, sequences)
     allowed.extend(LEAST)
     refuse_combinations(inputs, _ends(inputs), allowed)
-    draws = OutputDraws(inputs, store, device, workers)
-    result = _measure(inputs, draws, allowed, progress, StopRule(error, sequences, tuple(until)))
+    draws = OutputDraws(inputs, store, options.device, options.workers)
+    rule = StopRule(options.error, sequences, tuple(options.until))
+    result = _measure(inputs, draws, allowed, progress, rule)
     content = _document(result, draws)
     return StudyOutcome(digest(content["quantities"]), content, _report(result))
 
@@ -379,7 +380,7 @@ def _report(result: UncertaintyResult) -> StudyReport:
     if result.pictures:
         arrays = {}
         for name, moments in result.pictures.items():
-            for statistic, moment in zip(_KEPT, moments, strict=True):
+            for statistic, moment in zip(_PICTURE_STATISTICS, moments, strict=True):
                 arrays[f"{name} {statistic}"] = moment.numpy()
         files["pictures.npz"] = _npz(arrays)
     return StudyReport(

@@ -45,8 +45,8 @@ from neusee.workflows.tolerance.error_norm import error_of
 
 
 TIMES = 3  #: cold runs of a point; the median of their times counts
-_QUICK = 5.0  #: s; a recipe that takes longer is run once
-_ABOUT = {"step": "study accuracy"}
+_QUICK_SECONDS = 5.0  #: s; a recipe that takes longer is run once
+_STORED_AS = {"step": "study accuracy"}
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class PointCache:
             return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
         key = self.key(recipe)
         measurement = compute_once(
-            self.store, key, PointMeasurement, lambda: self._measure(recipe), _ABOUT
+            self.store, key, PointMeasurement, lambda: self._measure(recipe), _STORED_AS
         )
         return WorkPrecisionPoint(trial, measurement)
 
@@ -154,10 +154,14 @@ class PointCache:
         first run was slow.
         """
         recipe, seconds = point.trial.recipe, point.found.seconds
-        if recipe is None or not seconds or seconds[0] >= _QUICK:
+        if recipe is None or not seconds or seconds[0] >= _QUICK_SECONDS:
             return point
         timed = compute_once(
-            self.store, digest(self.key(recipe), number), list, lambda: [self._time(recipe)], _ABOUT
+            self.store,
+            digest(self.key(recipe), number),
+            list,
+            lambda: [self._time(recipe)],
+            _STORED_AS,
         )
         return WorkPrecisionPoint(point.trial, replace(point.found, seconds=[*seconds, *timed]))
 

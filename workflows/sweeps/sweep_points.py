@@ -352,6 +352,7 @@ class SweepPlan:
     #: work of each point without stored results, in seconds, or in steps if no step ran before
     work: tuple[float, ...]
     notes: tuple[str, ...]
+    device: str  #: of all points; a key depends on it
     series: RunSeries  #: with the digests of the code of all nodes, the same for all points
 
     @property
@@ -390,6 +391,7 @@ def plan_sweep(
         costs,
         tuple(work_of_points),
         tuple(checker.notes),
+        device,
         checker.series,
     )
 
@@ -398,7 +400,6 @@ def outcomes(
     plan: SweepPlan,
     store: Store,
     on_error: OnError = "stop",
-    device: str = "cpu",
     started: Callable[[Point], None] = lambda point: None,
     watch: Callable[[Event], None] | None = None,
     workers: int = 1,
@@ -413,7 +414,7 @@ def outcomes(
     memory = partial(memory_limit, None, workers)
 
     def alone(number: int) -> _Found:
-        return _found(plan, number, store, None, device, int(memory()))
+        return _found(plan, number, store, None, int(memory()))
 
     with closing(shared(alone, range(len(plan.checked)), workers, apart=True)) as ended:
         for number, returned in ended:
@@ -422,7 +423,7 @@ def outcomes(
             if returned is None:
                 started(checked.point)
             try:
-                outcome = returned[0] if returned else _found(plan, number, store, watch, device)
+                outcome = returned[0] if returned else _found(plan, number, store, watch)
             except Exception as error:
                 seconds = time.perf_counter() - began
                 error.add_note(f"at point {checked.point.number}: {checked.point.shown}")
@@ -452,13 +453,12 @@ def _found(
     number: int,
     store: Store,
     watch: Callable[[Event], None] | None,
-    device: str,
     memory: int | None = None,
 ) -> _Found:
     """Run one point of a sweep; return its state, time and numbers."""
     began = time.perf_counter()
     recipe = plan.checked[number].kept.recipe
-    result = run(recipe, store, watch=watch, device=device, memory=memory, series=plan.series)
+    result = run(recipe, store, watch=watch, device=plan.device, memory=memory, series=plan.series)
     numbers: list[ResultNumber] = []
     for step, value in result.values.items():
         rows = numbers_of(step, value)

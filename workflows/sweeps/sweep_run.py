@@ -359,36 +359,52 @@ class Sweep:
         return f"<p>{summary}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
+@dataclass(frozen=True)
+class SweepOptions:
+    """How the points of a sweep are made of the axes, and how they run."""
+
+    paired: bool = False  #: True for the n-th values of all axes together, not every combination
+    #: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each in its row
+    on_error: OnError = "stop"
+    device: str = "cpu"
+    #: processes that run points at the same time; 0 means one for each processor that other work
+    #: leaves free, and none beside threads of others, as in a notebook
+    workers: int = 0
+    folder: str | os.PathLike[str] = "."  #: to which relative paths refer
+
+
+_USUAL_OPTIONS = SweepOptions()
+
+
 def sweep(
     recipe: str | os.PathLike[str],
     axes: Mapping[str, str | Iterable[Any]],
     overrides: Sequence[str | Override] = (),
-    zip: bool = False,
     store: Store | None = None,
-    on_error: OnError = "stop",
-    device: str = "cpu",
-    folder: str | os.PathLike[str] | None = None,
-    workers: int = 0,
+    options: SweepOptions = _USUAL_OPTIONS,
 ) -> Sweep:
-    """Run ``recipe`` at every combination of axis values, or, with ``zip``, at the n-th values of
-    all axes together.
+    """Run ``recipe`` at every combination of axis values.
 
     Args: axes: by parameter or group, a list of values, or a text as on the command line, such
     as ``"linspace(450 nm, 650 nm, 5)"``. overrides: changes that are the same at every point.
-    on_error: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each
-    error into its row. folder: the folder to which relative paths refer, by default the current
-    folder. workers: the number of processes that run points at the same time; 0 means one for each
-    processor that other work leaves free, and none beside threads of others, as in a notebook.
 
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
-    working_folder = Path(folder or ".").absolute()
+    working_folder = Path(options.folder).absolute()
     arguments = [*read_words(overrides, working_folder), *read_axes(axes, working_folder)]
     sweeping = Sweeping(
-        os.fspath(recipe), arguments, working_folder, store or open_store(), zip, device
+        os.fspath(recipe),
+        arguments,
+        working_folder,
+        store or open_store(),
+        options.paired,
+        options.device,
     )
     point_outcomes = outcomes(
-        sweeping.plan, sweeping.store, on_error, device, workers=sweeping.workers(workers)
+        sweeping.plan,
+        sweeping.store,
+        options.on_error,
+        workers=sweeping.workers(options.workers),
     )
     return sweeping.sweep(list(point_outcomes), "complete")
 

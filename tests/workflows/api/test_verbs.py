@@ -128,8 +128,8 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
         "made/calibrate"
     )
     assert asked["calibrate"] == (
-        (recipe, store, Path("o"), (), progress),
-        {"walkers": 64, "move": "de", "draws": 200},
+        (recipe, store, Path("o"), (), progress, run_calibration.CalibrationOptions(64, "de", 200)),
+        {},
     )
     assert neusee.study(recipe, kind="leave-out", store=store, out="o", progress=progress) == Path(
         "made/study"

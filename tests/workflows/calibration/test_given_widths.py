@@ -88,12 +88,14 @@ def test_walkers_whose_guide_gives_a_wrong_ratio_fail_the_checks(camera, tmp_pat
             drawn, ratio = right.propose(own, rng)
             return drawn, 0 * ratio
 
-    monkeypatch.setattr(emcee_sampler, "_FIRST", 150)
-    monkeypatch.setattr(emcee_sampler, "_LONGEST", 150)
+    monkeypatch.setattr(emcee_sampler, "_FIRST_STEPS", 150)
+    monkeypatch.setattr(emcee_sampler, "_MOST_STEPS", 150)
     name, told = "importance sampling agrees with the chains", identify(problem, mode)
     for density, mark in ((right, "pass"), (Wrong(), "fail")):
         guide = law.guide._replace(density=density)
-        chains = emcee_sampler.sample(problem, mode, tmp_path / f"{mark}.h5", seed=1, guide=guide)
+        chains = emcee_sampler.sample(
+            problem, mode, tmp_path / f"{mark}.h5", emcee_sampler.Sampling(seed=1), guide=guide
+        )
         found = {
             c.name: c.mark for c in checks(problem, mode, told, replace(chains, long=True), law)
         }

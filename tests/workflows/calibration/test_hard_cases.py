@@ -184,7 +184,7 @@ def test_the_law_is_not_fooled_by_numbers_that_do_not_scatter(fitted, tmp_path):
 def starts(problem, mode, tmp_path):
     runs = [
         emcee_sampler.start_ensemble(
-            problem, mode, tmp_path / "none.h5", i, 1, 64, emcee_sampler.move("de")
+            problem, mode, tmp_path / "none.h5", i, emcee_sampler.Sampling(1, 64, "de")
         )
         for i in range(4)
     ]

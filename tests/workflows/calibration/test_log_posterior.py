@@ -87,8 +87,8 @@ class Stop(Exception):
 
 
 def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(emcee_sampler, "_FIRST", 20)
-    monkeypatch.setattr(emcee_sampler, "_LONGEST", 40)
+    monkeypatch.setattr(emcee_sampler, "_FIRST_STEPS", 20)
+    monkeypatch.setattr(emcee_sampler, "_MOST_STEPS", 40)
     p = problem(store, SEEN)
     best, lines = mode(p), []
 
@@ -97,15 +97,23 @@ def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
         if len(lines) == 2:
             raise Stop
 
-    whole = emcee_sampler.sample(p, best, tmp_path / "whole.h5", seed=3, walkers=16)
+    whole = emcee_sampler.sample(
+        p, best, tmp_path / "whole.h5", emcee_sampler.Sampling(seed=3, walkers=16)
+    )
     with pytest.raises(Stop):
-        emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16, progress=stop)
+        emcee_sampler.sample(
+            p, best, tmp_path / "cut.h5", emcee_sampler.Sampling(seed=3, walkers=16), progress=stop
+        )
     kept = emcee.backends.HDFBackend(str(tmp_path / "cut.h5"), name="ensemble3", read_only=True)
     assert 20 < kept.iteration < 40
-    again = emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16)
+    again = emcee_sampler.sample(
+        p, best, tmp_path / "cut.h5", emcee_sampler.Sampling(seed=3, walkers=16)
+    )
     assert np.array_equal(whole.draws, again.draws)
     assert np.array_equal(whole.log, again.log)
-    other = emcee_sampler.sample(p, best, tmp_path / "other.h5", seed=4, walkers=16)
+    other = emcee_sampler.sample(
+        p, best, tmp_path / "other.h5", emcee_sampler.Sampling(seed=4, walkers=16)
+    )
     assert not np.array_equal(whole.draws, other.draws)
     assert not list(tmp_path.glob("*.part"))
 
@@ -115,47 +123,62 @@ def test_what_has_ended_draws_nothing_more(store, tmp_path, monkeypatch):
     round alone.
     """
     for name, value in {
-        "_FIRST": 40,
-        "_TAUS": 0.0,
-        "_BURN": 0.0,
-        "_SURELY": 1e9,
-        "_CHANGE": 0.2,
+        "_FIRST_STEPS": 40,
+        "_LEAST_TAUS": 0.0,
+        "_DISCARDED_TAUS": 0.0,
+        "_SURE_TAUS": 1e9,
+        "_SETTLED_CHANGE": 0.2,
     }.items():
         monkeypatch.setattr(emcee_sampler, name, value)
     p = problem(store, SEEN)
     best = mode(p)
-    first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, effective_size=1)
+    first = emcee_sampler.sample(
+        p, best, tmp_path / "c.h5", emcee_sampler.Sampling(seed=3, walkers=16, effective_size=1)
+    )
     assert first.long
     monkeypatch.setattr(emcee.moves.DEMove, "get_proposal", None)
-    again = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, effective_size=1)
+    again = emcee_sampler.sample(
+        p, best, tmp_path / "c.h5", emcee_sampler.Sampling(seed=3, walkers=16, effective_size=1)
+    )
     assert again.long
     assert again.steps == first.steps
     assert np.array_equal(again.draws, first.draws)
 
 
 def test_draws_that_cannot_be_kept_are_drawn_and_said(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(emcee_sampler, "_FIRST", 20)
-    monkeypatch.setattr(emcee_sampler, "_LONGEST", 20)
+    monkeypatch.setattr(emcee_sampler, "_FIRST_STEPS", 20)
+    monkeypatch.setattr(emcee_sampler, "_MOST_STEPS", 20)
     (tmp_path / "file").write_text("no folder")
     p, said = problem(store, SEEN), []
     best = mode(p)
     found = emcee_sampler.sample(
-        p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, progress=said.append
+        p,
+        best,
+        tmp_path / "file" / "c.h5",
+        emcee_sampler.Sampling(seed=3, walkers=16),
+        progress=said.append,
     )
-    kept = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
+    kept = emcee_sampler.sample(
+        p, best, tmp_path / "c.h5", emcee_sampler.Sampling(seed=3, walkers=16)
+    )
     assert np.array_equal(found.draws, kept.draws)
     assert sum("an interruption would lose them" in line for line in said) == 1
 
 
 def test_a_damaged_file_of_draws_is_drawn_anew(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(emcee_sampler, "_FIRST", 20)
-    monkeypatch.setattr(emcee_sampler, "_LONGEST", 20)
+    monkeypatch.setattr(emcee_sampler, "_FIRST_STEPS", 20)
+    monkeypatch.setattr(emcee_sampler, "_MOST_STEPS", 20)
     p = problem(store, SEEN)
     best = mode(p)
-    first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
+    first = emcee_sampler.sample(
+        p, best, tmp_path / "c.h5", emcee_sampler.Sampling(seed=3, walkers=16)
+    )
     (tmp_path / "c.h5").write_bytes((tmp_path / "c.h5").read_bytes()[:3000])
     assert np.array_equal(
-        emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16).draws, first.draws
+        emcee_sampler.sample(
+            p, best, tmp_path / "c.h5", emcee_sampler.Sampling(seed=3, walkers=16)
+        ).draws,
+        first.draws,
     )
 
 
@@ -165,9 +188,11 @@ def drawn(store, tmp_path_factory):
     p = problem(store, SEEN)
     best = mode(p)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(emcee_sampler, "_FIRST", 400)
-        patch.setattr(emcee_sampler, "_LONGEST", 400)
-        chains = emcee_sampler.sample(p, best, tmp_path_factory.mktemp("draws") / "c.h5", seed=3)
+        patch.setattr(emcee_sampler, "_FIRST_STEPS", 400)
+        patch.setattr(emcee_sampler, "_MOST_STEPS", 400)
+        chains = emcee_sampler.sample(
+            p, best, tmp_path_factory.mktemp("draws") / "c.h5", emcee_sampler.Sampling(seed=3)
+        )
     return p, best, identify(p, best), replace(chains, long=True)
 
 
@@ -222,8 +247,8 @@ def said(capsys, *arguments):
 
 @pytest.mark.slow
 def test_short_chains_end_in_a_red_page_and_code_three(here, capsys, monkeypatch):
-    monkeypatch.setattr(emcee_sampler, "_FIRST", 60)
-    monkeypatch.setattr(emcee_sampler, "_LONGEST", 60)
+    monkeypatch.setattr(emcee_sampler, "_FIRST_STEPS", 60)
+    monkeypatch.setattr(emcee_sampler, "_MOST_STEPS", 60)
     code, printed = said(capsys, SEEN, "--walkers", "16")
     assert code == 3, printed.err
     assert "chains are long enough" in printed.err

@@ -10,7 +10,11 @@ import pytest
 from PIL import Image
 
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.run_calibration import FramesRefused, find_posterior
+from neusee.workflows.calibration.run_calibration import (
+    CalibrationOptions,
+    FramesRefused,
+    find_posterior,
+)
 from neusee.workflows.cli import app
 from neusee.workflows.frames.folder_recipe import recipe_of_folder
 from neusee.workflows.recipe.loading import load
@@ -51,7 +55,7 @@ def calibrated(camera, folder):
     written(camera, folder / "lab")
     store, told = Store(folder / "store"), []
     recipe = recipe_of_folder(folder / "lab", store, progress=told.append)
-    return find_posterior(recipe, store, told.append, walkers=64, move="de", draws=1000), told
+    return find_posterior(recipe, store, told.append, CalibrationOptions(64, "de", 1000)), told
 
 
 def judged(result, camera):

@@ -169,9 +169,7 @@ def test_emcee_draws_from_the_same_posterior(store, tmp_path):
         problem,
         find_mode(problem, initial_theta(problem)),
         tmp_path / "chain.h5",
-        seed=1,
-        walkers=32,
-        effective_size=500,
+        emcee_sampler.Sampling(seed=1, walkers=32, effective_size=500),
     )
     assert chains.long
     rows = {row.name: row for row in compare_models(problem.recipe, store)}
@@ -369,8 +367,8 @@ def test_a_misfit_is_what_chance_does_not_do():
 
 @pytest.mark.slow
 def test_the_page_of_a_camera_states_what_its_models_leave_open(tmp_path, monkeypatch):
-    monkeypatch.setattr(emcee_sampler, "_FIRST", 60)
-    monkeypatch.setattr(emcee_sampler, "_LONGEST", 60)
+    monkeypatch.setattr(emcee_sampler, "_FIRST_STEPS", 60)
+    monkeypatch.setattr(emcee_sampler, "_MOST_STEPS", 60)
     recipe = load("calibrate_camera")
     folder = run_calibration.calibrate(
         recipe, Store(tmp_path / "cache"), tmp_path / "runs", walkers=32

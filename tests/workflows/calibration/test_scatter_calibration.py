@@ -191,7 +191,11 @@ def test_chains_agree_with_weighted_draws(tmp_path):
     problem, mode = fitted({**TRUTH, "b0": 40.0}, seed=3)
     guide = draw_guide(problem, mode, np.random.default_rng(2))
     chains = emcee_sampler.sample(
-        problem, mode, tmp_path / "draws.h5", seed=1, walkers=32, effective_size=300, guide=guide
+        problem,
+        mode,
+        tmp_path / "draws.h5",
+        emcee_sampler.Sampling(seed=1, walkers=32, effective_size=300),
+        guide=guide,
     )
     draws, weight = weighted(problem, mode, 1)
     mean = weight @ draws

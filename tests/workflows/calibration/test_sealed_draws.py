@@ -30,7 +30,7 @@ MODE = SimpleNamespace(theta=np.zeros(2), log=0.0, draw=draw)
 @pytest.fixture
 def sampled(monkeypatch):
     """Returns the draws of a Gaussian, and how often the density was evaluated."""
-    for name in ("_FIRST", "_LONGEST"):
+    for name in ("_FIRST_STEPS", "_MOST_STEPS"):
         monkeypatch.setattr(emcee_sampler, name, 20)
     monkeypatch.delenv("NEUSEE_CACHE_SECRET", raising=False)
 
@@ -39,7 +39,9 @@ def sampled(monkeypatch):
         weigh = SimpleNamespace(
             names=PROBLEM.names, log_posterior=lambda x: calls.append(0) or log_posterior(x)
         )
-        return emcee_sampler.sample(weigh, MODE, file, seed=3, walkers=WALKERS).draws, len(calls)
+        return emcee_sampler.sample(
+            weigh, MODE, file, emcee_sampler.Sampling(3, WALKERS)
+        ).draws, len(calls)
 
     return sampled
 

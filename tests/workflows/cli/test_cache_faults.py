@@ -103,7 +103,7 @@ def shorten(command, monkeypatch):
     if command == "calibrate":
         from neusee.workflows.calibration import emcee_sampler
 
-        monkeypatch.setattr(emcee_sampler, "_LONGEST", 250)
+        monkeypatch.setattr(emcee_sampler, "_MOST_STEPS", 250)
     elif command == "evaluate":
         from neusee.workflows.evaluation import evaluation_page
 

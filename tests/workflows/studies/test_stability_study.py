@@ -10,7 +10,7 @@ import torch
 
 from neusee.nodes import node
 from neusee.nodes.optics import _psf, psf
-from neusee.nodes.optics._transform import _intensity
+from neusee.nodes.optics._transform import _intensity, _pupil_field
 from neusee.nodes.values import Pupil
 from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Step
@@ -151,7 +151,7 @@ def test_a_mask_from_a_file_has_a_stand_in_of_its_depth_so_that_what_follows_is_
     )
     assert 0.5 * depth < float(mask.max()) <= depth
     assert judge_step(pupil, chain.inputs(pupil.name), USUAL, recipe.seed).mark == "pass"
-    assert "takes the place of a mask from a file" in " ".join(stability_study._HOW.split())
+    assert "takes the place of a mask from a file" in " ".join(stability_study._GUIDE.split())
 
 
 def _without_restoration(recipe):
@@ -367,21 +367,21 @@ def test_a_fault_planted_in_the_light_fails_on_a_plate(fault, monkeypatch):
     # the faults are planted in the torch path
     monkeypatch.setattr(_intensity, "available", lambda device: False)
     assert judge_step(step, [_plate(), None], USUAL, 0).mark == "pass"
-    usual = _intensity.Field.__init__
+    usual = _pupil_field.Field.__init__
 
     def single(self, screens, view, dtype):
         with monkeypatch.context() as patch:
-            patch.setattr(_intensity, "_FEW_TURNS", math.inf)
+            patch.setattr(_pupil_field, "_FEW_TURNS", math.inf)
             usual(self, screens, view, dtype)
 
     if fault == "phase":
-        monkeypatch.setattr(_intensity.Field, "__init__", single)
+        monkeypatch.setattr(_pupil_field.Field, "__init__", single)
     elif fault == "backward":
         backward = _intensity.PupilIntensity.backward
 
         def wrong(ctx, *slopes):
             with monkeypatch.context() as patch:
-                patch.setattr(_intensity.Field, "__init__", single)
+                patch.setattr(_pupil_field.Field, "__init__", single)
                 return backward(ctx, *slopes)
 
         monkeypatch.setattr(_intensity, "KEPT_FIELD_BYTES", 0)

@@ -22,7 +22,7 @@ from neusee.workflows.graph.errors import RecipeError, RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps import sweep_points
 from neusee.workflows.sweeps import sweep_run as sweep_files
-from neusee.workflows.sweeps.sweep_run import sweep
+from neusee.workflows.sweeps.sweep_run import SweepOptions, sweep
 from tests.workflows.crate_rules import faults
 
 RECIPE = """\
@@ -117,7 +117,10 @@ def test_what_points_share_is_made_once(recipe, store, nodes):
 
 def test_paired_axes(recipe, store):
     found = sweep(
-        recipe, {"light.level": [1, 2], "light.colour": ["500 nm", "1 um"]}, zip=True, store=store
+        recipe,
+        {"light.level": [1, 2], "light.colour": ["500 nm", "1 um"]},
+        store=store,
+        options=SweepOptions(paired=True),
     )
     means = [row for row in found.rows if row["field"] == "mean"]
     assert [row["light.level"] for row in means] == [1, 2]
@@ -220,7 +223,9 @@ def test_a_failing_point_stops_the_sweep_with_its_error(recipe, store):
 
 
 def test_a_failing_point_is_kept_and_the_others_go_on(recipe, store):
-    found = sweep(recipe, AXES, ["sensor.most=1"], store=store, on_error="continue")
+    found = sweep(
+        recipe, AXES, ["sensor.most=1"], store=store, options=SweepOptions(on_error="continue")
+    )
     assert [o.point.number for o in found.failed] == [3, 4, 5, 6]
     row = next(row for row in found.rows if row["point"] == 3)
     assert (row["status"], row["step"], row["value"]) == ("failed", "noted", "")
@@ -281,7 +286,7 @@ def test_workers_give_the_same_rows_and_leave_nothing_in_the_store(recipe, tmp_p
     alone = sweep(recipe, AXES, store=Store(tmp_path / "alone"))
     nodes.CALLS.clear()
     store = Store(tmp_path / "shared")
-    found = sweep(recipe, AXES, store=store, workers=3)
+    found = sweep(recipe, AXES, store=store, options=SweepOptions(workers=3))
     assert nodes.CALLS == []
     assert of_numbers(found) == of_numbers(alone)
     assert [o.state for o in found.outcomes] == ["run"] * 6
@@ -290,16 +295,24 @@ def test_workers_give_the_same_rows_and_leave_nothing_in_the_store(recipe, tmp_p
         key: about.get("kept", True) for key, about in Store(tmp_path / "shared").entries()
     } == kept
     assert {path.name for path in (tmp_path / "shared/tmp").iterdir()} <= {".lock"}
-    again = sweep(recipe, AXES, store=Store(tmp_path / "shared"), workers=2)
+    again = sweep(recipe, AXES, store=Store(tmp_path / "shared"), options=SweepOptions(workers=2))
     assert [o.state for o in again.outcomes] == ["cached"] * 6
 
 
 def test_a_point_that_fails_in_a_worker_has_the_error_of_a_sweep_without_workers(recipe, store):
     with pytest.raises(RunError, match="3 e- are too many") as caught:
-        sweep(recipe, AXES, ["sensor.most=2"], store=store, workers=2)
+        sweep(recipe, AXES, ["sensor.most=2"], store=store, options=SweepOptions(workers=2))
     assert "sensor.read_noise=3 e-" in caught.value.__notes__[0]
-    found = sweep(recipe, AXES, ["sensor.most=1"], store=store, on_error="continue", workers=2)
-    alone = sweep(recipe, AXES, ["sensor.most=1"], store=store, on_error="continue")
+    found = sweep(
+        recipe,
+        AXES,
+        ["sensor.most=1"],
+        store=store,
+        options=SweepOptions(on_error="continue", workers=2),
+    )
+    alone = sweep(
+        recipe, AXES, ["sensor.most=1"], store=store, options=SweepOptions(on_error="continue")
+    )
     assert [o.point.number for o in found.failed] == [3, 4, 5, 6]
     assert of_numbers(found) == of_numbers(alone)
 
@@ -314,7 +327,7 @@ def test_points_of_a_killed_worker_are_run(recipe, store, nodes, monkeypatch):
         return whole(tensor, *args, **how)
 
     monkeypatch.setattr(torch.Tensor, "sum", deadly)
-    assert of_numbers(sweep(recipe, AXES, store=store, workers=2)) == wanted
+    assert of_numbers(sweep(recipe, AXES, store=store, options=SweepOptions(workers=2))) == wanted
 
 
 def test_workers_divide_the_memory_and_a_point_that_has_too_little_runs_here(
@@ -327,7 +340,7 @@ def test_workers_divide_the_memory_and_a_point_that_has_too_little_runs_here(
     wanted = of_numbers(sweep(recipe, AXES, store=Store(store.root.parent / "alone")))
     assert asked == []
     nodes.CALLS.clear()
-    assert of_numbers(sweep(recipe, AXES, store=store, workers=2)) == wanted
+    assert of_numbers(sweep(recipe, AXES, store=store, options=SweepOptions(workers=2))) == wanted
     assert nodes.CALLS.count("noted") == 6  # one byte is too little for any step
     free = local_executor.free_memory()
     monkeypatch.setattr(local_executor, "free_memory", lambda: free)
@@ -454,7 +467,10 @@ def test_a_product_is_a_data_set_with_the_axes_as_dimensions(recipe, store):
     pytest.importorskip("h5netcdf")
     pytest.importorskip("h5py")
     found = sweep(
-        recipe, {**AXES, "sensor.most": [2.5]}, store=store, on_error="continue"
+        recipe,
+        {**AXES, "sensor.most": [2.5]},
+        store=store,
+        options=SweepOptions(on_error="continue"),
     ).to_xarray()
     assert dict(found.sizes) == {
         "sensor.read_noise": 3,
@@ -481,8 +497,8 @@ def test_paired_axes_are_coordinates_of_the_points(recipe, store):
     found = sweep(
         recipe,
         {"light.level": [1, 2], "sensor.read_noise": ["1 e-", "2 e-"]},
-        zip=True,
         store=store,
+        options=SweepOptions(paired=True),
     ).to_xarray()
     assert found["quality.mean"].dims == ("point",)
     assert found["sensor.read_noise"].dims == ("point",)
@@ -527,7 +543,7 @@ def test_fifty_sweeps_leave_nothing_behind(recipe, tmp_path):
             axes,
             [f"light.level={level}", "sensor.most=1.5"],
             store=store,
-            on_error="continue",
+            options=SweepOptions(on_error="continue"),
         )
 
     def held():
