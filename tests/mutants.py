@@ -44,10 +44,10 @@ def within(room: str, *tests: str) -> str:
 EYE_FAULTS = (
     ("_eye", "5e-6 if wavelength < 1050e-9 else 13e-6", "13e-6", "eye_trains"),
     ("_eye", "5e-6 if wavelength < 1050e-9 else 13e-6", "5e-6", "eye_trains"),
-    ("_eye", "_COUNTED = 10.0", "_COUNTED = 100.0", "eye_trains"),
-    ("_eye", "_FEW = 600", "_FEW = 1200", "eye_trains"),
+    ("_eye", "_COUNTED_TIME = 10.0", "_COUNTED_TIME = 100.0", "eye_trains"),
+    ("_eye", "_FEW_PULSES = 600", "_FEW_PULSES = 1200", "eye_trains"),
     ("_eye", "_LEAST_C5 = 0.4", "_LEAST_C5 = 0.2", "eye_trains"),
-    ("_eye", "_BRIEF = 0.25", "_BRIEF = 0.30", "eye_trains"),
+    ("_eye", "_BRIEF_EXPOSURE = 0.25", "_BRIEF_EXPOSURE = 0.30", "eye_trains"),
     ("_eye", "5 * math.pow(groups, -0.25)", "math.pow(groups, -0.25)", "eye_trains"),
     ("_eye", "5 * math.pow(groups, -0.25)", "5 * math.pow(groups, -0.5)", "eye_trains"),
     ("_eye", "group_limit / pulses_in_group * factor", "group_limit * factor", "eye_trains"),
@@ -82,7 +82,7 @@ EYE_FAULTS = (
     ("_eye", "(age / 62.5) ** 4", "(age / 70) ** 4", "eye_dazzle"),
     ("_eye", "0.1 * pigmentation / angle", "0.2 * pigmentation / angle", "eye_dazzle"),
     ("_eye", "+ 0.0025 * pigmentation", "", "eye_dazzle"),
-    ("_eye", "_GLARE = (0.1, 100.0)", "_GLARE = (0.01, 100.0)", "eye_dazzle"),
+    ("_eye", "_GLARE_ANGLES = (0.1, 100.0)", "_GLARE_ANGLES = (0.01, 100.0)", "eye_dazzle"),
     ("_eye", "STEADY = 100.0", "STEADY = 20.0", "eye_dazzle"),
     ("_eye", "math.pow(background, 0.466)", "math.pow(background, 0.5)", "eye_dazzle"),
     ("_eye", "task.margin * threshold_luminance", "threshold_luminance", "eye_dazzle"),
@@ -315,8 +315,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/optics/_transform/_pupil_field.py",
-        "_FEW_TURNS = 2.0",
-        "_FEW_TURNS = 2e9",
+        "_FLOAT32_TURNS = 2.0",
+        "_FLOAT32_TURNS = 2e9",
         within(
             "nodes/optics", "psf_independent.py::test_without_a_compiler_the_error_is_as_stated_too"
         ),
@@ -464,7 +464,7 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/sensor/_frame_file.py",
-        "if _BYTE in (depth, bits) or values.dtype.itemsize == 1:",
+        "if _DISPLAY_BITS in (depth, bits) or values.dtype.itemsize == 1:",
         "if values.dtype.itemsize == 1:",
         within("nodes/sensor", "frame_file.py"),
     ),
@@ -725,7 +725,7 @@ MUTANTS = (
     *faults(
         "nodes/sensor/_noise.py",
         within("nodes/sensor", "draw_limits.py"),
-        ("SURE = math.log(1e4)", "SURE = math.log(1e3)"),
+        ("RARITY = math.log(1e4)", "RARITY = math.log(1e3)"),
         ("middle + 1.0, dtype", "middle + 2.0, dtype"),
         ("float(exceeding) > math.exp(-sure)", "float(exceeding) > math.exp(sure)"),
         ("weights + 2.0 * math.sqrt(weights * largest * sure) + 2.0", "weights + 2.0"),
@@ -773,10 +773,10 @@ MUTANTS = (
         within("nodes/laser", "beam.py"),
         ("_AGREE = 0.02\n", "_AGREE = 0.05\n"),
         ("_AGREE = 0.02\n", "_AGREE = 0.01\n"),
-        ("_SMALL = 1e-4 ", "_SMALL = 1e-1 "),
+        ("_SERIES_ARGUMENT = 1e-4 ", "_SERIES_ARGUMENT = 1e-1 "),
         ("duration * rate >= 1:", "duration * rate > 1:"),
         ("m_squared < 1:", "m_squared <= 1:"),
-        ("implied < 1 - _AGREE", "implied < 1"),
+        ("implied < 1 - _STATEMENTS_AGREE", "implied < 1"),
         ("max(implied, 1.0)", "implied"),
         ("and value > 0)", "and value >= 0)"),
         ("else 1 - x * x / 12\n\n", "else 1 - x * x / 6\n\n"),
@@ -966,7 +966,7 @@ MUTANTS = (
             "damage_parts.py::test_the_bracket_of_an_own_law_holds_nine_of_ten_devices_with_what_is_unknown_of_their_median",
         ),
         ("math.hypot(*log_deviations)", "sum(log_deviations)"),
-        ("_QUANTILE = 1.6448536269514722", "_QUANTILE = 1.2815515655446004"),
+        ("_NORMAL_QUANTILE = 1.6448536269514722", "_NORMAL_QUANTILE = 1.2815515655446004"),
     ),
     *faults(
         "nodes/laser/_damage_parts.py",
@@ -1035,7 +1035,7 @@ MUTANTS = (
             "nodes/laser",
             "damage_laws.py::test_the_probability_is_the_share_of_devices_and_its_ends_move_with_the_median",
         ),
-        ("_QUANTILE = 1.6448536269514722", "_QUANTILE = 1.959963984540054"),
+        ("_NORMAL_QUANTILE = 1.6448536269514722", "_NORMAL_QUANTILE = 1.959963984540054"),
         (
             "_QUANTILE * math.log(law.median_factor) / math.log(law.factor)",
             "_QUANTILE * math.log(law.median_factor)",
@@ -1251,8 +1251,8 @@ MUTANTS = (
             "nodes/optics",
             "pixel_average.py::test_a_very_fast_lens_is_said_to_be_beyond_scalar_theory",
         ),
-        ("_FAST = 1.2 ", "_FAST = 1.1 "),
-        ("number > _FAST * (1 + 1e-9)", "number >= _FAST"),
+        ("_FAST_F_NUMBER = 1.2 ", "_FAST_F_NUMBER = 1.1 "),
+        ("number > _FAST_F_NUMBER * (1 + 1e-9)", "number >= _FAST_F_NUMBER"),
     ),
     *faults(
         "nodes/optics/_psf.py",
@@ -1300,8 +1300,8 @@ MUTANTS = (
         ("abs(0 - spot_place)", "abs(1 - spot_place)"),
         ('zip("yx", camera.shape', 'zip("yx", camera.shape[::-1]'),
         (
-            'n, spot_place in zip("yx", camera.shape, spot(camera), strict',
-            'n, spot_place in zip("yx", camera.shape, spot(camera)[::-1], strict',
+            'n, spot_place in zip("yx", camera.shape, spot_position(camera), strict',
+            'n, spot_place in zip("yx", camera.shape, spot_position(camera)[::-1], strict',
         ),
         ("reach > limit * (1 + 1e-9)", "reach > limit * (1 + 1e-2)"),
     ),
@@ -1376,7 +1376,7 @@ MUTANTS = (
             "is_wider(diameter, grid_width):\n        text",
             "diameter > 2 * grid_width:\n        text",
         ),
-        ("diameter / pitch * (1 - _SAME)", "diameter / pitch / 2"),
+        ("diameter / pitch * (1 - _ROUNDED_LENGTH)", "diameter / pitch / 2"),
     ),
     # What a laser does along the axis.
     *faults(
@@ -1814,7 +1814,7 @@ MUTANTS = (
             "nodes/laser", "summit.py::test_light_that_the_wings_do_not_explain_may_be_in_one_spot"
         ),
         (
-            "torch.where(missing_share > _WINGS, missing_share, share_beyond_wings)",
+            "torch.where(missing_share > _WINGS_SHARE, missing_share, share_beyond_wings)",
             "share_beyond_wings",
         ),
         ("1 - light_with_wings(image) / passing", "0 * lacking"),
@@ -1826,7 +1826,10 @@ MUTANTS = (
             "nodes/laser",
             "summit.py::test_light_outside_a_window_is_in_no_spot_where_the_wings_explain_it",
         ),
-        ("torch.where(missing_share > _WINGS, missing_share, share_beyond_wings)", "missing_share"),
+        (
+            "torch.where(missing_share > _WINGS_SHARE, missing_share, share_beyond_wings)",
+            "missing_share",
+        ),
     ),
     *faults(
         "workflows/safety/laser_spots.py",
@@ -2068,8 +2071,8 @@ MUTANTS = (
         ),
         ("lit_sign = torch.where(is_lit, -1.0, 1.0)", "lit_sign = torch.where(is_lit, 1.0, -1.0)"),
         (
-            "unobstructed = torch.where(is_lit, _geometric(v, kappa), 0.0)",
-            "unobstructed = _geometric(v, kappa)",
+            "unobstructed = torch.where(is_lit, _field_without_rim(v, kappa), 0.0)",
+            "unobstructed = _field_without_rim(v, kappa)",
         ),
     ),
     *faults(
@@ -2388,7 +2391,7 @@ MUTANTS = (
             "protection.py::test_the_share_of_white_light_is_a_share_of_the_photons_of_daylight",
         ),
         ("if not band_end > band_start:", "if not high > low:"),
-        ("min(high * (1 + edge), _WHITE[1])", "high * (1 + edge)"),
+        ("min(high * (1 + edge), _WHITE_RANGE[1])", "high * (1 + edge)"),
         ("low * (1 - edge)", "low * (1 + edge)"),
     ),
     *faults(

@@ -125,8 +125,8 @@ from neusee.nodes.scene._exr import picture_size
 from neusee.nodes.scene._photograph import read_header
 from neusee.nodes.scene._photograph import list_photographs
 from neusee.nodes.sensor._frame_file import read_frame
-from neusee.nodes.spectra._plausible_spectra import _read as reflectances
-from neusee.nodes.spectra._lift import _read as lift_weights
+from neusee.nodes.spectra._plausible_spectra import _spectra_of_file as reflectances
+from neusee.nodes.spectra._lift import _checkpoint_tensors as lift_weights
 from neusee.nodes.units import existing_file as existing
 from neusee.workflows import load
 from neusee.workflows.calibration.emcee_sampler import _read as chain

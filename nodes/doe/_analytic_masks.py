@@ -18,8 +18,8 @@ from neusee.nodes.doe._refractive_index import (
     height_from_phase,
     refuse_material,
 )
-from neusee.nodes.optics._pupil import surface
-from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, polar
+from neusee.nodes.optics._pupil import zernike_surface
+from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, polar_coordinates, pupil_axes
 from neusee.nodes.units import Angle, Charge, Count, Height, Slope, Wavelength
 from neusee.nodes.values import Stop
 
@@ -49,7 +49,7 @@ def vortex(
     Source: Watnik, Ruane, Swartzlander, Opt. Eng. 55, 123102 (2016).
     """
     grid = grid_of(stop)
-    return height_from_phase(charge * polar(grid)[1], grid, wavelength, material)
+    return height_from_phase(charge * polar_coordinates(grid)[1], grid, wavelength, material)
 
 
 @node()
@@ -65,7 +65,9 @@ def axicon(
     Source: Watnik, Ruane, Swartzlander, Opt. Eng. 55, 123102 (2016).
     """
     grid = grid_of(stop)
-    return height_from_phase(2 * math.pi * waves * polar(grid)[0], grid, wavelength, material)
+    return height_from_phase(
+        2 * math.pi * waves * polar_coordinates(grid)[0], grid, wavelength, material
+    )
 
 
 @node()
@@ -85,7 +87,7 @@ def spiral_axicon(
     Source: Luo et al., Curr. Opt. Photon. 8, 355 (2024).
     """
     grid = grid_of(stop)
-    radius, azimuth = polar(grid)
+    radius, azimuth = polar_coordinates(grid)
     return height_from_phase(
         2 * math.pi * waves * radius + charge * azimuth, grid, wavelength, material
     )
@@ -104,7 +106,7 @@ def cubic(
     Source: Dowski, Cathey, Appl. Opt. 34, 1859 (1995).
     """
     grid = grid_of(stop)
-    v, u = axes(grid)
+    v, u = pupil_axes(grid)
     return height_from_phase(2 * math.pi * waves * (u**3 + v**3), grid, wavelength, material)
 
 
@@ -114,7 +116,7 @@ def _half_rings(
     """Return the phase (v, u) of the half-ring mask in rad: 2 pi a r, with the sign of one side of
     the axis.
     """
-    v, u = axes(grid)
+    v, u = pupil_axes(grid)
     squared_radius = v.square() + u.square()
     # annuli of equal area have equal steps of the squared radius
     annulus = (squared_radius * len(waves)).floor_().to(torch.int32).clamp_(max=len(waves) - 1)
@@ -175,7 +177,7 @@ def zernike(
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
     grid = grid_of(stop)
-    phase = surface(coefficients, grid) * (2 * math.pi / wavelength)
+    phase = zernike_surface(coefficients, grid) * (2 * math.pi / wavelength)
     return height_from_phase(phase, grid, wavelength, material)
 
 

@@ -16,8 +16,8 @@ from neusee.nodes.doe._refractive_index import (
     refuse_material,
     wave_height,
 )
-from neusee.nodes.optics._pupil import factors
-from neusee.nodes.optics._pupil_grid import grid_of, refuse_other_grid, stripes
+from neusee.nodes.optics._pupil import phase_screen_factors
+from neusee.nodes.optics._pupil_grid import grid_of, refuse_other_grid, row_stripes
 from neusee.nodes.precision import refuse_half
 from neusee.nodes.units import Depth, Length, PupilPitch, Wavelength
 from neusee.nodes.values import Stop
@@ -354,9 +354,9 @@ def height_error(
     deepened = height if depth == 0 else height * (1 + depth)
     if rms == 0:
         return deepened
-    rows, columns = factors(grid, scale, rng, height.device)
+    rows, columns = phase_screen_factors(grid, scale, rng, height.device)
     random_error = torch.cat(
-        [(rms * (rows[stripe] @ columns)).to(height.dtype) for stripe in stripes(grid)]
+        [(rms * (rows[stripe] @ columns)).to(height.dtype) for stripe in row_stripes(grid)]
     )
     return deepened + random_error
 

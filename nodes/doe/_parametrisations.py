@@ -27,8 +27,8 @@ from neusee.nodes.doe._fabrication import smooth
 from neusee.nodes.doe._refractive_index import Material, height_checks, height_from_phase
 from neusee.nodes.doe._sampled_height_map import height_range, pixelwise
 from neusee.nodes.network_weights import loaded, same_layout
-from neusee.nodes.optics._pupil import combine, screen
-from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, pupil_grid
+from neusee.nodes.optics._pupil import phase_screen, zernike_sum
+from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside_stop, pupil_axes, pupil_grid
 from neusee.nodes.resampling import enlarge
 from neusee.nodes.units import Count, DataFile, Depth, Layers
 from neusee.nodes.values import Stop
@@ -214,7 +214,7 @@ class Pixels(nn.Module):
         super().__init__()
         self.max_height = max_height
         if start is None:
-            logits = 1.5 * screen(pupil_grid(grid, 1.0, float(grid)), scale, rng)
+            logits = 1.5 * phase_screen(pupil_grid(grid, 1.0, float(grid)), scale, rng)
         else:
             share = enlarge(start.double() / max_height, grid, grid)
             logits = torch.logit(share.clamp(_LOGIT_MARGIN, 1 - _LOGIT_MARGIN))
@@ -253,12 +253,12 @@ class Modes(nn.Module):
 
     def _polynomials_on(self, grid: PupilGrid) -> Tensor:
         """Return the Zernike polynomials (mode, v, u) on a pupil grid, 0 outside the stop."""
-        v, u = axes(grid, self.waves.device)
+        v, u = pupil_axes(grid, self.waves.device)
         polynomials = [
-            combine({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples)
+            zernike_sum({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples)
             for k in range(len(self.waves))
         ]
-        return torch.stack(polynomials).where(inside(grid, v.device), 0.0).to(torch.float32)
+        return torch.stack(polynomials).where(inside_stop(grid, v.device), 0.0).to(torch.float32)
 
     def forward(self, stop: Stop) -> Tensor:
         """Return the height map (v, u) on the pupil grid of ``stop``."""
@@ -303,7 +303,7 @@ class Rings(nn.Module):
 
     def _annuli_on(self, grid: PupilGrid) -> Tensor:
         """Return the number (v, u) of the annulus in which each sample lies."""
-        v, u = axes(grid, self.slopes.device)
+        v, u = pupil_axes(grid, self.slopes.device)
         return (
             ((v.square() + u.square()) * len(self.slopes))
             .floor()
@@ -314,7 +314,7 @@ class Rings(nn.Module):
     def forward(self, stop: Stop) -> Tensor:
         """Return the height map (v, u) on the pupil grid of ``stop``."""
         grid = grid_of(stop)
-        v, u = axes(grid, self.slopes.device)
+        v, u = pupil_axes(grid, self.slopes.device)
         annulus = self._annuli(grid)
         phase = self.slopes.double()[annulus] * torch.hypot(v, u) + self.steps.double()[annulus]
         side_sign = torch.sign(u) if self.sided else torch.ones_like(u)
@@ -472,7 +472,9 @@ class Polynomials(nn.Module):
 
     def _products_on(self, grid: PupilGrid) -> Tensor:
         """Return the products (product, v, u) on a pupil grid."""
-        rows, columns = (legendre(axis, self.degree) for axis in axes(grid, self.waves.device))
+        rows, columns = (
+            legendre(axis, self.degree) for axis in pupil_axes(grid, self.waves.device)
+        )
         return torch.stack(
             [
                 rows[row_degree] * columns[column_degree]
@@ -515,7 +517,7 @@ class Streak(nn.Module):
     def forward(self, stop: Stop) -> Tensor:
         """Return the height map (v, u) on the pupil grid of ``stop``."""
         grid = grid_of(stop)
-        v, u = axes(grid, self.waves.device)
+        v, u = pupil_axes(grid, self.waves.device)
         position = u * self.angle.cos() + v * self.angle.sin()
         # from degree 2 on: below it a mask only shifts the spot
         polynomials = legendre(position, len(self.waves) + 1)[2:]
@@ -546,7 +548,7 @@ class LearntStop(nn.Module):
         float32 in [0, 1].
         """
         grid = grid_of(stop)
-        v, u = axes(grid, self.logit.device)
+        v, u = pupil_axes(grid, self.logit.device)
         samples = grid.diameter / grid.pitch
         # a stop of diameter 1 is open up to the rim of the lens
         rim_radius = self.diameter().double() * (1 + 1 / samples)

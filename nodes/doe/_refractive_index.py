@@ -25,9 +25,9 @@ from typing_extensions import TypedDict
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.optics._pupil_grid import PupilGrid, inside
+from neusee.nodes.optics._pupil_grid import PupilGrid, inside_stop
 from neusee.nodes.spectra._cie_tables import Table
-from neusee.nodes.spectra._table_files import LENGTHS, Curves, Rows, curves, refused, table_rows
+from neusee.nodes.spectra._table_files import LENGTHS, Curves, Rows, curves, table_error, table_rows
 from neusee.nodes.units import DataFile, Real, Wavelength
 from neusee.nodes.values import Bands
 
@@ -142,7 +142,7 @@ def refuse_glass(glass: Path | Sellmeier) -> None:
             _refuse_coefficients(index_data, _glass_name(glass))
     except (OSError, ValueError) as error:
         if isinstance(glass, Path):
-            raise refused("material", _COLUMN_ADVICE, error) from None
+            raise table_error("material", _COLUMN_ADVICE, error) from None
         raise ParameterError("material", str(error)) from None
 
 
@@ -447,7 +447,7 @@ def height_from_phase(
 
     The height outside the stop is 0 too.
     """
-    in_stop = inside(grid, phase.device)
+    in_stop = inside_stop(grid, phase.device)
     phase_from_lowest = phase - torch.where(in_stop, phase, math.inf).min()
     return torch.where(
         in_stop, phase_from_lowest * (wave_height(material, wavelength) / (2 * math.pi)), 0.0

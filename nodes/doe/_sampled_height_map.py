@@ -15,8 +15,8 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.doe._height_map_files import map_header, read_height_map
 from neusee.nodes.doe._refractive_index import height_checks
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.optics._pupil import screen
-from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside
+from neusee.nodes.optics._pupil import phase_screen
+from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside_stop
 from neusee.nodes.units import DataFile, Depth, LengthUnit, PupilPitch
 from neusee.nodes.values import Stop
 
@@ -52,7 +52,7 @@ def resampling_error(height: Tensor, pitch: float, grid: PupilGrid) -> float:
     difference = _interpolated(height, positions, cubic=True) - _interpolated(
         height, positions, cubic=False
     )
-    return float(difference[inside(grid)].square().mean().sqrt())
+    return float(difference[inside_stop(grid)].square().mean().sqrt())
 
 
 def coverage_problem(shape: tuple[int, ...], pitch: float, grid: PupilGrid) -> str:
@@ -194,7 +194,7 @@ def pixelwise(
     Source: by definition.
     """
     if file is None:
-        random_screen = screen(grid_of(stop), scale, rng)
+        random_screen = phase_screen(grid_of(stop), scale, rng)
         return (height_range(None, depth) * torch.sigmoid(1.5 * random_screen)).to(torch.float32)
     lengths = _lengths(file, depth, unit, pitch)
     file_pitch = _interpolation_pitch(file, grid_of(stop), lengths["pitch"], pupil_pitch)

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
-from neusee.nodes.optics._pupil_grid import axes, grid_of
+from neusee.nodes.optics._pupil_grid import grid_of, pupil_axes
 from neusee.nodes.precision import single
 from neusee.nodes.units import Fraction, Linewidth, Wavelength
 from neusee.nodes.values import Bands, Shade, Stop
@@ -52,7 +52,7 @@ def shade(
             circular aperture).
     """
     grid = grid_of(stop)
-    v, u = axes(grid)
+    v, u = pupil_axes(grid)
     is_open = (v.square() + u.square() <= diameter**2).float()
     rows = [(centre, width, depth) for centre in notches]
     # the amplitude is the root of the transmittance
@@ -77,7 +77,7 @@ def _(
 @shade.check
 def _(result: Shade, stop: Stop, **params: Any) -> list[Check]:
     grid = grid_of(stop)
-    v, u = axes(grid)
+    v, u = pupil_axes(grid)
     share = float(result.amplitude.double().square().sum() / (v.square() + u.square() <= 1).sum())
     return [Check(f"the shade passes {share:.4g} of the light, away from its notches", share > 0)]
 

@@ -9,8 +9,8 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, TensorStats, node
-from neusee.nodes.optics._pupil import factors, surface
-from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside, stripes
+from neusee.nodes.optics._pupil import phase_screen_factors, zernike_surface
+from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside_stop, row_stripes
 from neusee.nodes.units import Fraction, Waves
 from neusee.nodes.values import Dirt, Stop
 
@@ -181,11 +181,11 @@ def dirt(
     grains = _grains(dust, dust_radius, grains_rng)
     scratch_lines = _scratches(scratches, scratch_length, scratch_width, lines_rng)
     # each random field is the product of a factor along the rows and one along the columns
-    film_rows, film_columns = factors(grid, grease_scale, film_rng)
-    patch_rows, patch_columns = factors(grid, smudge_scale, patches_rng)
+    film_rows, film_columns = phase_screen_factors(grid, grease_scale, film_rng)
+    patch_rows, patch_columns = phase_screen_factors(grid, smudge_scale, patches_rng)
     dent_terms = _dents(WAVE * dents, dents_rng)
     amplitude, path = (torch.empty(grid.samples, grid.samples) for _ in range(2))
-    for rows in stripes(grid):
+    for rows in row_stripes(grid):
         amplitude[rows] = 1.0
         if smudges:
             amplitude[rows] = 1 - smudges * torch.sigmoid(3 * (patch_rows[rows] @ patch_columns))
@@ -193,7 +193,7 @@ def dirt(
         if grease:
             path[rows] = WAVE * grease * (film_rows[rows] @ film_columns)
         if dent_terms:
-            path[rows] += surface(dent_terms, grid, rows=rows)
+            path[rows] += zernike_surface(dent_terms, grid, rows=rows)
     return Dirt(stamp(amplitude, [*grains, *scratch_lines], grid), path)
 
 
@@ -314,8 +314,8 @@ def _light_and_path(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
     in the dirt in waves at 550 nm, over the pupil.
     """
     pupil_sums = torch.zeros(4, dtype=torch.float64)
-    for rows in stripes(grid):
-        in_pupil = inside(grid, dirt.path.device, rows)
+    for rows in row_stripes(grid):
+        in_pupil = inside_stop(grid, dirt.path.device, rows)
         amplitude, path_waves = (
             dirt.amplitude[rows][in_pupil].double(),
             dirt.path[rows][in_pupil].double() / WAVE,

@@ -26,8 +26,8 @@ Number = TypeVar("Number", float, Tensor)
 Convention = Literal["1/e2", "1/e"]
 
 #: largest relative difference of two statements of one quantity, because data sheets round
-_AGREE = 0.02
-_SMALL = 1e-4  #: argument below which a series replaces a quotient of two small numbers
+_STATEMENTS_AGREE = 0.02
+_SERIES_ARGUMENT = 1e-4  #: argument below which a series replaces a quotient of two small numbers
 
 
 class Beam(NamedTuple):
@@ -95,10 +95,10 @@ def beam(
             )
     # exp(-2 r^2 / w^2) is 1/e at w / sqrt(2)
     to_e2 = math.sqrt(2) if convention == "1/e" else 1.0
-    width, angle, quality = _shape(
+    width, angle, quality = _completed_shape(
         wavelength, waist and waist * to_e2, divergence and divergence * to_e2, m_squared
     )
-    mean_power, energy, duration, rate = _emission(
+    mean_power, energy, duration, rate = _completed_emission(
         power, pulse_energy, pulse_duration, repetition_rate
     )
     return Beam(
@@ -113,7 +113,7 @@ def beam(
     )
 
 
-def _emission(
+def _completed_emission(
     power: float | None, energy: float | None, duration: float | None, rate: float | None
 ) -> tuple[float | None, float | None, float | None, float | None]:
     """Return (mean power in W, pulse energy in J, pulse duration in s, repetition rate in Hz),
@@ -164,7 +164,7 @@ def _refuse_single_pulse(power: float | None, energy: float | None) -> None:
 def _refuse_other_power(power: float | None, energy: float, rate: float) -> None:
     """Raise ParameterError for a mean power that is not pulse energy times repetition rate."""
     mean = energy * rate
-    if power is not None and not math.isclose(plain(power), plain(mean), rel_tol=_AGREE):
+    if power is not None and not math.isclose(plain(power), plain(mean), rel_tol=_STATEMENTS_AGREE):
         text = (
             f"pulse energy {energy:.4g} J x repetition rate {rate:.4g} Hz = {mean:.4g} W, not power"
             f" {power:.4g} W"
@@ -182,7 +182,7 @@ def _refuse_long_pulse(duration: float, rate: float) -> None:
         raise ParameterError("pulse_duration", f"{text}, or a lower repetition_rate")
 
 
-def _shape(
+def _completed_shape(
     wavelength: float, waist: float | None, divergence: float | None, m_squared: float | None
 ) -> tuple[float, float, float]:
     """Return (waist in m, divergence in rad, M2) of a beam at 1/e2, from two or three of them, or
@@ -220,13 +220,15 @@ def _implied_quality(
     stated_text = (
         f"waist {waist:.4g} m and divergence {divergence:.4g} rad (1/e2) have M2 = {implied:.4g}"
     )
-    if implied < 1 - _AGREE:
+    if implied < 1 - _STATEMENTS_AGREE:
         text = (
             f"{stated_text}, but no beam has less than 1: at this waist the divergence is at least"
             f" {diffraction / waist:.4g} rad"
         )
         raise ParameterError("divergence", text)
-    if m_squared is not None and not math.isclose(plain(implied), plain(m_squared), rel_tol=_AGREE):
+    if m_squared is not None and not math.isclose(
+        plain(implied), plain(m_squared), rel_tol=_STATEMENTS_AGREE
+    ):
         raise ParameterError(
             "m_squared", f"{stated_text}, not {m_squared:g}: leave one of the three out"
         )
@@ -415,9 +417,11 @@ def underfilled(x: Number) -> Number:
     = (D / (2 w))^2.
     """
     if isinstance(x, Tensor):
-        safe_x = x.where(x > _SMALL, 1.0)
-        return torch.where(x > _SMALL, 2 / safe_x * torch.tanh(safe_x / 2), 1 - x * x / 12)
-    return 2 / x * math.tanh(x / 2) if x > _SMALL else 1 - x * x / 12
+        safe_x = x.where(x > _SERIES_ARGUMENT, 1.0)
+        return torch.where(
+            x > _SERIES_ARGUMENT, 2 / safe_x * torch.tanh(safe_x / 2), 1 - x * x / 12
+        )
+    return 2 / x * math.tanh(x / 2) if x > _SERIES_ARGUMENT else 1 - x * x / 12
 
 
 def _radius_squared(beam: Beam, distance: Number) -> Number:
@@ -447,7 +451,7 @@ def _expm1(x: Number) -> Number:
 
 Law = Literal["kruse", "kim"]
 _KOSCHMIEDER = 3.912  #: -ln 0.02: at the visibility a black object has 2 % of its contrast left
-_AT = 550e-9  #: m, wavelength of the visibility
+_VISIBILITY_WAVELENGTH = 550e-9  #: m, wavelength of the visibility
 
 
 def air_transmittance(
@@ -477,7 +481,12 @@ def air_transmittance(
             "visibility", f"{visibility:g} m is no visibility: give a number above 0"
         )
     exponent = size_exponent(visibility, law)
-    optical_depth = _KOSCHMIEDER / visibility * math.pow(wavelength / _AT, -exponent) * distance
+    optical_depth = (
+        _KOSCHMIEDER
+        / visibility
+        * math.pow(wavelength / _VISIBILITY_WAVELENGTH, -exponent)
+        * distance
+    )
     return (
         torch.exp(-optical_depth) if isinstance(optical_depth, Tensor) else math.exp(-optical_depth)
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.laser._dazzle import _over_feature, peak_light
+from neusee.nodes.laser._dazzle import mean_over_feature, peak_light
 from neusee.nodes.laser._round_spot import legendre, round_spot
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Count, PixelPitch, Shape
@@ -27,13 +27,14 @@ from neusee.nodes.values import Bands, Psf
 
 RINGS = 160  #: rings about the spot, at equal ratios of their radii
 PARTS = 48  #: groups of as many pixels in each ring, from the brightest to the faintest
-_LEVELS = 3000  #: of light, at equal ratios, into which pixels are sorted
-_DECADES = 24.0  #: of light below the brightest pixel; fainter pixels count as 0
-_LAW = 1.5  #: factor on the light of the radial law outside, since wings of a PSF are no smooth law
-_INNER = 48  #: pixels from the spot to each side that are computed one by one
-_SHELLS = 3000  #: radii beyond these pixels
-_FRINGE = 0.06  #: step of v = pi x / (lambda N) in which no fringe of a spot changes much
-_FINEST = 24  #: points across a pixel, at most, but for the brightest ones
+_LIGHT_LEVELS = 3000  #: of light, at equal ratios, into which pixels are sorted
+_LIGHT_DECADES = 24.0  #: of light below the brightest pixel; fainter pixels count as 0
+#: factor on the light of the radial law outside, since wings of a PSF are no smooth law
+_WING_FACTOR = 1.5
+_INNER_PIXELS = 48  #: pixels from the spot to each side that are computed one by one
+_SHELL_COUNT = 3000  #: radii beyond these pixels
+_FRINGE_STEP = 0.06  #: step of v = pi x / (lambda N) in which no fringe of a spot changes much
+_MOST_PIXEL_POINTS = 24  #: points across a pixel, at most, but for the brightest ones
 
 
 class BrightPixels(NamedTuple):
@@ -86,8 +87,10 @@ def bright_pixels(
     # photons of each wavelength, which fill wells
     weights = (bands.weights * bands.centres).double()
     weights = weights / weights.sum()
-    samples_across = _samples(pixel_pitch, sample_pitch)
-    bands_of_pixels = (_pixels(band.detach().double(), samples_across) for band in psf.intensity)
+    samples_across = _samples_across(pixel_pitch, sample_pitch)
+    bands_of_pixels = (
+        _light_of_pixels(band.detach().double(), samples_across) for band in psf.intensity
+    )
     image = torch.as_tensor(
         sum(w * band for w, band in zip(weights.tolist(), bands_of_pixels, strict=True))
     )
@@ -95,12 +98,12 @@ def bright_pixels(
     window_smaller = [m < n for m, n in zip(image.shape, shape, strict=True)]
     rim = _rim(image.cpu(), window_smaller)
     image = crop(image, shape=(min(shape[0], image.shape[0]), min(shape[1], image.shape[1])))
-    smooth = image if feature == 1 else _over_feature(image[None], feature)[0]
-    groups = _grouped(image.cpu(), smooth.cpu())
+    smooth = image if feature == 1 else mean_over_feature(image[None], feature)[0]
+    groups = _pixel_groups(image.cpu(), smooth.cpu())
     return BrightPixels(*groups, rim)
 
 
-def _samples(pixel_pitch: float, sample_pitch: float | None) -> int:
+def _samples_across(pixel_pitch: float, sample_pitch: float | None) -> int:
     """Return the number of samples along the side of a pixel."""
     ratio = pixel_pitch / (sample_pitch or pixel_pitch)
     if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
@@ -112,7 +115,7 @@ def _samples(pixel_pitch: float, sample_pitch: float | None) -> int:
     return round(ratio)
 
 
-def _pixels(light: Tensor, samples: int) -> Tensor:
+def _light_of_pixels(light: Tensor, samples: int) -> Tensor:
     """Return the light (y, x) of each pixel, the sum of its ``samples`` x ``samples`` samples; a
     part of a pixel at the end is left out.
     """
@@ -126,7 +129,7 @@ def _pixels(light: Tensor, samples: int) -> Tensor:
     return light if samples == 1 else avg_pool2d(light[None], samples)[0] * samples**2
 
 
-def _grouped(image: Tensor, smooth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _pixel_groups(image: Tensor, smooth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return radius, number of pixels, light and smoothed light (group,) of the groups of pixels,
     `PARTS` in each ring.
     """
@@ -167,25 +170,27 @@ def _rings(rows: int, columns: int) -> _Rings:
     radius = np.sqrt(
         np.bincount(ring_number, squared_distance, minlength=RINGS) / np.maximum(pixels, 1)
     )
-    return _Rings(ring_number * (_LEVELS + 1), radius, pixels)
+    return _Rings(ring_number * (_LIGHT_LEVELS + 1), radius, pixels)
 
 
 def _quantiles(light: np.ndarray, rings: _Rings) -> np.ndarray:
     """Return the light (ring, part) of the pixels in the middle of each of `PARTS` groups of a
     ring, from its brightest group to its faintest.
 
-    The pixels are sorted into `_LEVELS` levels of light at equal ratios, so that one count for each
-    ring and level gives the order of all of them.
+    The pixels are sorted into `_LIGHT_LEVELS` levels of light at equal ratios, so that one count
+    for each ring and level gives the order of all of them.
     """
     brightest = float(light.max(initial=0.0))
     if not brightest > 0:
         return np.zeros((RINGS, PARTS))
-    log_step = _DECADES * math.log(10) / _LEVELS
-    faintest = brightest * math.exp(-(_LEVELS + 1) * log_step)
+    log_step = _LIGHT_DECADES * math.log(10) / _LIGHT_LEVELS
+    faintest = brightest * math.exp(-(_LIGHT_LEVELS + 1) * log_step)
     steps_below = np.log(np.maximum(light, faintest) / brightest) * (-1 / log_step)
-    level = np.minimum(steps_below, _LEVELS).astype(np.int64)
+    level = np.minimum(steps_below, _LIGHT_LEVELS).astype(np.int64)
     # one count for each ring and level: `number` is the ring times the number of levels
-    counts = np.bincount(rings.number + level, minlength=RINGS * (_LEVELS + 1)).reshape(RINGS, -1)
+    counts = np.bincount(rings.number + level, minlength=RINGS * (_LIGHT_LEVELS + 1)).reshape(
+        RINGS, -1
+    )
     brighter_counts = counts.cumsum(1)
     middle_ranks = (np.arange(PARTS) + 0.5) / PARTS * rings.pixels[:, None]
     levels_at_ranks = np.stack(
@@ -196,7 +201,9 @@ def _quantiles(light: np.ndarray, rings: _Rings) -> np.ndarray:
     )
     # the middle of a level; the last level holds what counts as 0
     return np.where(
-        levels_at_ranks < _LEVELS, brightest * np.exp(-(levels_at_ranks + 0.5) * log_step), 0.0
+        levels_at_ranks < _LIGHT_LEVELS,
+        brightest * np.exp(-(levels_at_ranks + 0.5) * log_step),
+        0.0,
     )
 
 
@@ -206,8 +213,8 @@ def _rim(image: Tensor, narrow: list[bool]) -> Tensor:
 
     The distance, in pixels, is that of the nearest such side. The light of the rim is the mean of
     all its pixels, each brought to this distance by the third power of its own. The known light is
-    that of the window and, `_LAW` times, that of the radial law on the plane outside. Without a
-    side where the sensor goes on, distance and light are 0.
+    that of the window and, `_WING_FACTOR` times, that of the radial law on the plane outside.
+    Without a side where the sensor goes on, distance and light are 0.
     """
     light_of_window = image.double().sum()
     if not any(narrow):
@@ -226,20 +233,24 @@ def _rim(image: Tensor, narrow: list[bool]) -> Tensor:
     outside_light = 4 * light_times_cube * math.hypot(*half_sides) / (half_sides[0] * half_sides[1])
     rim_distance = torch.tensor(distance, dtype=torch.float64)
     return torch.stack(
-        [rim_distance, light_times_cube / distance**3, light_of_window + _LAW * outside_light]
+        [
+            rim_distance,
+            light_times_cube / distance**3,
+            light_of_window + _WING_FACTOR * outside_light,
+        ]
     )
 
 
 def light_with_wings(image: Tensor) -> Tensor:
-    """Return the light of a window (y, x) and of the plane outside, there `_LAW` times that of
-    the radial law.
+    """Return the light of a window (y, x) and of the plane outside, there `_WING_FACTOR` times that
+    of the radial law.
     """
     return _rim(image, [True, True])[2]
 
 
 @bright_pixels.preflight
 def _(*, pixel_pitch: float, sample_pitch: float | None = None, **_: Any) -> list[str]:
-    _samples(pixel_pitch, sample_pitch)
+    _samples_across(pixel_pitch, sample_pitch)
     return []
 
 
@@ -264,7 +275,7 @@ def with_frame(groups: BrightPixels, shape: tuple[int, int]) -> BrightPixels:
     if not (missing_pixels >= 1 and float(groups.rim[0]) > 0):
         return groups
     distance, light, _ = groups.rim.tolist()
-    radius, pixels = _shells(
+    radius, pixels = _outer_rings(
         shape,
         shape[0] * shape[1] - missing_pixels,
         torch.full((1, 2), distance, dtype=torch.float64),
@@ -312,9 +323,9 @@ def round_pixels(
     passing_share = 1.0 if fill < 1e-9 else -math.expm1(-2 * fill) / (2 * fill)
     # light of a pixel as bright as the peak, in units of the light that passes
     scale = peak_light(spread) / passing_share
-    positions, alike_pixels = _inner(shape, spread)
+    positions, alike_pixels = _inner_pixels(shape, spread)
     inner_light = scale * _over_squares(positions, fill, waves, spread)
-    shell_radii, shell_pixels = _shells(shape, float(alike_pixels.sum()), positions)
+    shell_radii, shell_pixels = _outer_rings(shape, float(alike_pixels.sum()), positions)
     outer_light = scale * _over_rings(shell_radii, fill, waves, spread)
     radius = torch.cat([positions.square().sum(1).sqrt(), shell_radii])
     pixels, light = torch.cat([alike_pixels, shell_pixels]), torch.cat([inner_light, outer_light])
@@ -324,14 +335,14 @@ def round_pixels(
     return BrightPixels(radius, pixels, light, smooth, rim)
 
 
-def _inner(shape: tuple[int, int], spread: float) -> tuple[Tensor, Tensor]:
+def _inner_pixels(shape: tuple[int, int], spread: float) -> tuple[Tensor, Tensor]:
     """Return the positions (pixel, (y, x)) of the pixels around the spot, of which symmetric ones
     are listed once, and the number of pixels that each stands for.
 
     Positions are in pixels from the spot, in one quadrant, and in half of it where the part is
     square.
     """
-    half_sides = [min(_INNER, (n - 1) // 2) for n in shape]
+    half_sides = [min(_INNER_PIXELS, (n - 1) // 2) for n in shape]
     y, x = torch.meshgrid(
         *(torch.arange(half_side + 1.0, dtype=torch.float64) for half_side in half_sides),
         indexing="ij",
@@ -345,7 +356,7 @@ def _inner(shape: tuple[int, int], spread: float) -> tuple[Tensor, Tensor]:
     return torch.stack([y.flatten(), x.flatten()], 1), alike_pixels.flatten().double()
 
 
-def _shells(shape: tuple[int, int], counted: float, places: Tensor) -> tuple[Tensor, Tensor]:
+def _outer_rings(shape: tuple[int, int], counted: float, places: Tensor) -> tuple[Tensor, Tensor]:
     """Return the radii in pixels of rings beyond the inner pixels, and the number of pixels of the
     sensor in each ring.
 
@@ -359,18 +370,23 @@ def _shells(shape: tuple[int, int], counted: float, places: Tensor) -> tuple[Ten
     inner_half = places.amax(0) + 0.5
     start = float(torch.minimum(inner_half, half_sides).min())
     edges = torch.logspace(
-        math.log10(start), math.log10(float(half_sides.norm())), _SHELLS + 1, dtype=torch.float64
+        math.log10(start),
+        math.log10(float(half_sides.norm())),
+        _SHELL_COUNT + 1,
+        dtype=torch.float64,
     )
     radii = (edges[1:] + edges[:-1]) / 2
     # the area of a ring inside the sensor and outside the inner rectangle
-    ring_pixels = (_arc(radii, half_sides) - _arc(radii, inner_half)).clamp_min(0) * edges.diff()
+    ring_pixels = (_arc_inside(radii, half_sides) - _arc_inside(radii, inner_half)).clamp_min(
+        0
+    ) * edges.diff()
     not_empty = ring_pixels > 0
     radii, ring_pixels = radii[not_empty], ring_pixels[not_empty]
     # scaled, so that the numbers add up to the pixels that are left
     return radii, ring_pixels * (outer_pixels / ring_pixels.sum())
 
 
-def _arc(radius: Tensor, half: Tensor) -> Tensor:
+def _arc_inside(radius: Tensor, half: Tensor) -> Tensor:
     """Return the length of the circle of each radius that lies inside a rectangle of half sides
     (y, x).
     """
@@ -383,14 +399,17 @@ def _over_squares(places: Tensor, fill: float, waves: float, spread: float) -> T
     """Return the mean irradiance of the pixels at ``places``, from a table over the radius."""
     # from the middle of a pixel to its corner it is 0.71
     table_end = float(places.square().sum(1).max().sqrt()) + 0.75
-    steps = math.ceil(table_end * math.pi / spread / _FRINGE)
+    steps = math.ceil(table_end * math.pi / spread / _FRINGE_STEP)
     radii = torch.linspace(0.0, table_end, min(max(steps, 400), 40_000), dtype=torch.float64)
     # the argument is v = pi x / (lambda N), with x in pixels
     table = round_spot(radii * (math.pi / spread), fill, waves)
     mean_irradiance = torch.zeros(len(places), dtype=torch.float64)
     near_spot = places.amax(1) <= 2
     # the spot may be far smaller than one of the nearest pixels, which takes more points
-    for pixels_of_group, node_limit in ((near_spot, 4 * _FINEST * 4), (~near_spot, _FINEST)):
+    for pixels_of_group, node_limit in (
+        (near_spot, 4 * _MOST_PIXEL_POINTS * 4),
+        (~near_spot, _MOST_PIXEL_POINTS),
+    ):
         points, weights = (
             torch.from_numpy(values)
             for values in legendre(min(node_limit, 3 + math.ceil(5 / spread)))
@@ -438,7 +457,7 @@ def _over_rings(radius: Tensor, fill: float, waves: float, spread: float) -> Ten
     # by chance, since even steps are in step with the fringes at some radii
     azimuth = random_share * (math.pi / 4)
     cosine, sine = azimuth.cos(), azimuth.sin()
-    point_count = min(_FINEST, 5 + math.ceil(6 / spread))
+    point_count = min(_MOST_PIXEL_POINTS, 5 + math.ceil(6 / spread))
     # from corner to corner, the square is cos + sin wide across the rings
     offset = ((torch.arange(point_count, dtype=torch.float64) + 0.5) / point_count - 0.5) * (
         cosine + sine
@@ -488,12 +507,12 @@ def _smoothed(radius: Tensor, pixels: Tensor, light: Tensor, feature: float) -> 
 # higher one.
 
 
-_NEAR = 0.5  #: of the brightest sample, from which the summit of a lobe may be higher than it
-_FLOOR = 1e-30  #: of the brightest sample, below which light is dark
+_LOBE_SHARE = 0.5  #: of the brightest sample, from which the summit of a lobe may be higher than it
+_DARK_SHARE = 1e-30  #: of the brightest sample, below which light is dark
 #: a sample and its four neighbours, in samples along y and x
-_CROSS = ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))
+_NEIGHBOUR_OFFSETS = ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))
 #: share of the light outside a window, at most, that the wings of a spot in the window explain
-_WINGS = 0.03
+_WINGS_SHARE = 0.03
 
 
 def summit_gain(image: Tensor) -> Tensor:
@@ -515,15 +534,15 @@ def summit_gain(image: Tensor) -> Tensor:
         return torch.ones((), dtype=torch.float64)
     inner = image[1:-1, 1:-1]
     # a few samples: no other one is a summit
-    y, x = (inner > _NEAR * brightest).nonzero(as_tuple=True)
+    y, x = (inner > _LOBE_SHARE * brightest).nonzero(as_tuple=True)
     log_light, above, below, left, right = (
-        (image[y + 1 + dy, x + 1 + dx].double() / brightest).clamp_min(_FLOOR).log()
-        for dy, dx in _CROSS
+        (image[y + 1 + dy, x + 1 + dx].double() / brightest).clamp_min(_DARK_SHARE).log()
+        for dy, dx in _NEIGHBOUR_OFFSETS
     )
     is_lobe, log_gain = torch.ones_like(log_light, dtype=torch.bool), torch.zeros_like(log_light)
     for before, after in ((above, below), (left, right)):
         is_lobe = is_lobe & (log_light >= before) & (log_light >= after)
-        curvature = (2 * log_light - before - after).clamp_min(_FLOOR)
+        curvature = (2 * log_light - before - after).clamp_min(_DARK_SHARE)
         # summit of the parabola through three points above the middle one
         log_gain = log_gain + (after - before).square() / (8 * curvature)
     summits = torch.where(is_lobe, log_light + log_gain, 0.0)
@@ -549,4 +568,4 @@ def unseen_light(image: Tensor, passing: float) -> Tensor:
     """
     missing_share = 1 - image.double().sum() / passing
     share_beyond_wings = 1 - light_with_wings(image) / passing
-    return torch.where(missing_share > _WINGS, missing_share, share_beyond_wings).clamp_min(0)
+    return torch.where(missing_share > _WINGS_SHARE, missing_share, share_beyond_wings).clamp_min(0)

@@ -20,8 +20,8 @@ from neusee.nodes.laser._round_spot import bilinear, legendre
 # limit.
 
 
-_SAMPLES = 400  #: distances at which a margin is looked at first
-_ROUNDS = 60  #: halvings of an interval, to the last bit of a distance
+_SAMPLED_DISTANCES = 400  #: distances at which a margin is looked at first
+_HALVINGS = 60  #: halvings of an interval, to the last bit of a distance
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
@@ -76,7 +76,7 @@ def defocus_of_source(
 
 
 def distance_intervals(
-    margin: Callable[[float], float], near: float, far: float, samples: int = _SAMPLES
+    margin: Callable[[float], float], near: float, far: float, samples: int = _SAMPLED_DISTANCES
 ) -> list[tuple[float, float]]:
     """Return the intervals of distance in m between ``near`` and ``far`` at which a margin is above
     0, in rising order.
@@ -137,7 +137,7 @@ def _extremum(
     margin there, by golden section of the logarithm of the distance.
     """
     low, high = math.log(a), math.log(b)
-    for _ in range(_ROUNDS):
+    for _ in range(_HALVINGS):
         # two points that divide the interval in the golden ratio
         lower, upper = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
         if sign * value(math.exp(lower)) > sign * value(math.exp(upper)):
@@ -152,7 +152,7 @@ def _crossing(value: Callable[[float], float], a: float, b: float, above: bool) 
     """Return the distance between a and b at which a margin passes 0, by bisection; ``above`` says
     that it is above 0 at a.
     """
-    for _ in range(_ROUNDS):
+    for _ in range(_HALVINGS):
         middle = math.sqrt(a * b)
         a, b = (middle, b) if (value(middle) > 0) == above else (a, middle)
     return math.sqrt(a * b)
@@ -170,24 +170,24 @@ def _crossing(value: Callable[[float], float], a: float, b: float, above: bool) 
 
 
 #: of the even, focused pupil: integral of (2 J1(v) / v)^2 over v from 0 on
-_AIRY = 16 / (3 * math.pi)
+_AIRY_HEAT = 16 / (3 * math.pi)
 #: defocus and fill up to which the heat is interpolated in a table
 _TABLE_WAVES, _TABLE_FILL = 8.0, 8.0
 _WAVE_STEPS, _FILL_STEPS = 401, 33
 #: reach up to which irradiance is summed, twice that of the geometric edge
-_EDGE = 8 * math.pi * _TABLE_WAVES
-_STEP = 0.1  #: of the reach, between its samples
+_LARGEST_REACH = 8 * math.pi * _TABLE_WAVES
+_REACH_STEP = 0.1  #: of the reach, between its samples
 #: reach within which the hottest point is looked for: farther out the heat of a spot only falls
-_HOTTEST = 6.0
-_POINTS = 25  #: of them
-_PARTS = 32  #: of a step, over which the inverse distance is averaged
-_NODES = 256  #: of the quadrature over the pupil
+_HOTTEST_REACH = 6.0
+_HEATED_POINTS = 25  #: of them
+_STEP_PARTS = 32  #: of a step, over which the inverse distance is averaged
+_PUPIL_NODES = 256  #: of the quadrature over the pupil
 #: what keeps the heat of straight rays finite and flat near focus, and is as good as nothing
 #: elsewhere
-_NEAR = 9.0
+_FOCUS_TERM = 9.0
 #: power of the defocus with which the heat of the rings falls beyond the table, where it is found
 #: 0.93
-_FALL = 0.9
+_RING_FALL = 0.9
 
 
 def spot_heat(fill: Tensor, waves: Tensor) -> Tensor:
@@ -215,17 +215,19 @@ def spot_heat(fill: Tensor, waves: Tensor) -> Tensor:
     heat_ratio = bilinear(_heat_table(), table_row, table_column)
     ring_excess = (heat_ratio - 1).clamp_min(0) * (
         _TABLE_WAVES / waves.clamp_min(_TABLE_WAVES)
-    ) ** _FALL
+    ) ** _RING_FALL
     return (
-        _even_disc(fill, waves) * heat_ratio.where(waves <= _TABLE_WAVES, 1 + ring_excess) / _AIRY
+        _even_disc(fill, waves)
+        * heat_ratio.where(waves <= _TABLE_WAVES, 1 + ring_excess)
+        / _AIRY_HEAT
     )
 
 
 def _even_disc(fill: Tensor, waves: Tensor) -> Tensor:
     """Return the heat in the middle of the spot of straight rays, in the unit of `spot_heat`
-    before its division by `_AIRY`; near focus a smooth function that stays finite.
+    before its division by `_AIRY_HEAT`; near focus a smooth function that stays finite.
     """
-    focus_term = _NEAR / (1 + waves.square() + fill.square() / 4)
+    focus_term = _FOCUS_TERM / (1 + waves.square() + fill.square() / 4)
     spot_size = torch.sqrt(fill.square() + (2 * math.pi * waves).square() + focus_term)
     root = torch.sqrt(2 * fill).clamp_min(1e-6)
     # mean of exp(-2 fill rho^2) along a radius
@@ -241,15 +243,18 @@ def _heat_table() -> Tensor:
     waves = torch.linspace(0, _TABLE_WAVES, _WAVE_STEPS, dtype=torch.float64)
     fills = torch.linspace(0, _TABLE_FILL, _FILL_STEPS, dtype=torch.float64)
     # middles of rings of the reach v
-    reach = (torch.arange(round(_EDGE / _STEP), dtype=torch.float64) + 0.5) * _STEP
+    reach = (
+        torch.arange(round(_LARGEST_REACH / _REACH_STEP), dtype=torch.float64) + 0.5
+    ) * _REACH_STEP
     heat_weights = _mean_inverse_distance(reach)
-    nodes, weights = (torch.from_numpy(x) for x in legendre(_NODES))
+    nodes, weights = (torch.from_numpy(x) for x in legendre(_PUPIL_NODES))
     # the quadrature is over the squared radius in the pupil, from 0 to 1
     squared_radius = (nodes + 1) / 2
     bessel = torch.special.bessel_j0(reach[:, None] * squared_radius.sqrt())
     taper = torch.exp(-fills[:, None] * squared_radius) * weights / 4
-    # integral beyond `_EDGE` of 4 exp(-2 fill) J1(v)^2 / v^2, with the mean J1^2 = 1 / (pi v)
-    wing_heat = 4 * torch.exp(-2 * fills) / (math.pi * _EDGE**2) * 0.5
+    # integral beyond `_LARGEST_REACH` of 4 exp(-2 fill) J1(v)^2 / v^2, with the mean J1^2 =
+    # 1 / (pi v)
+    wing_heat = 4 * torch.exp(-2 * fills) / (math.pi * _LARGEST_REACH**2) * 0.5
     rows = []
     for wave_count in waves.tolist():
         phase = 2 * math.pi * wave_count * squared_radius
@@ -270,8 +275,10 @@ def _mean_inverse_distance(reach: Tensor) -> Tensor:
     """
     from scipy.special import ellipkm1
 
-    points = torch.linspace(0, _HOTTEST, _POINTS, dtype=torch.float64)[:, None, None]
-    offsets = ((torch.arange(_PARTS, dtype=torch.float64) + 0.5) / _PARTS - 0.5) * _STEP
+    points = torch.linspace(0, _HOTTEST_REACH, _HEATED_POINTS, dtype=torch.float64)[:, None, None]
+    offsets = (
+        (torch.arange(_STEP_PARTS, dtype=torch.float64) + 0.5) / _STEP_PARTS - 0.5
+    ) * _REACH_STEP
     ring_radii = reach[:, None] + offsets
     one_minus_m = ((points - ring_radii) / (points + ring_radii)).square().clamp_min(1e-14)
     kernel = (
@@ -281,7 +288,7 @@ def _mean_inverse_distance(reach: Tensor) -> Tensor:
         / (points + ring_radii)
         * torch.from_numpy(ellipkm1(one_minus_m.numpy()))
     )
-    return kernel.mean(-1) * _STEP
+    return kernel.mean(-1) * _REACH_STEP
 
 
 # --- spot on sensor -------------------------------------------------------------------------------

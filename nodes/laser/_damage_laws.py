@@ -32,7 +32,8 @@ KINDS: tuple[Kind, ...] = ("point", "line", "cross", "destruction", "frame")
 #: m2/s, of silicon at room temperature: 148 W/(m K) / (2330 kg/m3 x 710 J/(kg K))
 DIFFUSIVITY = 9e-5
 LEVEL = 0.9  #: probability of every interval of this module
-_QUANTILE = 1.6448536269514722  #: of the standard normal distribution at 0.95: both ends of `LEVEL`
+#: of the standard normal distribution at 0.95: both ends of `LEVEL`
+_NORMAL_QUANTILE = 1.6448536269514722
 
 
 class DamageLaw(NamedTuple):
@@ -94,10 +95,10 @@ def matching_laws(
     """Return the laws that hold for a class of sensors, a wavelength in m and a duration in s."""
     device_laws = [law for law in laws if law.device.casefold() == device.casefold()]
     quantity_laws = [law for law in device_laws if law.quantity == quantity]
-    return tuple(law for law in quantity_laws if _reaches(law, wavelength, duration))
+    return tuple(law for law in quantity_laws if _holds(law, wavelength, duration))
 
 
-def _reaches(law: DamageLaw, wavelength: float, duration: float) -> bool:
+def _holds(law: DamageLaw, wavelength: float, duration: float) -> bool:
     """Return True if a law holds at a wavelength in m and for a duration in s."""
     in_wavelengths = law.wavelengths[0] <= wavelength <= law.wavelengths[1]
     return in_wavelengths and law.durations[0] <= duration <= law.durations[1]
@@ -174,16 +175,16 @@ def damage_at(
         return Damage(ratio, None, None, None)
     # standard deviations of ln threshold by which the exposure is above the median device
     deviations = math.log(ratio) / math.log(law.factor) if ratio > 0 else -math.inf
-    median_shift = _QUANTILE * math.log(law.median_factor) / math.log(law.factor)
+    median_shift = _NORMAL_QUANTILE * math.log(law.median_factor) / math.log(law.factor)
     return Damage(
         ratio,
-        _normal(deviations),
-        _normal(deviations - median_shift),
-        _normal(deviations + median_shift),
+        _normal_distribution(deviations),
+        _normal_distribution(deviations - median_shift),
+        _normal_distribution(deviations + median_shift),
     )
 
 
-def _normal(x: float) -> float:
+def _normal_distribution(x: float) -> float:
     """Return the standard normal distribution function, accurate in its lower tail."""
     return math.erfc(-x / math.sqrt(2)) / 2
 
@@ -252,10 +253,10 @@ def first_damage(
     Source: the sources of both laws.
     """
     time = double(duration)
-    spot_factors = _steady(ends.continuous, time, spot, small_spot_exponent)
+    spot_factors = _steady_spot_factor(ends.continuous, time, spot, small_spot_exponent)
     join_time = torch.full_like(time, CONTINUOUS_FROM)
     fluence_at_join = (
-        _steady(ends.continuous, join_time, spot, small_spot_exponent)
+        _steady_spot_factor(ends.continuous, join_time, spot, small_spot_exponent)
         * ends.continuous.median
         * CONTINUOUS_FROM
     )
@@ -278,7 +279,7 @@ def first_damage(
     )
 
 
-def _steady(
+def _steady_spot_factor(
     law: DamageLaw, duration: Tensor, spot: Number | None, small_spot_exponent: Number
 ) -> Tensor:
     """Return the factor on the continuous law for a spot; 1 without a spot."""
@@ -301,7 +302,7 @@ _SCHWARZ = (
     "Schwarz et al., Opt. Eng. 56, 034108 (2017), as summarised in Laser Focus World, July 2018:"
     " 532 nm, spot 25.7 um continuous, 28.2 um for pulses of 10 ns"
 )
-_TENS = f"{_SCHWARZ}; a bracket, tens of kW/cm2, read as 10 to 100 kW/cm2"
+_TENS_OF_KILOWATTS = f"{_SCHWARZ}; a bracket, tens of kW/cm2, read as 10 to 100 kW/cm2"
 _FRONT_SIDE = (
     "Photonics 12, 790 (2025), abstract: front-side illuminated CMOS, 532 nm, nanosecond pulses; "
     "one figure without spread"
@@ -340,7 +341,7 @@ def _bracket(device: str) -> DamageLaw:
         wavelengths=GREEN,
         durations=_CONTINUOUS,
         spot=25.7e-6,
-        source=_TENS,
+        source=_TENS_OF_KILOWATTS,
         low=10e3 * _PER_CM2,
         high=100e3 * _PER_CM2,
     )
@@ -372,7 +373,7 @@ ABSORPTION_SOURCE = (
     "extinction of silicon at 300 K: Green, Sol. Energ. Mat. Sol. Cells 92, 1305 (2008), as"
     " tabulated in the refractiveindex.info database (CC0)"
 )
-_STEP = 10e-9  #: m, between two entries of the table
+_TABLE_STEP = 10e-9  #: m, between two entries of the table
 #: extinction coefficient k of silicon from 400 to 1100 nm
 _EXTINCTION = (
     2.9600e-1, 2.2700e-1, 1.7600e-1, 1.3800e-1, 1.0700e-1, 8.6302e-2, 7.1381e-2, 6.2086e-2,
@@ -400,10 +401,10 @@ def silicon_absorption(wavelength: float) -> float:
         raise ValueError(
             f"no absorption of silicon at {wavelength * 1e9:.5g} nm: the table has 400 to 1100 nm"
         )
-    entries = [first + _STEP * index for index in range(len(_EXTINCTION))]
+    entries = [first + _TABLE_STEP * index for index in range(len(_EXTINCTION))]
     # of the entry below the wavelength; the last entry has no interval above it
     index = min(max(bisect.bisect(entries, wavelength) - 1, 0), len(_EXTINCTION) - 2)
-    share = (wavelength - entries[index]) / _STEP
+    share = (wavelength - entries[index]) / _TABLE_STEP
     log_extinction = (1 - share) * math.log(_EXTINCTION[index]) + share * math.log(
         _EXTINCTION[index + 1]
     )

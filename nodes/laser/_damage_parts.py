@@ -44,9 +44,9 @@ PARTS: tuple[Part, ...] = ("pulse", "mean", "accumulation", "incubation")
 MEASURED = 532e-9  #: m, wavelength of the published experiments
 #: exponents S of F_N = F_1 N^(S - 1): least, middle, largest; an assumption
 INCUBATION = (0.8, 0.9, 1.0)
-_QUANTILE = 1.6448536269514722  #: of the standard normal distribution at 0.95
+_NORMAL_QUANTILE = 1.6448536269514722  #: of the standard normal distribution at 0.95
 _MILLISECOND = 1e-3  #: s, shortest dwell of the published continuous law
-_OWN = "own law"
+_OWN_LAW = "own law"
 _SUPERPOSED = (
     "heat of one pulse above the mean, and of the mean, superposed: our derivation for linear heat"
     " conduction"
@@ -176,11 +176,10 @@ def damage_parts(
     means = [*_own_parts(light, device, own, "mean")] or [_first_part(light, curve, "mean")]
     pulse, mean = _lowest(pulses), _lowest(means)
     many_pulse_parts = [_accumulation(light, pulse, mean), _incubation(light, pulse)]
-    other_laws = [
-        judged for judged in (*pulses, *means) if judged is not pulse and judged is not mean
-    ]
-    has_own_law = any(judged.note.startswith(_OWN) for judged in pulses)
-    further_kinds = () if has_own_law else _further(light, device, curve, published)
+    other_laws = [judged for judged in pulses if judged is not pulse]
+    other_laws += [judged for judged in means if judged is not mean]
+    has_own_law = any(judged.note.startswith(_OWN_LAW) for judged in pulses)
+    further_kinds = () if has_own_law else _further_kinds(light, device, curve, published)
     return (pulse, mean, *many_pulse_parts, *other_laws, *further_kinds)
 
 
@@ -218,8 +217,11 @@ def _first_law(device: str, quantity: Quantity, published: Sequence[DamageLaw]) 
     """Return the published law of the first damage (the kind `point`) of a device in a quantity,
     or None.
     """
-    first_laws = [law for law in published if law.damage == "point" and law.quantity == quantity]
-    return next((law for law in first_laws if law.device.casefold() == device.casefold()), None)
+    for law in published:
+        is_first_damage = law.damage == "point" and law.quantity == quantity
+        if is_first_damage and law.device.casefold() == device.casefold():
+            return law
+    return None
 
 
 def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part) -> DamagePart:
@@ -235,7 +237,7 @@ def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part
     bracket = first_damage(curve, duration, light.spot, light.small_spot_exponent)
     # of a whole pulse, of which a share falls into the dwell time; or fluence to irradiance
     bracket = bracket.times(1 / light.caught) if as_pulse else bracket.times(1 / duration)
-    wavelength_factors, wavelength_note = _wavelength(light, curve.pulse)
+    wavelength_factors, wavelength_note = _wavelength_factors(light, curve.pulse)
     return DamagePart(
         part=share_of_light,
         kind="point",
@@ -243,11 +245,11 @@ def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part
         threshold=bracket.times(wavelength_factors),
         source=_curve_source(curve, duration),
         note="; ".join(text for text in (_duration_note(duration), wavelength_note) if text),
-        reason=_shorter(duration),
+        reason=_short_pulse_reason(duration),
     )
 
 
-def _shorter(duration: Tensor) -> str:
+def _short_pulse_reason(duration: Tensor) -> str:
     """Return why light that is shorter than any published threshold is not judged from below;
     empty otherwise.
     """
@@ -286,7 +288,7 @@ def _duration_note(duration: Tensor) -> str:
     return ""
 
 
-def _wavelength(light: LightInTime, law: DamageLaw) -> tuple[tuple[float, float], str]:
+def _wavelength_factors(light: LightInTime, law: DamageLaw) -> tuple[tuple[float, float], str]:
     """Return the least and the largest factor on a published threshold for the wavelength, and a
     note on both.
     """
@@ -303,7 +305,7 @@ def _wavelength(light: LightInTime, law: DamageLaw) -> tuple[tuple[float, float]
     )
 
 
-def _further(
+def _further_kinds(
     light: LightInTime, device: str, curve: CurveEnds | str, published: Sequence[DamageLaw]
 ) -> Iterator[DamagePart]:
     """Yield the further kinds of damage (line, cross, destruction, frame) that are published for
@@ -312,7 +314,7 @@ def _further(
     if isinstance(curve, str) or light.pulse_duration is None:
         return
     duration = float(double(light.duration).flatten()[0])
-    wavelength_factors, wavelength_note = _wavelength(light, curve.pulse)
+    wavelength_factors, wavelength_note = _wavelength_factors(light, curve.pulse)
     for law in matching_laws(published, device, MEASURED, duration, "fluence"):
         if law.damage != "point":
             threshold = double(law.median) / light.caught
@@ -338,6 +340,7 @@ def _own_parts(
 ) -> Iterator[DamagePart]:
     """Yield one pulse, or the mean, judged by each law of the user that holds for it."""
     as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
+    judged_quantity: Quantity = "fluence" if as_pulse else "irradiance"
     duration = light.duration if as_pulse else double(light.dwell)
     # laws are chosen by the first of several durations
     first_duration = float(duration.flatten()[0])
@@ -348,15 +351,18 @@ def _own_parts(
                 law, light, duration
             )
             threshold_factor = threshold_factor / light.caught if as_pulse else threshold_factor
-            note = _OWN if law.spot is None else f"{_OWN}, for a spot of {law.spot * 1e6:.3g} um"
+            note = _OWN_LAW
+            if law.spot is not None:
+                note = f"{_OWN_LAW}, for a spot of {law.spot * 1e6:.3g} um"
+            law_with_spread = law if law.has_spread else None
             yield DamagePart(
                 part=share_of_light,
                 kind=law.damage,
-                quantity="fluence" if as_pulse else "irradiance",
+                quantity=judged_quantity,
                 threshold=_own_bracket(law).times(threshold_factor),
                 source=law.source,
                 note=note,
-                law=law if law.has_spread else None,
+                law=law_with_spread,
             )
 
 
@@ -390,7 +396,9 @@ def _own_bracket(law: DamageLaw) -> Bracket:
         math.log(factor) for factor in (law.factor, law.median_factor) if factor is not None
     ]
     # both spreads are independent: their logarithms add in squares
-    bracket_factor = math.exp(_QUANTILE * math.hypot(*log_deviations)) if log_deviations else 1.0
+    bracket_factor = (
+        math.exp(_NORMAL_QUANTILE * math.hypot(*log_deviations)) if log_deviations else 1.0
+    )
     return Bracket(median / bracket_factor, median, median * bracket_factor)
 
 

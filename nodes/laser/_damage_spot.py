@@ -78,7 +78,7 @@ class SpotDamage(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Exposed:
+class _ExposedSensor:
     """The light of a laser on the sensor."""
 
     fluence: Tensor | None  #: (y, x) J/m2 of one pulse; None for continuous light
@@ -134,11 +134,11 @@ def damage(
         "thresholds": thresholds,
         "small_spot_exponent": small_spot_exponent,
     }
-    exposed = _exposed(spot, line, light, exposure, choice)
+    exposed = _exposed_sensor(spot, line, light, exposure, choice)
     diameter = heated_spot(exposed.irradiance, pixel_pitch)
     # a wider spot is heated more, so that its thresholds are lower
-    parts = _parts(exposed.time, choice, diameter)
-    no_pulse = exposed.fluence is not None and light is not None and _caught(light) <= 0
+    parts = _parts_for_spot(exposed.time, choice, diameter)
+    no_pulse = exposed.fluence is not None and light is not None and _pulses_in_exposure(light) <= 0
     pattern = torch.zeros(spot.shape[-2:], dtype=torch.uint8, device=spot.device)
     part_rows = []
     for damage_part in parts:
@@ -146,7 +146,8 @@ def damage(
         exposure_picture = (
             exposed.fluence if is_fluence and exposed.fluence is not None else exposed.irradiance
         )
-        part_rows.append(_row(damage_part, math.nan if no_pulse else float(exposure_picture.max())))
+        peak = math.nan if no_pulse else float(exposure_picture.max())
+        part_rows.append(_fields_of_part(damage_part, peak))
         if damage_part.threshold is not None and not no_pulse:
             over_threshold = exposure_picture >= float(damage_part.threshold.middle) * resilience
             # bit k of the pattern stands for the kind KINDS[k]
@@ -156,7 +157,7 @@ def damage(
     return SpotDamage._make([*part_columns, pattern])
 
 
-def _row(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
+def _fields_of_part(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
     """Return (ratio, least, most, probability, low, high, peak, threshold) of one part of the
     light: the first eight fields of `SpotDamage`.
 
@@ -189,29 +190,29 @@ def _row(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
     )
 
 
-def _caught(light: LaserLight) -> float:
+def _pulses_in_exposure(light: LaserLight) -> float:
     """Return the number of pulses in an exposure; 1 for a laser that is given by its strength."""
     return float(light.pulses) if float(light.pulse_fluence) > 0 else 1.0
 
 
-def _exposed(
+def _exposed_sensor(
     spot: Tensor, line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]
-) -> _Exposed:
+) -> _ExposedSensor:
     """Return the fluence of one pulse and the mean irradiance over the dwell time, in each
     pixel.
     """
     mean_irradiance = spot.detach().sum(0, dtype=torch.float64)
-    time = _in_time(line, light, exposure, choice)
+    time = _light_in_time(line, light, exposure, choice)
     if choice["pulse_duration"] is None:
-        return _Exposed(None, mean_irradiance, time)
-    pulse_count = 1.0 if light is None else _caught(light)
+        return _ExposedSensor(None, mean_irradiance, time)
+    pulse_count = 1.0 if light is None else _pulses_in_exposure(light)
     # mean irradiance x exposure is the fluence of all pulses of the exposure
     fluence = mean_irradiance * (exposure / pulse_count if pulse_count > 0 else math.nan)
     # fluence x pulses a second x share of a pulse in the dwell time
-    return _Exposed(fluence, fluence * float(time.rate * time.caught), time)
+    return _ExposedSensor(fluence, fluence * float(time.rate * time.caught), time)
 
 
-def _in_time(
+def _light_in_time(
     line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]
 ) -> LightInTime:
     """Return the duration and the rate of the light of a laser over the dwell time.
@@ -221,16 +222,18 @@ def _in_time(
     rate = choice["repetition_rate"]
     if rate is None and light is not None and not light.pulses.is_meta and float(light.pulses) > 1:
         rate = float(light.pulses) / exposure
+    if choice["pulse_duration"] is None:
+        rate = None
     return LightInTime(
         wavelength=mean_wavelength(line),
         dwell=choice["dwell"],
         pulse_duration=choice["pulse_duration"],
-        repetition_rate=None if choice["pulse_duration"] is None else rate,
+        repetition_rate=rate,
         small_spot_exponent=choice["small_spot_exponent"],
     )
 
 
-def _parts(
+def _parts_for_spot(
     time: LightInTime, choice: dict[str, Any], diameter: float | None = None
 ) -> tuple[DamagePart, ...]:
     """Return the parts of the light with their thresholds for a heated spot of a diameter in m."""
@@ -276,7 +279,7 @@ def _has_sentence(damage_part: DamagePart, continuous: bool) -> bool:
     return damage_part.part == "mean" or not continuous
 
 
-def _name(damage_part: DamagePart, continuous: bool) -> str:
+def _part_name(damage_part: DamagePart, continuous: bool) -> str:
     """Return the part of the light and the kind of damage, as sentences name them."""
     return f"{'continuous light' if continuous else damage_part.part}, {damage_part.kind}"
 
@@ -285,7 +288,7 @@ def _threshold_text(damage_part: DamagePart, continuous: bool) -> str:
     """Return the threshold of a part of the light in one sentence, or why the part is not
     judged.
     """
-    name = _name(damage_part, continuous)
+    name = _part_name(damage_part, continuous)
     if damage_part.threshold is None:
         return f"{name}: not judged: {damage_part.reason}"
     low, middle, high = (
@@ -339,7 +342,7 @@ def _sentence(damage_part: DamagePart, row: tuple[float, ...], continuous: bool)
     ``row`` holds the first eight fields of `SpotDamage` for this part.
     """
     ratio, least_ratio, most_ratio, share, low, high, peak, threshold = row
-    part_name = _name(damage_part, continuous)
+    part_name = _part_name(damage_part, continuous)
     if math.isnan(ratio):
         return f"{part_name}: not judged: {damage_part.reason or _NO_PULSE}"
     unit = _UNITS[damage_part.quantity]
@@ -373,7 +376,7 @@ def parts_before(
         "thresholds": params.get("thresholds", "published"),
         "small_spot_exponent": params.get("small_spot_exponent", 0.0),
     }
-    return _parts(_in_time(line, light, exposure, choice), choice)
+    return _parts_for_spot(_light_in_time(line, light, exposure, choice), choice)
 
 
 def heated_spot(image: Tensor, pitch: float, lost: float = 0.0) -> float | None:
@@ -428,13 +431,13 @@ def own_laws(thresholds: Thresholds) -> tuple[DamageLaw, ...]:
     if not isinstance(thresholds, Path):
         return ()
     try:
-        return _from_file(thresholds)
+        return _laws_of_file(thresholds)
     except ValueError as error:
         raise ParameterError("thresholds", str(error)) from None
 
 
 @once_per_version
-def _from_file(file: Path) -> tuple[DamageLaw, ...]:
+def _laws_of_file(file: Path) -> tuple[DamageLaw, ...]:
     return read_damage_laws(file)
 
 
@@ -479,22 +482,26 @@ def damaged_pixels(
     white = float(max(1, min(2**bits - 1, int(full_well * gain - 0.5))))
     damaged_frame = (
         single(raw)
-        .masked_fill(_of(pattern, "point"), white)
-        .masked_fill(_of(pattern, "destruction"), 0.0)
+        .masked_fill(_pixels_with(pattern, "point"), white)
+        .masked_fill(_pixels_with(pattern, "destruction"), 0.0)
     )
     if device.casefold() == "ccd":
-        damaged_frame = damaged_frame.masked_fill(_of(pattern, "line").any(-2, keepdim=True), white)
+        damaged_frame = damaged_frame.masked_fill(
+            _pixels_with(pattern, "line").any(-2, keepdim=True), white
+        )
     else:
-        damaged_frame = damaged_frame.masked_fill(_of(pattern, "line").any(-1, keepdim=True), 0.0)
-    cross = _of(pattern, "cross")
+        damaged_frame = damaged_frame.masked_fill(
+            _pixels_with(pattern, "line").any(-1, keepdim=True), 0.0
+        )
+    cross = _pixels_with(pattern, "cross")
     # `any` over an axis, kept: one damaged pixel takes its whole row or column
     damaged_frame = damaged_frame.masked_fill(
         cross.any(-1, keepdim=True) | cross.any(-2, keepdim=True), 0.0
     )
-    return damaged_frame.masked_fill(_of(pattern, "frame").any(), 0.0)
+    return damaged_frame.masked_fill(_pixels_with(pattern, "frame").any(), 0.0)
 
 
-def _of(pattern: Tensor, kind: Kind) -> Tensor:
+def _pixels_with(pattern: Tensor, kind: Kind) -> Tensor:
     """Return True for the pixels (y, x) of a pattern that have a kind of damage: bit k stands for
     the kind KINDS[k].
     """

@@ -25,9 +25,9 @@ from neusee.nodes.spectra._table_files import Column, place
 # shots between the levels, the data hold a bracket and no spread.
 
 
-_ROUNDS = 200  #: of Fisher scoring, at most
-_CLOSE = 1e-10  #: change of the parameters at which the fit ends
-_TINY = 1e-12  #: least probability of a shot in the weights
+_MOST_ROUNDS = 200  #: of Fisher scoring, at most
+_CLOSE_PARAMETERS = 1e-10  #: change of the parameters at which the fit ends
+_LEAST_PROBABILITY = 1e-12  #: least probability of a shot in the weights
 
 Numbers = NDArray[np.float64]
 
@@ -123,9 +123,9 @@ def _probit(logs: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
     )
     information = np.eye(2)
     # Fisher scoring: coefficients += information^-1 score
-    for _ in range(_ROUNDS):
+    for _ in range(_MOST_ROUNDS):
         probits = design @ coefficients
-        damaged_share = np.clip(ndtr(probits), _TINY, 1 - _TINY)
+        damaged_share = np.clip(ndtr(probits), _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY)
         normal_density = np.exp(-(probits**2) / 2) / math.sqrt(2 * math.pi)
         weights = count * normal_density**2 / (damaged_share * (1 - damaged_share))
         information = design.T @ (design * weights[:, None])
@@ -136,7 +136,7 @@ def _probit(logs: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
         )
         change = np.linalg.solve(information, score)
         coefficients = coefficients + change
-        if np.abs(change).max() < _CLOSE * (1 + np.abs(coefficients).max()):
+        if np.abs(change).max() < _CLOSE_PARAMETERS * (1 + np.abs(coefficients).max()):
             break
     intercept, slope = float(coefficients[0]), float(coefficients[1])
     if not (math.isfinite(slope) and slope > 0):
@@ -168,7 +168,7 @@ _LENGTHS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "m": 1.0}
 _TIMES = {"fs": 1e-15, "ps": 1e-12, "ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
 _IRRADIANCES = {"W/m2": 1.0, "W/cm2": 1e4, "kW/cm2": 1e7, "MW/cm2": 1e10}
 _FLUENCES = {"J/m2": 1.0, "mJ/cm2": 10.0, "J/cm2": 1e4}
-_NONE: dict[str, float] = {"": 1.0, "1": 1.0}
+_PLAIN_NUMBERS: dict[str, float] = {"": 1.0, "1": 1.0}
 #: the units of each quantity that a heading may name; a quantity without units is a text
 _UNITS: dict[str, dict[str, float]] = {
     "device": {},
@@ -182,16 +182,18 @@ _UNITS: dict[str, dict[str, float]] = {
     "low": _IRRADIANCES | _FLUENCES,
     "high": _IRRADIANCES | _FLUENCES,
     "level": _IRRADIANCES | _FLUENCES,
-    "shots": _NONE,
-    "damaged": _NONE,
-    "factor": _NONE,
-    "median factor": _NONE,
+    "shots": _PLAIN_NUMBERS,
+    "damaged": _PLAIN_NUMBERS,
+    "factor": _PLAIN_NUMBERS,
+    "median factor": _PLAIN_NUMBERS,
     "spot": _LENGTHS,
 }
 _OPTIONAL = ("low", "high", "factor", "median factor", "spot")
 _COUNTS = ("shots", "damaged")
-_SHARED = tuple(name for name in _UNITS if name not in ("threshold", "level", *_COUNTS, *_OPTIONAL))
-_FORM = (
+_LAW_COLUMNS = tuple(
+    name for name in _UNITS if name not in ("threshold", "level", *_COUNTS, *_OPTIONAL)
+)
+_TABLE_FORM = (
     "write a header such as device,damage,wavelength from (nm),wavelength to (nm),duration from"
     " (s),duration to (s),threshold (kW/cm2),low (kW/cm2),high (kW/cm2),factor,median factor,spot"
     " (um),source, or with level (J/cm2),shots,damaged in place of the threshold and its factors"
@@ -229,11 +231,11 @@ def read_damage_laws(file: Path) -> tuple[DamageLaw, ...]:
     if file.suffix.lower() in (".yaml", ".yml", ".json", ".xlsx"):
         raise ValueError(
             f"{file.name} is no CSV file: thresholds are read from a table with one law a row;"
-            f" {_FORM}"
+            f" {_TABLE_FORM}"
         )
     rows = list(csv_rows(file))
     if len(rows) < 2:
-        raise ValueError(f"{file.name} has no laws of damage below a header: {_FORM}")
+        raise ValueError(f"{file.name} has no laws of damage below a header: {_TABLE_FORM}")
     columns = [_heading(file, rows[0][0], index, cell) for index, cell in enumerate(rows[0][1])]
     quantities = {column.quantity for column in columns}
     has_shots = bool(quantities & {"level", *_COUNTS})
@@ -244,10 +246,12 @@ def read_damage_laws(file: Path) -> tuple[DamageLaw, ...]:
 
 def _refuse_columns(file: Path, names: set[str], has_shots: bool) -> None:
     """Raise ValueError for a column that is missing, and for thresholds beside shots."""
-    required_columns = (*_SHARED, "level", *_COUNTS) if has_shots else (*_SHARED, "threshold")
+    required_columns = (
+        (*_LAW_COLUMNS, "level", *_COUNTS) if has_shots else (*_LAW_COLUMNS, "threshold")
+    )
     missing_columns = [name for name in required_columns if name not in names]
     if missing_columns:
-        raise ValueError(f"{file.name}: no column {missing_columns[0]}: {_FORM}")
+        raise ValueError(f"{file.name}: no column {missing_columns[0]}: {_TABLE_FORM}")
     excluded = sorted(names & {"threshold", "low", "high", "factor", "median factor"})
     if has_shots and excluded:
         raise ValueError(
@@ -277,7 +281,8 @@ def _heading(file: Path, line: int, index: int, cell: str) -> Column:
     column = Column(quantity.strip().casefold(), unit.strip())
     if column.quantity not in _UNITS:
         raise ValueError(
-            f"{file.name}:{line}, column {index + 1}: no quantity {quantity.strip()!r}: {_FORM}"
+            f"{file.name}:{line}, column {index + 1}: no quantity {quantity.strip()!r}:"
+            f" {_TABLE_FORM}"
         )
     units = _UNITS[column.quantity]
     if units and column.unit not in units:
@@ -292,10 +297,10 @@ def _law(cells: list[_Cell]) -> DamageLaw:
     bracket where the row states it.
 
     Raises ValueError for only one of factor and median factor, and for the mistakes that `_values`,
-    `_filled` and `_bracket` refuse.
+    `_filled_cell` and `_bracket` refuse.
     """
     values = _values(cells, "threshold")
-    threshold = _filled(cells, "threshold")
+    threshold = _filled_cell(cells, "threshold")
     cell_of = {cell.column.quantity: cell for cell in cells}
     if (values.get("factor") is None) != (values.get("median factor") is None):
         cell = cell_of.get("factor") or cell_of["median factor"]
@@ -306,7 +311,7 @@ def _law(cells: list[_Cell]) -> DamageLaw:
         raise ValueError(f"{cell.where}: {text}")
     bracket_low, bracket_high = _bracket(cell_of, values, threshold)
     return DamageLaw(
-        **_described(values),
+        **_law_arguments(values),
         quantity=_quantity(threshold),
         median=cast(float, _value(threshold)),
         factor=values.get("factor"),
@@ -369,15 +374,16 @@ def _values(cells: list[_Cell], *but: str) -> dict[str, Any]:
     return values
 
 
-def _filled(cells: list[_Cell], name: str) -> _Cell:
+def _filled_cell(cells: list[_Cell], name: str) -> _Cell:
     """Return the one cell of a row with a text, among the columns of a quantity (thresholds may
     have a column in W/cm2 and one in J/cm2).
 
     Raises ValueError for no such cell and for several.
     """
-    filled_cells = [cell for cell in cells if cell.column.quantity == name and cell.text]
+    cells_of_quantity = [cell for cell in cells if cell.column.quantity == name]
+    filled_cells = [cell for cell in cells_of_quantity if cell.text]
     if len(filled_cells) != 1:
-        where = next(cell.where for cell in cells if cell.column.quantity == name)
+        where = cells_of_quantity[0].where
         text = f"{len(filled_cells)} {name}s in this row"
         raise ValueError(
             f"{where}: {text}: give one, an irradiance for continuous light or a fluence for a"
@@ -391,7 +397,7 @@ def _quantity(cell: _Cell) -> Quantity:
     return "irradiance" if cell.column.unit in _IRRADIANCES else "fluence"
 
 
-def _described(values: dict[str, Any]) -> dict[str, Any]:
+def _law_arguments(values: dict[str, Any]) -> dict[str, Any]:
     """Return the arguments of `DamageLaw` beside its threshold and spread, from the values of a
     row.
     """
@@ -411,8 +417,8 @@ def _fitted_laws(table: list[list[_Cell]]) -> tuple[DamageLaw, ...]:
     """
     rows_of_test: dict[tuple[Any, ...], list[list[_Cell]]] = {}
     for cells in table:
-        law_arguments = _described(_values(cells, "level", *_COUNTS))
-        test_key = (*law_arguments.values(), _quantity(_filled(cells, "level")))
+        law_arguments = _law_arguments(_values(cells, "level", *_COUNTS))
+        test_key = (*law_arguments.values(), _quantity(_filled_cell(cells, "level")))
         rows_of_test.setdefault(test_key, []).append(cells)
     return tuple(_fitted_law(rows) for rows in rows_of_test.values())
 
@@ -421,7 +427,7 @@ def _fitted_law(rows: list[list[_Cell]]) -> DamageLaw:
     """Return the law that is fitted to the shots of one test; raise ValueError, with the place of
     the first row, where they show no threshold.
     """
-    first_level = _filled(rows[0], "level")
+    first_level = _filled_cell(rows[0], "level")
     try:
         fitted = fit_shots([_shots(cells) for cells in rows])
     except _AtCell as error:
@@ -430,7 +436,7 @@ def _fitted_law(rows: list[list[_Cell]]) -> DamageLaw:
         raise ValueError(f"{first_level.where}: {error}") from None
     return DamageLaw(
         # all rows of a test agree in these values
-        **_described(_values(rows[0], "level", *_COUNTS)),
+        **_law_arguments(_values(rows[0], "level", *_COUNTS)),
         quantity=_quantity(first_level),
         median=fitted.median,
         factor=fitted.factor,
@@ -453,7 +459,7 @@ def _shots(cells: list[_Cell]) -> Shots:
             f"{cell_of['damaged'].where}: {damaged} damaged of {count} shots: give at most as many"
             " as shots"
         )
-    return Shots(cast(float, _value(_filled(cells, "level"))), count, damaged)
+    return Shots(cast(float, _value(_filled_cell(cells, "level"))), count, damaged)
 
 
 def _count(cell: _Cell) -> int:

@@ -29,7 +29,7 @@ Sampling = Literal["integrated", "point"]
 Rule = Literal["snr", "contrast"]
 
 _FIRST_ZERO = 3.8317059702075125  #: of J1
-_WIDEST = 1024  #: pixels from the axis up to which pixels are counted one by one
+_FARTHEST_COUNTED = 1024  #: pixels from the axis up to which pixels are counted one by one
 _HALVINGS = 60  #: of an interval of the strength
 
 
@@ -85,7 +85,7 @@ def counted_pixels(strength: float, spread: float, sampling: Sampling = "integra
         spread / math.pi * max(_FIRST_ZERO, (8 * strength / (math.pi * mean_over_peak)) ** (1 / 3))
         + 3
     )
-    if radius > _WIDEST:
+    if radius > _FARTHEST_COUNTED:
         raise ValueError(
             f"the dazzled area reaches {radius:.0f} pixels from the axis: use dazzled_pixels"
         )
@@ -239,9 +239,10 @@ def _(result: DazzleCurve, *inputs: Any, **params: Any) -> list[Check]:
     top = int(result.strengths.argmax())
     share, strength = float(result.share[top]), float(result.strengths[top])
     text = f"{share:.2%} of the window is dazzled at strength {strength:.3g}"
-    return [
-        Check(text if share < 0.5 else f"{text}: the PSF may reach beyond its window", share < 0.5)
-    ]
+    if share < 0.5:
+        return [Check(text, True)]
+    # a share that is NaN is not good either
+    return [Check(f"{text}: the PSF may reach beyond its window", False)]
 
 
 # --- dazzle picture -------------------------------------------------------------------------------
@@ -308,7 +309,7 @@ def dazzle(
         )
     free_well = full_well - offset
     lost_before, full_with_laser = (scene >= free_well).any(-3), (scene + veil >= free_well).any(-3)
-    background, mean_veil = _over_feature(scene, feature), _over_feature(veil, feature)
+    background, mean_veil = mean_over_feature(scene, feature), mean_over_feature(veil, feature)
     largest_veil = veil_limit(
         background,
         contrast=contrast,
@@ -327,7 +328,7 @@ def dazzle(
     return Dazzle(counts[0], counts[1], (counts[0] + counts[1]) / pixels, counts[2] / pixels)
 
 
-def _over_feature(image: Tensor, size: int) -> Tensor:
+def mean_over_feature(image: Tensor, size: int) -> Tensor:
     """Return the mean of an image (channel, y, x) over a square of ``size`` pixels around each
     pixel.
     """

@@ -20,8 +20,8 @@ from neusee.nodes.spectra._cie_tables import observer
 
 
 BLINK = 0.25  #: s, in which the eye turns away from visible light
-_SHORTEST, _LONGEST = 1e-11, 3e4  #: s, of an exposure
-_FIRST, _LAST = 400e-9, 100e-6  #: m
+_SHORTEST_EXPOSURE, _LONGEST_EXPOSURE = 1e-11, 3e4  #: s, of an exposure
+_SHORTEST_WAVELENGTH, _LONGEST_WAVELENGTH = 400e-9, 100e-6  #: m
 
 
 def eye_mpe(wavelength: float, duration: float) -> float:
@@ -67,7 +67,7 @@ def _strictest(wavelength: float, duration: float) -> _Law:
     """Return the law that limits the exposure of the eye at a wavelength in m for a duration in
     s.
     """
-    _refuse(wavelength, duration)
+    _refuse_unknown(wavelength, duration)
     nm = wavelength * 1e9
     if nm >= 1400:
         return _cornea(nm, duration)
@@ -81,7 +81,7 @@ def _power_law(factor: float, weight: float, duration: float, exponent: float) -
     return _Law(limit, f"{factor:g} * {weight:.7g} * {duration:.7g}**{exponent:g}")
 
 
-def _constant(factor: float, weight: float, duration: float, full: float) -> _Law:
+def _constant_law(factor: float, weight: float, duration: float, full: float) -> _Law:
     """Return the law factor x weight; for durations shorter than ``full`` s it is less in
     proportion to the duration (a constant irradiance).
     """
@@ -92,20 +92,20 @@ def _constant(factor: float, weight: float, duration: float, full: float) -> _La
     )
 
 
-def _refuse(wavelength: float, duration: float) -> None:
+def _refuse_unknown(wavelength: float, duration: float) -> None:
     """Raise ParameterError where this module has no formula."""
-    if not _FIRST <= wavelength <= _LAST:
+    if not _SHORTEST_WAVELENGTH <= wavelength <= _LONGEST_WAVELENGTH:
         text = (
             f"no exposure limit of the eye at {wavelength * 1e9:g} nm: 400 nm to 100 um are known"
             " here"
         )
         raise ParameterError("wavelength", f"{text}; take the limit from the standard")
-    if not _SHORTEST <= duration <= _LONGEST:
+    if not _SHORTEST_EXPOSURE <= duration <= _LONGEST_EXPOSURE:
         text = f"no exposure limit of the eye for {duration:g} s: 10 ps to 30 000 s are known here"
         raise ParameterError("duration", f"{text}; take the limit from the standard")
 
 
-def _near_infrared(nm: float) -> tuple[float, float]:
+def _infrared_factors(nm: float) -> tuple[float, float]:
     """Return the factors C_A and C_C of the standard at a wavelength in nm; both are 1 for visible
     light and raise the limit in the infrared, of which less reaches the retina.
     """
@@ -125,7 +125,7 @@ def _retina(nm: float, duration: float) -> _Law:
     """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry
     below 500 nm.
     """
-    c_a, c_c = _near_infrared(nm)
+    c_a, c_c = _infrared_factors(nm)
     if duration >= 10:
         # J/m2 over more than 10 s: constant irradiances in W/m2 times the duration
         heat_limit = _power_law(10, c_a * c_c, duration, 1)
@@ -135,19 +135,23 @@ def _retina(nm: float, duration: float) -> _Law:
         return heat_limit if nm >= 500 else min(heat_limit, photochemical_limit)
     if nm < 1050:
         return (
-            _constant(2e-3, c_a, 1, 0) if duration <= 5e-6 else _power_law(18, c_a, duration, 0.75)
+            _constant_law(2e-3, c_a, 1, 0)
+            if duration <= 5e-6
+            else _power_law(18, c_a, duration, 0.75)
         )
-    return _constant(2e-2, c_c, 1, 0) if duration <= 13e-6 else _power_law(90, c_c, duration, 0.75)
+    return (
+        _constant_law(2e-2, c_c, 1, 0) if duration <= 13e-6 else _power_law(90, c_c, duration, 0.75)
+    )
 
 
 def _skin(nm: float, duration: float) -> _Law:
     """Return the limit of the skin in J/m2 from 700 to 1400 nm."""
-    c_a, _ = _near_infrared(nm)
+    c_a, _ = _infrared_factors(nm)
     if duration >= 10:
         return _power_law(2000, c_a, duration, 1)
     if duration >= 1e-7:
         return _power_law(1.1e4, c_a, duration, 0.25)
-    return _constant(200, c_a, duration, 1e-9)
+    return _constant_law(200, c_a, duration, 1e-9)
 
 
 def _cornea(nm: float, duration: float) -> _Law:
@@ -160,7 +164,7 @@ def _cornea(nm: float, duration: float) -> _Law:
     elif nm >= 2600:
         flat_limit, flat_duration = 100.0, 1e-7
     if duration <= flat_duration:
-        return _constant(flat_limit, 1, duration, 1e-9)
+        return _constant_law(flat_limit, 1, duration, 1e-9)
     return _power_law(5600, 1, duration, 0.25)
 
 
@@ -171,7 +175,7 @@ def eye_aperture(wavelength: float, duration: float) -> float:
     s, then 3.5 mm.
     Source: IEC 60825-1:2014, Table A.6.
     """
-    _refuse(wavelength, duration)
+    _refuse_unknown(wavelength, duration)
     if wavelength < 1400e-9:
         return 7e-3
     return 1e-3 if duration <= 0.35 else 1e-3 * min(3.5, 1.5 * math.pow(duration, 0.375))
@@ -224,10 +228,10 @@ def eye_share(limit: float, aperture: float, emitted: float) -> float:
 TrainRule = Literal["IEC 60825-1:2014", "N^(-1/4)"]
 TRAIN_RULES: tuple[TrainRule, ...] = get_args(TrainRule)
 
-_COUNTED = 10.0  #: s, T2 of a small source: pulses are counted within this time for C5
-_FEW = 600  #: pulses up to which C5 is 1
+_COUNTED_TIME = 10.0  #: s, T2 of a small source: pulses are counted within this time for C5
+_FEW_PULSES = 600  #: pulses up to which C5 is 1
 _LEAST_C5 = 0.4
-_BRIEF = 0.25  #: s, an exposure up to which C5 is 1
+_BRIEF_EXPOSURE = 0.25  #: s, an exposure up to which C5 is 1
 
 
 class TrainLimit(NamedTuple):
@@ -310,7 +314,7 @@ def train_limit(
     if wavelength >= 1400e-9:
         return TrainLimit(single, mean, math.inf, 1.0, max(1.0, duration * repetition_rate), 1.0)
     group_time = _summed_time(wavelength)
-    counting_time = min(duration, _COUNTED) if rule == "IEC 60825-1:2014" else duration
+    counting_time = min(duration, _COUNTED_TIME) if rule == "IEC 60825-1:2014" else duration
     pulses = max(1.0, counting_time * repetition_rate)
     pulses_in_group = min(pulses, max(1.0, group_time * repetition_rate))
     groups = pulses / pulses_in_group
@@ -320,9 +324,8 @@ def train_limit(
         else math.pow(groups, -0.25)
     )
     # several pulses within T_i count as one of T_i, with the limit of that duration
-    group_limit = eye_mpe(
-        wavelength, max(group_time, pulse_duration) if pulses_in_group > 1 else pulse_duration
-    )
+    group_duration = max(group_time, pulse_duration) if pulses_in_group > 1 else pulse_duration
+    group_limit = eye_mpe(wavelength, group_duration)
     return TrainLimit(
         single, mean, group_limit / pulses_in_group * factor, pulses_in_group, groups, factor
     )
@@ -337,7 +340,7 @@ def _c5(groups: float, pulse_duration: float, duration: float, summed: float) ->
     """Return C5 of the edition of 2014 for a source below 5 mrad, from the number of groups of
     pulses, the durations in s and the time ``summed`` (T_i) within which pulses count as one.
     """
-    if pulse_duration > summed or duration <= _BRIEF or groups <= _FEW:
+    if pulse_duration > summed or duration <= _BRIEF_EXPOSURE or groups <= _FEW_PULSES:
         return 1.0
     return min(1.0, max(_LEAST_C5, 5 * math.pow(groups, -0.25)))
 
@@ -422,11 +425,11 @@ def nominal_ocular_hazard_distance(
 LUMENS_PER_WATT = 683.0  #: at 555 nm
 STEADY = 100.0  #: Hz, from which a train of pulses looks steady: above the fusion of flicker
 _VISIBLE = (380e-9, 780e-9)  #: m
-_GLARE = (0.1, 100.0)  #: deg, of the CIE general disability glare equation
+_GLARE_ANGLES = (0.1, 100.0)  #: deg, of the CIE general disability glare equation
 _AGES = (23.0, 75.0)  #: years, of Adrian's factor of age
-_SIZES = (1.0, 60.0)  #: arc minutes of a target
-_VEILS = (1e-6, 1e9)  #: least and largest veil that is looked for, times the background
-_HALVINGS = 80  #: of the logarithm of the veil
+_TARGET_SIZES = (1.0, 60.0)  #: arc minutes of a target
+_VEIL_RANGE = (1e-6, 1e9)  #: least and largest veil that is looked for, times the background
+_VEIL_HALVINGS = 80  #: of the logarithm of the veil
 
 
 class DazzleTask(NamedTuple):
@@ -467,10 +470,10 @@ def veil_per_lux(angle: float, age: float, pigmentation: float) -> float:
     Raises ParameterError for another angle.
     Source: CIE 146:2002; Vos, Clin. Exp. Optom. 86, 363 (2003); read in public programs that agree.
     """
-    if not _GLARE[0] <= angle <= _GLARE[1]:
+    if not _GLARE_ANGLES[0] <= angle <= _GLARE_ANGLES[1]:
         text = (
-            f"{angle:g} deg: the glare equation of the CIE holds from {_GLARE[0]:g} to"
-            f" {_GLARE[1]:g} deg"
+            f"{angle:g} deg: the glare equation of the CIE holds from {_GLARE_ANGLES[0]:g} to"
+            f" {_GLARE_ANGLES[1]:g} deg"
         )
         raise ParameterError("angle", text)
     age_factor = 1 + (age / 62.5) ** 4
@@ -492,7 +495,7 @@ def threshold_luminance(background: float, size: float, age: float) -> float:
     Source: Adrian, Lighting Res. Technol. 21, 181 (1989); read in two public programs that agree.
     """
     for name, value, (low, high), unit in (
-        ("size", size, _SIZES, "arc minutes"),
+        ("size", size, _TARGET_SIZES, "arc minutes"),
         ("age", age, _AGES, "years"),
     ):
         if not low <= value <= high:
@@ -555,11 +558,11 @@ def dazzle_illuminance(task: DazzleTask) -> float:
         total_luminance = task.background * (1 + veil)
         return difference >= task.margin * threshold_luminance(total_luminance, task.size, task.age)
 
-    seen_veil, hiding_veil = _VEILS
+    seen_veil, hiding_veil = _VEIL_RANGE
     if not is_seen(seen_veil):
         return 0.0
     # bisection of the logarithm of the veil, in units of the background
-    for _ in range(_HALVINGS):
+    for _ in range(_VEIL_HALVINGS):
         middle = math.sqrt(seen_veil * hiding_veil)
         seen_veil, hiding_veil = (middle, hiding_veil) if is_seen(middle) else (seen_veil, middle)
     return seen_veil * task.background / veil_of_lux

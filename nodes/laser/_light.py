@@ -25,7 +25,7 @@ from neusee.nodes.laser._beam import (
 )
 from neusee.nodes.laser._damage_laws import double
 from neusee.nodes.optics._lens import refuse_impossible_f_number
-from neusee.nodes.optics._pupil_grid import clear_area, gaussian_over
+from neusee.nodes.optics._pupil_grid import clear_area, gaussian_integral
 from neusee.nodes.spectra._bands import mean_wavelength
 from neusee.nodes.spectra._cie_tables import daylight
 from neusee.nodes.units import (
@@ -46,10 +46,10 @@ from neusee.nodes.values import Bands, LaserLight, Stop, Wavefront
 
 Quality = Annotated[float, Field(ge=1, le=1e6)]  #: M2 of a beam
 Multiple = Annotated[float, Field(ge=0, le=1e18)]
-_NEAR = 0.25  #: waves of defocus at 550 nm from which a near laser is worth a note
+_NOTED_DEFOCUS = 0.25  #: waves of defocus at 550 nm from which a near laser is worth a note
 #: largest error of the spot by the staircase rim of the pupil, over waves of defocus / samples
-_RIM = 1.5
-_WAVE = 550e-9  #: m; the wavelength in which waves of defocus are counted
+_RIM_ERROR = 1.5
+_DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
 class _Geometry(NamedTuple):
@@ -91,7 +91,7 @@ def wavefront(
     """
     if distance is None:
         return Wavefront(*torch.zeros(2, dtype=torch.float64))
-    beam = _shaped(line, _Geometry(waist, divergence, m_squared, convention, distance))
+    beam = _beam_of_line(line, _Geometry(waist, divergence, m_squared, convention, distance))
     return Wavefront(
         double(beam_radius(beam, distance) ** -2), double(1 / curvature_radius(beam, distance))
     )
@@ -158,8 +158,8 @@ def light(
     if distance is None:
         raise ParameterError("distance", "the distance of the laser is not known: give distance")
     geometry = _Geometry(waist, divergence, m_squared, convention, distance)
-    beam = _shaped(line, geometry, power, pulse_energy, pulse_duration, repetition_rate)
-    air_share = _air(beam.wavelength, distance, air_transmittance, visibility, haze)
+    beam = _beam_of_line(line, geometry, power, pulse_energy, pulse_duration, repetition_rate)
+    air_share = _air_share(beam.wavelength, distance, air_transmittance, visibility, haze)
     pulses = pulses_within(beam, exposure, pulse_delay)
     mean_power = beam.power if beam.pulse_energy is None else beam.pulse_energy * pulses / exposure
     assert mean_power is not None
@@ -169,12 +169,12 @@ def light(
     focus_area, radius_at_lens = (beam.wavelength * focal_length) ** 2, beam_radius(beam, distance)
     even_peak = flux * clear_area(stop) / focus_area
     # the irradiance is the squared field: its radius is smaller by sqrt(2)
-    power_in_lens = irradiance * gaussian_over(stop, radius_at_lens / math.sqrt(2))
+    power_in_lens = irradiance * gaussian_integral(stop, radius_at_lens / math.sqrt(2))
     # on the sensor: (integral of the field over the pupil / (wavelength x focal length))^2
     peak_density = (
         axis_density(beam, distance, air_share)
         * lens_transmittance
-        * gaussian_over(stop, radius_at_lens) ** 2
+        * gaussian_integral(stop, radius_at_lens) ** 2
         / focus_area
     )
     return LaserLight(
@@ -231,7 +231,7 @@ def pulses_within(beam: Beam, exposure: float, delay: float) -> float:
     return begun(exposure - delay) - begun(-delay)
 
 
-def _shaped(line: Bands, shape: _Geometry, *emission: float | None) -> Beam:
+def _beam_of_line(line: Bands, shape: _Geometry, *emission: float | None) -> Beam:
     """Return the beam of a laser line.
 
     ``emission`` is (power, pulse energy, pulse duration, repetition rate); without it the power is
@@ -251,7 +251,7 @@ def _shaped(line: Bands, shape: _Geometry, *emission: float | None) -> Beam:
     )
 
 
-def _air(
+def _air_share(
     wavelength: float,
     distance: float,
     share: float | None,
@@ -273,16 +273,16 @@ def _air(
 
 # --- what is refused before the run ---------------------------------------------------------------
 
-_BEAM = ("waist", "divergence", "m_squared")
-_PULSE = ("pulse_energy", "pulse_duration", "repetition_rate")
-_AIR = ("air_transmittance", "visibility", "haze")
+_BEAM_SETTINGS = ("waist", "divergence", "m_squared")
+_PULSE_SETTINGS = ("pulse_energy", "pulse_duration", "repetition_rate")
+_AIR_SETTINGS = ("air_transmittance", "visibility", "haze")
 #: settings that state the light in watts and metres
-_ABSOLUTE = ("power", *_PULSE, *_BEAM, "distance", *_AIR)
+_ABSOLUTE_SETTINGS = ("power", *_PULSE_SETTINGS, *_BEAM_SETTINGS, "distance", *_AIR_SETTINGS)
 
 
 @light.preflight
 def _(*, line: Bands | None = None, stop: Stop | None = None, **params: Any) -> list[str]:
-    stated = [name for name in _ABSOLUTE if params[name] is not None]
+    stated = [name for name in _ABSOLUTE_SETTINGS if params[name] is not None]
     if params["strength"] is not None:
         _refuse_beside_strength(stated)
         return []
@@ -310,7 +310,8 @@ def _refuse_unknown_light(stated: list[str]) -> None:
             "the light of this laser is not known: give strength, or power (or pulse_energy) with"
             " distance"
         )
-        raise ParameterError(stated[0] if stated else "line.wavelength", text)
+        parameter = stated[0] if stated else "line.wavelength"
+        raise ParameterError(parameter, text)
     if "distance" not in stated:
         raise ParameterError(
             stated[0],
@@ -346,12 +347,12 @@ def _out_of_focus(line: Bands, stop: Stop, params: dict[str, Any]) -> list[str]:
     """Return a note on a laser that is so near that a lens focused at infinity does not focus
     it.
     """
-    shape = {name: params[name] for name in (*_BEAM, "convention", "distance")}
+    shape = {name: params[name] for name in (*_BEAM_SETTINGS, "convention", "distance")}
     # D^2 / (8 lambda R): defocus at the rim of a lens focused at infinity
-    waves = float(wavefront(line, **shape).curvature * stop.diameter**2) / 8 / _WAVE
-    if waves <= _NEAR:
+    waves = float(wavefront(line, **shape).curvature * stop.diameter**2) / 8 / _DEFOCUS_WAVELENGTH
+    if waves <= _NOTED_DEFOCUS:
         return []
-    accuracy_text = f"its spot is exact to {_RIM * waves / int(stop.samples):.2g} of its peak"
+    accuracy_text = f"its spot is exact to {_RIM_ERROR * waves / int(stop.samples):.2g} of its peak"
     text = (
         f"a laser at {params['distance']:g} m is {waves:.3g} waves out of focus for a lens focused"
         " at infinity"
@@ -379,10 +380,10 @@ def _pulse_notes(light_of_laser: LaserLight, params: dict[str, Any]) -> list[str
 
 # What they do to the light of a laser, and what they take from the picture.
 
-_WHITE = (400e-9, 700e-9)  #: m, over which the white light of the picture counts
-_DAYLIGHT = 6504.0  #: K
+_WHITE_RANGE = (400e-9, 700e-9)  #: m, over which the white light of the picture counts
+_DAYLIGHT_TEMPERATURE = 6504.0  #: K
 EDGE = 0.01  #: of the wavelength, on each side: what a real notch blocks beside its band
-_GREEN = 550e-9  #: m
+_GREEN_WAVELENGTH = 550e-9  #: m
 
 
 def optical_density(factor: float) -> float:
@@ -442,12 +443,16 @@ def white_share(low: float, high: float, edge: float = EDGE) -> float:
 
     wavelengths = (
         # every 0.5 nm; the added 0.25 nm keeps the end in despite rounding
-        torch.arange(_WHITE[0] * 1e9, _WHITE[1] * 1e9 + 0.25, 0.5, dtype=torch.float64) * 1e-9
+        torch.arange(_WHITE_RANGE[0] * 1e9, _WHITE_RANGE[1] * 1e9 + 0.25, 0.5, dtype=torch.float64)
+        * 1e-9
     )
     # power of daylight times wavelength is proportional to photons
-    photons = daylight(_DAYLIGHT).at(wavelengths)[0] * wavelengths
+    photons = daylight(_DAYLIGHT_TEMPERATURE).at(wavelengths)[0] * wavelengths
     total = torch.trapezoid(photons, wavelengths)
-    band_start, band_end = max(low * (1 - edge), _WHITE[0]), min(high * (1 + edge), _WHITE[1])
+    band_start, band_end = (
+        max(low * (1 - edge), _WHITE_RANGE[0]),
+        min(high * (1 + edge), _WHITE_RANGE[1]),
+    )
     if not band_end > band_start:
         return 0.0
     band_ends = torch.tensor([band_start, band_end], dtype=torch.float64)
@@ -462,7 +467,8 @@ def white_share(low: float, high: float, edge: float = EDGE) -> float:
     # share of photons, by the same rule as the total
     return float(
         torch.trapezoid(
-            daylight(_DAYLIGHT).at(inside_wavelengths)[0] * inside_wavelengths, inside_wavelengths
+            daylight(_DAYLIGHT_TEMPERATURE).at(inside_wavelengths)[0] * inside_wavelengths,
+            inside_wavelengths,
         )
         / total
     )
@@ -483,7 +489,7 @@ def stopped_share(diameter: float, stopped: float) -> float:
 
 
 def diffraction_cutoff(
-    focal_length: float, diameter: float, pixel_pitch: float, wavelength: float = _GREEN
+    focal_length: float, diameter: float, pixel_pitch: float, wavelength: float = _GREEN_WAVELENGTH
 ) -> float:
     """Return the finest detail that diffraction leaves, in cycles a pixel: pixel pitch /
     (wavelength x f-number).

@@ -57,7 +57,7 @@ def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
     double_kappa = 2 * abs(kappa)
     # the lens cuts nothing off: a Gaussian spot
     if fill > _DARK:
-        return _irradiance(_geometric(v, kappa), reach)
+        return _irradiance(_field_without_rim(v, kappa), reach)
     # each region has the series that converges there; what is between is integrated, or taken as a
     # straight edge for a wide spot
     is_beyond = v > max(_APART * double_kappa, _SMALL / 2) + _SMALL / 2
@@ -65,14 +65,14 @@ def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
         (v * _APART < double_kappa) if double_kappa > _SMALL else torch.zeros_like(is_beyond)
     )
     field = torch.zeros(len(v), dtype=torch.complex128)
-    field[is_beyond] = _beyond(v[is_beyond], kappa)
+    field[is_beyond] = _field_beyond(v[is_beyond], kappa)
     if bool(is_within.any()):
-        field[is_within] = _within(v[is_within], kappa)
+        field[is_within] = _field_within(v[is_within], kappa)
     is_between = ~(is_beyond | is_within)
     field[is_between] = (
-        _at_the_edge(v[is_between], kappa)
+        _field_at_edge(v[is_between], kappa)
         if double_kappa > _LARGE
-        else _integrated(v[is_between], kappa)
+        else _field_by_quadrature(v[is_between], kappa)
     )
     return _irradiance(field, reach)
 
@@ -85,12 +85,12 @@ def _irradiance(field: Tensor, reach: Tensor) -> Tensor:
     return irradiance.reshape(reach.shape)
 
 
-def _geometric(v: Tensor, kappa: complex) -> Tensor:
+def _field_without_rim(v: Tensor, kappa: complex) -> Tensor:
     """Return the field of a beam that no rim cuts off."""
     return torch.exp(-v.square() / (4 * kappa)) / (2 * kappa)
 
 
-def _beyond(v: Tensor, kappa: complex) -> Tensor:
+def _field_beyond(v: Tensor, kappa: complex) -> Tensor:
     """Return the field for v above |2 kappa|: exp(-kappa) sum of (2 kappa / v)^n J(n + 1, v) / v.
 
     Far out few terms are needed, so that the places are taken in parts.
@@ -123,11 +123,11 @@ def _far_series(v: Tensor, kappa: complex, terms: int) -> Tensor:
         previous_bessel, bessel = bessel, 2 * n / v * bessel - previous_bessel
         power = power * ratio
         series = series + power * bessel
-    field: Tensor = _exp(-kappa) * series / v
+    field: Tensor = _complex_exp(-kappa) * series / v
     return field
 
 
-def _within(v: Tensor, kappa: complex) -> Tensor:
+def _field_within(v: Tensor, kappa: complex) -> Tensor:
     """Return the field for v below |2 kappa|: that of a beam without a rim, less the wave from the
     rim, a series of (-v / (2 kappa))^n J(n, v).
     """
@@ -138,12 +138,12 @@ def _within(v: Tensor, kappa: complex) -> Tensor:
     for n in range(1, _TERMS):
         power = power * ratio
         series = series + power * bessel_next
-        bessel_n, bessel_next = bessel_next, _next(n, safe_v, bessel_n, bessel_next)
-    field: Tensor = _geometric(v, kappa) - _exp(-kappa) / (2 * kappa) * series
+        bessel_n, bessel_next = bessel_next, _next_bessel(n, safe_v, bessel_n, bessel_next)
+    field: Tensor = _field_without_rim(v, kappa) - _complex_exp(-kappa) / (2 * kappa) * series
     return field
 
 
-def _next(n: int, v: Tensor, last: Tensor, bessel: Tensor) -> Tensor:
+def _next_bessel(n: int, v: Tensor, last: Tensor, bessel: Tensor) -> Tensor:
     """Return J(n + 1, v) from J(n - 1, v) (``last``) and J(n, v) (``bessel``).
 
     Beyond the order v the recurrence is unstable while J falls fast: return 0 there.
@@ -152,7 +152,7 @@ def _next(n: int, v: Tensor, last: Tensor, bessel: Tensor) -> Tensor:
     return torch.where((v > n + 1) | (following.abs() < bessel.abs()), following, 0.0)
 
 
-def _integrated(v: Tensor, kappa: complex) -> Tensor:
+def _field_by_quadrature(v: Tensor, kappa: complex) -> Tensor:
     """Return the field by Gauss-Legendre quadrature over the square of the radius."""
     if not len(v):
         return torch.zeros(0, dtype=torch.complex128)
@@ -172,7 +172,7 @@ def _integrated(v: Tensor, kappa: complex) -> Tensor:
     return torch.cat(fields)
 
 
-def _at_the_edge(v: Tensor, kappa: complex) -> Tensor:
+def _field_at_edge(v: Tensor, kappa: complex) -> Tensor:
     """Return the field around the geometric edge of a wide spot: a beam behind a straight edge, to
     first order in 1/v.
 
@@ -193,11 +193,13 @@ def _at_the_edge(v: Tensor, kappa: complex) -> Tensor:
     ones = torch.ones_like(saddle)
     edge_rest = eighth_turn * amplitude / (-2 * kappa * (ones + saddle.sqrt()))
     outward_wave = amplitude / eighth_turn / (1j * v - 2 * kappa) * inward_wave.conj()
-    unobstructed = torch.where(is_lit, _geometric(v, kappa), 0.0)
-    return unobstructed + _exp(-kappa) * ((edge_wave + edge_rest) * inward_wave + outward_wave)
+    unobstructed = torch.where(is_lit, _field_without_rim(v, kappa), 0.0)
+    return unobstructed + _complex_exp(-kappa) * (
+        (edge_wave + edge_rest) * inward_wave + outward_wave
+    )
 
 
-def _exp(z: complex) -> complex:
+def _complex_exp(z: complex) -> complex:
     """Return exp(z) of a complex number."""
     return math.exp(z.real) * complex(math.cos(z.imag), math.sin(z.imag))
 
@@ -235,7 +237,7 @@ def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
     fill, phase = fill.double() + zeros, 2 * math.pi * waves.double().abs() + zeros
     least_phase, largest_phase = phase * (1 - within), phase * (1 + within)
     rim = torch.exp(-fill)
-    largest = _on_axis(fill, rim, phase)
+    largest = _axis_irradiance(fill, rim, phase)
     if within:
         # phase at which the sine on the axis is largest: an odd multiple of pi
         odd_phase = math.pi * (2 * torch.ceil(least_phase / (2 * math.pi) - 0.5) + 1)
@@ -243,7 +245,7 @@ def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
         phase_of_peak = odd_phase - (1 + rim).square() / (rim * odd_phase).clamp_min(1e-12)
         for angle in (least_phase, largest_phase, odd_phase, phase_of_peak):
             largest = torch.maximum(
-                largest, _on_axis(fill, rim, angle.clamp(least_phase, largest_phase))
+                largest, _axis_irradiance(fill, rim, angle.clamp(least_phase, largest_phase))
             )
     may_ring = (largest_phase > 2 * math.pi * _FIRST) & (fill < _TABLE_FILL)
     if bool(may_ring.any()):
@@ -255,7 +257,7 @@ def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
     return largest
 
 
-def _on_axis(fill: Tensor, rim: Tensor, phase: Tensor) -> Tensor:
+def _axis_irradiance(fill: Tensor, rim: Tensor, phase: Tensor) -> Tensor:
     """Return the irradiance on the axis, |1 - exp(-kappa)|^2 / |kappa|^2, for a fill and a
     ``phase`` 2 pi W at the rim; ``rim`` is exp(-fill).
     """

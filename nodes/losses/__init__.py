@@ -13,6 +13,7 @@ from neusee.nodes.losses._mask_losses import (
 from neusee.nodes.losses._protected_losses import (
     ContrastVariance,
     PeakLimit,
+    ProtectedPicture,
     SceneLight,
     best_stop,
     filtered_error,
@@ -33,6 +34,7 @@ __all__ = [
     "NoiseVariance",
     "OneBandShare",
     "PeakLimit",
+    "ProtectedPicture",
     "SceneLight",
     "background_loss",
     "best_stop",

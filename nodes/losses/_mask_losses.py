@@ -126,13 +126,13 @@ def contrast(
     kernels_and_cut_offs = zip(single(psf.intensity), cut_off(psf).tolist(), strict=True)
     return torch.stack(
         [
-            _lost(kernel, cut_off_frequency, floor, up_to)
+            _contrast_loss(kernel, cut_off_frequency, floor, up_to)
             for kernel, cut_off_frequency in kernels_and_cut_offs
         ]
     ).sum()
 
 
-def _lost(kernel: Tensor, passed: float, floor: float, up_to: float | None) -> Tensor:
+def _contrast_loss(kernel: Tensor, passed: float, floor: float, up_to: float | None) -> Tensor:
     """Return -mean(ln sqrt(MTF^2 + floor^2)) of one band, over the frequencies that the lens passes
     and that are at most ``up_to``, in cycles per pixel.
     """
@@ -214,13 +214,13 @@ def wiener(
     channel_psfs = effective_psf(psf, illuminant, responses, bands).to(intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity)
     signal = (fall((y, x)) / noise).to(intensity)  # signal over noise, by frequency
-    counted_signal = signal * _counted((y, x), up_to).to(signal)
+    counted_signal = signal * _counted_frequencies((y, x), up_to).to(signal)
     bands_otf, error_shares = torch.fft.rfft2(intensity), list[Tensor]()
     for channel_otf, share in zip(torch.fft.rfft2(channel_psfs), shares, strict=True):
-        signal_behind = signal * _square(channel_otf)
+        signal_behind = signal * _squared_modulus(channel_otf)
         # signal times the square of the filter
         signal_filtered = signal * signal_behind / (signal_behind + 1).square()
-        band_difference = torch.tensordot(share, _square(bands_otf - channel_otf), 1)
+        band_difference = torch.tensordot(share, _squared_modulus(bands_otf - channel_otf), 1)
         error_variance = 1 / (signal_behind + 1) + colour * signal_filtered * band_difference
         # relative to the variance of the picture, at the frequencies that count
         error_shares.append(
@@ -230,12 +230,12 @@ def wiener(
     return result
 
 
-def _square(spectrum: Tensor) -> Tensor:
+def _squared_modulus(spectrum: Tensor) -> Tensor:
     """Return |spectrum|^2."""
     return spectrum.real.square() + spectrum.imag.square()
 
 
-def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
+def _counted_frequencies(size: tuple[int, int], up_to: float | None) -> Tensor:
     """Return True at the spatial frequencies above 0 and up to ``up_to``, in the layout of
     `torch.fft.rfft2`.
     """

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes.losses._mask_losses import HighestFrequency
-from neusee.nodes.optics._lens import averaging, cut_off, round_lens, stop_width
+from neusee.nodes.optics._lens import averaged_side, cut_off, round_lens, stop_width
 from neusee.nodes.precision import single
 from neusee.nodes.restore._inverse._masked_blur import effective_psf, grey_shares, times
 from neusee.nodes.units import Electrons, Fraction
@@ -27,7 +27,26 @@ from neusee.nodes.values import Bands, Psf
 
 
 _DARK = 1e-30  #: ratio of light below which a band counts as dark
-_RADII = 8192  #: of a table of contrast by frequency, up to the corner of the spectrum
+_TABLE_RADII = 8192  #: of a table of contrast by frequency, up to the corner of the spectrum
+
+
+class GreyScene(NamedTuple):
+    """What decides the share of each band in the channels of a camera that sees a grey scene."""
+
+    illuminant: Tensor  #: (band,)
+    responses: Tensor  #: (channel, band)
+    bands: Bands
+
+
+class ProtectedPicture(NamedTuple):
+    """The picture that a camera takes of a natural scene, and the limit of a laser's peak in it."""
+
+    light: float  #: e- in a pixel behind the clear lens, mean of the scene
+    read_noise: float  #: e-, standard deviation
+    veil: float = 0.0  #: e- in a pixel, even light of the laser
+    limit: float | None = None  #: of the LSR; None for no limit
+    contrast: float = 0.1  #: variance of the relative brightness of the scene
+    up_to: float | None = None  #: cycles per pixel, highest frequency that counts; None for all
 
 
 class Exposure(NamedTuple):
@@ -56,7 +75,7 @@ def natural_spectrum(size: tuple[int, int], contrast: float, like: Tensor) -> Te
     return power * (contrast / mean_power.where(mean_power > 0, 1.0))
 
 
-def quanta(passed: Tensor, exposure: Exposure, filtered: Tensor) -> Tensor:
+def noise_equivalent_quanta(passed: Tensor, exposure: Exposure, filtered: Tensor) -> Tensor:
     """Return the noise equivalent quanta (T n MTF)^2 / (T n + veil + read^2) behind a filter of
     transmittance T.
 
@@ -68,7 +87,7 @@ def quanta(passed: Tensor, exposure: Exposure, filtered: Tensor) -> Tensor:
     return filtered_light.square() * passed / noise.clamp_min(_DARK)
 
 
-def mean_of(values: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
+def spectrum_mean(values: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
     """Return the mean of half a spectrum over the whole spectrum, at the frequencies
     ``counted``.
     """
@@ -81,12 +100,14 @@ def error_share(snr: Tensor, spectrum: Tensor, size: tuple[int, int], counted: T
     """Return the error variance after a Wiener filter, over the variance of the scene, at some
     frequencies.
     """
-    return mean_of(spectrum / (1 + snr), size, counted) / mean_of(spectrum, size, counted)
+    return spectrum_mean(spectrum / (1 + snr), size, counted) / spectrum_mean(
+        spectrum, size, counted
+    )
 
 
-def bits(snr: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
+def information_share(snr: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
     """Return the mean of log2(1 + SNR) over some frequencies."""
-    return mean_of(torch.log2(1 + snr), size, counted)
+    return spectrum_mean(torch.log2(1 + snr), size, counted)
 
 
 def peak_share(intensity: Tensor, clear_peak: Tensor, power: float | None) -> Tensor:
@@ -107,7 +128,7 @@ def peak_share(intensity: Tensor, clear_peak: Tensor, power: float | None) -> Te
     return smooth_peak
 
 
-def filter_of(peak: Tensor, limit: float | None) -> Tensor:
+def filter_transmittance(peak: Tensor, limit: float | None) -> Tensor:
     """Return the transmittance of the grey filter that lowers a peak to ``limit``; 1 where the
     peak is lower.
     """
@@ -124,15 +145,15 @@ def round_mtf(frequency: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
     it is linear.
     """
     # 0.75 is beyond the corner of the spectrum, sqrt(1/2) cycles per pixel
-    radii = torch.linspace(0.0, 0.75, _RADII, dtype=torch.float64)
+    radii = torch.linspace(0.0, 0.75, _TABLE_RADII, dtype=torch.float64)
     share_of_cut = (radii / cuts[:, None]).clamp_max(1.0)
     # transfer function of a round pupil without aberrations, summed over bands
     table = shares @ (
         (torch.acos(share_of_cut) - share_of_cut * (1 - share_of_cut.square()).sqrt())
         * (2 / math.pi)
     )
-    table_place = frequency * ((_RADII - 1) / 0.75)
-    row_below = table_place.long().clamp_max(_RADII - 2)
+    table_place = frequency * ((_TABLE_RADII - 1) / 0.75)
+    row_below = table_place.long().clamp_max(_TABLE_RADII - 2)
     return torch.lerp(
         table[:, row_below],
         table[:, row_below + 1],
@@ -149,7 +170,7 @@ def round_mtf(frequency: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
 PeakLimit = Annotated[float, Field(gt=0, le=1)]  #: of the LSR
 ContrastVariance = Annotated[float, Field(gt=0, le=1)]
 SceneLight = Annotated[Electrons, Field(gt=0)]
-_STOPS = 24  #: diameters that are tried, and again on each side of the best
+_TRIED_STOPS = 24  #: diameters that are tried, and again on each side of the best
 NormPower = Annotated[float, Field(ge=8, le=256)]
 
 
@@ -193,11 +214,10 @@ def filtered_error(
             Barrett and Myers, Foundations of Image Science, 2004, ch. 13; spectrum of natural
             scenes: Field, J. Opt. Soc. Am. A 4, 2379 (1987). The limit by a filter is ours.
     """
-    exposure = Exposure(light, read_noise, veil, transmittance)
-    snr, spectrum, counted = _behind(
-        psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to)
-    )
-    error_variance = error_share(snr, spectrum, _size(psf), counted)
+    scene = GreyScene(illuminant, responses, bands)
+    picture = ProtectedPicture(light, read_noise, veil, limit, contrast, up_to)
+    snr, spectrum, counted = _snr_behind_mask(psf, scene, picture, transmittance, power)
+    error_variance = error_share(snr, spectrum, _window_of(psf), counted)
     return error_variance.clamp_min(1e-30).log().mean().to(single(psf.intensity))
 
 
@@ -232,34 +252,36 @@ def information(
     Source: Shannon, Proc. IRE 37, 10 (1949), for Gaussian signals and noise; NEQ as in Barrett and
             Myers, Foundations of Image Science, 2004, ch. 13.
     """
-    exposure = Exposure(light, read_noise, veil, transmittance)
-    snr, _, counted = _behind(
-        psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to)
-    )
-    return -bits(snr, _size(psf), counted).mean().to(single(psf.intensity))
+    scene = GreyScene(illuminant, responses, bands)
+    picture = ProtectedPicture(light, read_noise, veil, limit, contrast, up_to)
+    snr, _, counted = _snr_behind_mask(psf, scene, picture, transmittance, power)
+    return -information_share(snr, _window_of(psf), counted).mean().to(single(psf.intensity))
 
 
-def _behind(
+def _snr_behind_mask(
     psf: Psf,
-    grey: tuple[Tensor, Tensor, Bands],
-    exposure: Exposure,
-    settings: tuple[float | None, float | None, float, float | None],
+    scene: GreyScene,
+    picture: ProtectedPicture,
+    transmittance: float,
+    power: float | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return NEQ x S of each channel behind mask and filter, S, and which frequencies count.
 
-    ``grey`` is illuminant, responses and bands, ``settings`` limit, power of the norm, contrast and
-    highest frequency.
+    ``transmittance`` is the share of the light that the pupil of the mask lets through, and
+    ``power`` that of the norm in place of the maximum over pixels.
     """
-    limit, power, contrast, up_to = settings
-    size, kernels = _size(psf), effective_psf(psf, *grey, torch.float64).double()
+    size, kernels = _window_of(psf), effective_psf(psf, *scene, torch.float64).double()
     otf = torch.fft.rfft2(kernels)
-    spectrum = natural_spectrum(size, contrast, kernels)
-    transmittance = filter_of(peak_share(psf.intensity, psf.clear_peak, power), limit)
-    noise_quanta = quanta(otf.real.square() + otf.imag.square(), exposure, transmittance)
-    return noise_quanta * spectrum, spectrum, _counted(size, up_to, kernels)
+    spectrum = natural_spectrum(size, picture.contrast, kernels)
+    filtered = filter_transmittance(peak_share(psf.intensity, psf.clear_peak, power), picture.limit)
+    exposure = Exposure(picture.light, picture.read_noise, picture.veil, transmittance)
+    noise_quanta = noise_equivalent_quanta(
+        otf.real.square() + otf.imag.square(), exposure, filtered
+    )
+    return noise_quanta * spectrum, spectrum, _counted_frequencies(size, picture.up_to, kernels)
 
 
-def _counted(size: tuple[int, int], up_to: float | None, like: Tensor) -> Tensor:
+def _counted_frequencies(size: tuple[int, int], up_to: float | None, like: Tensor) -> Tensor:
     """Return True for the frequencies of half a spectrum above 0 and up to ``up_to``, None for
     all.
     """
@@ -267,23 +289,43 @@ def _counted(size: tuple[int, int], up_to: float | None, like: Tensor) -> Tensor
     return (frequency > 0) & (frequency <= (1.0 if up_to is None else up_to))
 
 
-def _size(psf: Psf) -> tuple[int, int]:
+def _window_of(psf: Psf) -> tuple[int, int]:
     """Return the size (y, x) of a PSF."""
     return psf.intensity.shape[-2], psf.intensity.shape[-1]
 
 
 @filtered_error.reference
-def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings: Any) -> Tensor:
+def _(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    transmittance: float = 1.0,
+    power: float | None = None,
+    **settings: Any,
+) -> Tensor:
+    scene, picture = GreyScene(illuminant, responses, bands), ProtectedPicture(**settings)
     logs = [
         (spectrum / (1 + snr))[counted].sum().div(spectrum[counted].sum()).clamp_min(1e-30).log()
-        for snr, spectrum, counted in _by_definition(psf, illuminant, responses, bands, **settings)
+        for snr, spectrum, counted in _by_definition(psf, scene, picture, transmittance, power)
     ]
     return torch.stack(logs).mean()
 
 
 @information.reference
-def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings: Any) -> Tensor:
-    channels = _by_definition(psf, illuminant, responses, bands, **settings)
+def _(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    transmittance: float = 1.0,
+    power: float | None = None,
+    **settings: Any,
+) -> Tensor:
+    scene, picture = GreyScene(illuminant, responses, bands), ProtectedPicture(**settings)
+    channels = _by_definition(psf, scene, picture, transmittance, power)
     return -torch.stack(
         [snr[counted].log1p().mean() / math.log(2) for snr, _, counted in channels]
     ).mean()
@@ -291,41 +333,34 @@ def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings:
 
 def _by_definition(
     psf: Psf,
-    illuminant: Tensor,
-    responses: Tensor,
-    bands: Bands,
-    *,
-    light: float,
-    read_noise: float,
-    veil: float = 0.0,
-    limit: float | None = None,
-    transmittance: float = 1.0,
-    contrast: float = 0.1,
-    up_to: float | None = None,
-    power: float | None = None,
+    scene: GreyScene,
+    picture: ProtectedPicture,
+    transmittance: float,
+    power: float | None,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Yield NEQ x S, S and the counted frequencies of each channel, on the whole spectrum."""
     y, x = psf.intensity.shape[-2:]
     fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.fftfreq(x, dtype=torch.float64)
     squared_frequency = fy[:, None].square() + fx.square()
     spectrum = torch.where(squared_frequency > 0, 1 / squared_frequency, 0.0)
-    spectrum = spectrum * (contrast * x * y / spectrum.sum().clamp_min(1e-300))
+    spectrum = spectrum * (picture.contrast * x * y / spectrum.sum().clamp_min(1e-300))
     lsr = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten()
     peak = (
         lsr.max()
         if power is None
         else (power * lsr.clamp_min(1e-300).log()).logsumexp(0).div(power).exp()
     )
-    transmittance_of_filter = (
-        torch.minimum(torch.ones(()), limit / peak) if limit is not None else torch.ones(())
-    )
-    sensitivity = responses.double() * (illuminant.double() * bands.centres)
+    transmittance_of_filter = torch.ones(())
+    if picture.limit is not None:
+        transmittance_of_filter = torch.minimum(transmittance_of_filter, picture.limit / peak)
+    sensitivity = scene.responses.double() * (scene.illuminant.double() * scene.bands.centres)
     for share in sensitivity / sensitivity.sum(-1, keepdim=True):
         transfer = torch.fft.fft2(torch.tensordot(share, psf.intensity.double(), 1)).abs()
-        noise = transmittance_of_filter * (light * transmittance + veil) + read_noise**2
-        counted = (squared_frequency > 0) & (squared_frequency <= (up_to or 1.0) ** 2)
+        light_and_veil = picture.light * transmittance + picture.veil
+        noise = transmittance_of_filter * light_and_veil + picture.read_noise**2
+        counted = (squared_frequency > 0) & (squared_frequency <= (picture.up_to or 1.0) ** 2)
         yield (
-            (transmittance_of_filter * light * transfer).square() / noise * spectrum,
+            (transmittance_of_filter * picture.light * transfer).square() / noise * spectrum,
             spectrum,
             counted,
         )
@@ -336,13 +371,7 @@ def best_stop(
     illuminant: Tensor,
     responses: Tensor,
     bands: Bands,
-    *,
-    light: float,
-    read_noise: float,
-    veil: float = 0.0,
-    limit: float | None = None,
-    contrast: float = 0.1,
-    up_to: float | None = None,
+    picture: ProtectedPicture,
     measure: Literal["filtered_error", "information"] = "filtered_error",
 ) -> tuple[float, float, float]:
     """Return the least loss of a round stop with a grey filter at the same limit, its diameter and
@@ -353,17 +382,20 @@ def best_stop(
     and its light with the second power. ``measure`` names the loss: ``filtered_error`` or
     ``information``.
     """
-    size, grey = _size(plain), grey_shares(illuminant, responses, bands)
-    cut_offs, sides = cut_off(plain).cpu(), averaging(plain).cpu()
+    size, grey = _window_of(plain), grey_shares(illuminant, responses, bands)
+    cut_offs, sides = cut_off(plain).cpu(), averaged_side(plain).cpu()
     pixel_contrast = _pixel_contrast(size, float(sides.max()))
-    spectrum = natural_spectrum(size, contrast, cut_offs)
-    counted, frequency = _counted(size, up_to, cut_offs), frequencies(size, cut_offs)
+    spectrum = natural_spectrum(size, picture.contrast, cut_offs)
+    counted, frequency = (
+        _counted_frequencies(size, picture.up_to, cut_offs),
+        frequencies(size, cut_offs),
+    )
 
     def loss_of(width: float) -> tuple[float, float, float]:
-        filtered = filter_of(_stop_peak(width, cut_offs, sides), limit)
-        exposure = Exposure(light, read_noise, veil, width**2)
+        filtered = filter_transmittance(_stop_peak(width, cut_offs, sides), picture.limit)
+        exposure = Exposure(picture.light, picture.read_noise, picture.veil, width**2)
         snr = (
-            quanta(
+            noise_equivalent_quanta(
                 (width**2 * pixel_contrast * round_mtf(frequency, width * cut_offs, grey)).square(),
                 exposure,
                 filtered,
@@ -371,16 +403,21 @@ def best_stop(
             * spectrum
         )
         log_error = error_share(snr, spectrum, size, counted).clamp_min(1e-30).log()
-        loss = log_error if measure == "filtered_error" else -bits(snr, size, counted)
+        loss = log_error if measure == "filtered_error" else -information_share(snr, size, counted)
         return float(loss.mean()), width, float(filtered)
 
     # a narrower stop loses light and contrast, and protects more than is asked
-    narrowest = float(stop_width(torch.full_like(cut_offs, limit or 1.0), cut_offs, sides).min())
+    narrowest = float(
+        stop_width(torch.full_like(cut_offs, picture.limit or 1.0), cut_offs, sides).min()
+    )
     # evenly spaced widths, then finer ones on each side of the best
-    coarse_best = min(loss_of(1.0 + i / (_STOPS - 1) * (narrowest - 1.0)) for i in range(_STOPS))
-    width_step = (1.0 - narrowest) / (_STOPS - 1)
+    coarse_best = min(
+        loss_of(1.0 + i / (_TRIED_STOPS - 1) * (narrowest - 1.0)) for i in range(_TRIED_STOPS)
+    )
+    width_step = (1.0 - narrowest) / (_TRIED_STOPS - 1)
     finer_widths = (
-        coarse_best[1] + i / (_STOPS - 1) * width_step for i in range(1 - _STOPS, _STOPS)
+        coarse_best[1] + i / (_TRIED_STOPS - 1) * width_step
+        for i in range(1 - _TRIED_STOPS, _TRIED_STOPS)
     )
     return min(
         [coarse_best, *(loss_of(width) for width in finer_widths if narrowest <= width <= 1.0)]

@@ -2,6 +2,7 @@
 
 from neusee.nodes.metrics import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.metrics._picture_quality import (
+    Attack,
     Attacked,
     Filtered,
     GlareLevels,
@@ -58,6 +59,7 @@ from neusee.nodes.metrics._suppression import (
 
 __all__ = [
     "TARGETS",
+    "Attack",
     "Attacked",
     "Filtered",
     "GlareLevels",

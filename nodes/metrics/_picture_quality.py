@@ -15,8 +15,8 @@ from neusee.nodes.restore._inverse._masked_blur import grey_shares
 from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
 
-_WINDOW = 11  #: width in pixels of the Gaussian window of SSIM
-_STRIPE = 118  #: rows that are compared at a time: 128 with the margin of the window
+_SSIM_WINDOW = 11  #: width in pixels of the Gaussian window of SSIM
+_STRIPE_ROWS = 118  #: rows that are compared at a time: 128 with the margin of the window
 
 
 class Quality(NamedTuple):
@@ -55,16 +55,16 @@ def quality(
     Source: Wang et al., IEEE Trans. Image Process. 13, 600 (2004); sRGB as IEC 61966-2-1.
     """
     require_same_shape(estimate, truth)
-    a, b = (_inside(x, border) for x in (estimate, truth))
-    if min(a.shape[-2:]) < _WINDOW:
-        size = f"{_WINDOW} x {_WINDOW}"
+    a, b = (_without_border(x, border) for x in (estimate, truth))
+    if min(a.shape[-2:]) < _SSIM_WINDOW:
+        size = f"{_SSIM_WINDOW} x {_SSIM_WINDOW}"
         raise ValueError(
             f"SSIM needs {size} pixels, not {tuple(a.shape[-2:])} inside the border: give a larger"
             " picture"
         )
-    absolute_sum, square_sum, ssim_sum = _sums(a, b, domain)
+    absolute_sum, square_sum, ssim_sum = _difference_sums(a, b, domain)
     psnr = -10.0 * (square_sum / a.numel()).clamp_min(1e-20).log10()
-    window_count = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
+    window_count = a[..., _SSIM_WINDOW - 1 :, _SSIM_WINDOW - 1 :].numel()
     return Quality(absolute_sum / a.numel(), psnr, ssim_sum / window_count)
 
 
@@ -85,13 +85,13 @@ def require_same_shape(
         )
 
 
-def _inside(picture: Tensor, border: int) -> Tensor:
+def _without_border(picture: Tensor, border: int) -> Tensor:
     """Return a picture without a border of so many pixels, at least float32."""
     y, x = picture.shape[-2:]
     return single(picture)[..., border : max(y - border, border), border : max(x - border, border)]
 
 
-def _shown(picture: Tensor, domain: str) -> Tensor:
+def _displayed(picture: Tensor, domain: str) -> Tensor:
     """Return a picture as a display shows it, clipped to [0, 1] and encoded in sRGB unless
     ``domain`` is linear.
     """
@@ -105,18 +105,19 @@ def _shown(picture: Tensor, domain: str) -> Tensor:
     return encoded.where(displayable < 1, encoded - encoded.detach() + 1)
 
 
-def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
+def _difference_sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
     """Return the sums of absolute difference, squared difference and SSIM over all pixels, in
     stripes that fit the CPU cache.
     """
     absolute_sum, square_sum, ssim_sum = (
         torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3)
     )
-    rows = a.shape[-2] - _WINDOW + 1
-    for first in range(0, rows, _STRIPE):
-        last = min(first + _STRIPE, rows)
+    rows = a.shape[-2] - _SSIM_WINDOW + 1
+    for first in range(0, rows, _STRIPE_ROWS):
+        last = min(first + _STRIPE_ROWS, rows)
         estimate_stripe, truth_stripe = (
-            _shown(picture[..., first : last + _WINDOW - 1, :], domain) for picture in (a, b)
+            _displayed(picture[..., first : last + _SSIM_WINDOW - 1, :], domain)
+            for picture in (a, b)
         )
         # the next stripe counts the remaining rows
         counted_rows = None if last == rows else last - first
@@ -135,7 +136,7 @@ def _ssim(p: Tensor, q: Tensor) -> Tensor:
 
     pictures = (x.reshape(1, -1, *x.shape[-2:]) for x in (p, q))
     with exact_convolutions(p):
-        similarity: Tensor = ssim(*pictures, _WINDOW, eps=0.0, padding="valid")
+        similarity: Tensor = ssim(*pictures, _SSIM_WINDOW, eps=0.0, padding="valid")
     return similarity
 
 
@@ -146,7 +147,7 @@ def _ssim(p: Tensor, q: Tensor) -> Tensor:
 
 
 Light = Annotated[Electrons, Field(gt=0)]  #: electrons a pixel
-_LEAST = 1e-30  #: NEQ below which a frequency counts as lost
+_LOST_NEQ = 1e-30  #: NEQ below which a frequency counts as lost
 #: cycles per pixel; 0.71 is the corner of the spectrum
 HighestFrequency = Annotated[float, Field(gt=0, le=0.71)]
 #: of the contrast of a scene, relative to its squared mean
@@ -203,13 +204,13 @@ def filtered_picture(
     light = otf[:, 0, 0].real
     noise_variances = noise_variance(electrons * light, glare, read_noise, prnu, residual_glare)
     neq = (electrons * otf.abs()).square() / noise_variances[:, None, None]
-    power, counted = _on(
+    power, counted = _on_device_of(
         neq, natural_power(tuple(neq.shape[-2:]), variance), low_frequencies(neq.shape[-2:], up_to)
     )
     # the Wiener filter leaves S / (1 + NEQ S) of the scene's power S
     error = (power / (1 + neq * power)).sum((-2, -1)) / power.sum()
     information = 0.5 * torch.log2(1 + neq * power).mean((-2, -1))
-    logs = neq[:, counted].clamp_min(_LEAST).log().mean(-1)
+    logs = neq[:, counted].clamp_min(_LOST_NEQ).log().mean(-1)
     return Filtered(error, information, logs, light)
 
 
@@ -261,7 +262,7 @@ def _(
             (
                 float((power / (1 + neq * power)).sum() / power.sum()),
                 float(torch.log2(1 + neq * power).mean() / 2),
-                float(torch.log(neq[counted].clamp_min(_LEAST)).mean()),
+                float(torch.log(neq[counted].clamp_min(_LOST_NEQ)).mean()),
                 light_share,
             )
         )
@@ -279,7 +280,7 @@ def _(result: Filtered, *inputs: Any, electrons: float, **params: Any) -> list[C
     return [Check(text, ok)]
 
 
-def _on(like: Tensor, *tensors: Tensor) -> list[Tensor]:
+def _on_device_of(like: Tensor, *tensors: Tensor) -> list[Tensor]:
     """Return tensors on the device of the first one."""
     return [x.to(like.device) for x in tensors]
 
@@ -319,7 +320,7 @@ def natural_power(shape: tuple[int, ...], variance: float) -> Tensor:
     The power falls with the square of the frequency, is 0 at frequency 0, and its mean over all
     frequencies is ``variance``.
     """
-    squared_frequency = _square_frequency(shape)
+    squared_frequency = _squared_frequency(shape)
     power = torch.where(
         squared_frequency > 0, 1.0 / squared_frequency.where(squared_frequency > 0, 1.0), 0.0
     )
@@ -331,12 +332,12 @@ def low_frequencies(shape: tuple[int, ...], up_to: float) -> Tensor:
     """Return True at the frequencies above 0 and up to ``up_to`` cycles per pixel, in the layout
     of an FFT: (y, x).
     """
-    squared_frequency = _square_frequency(shape)
+    squared_frequency = _squared_frequency(shape)
     low: Tensor = (squared_frequency > 0) & (squared_frequency <= up_to**2)
     return low
 
 
-def _square_frequency(shape: tuple[int, ...]) -> Tensor:
+def _squared_frequency(shape: tuple[int, ...]) -> Tensor:
     """Return the squared frequencies (y, x) of an FFT, in cycles per pixel."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in shape)
     squared: Tensor = fy[:, None].square() + fx.square()
@@ -358,7 +359,7 @@ def decibels(ratio: float) -> float:
 
 
 #: decades of the bins, and bins a decade, which give an error of 1e-4
-_LEAST_FREQUENCY, _MOST, _EACH = -20, 8, 40
+_FIRST_POWER_DECADE, _LAST_POWER_DECADE, _POWER_BINS_PER_DECADE = -20, 8, 40
 
 
 class PictureSpectrum(NamedTuple):
@@ -379,20 +380,14 @@ class PictureSpectrum(NamedTuple):
 
 
 def picture_spectrum(
-    true: Psf,
-    assumed: Psf,
-    illuminant: Tensor,
-    responses: Tensor,
-    bands: Bands,
-    variance: float = 0.1,
-    up_to: float = 0.12,
+    true: Tensor, assumed: Tensor, variance: float = 0.1, up_to: float = 0.12
 ) -> PictureSpectrum:
-    """Sort the frequencies of a picture by their power; ``assumed`` is the PSF that the filter
-    takes for the true one.
+    """Sort the frequencies of a picture by their power.
+
+    ``true`` and ``assumed`` are PSFs (channel, y, x) of `channel_psf`: the one of the picture, and
+    the one that the filter takes for it.
     """
-    otf, assumed_otf = (
-        torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)) for psf in (true, assumed)
-    )
+    otf, assumed_otf = torch.fft.fft2(true), torch.fft.fft2(assumed)
     scene = natural_power(tuple(otf.shape[-2:]), variance)
     is_low = low_frequencies(tuple(otf.shape[-2:]), up_to)
     share = scene / scene.sum()
@@ -420,12 +415,14 @@ def _binned(value: Tensor, *weights: Tensor) -> list[Tensor]:
     sums of all weights.
     """
     bin_index = (
-        ((value.clamp_min(1e-300).log10() - _LEAST_FREQUENCY) * _EACH)
+        ((value.clamp_min(1e-300).log10() - _FIRST_POWER_DECADE) * _POWER_BINS_PER_DECADE)
         .long()
-        .clamp(0, (_MOST - _LEAST_FREQUENCY) * _EACH - 1)
+        .clamp(0, (_LAST_POWER_DECADE - _FIRST_POWER_DECADE) * _POWER_BINS_PER_DECADE - 1)
         .flatten()
     )
-    zero_bins = torch.zeros((_MOST - _LEAST_FREQUENCY) * _EACH, dtype=torch.float64)
+    zero_bins = torch.zeros(
+        (_LAST_POWER_DECADE - _FIRST_POWER_DECADE) * _POWER_BINS_PER_DECADE, dtype=torch.float64
+    )
     weight_sums = [zero_bins.index_add(0, bin_index, weight.flatten()) for weight in weights]
     weighted_sum = zero_bins.index_add(0, bin_index, (value * weights[0]).flatten())
     return [
@@ -496,12 +493,12 @@ def radial_contrast(
 # pixels that are left.
 
 
-_LEAST_ATTACK, _MOST_ATTACK, _ATTACKS_EACH = (
+_FIRST_GLARE_DECADE, _LAST_GLARE_DECADE, _GLARE_BINS_PER_DECADE = (
     -16,
     1,
     20,
 )  #: decades of the glare, and bins a decade
-_NOISES = 48  #: noises for which the error is computed; others are interpolated, to 1e-4
+_TABLE_NOISES = 48  #: noises for which the error is computed; others are interpolated, to 1e-4
 
 
 class GlareLevels(NamedTuple):
@@ -522,6 +519,14 @@ class PixelNoise(NamedTuple):
     residual_glare: float  #: share of the glare that is subtracted wrongly
 
 
+class Attack(NamedTuple):
+    """The lasers that attack a picture, from the weakest to the strongest."""
+
+    #: (strength,); 1 fills one pixel behind the clear lens in the channel that responds most
+    strengths: Tensor
+    colour: Tensor  #: (channel,) response of each channel relative to the one that responds most
+
+
 class Attacked(NamedTuple):
     """What is left of a picture under attack, averaged over pixels and channels."""
 
@@ -535,12 +540,12 @@ def glare_levels(light: Tensor, clear_peak: float) -> GlareLevels:
     """Sort the pixels of a field by the light (y, x) that a laser sends to each pixel."""
     relative = light.double().flatten() / clear_peak
     bin_index = (
-        ((relative.clamp_min(1e-300).log10() - _LEAST_ATTACK) * _ATTACKS_EACH)
+        ((relative.clamp_min(1e-300).log10() - _FIRST_GLARE_DECADE) * _GLARE_BINS_PER_DECADE)
         .long()
-        .clamp(0, (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH - 1)
+        .clamp(0, (_LAST_GLARE_DECADE - _FIRST_GLARE_DECADE) * _GLARE_BINS_PER_DECADE - 1)
     )
     zero_bins = torch.zeros(
-        (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH,
+        (_LAST_GLARE_DECADE - _FIRST_GLARE_DECADE) * _GLARE_BINS_PER_DECADE,
         dtype=torch.float64,
     )
     count = zero_bins.index_add(0, bin_index, torch.ones_like(relative))
@@ -553,25 +558,22 @@ def attacked_picture(
     spectrum: PictureSpectrum,
     glare: GlareLevels,
     noise: PixelNoise,
+    attack: Attack,
     *,
     electrons: float,
     transmittance: float,
-    strengths: Tensor,
-    colour: Tensor,
 ) -> Attacked:
     """Return error, information and share of seen pixels at each strength of a laser: (strength,)
     each.
 
-    A strength of 1 fills one pixel behind the clear lens in the channel that responds most;
-    ``colour`` (channel,) is the response of each channel relative to that one. A grey filter of
-    ``transmittance`` dims scene and laser alike. The Wiener filter knows the noise of each pixel,
-    and a pixel is lost where scene and glare fill it.
+    A grey filter of ``transmittance`` dims scene and laser alike. The Wiener filter knows the noise
+    of each pixel, and a pixel is lost where scene and glare fill it.
     """
     amplitude = electrons * transmittance
     light = amplitude * spectrum.light
     # strengths count in full wells at the peak of the clear lens
-    peak_light = noise.full_well * strengths[:, None, None] * transmittance
-    laser_light = peak_light * glare.level[:, None] * colour  # (strength, bin, channel)
+    peak_light = noise.full_well * attack.strengths[:, None, None] * transmittance
+    laser_light = peak_light * glare.level[:, None] * attack.colour  # (strength, bin, channel)
     not_full = (laser_light + light) < noise.full_well
     noise_without_glare = noise_variance(
         light, 0.0, noise.read_noise, noise.prnu, noise.residual_glare
@@ -579,7 +581,7 @@ def attacked_picture(
     noise_at_full_well = noise_variance(
         light, noise.full_well, noise.read_noise, noise.prnu, noise.residual_glare
     )
-    noise_steps = torch.linspace(0, 1, _NOISES, dtype=torch.float64)[:, None]
+    noise_steps = torch.linspace(0, 1, _TABLE_NOISES, dtype=torch.float64)[:, None]
     # the error depends on the noise alone: a table over its logarithm, (noise, channel)
     log_noise_table = (
         noise_without_glare.log() + noise_steps * (noise_at_full_well / noise_without_glare).log()
@@ -590,10 +592,10 @@ def attacked_picture(
     table_place = (
         (log_noise - noise_without_glare.log())
         / (noise_at_full_well / noise_without_glare).log()
-        * (_NOISES - 1)
-    ).clamp(0, _NOISES - 1 - 1e-9)
+        * (_TABLE_NOISES - 1)
+    ).clamp(0, _TABLE_NOISES - 1 - 1e-9)
     error, bits = (
-        _between(f(spectrum, amplitude, log_noise_table.exp()), table_place)
+        _interpolated_rows(f(spectrum, amplitude, log_noise_table.exp()), table_place)
         for f in (remaining_error, information_bits)
     )
     weights = glare.share[:, None]
@@ -601,7 +603,7 @@ def attacked_picture(
     return Attacked(*((weights * mean).sum(1).mean(-1) for mean in means))
 
 
-def _between(table: Tensor, place: Tensor) -> Tensor:
+def _interpolated_rows(table: Tensor, place: Tensor) -> Tensor:
     """Interpolate a table (noise, channel) at real rows ``place`` (strength, bin, channel)."""
     row_below = place.floor().long()
     channel = torch.arange(table.shape[1])

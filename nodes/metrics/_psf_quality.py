@@ -12,9 +12,9 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.metrics._picture_quality import channel_psf
 from neusee.nodes.optics import psf as focus
-from neusee.nodes.optics import pupil_has_large_steps
 from neusee.nodes.optics._lens import cut_off
 from neusee.nodes.optics._psf_definition import SensorSampling
+from neusee.nodes.optics._pupil import SCREENS, thinned_pupil
 from neusee.nodes.precision import refuse_half
 from neusee.nodes.units import FocalLength, PixelPitch, SensorLength
 from neusee.nodes.values import Bands, Psf, Pupil
@@ -56,13 +56,13 @@ def mtf(psf: Psf) -> Mtf:
             pupil).
     """
     rows = [
-        _contrast(kernel, cut)
+        _contrast_statistics(kernel, cut)
         for kernel, cut in zip(psf.intensity, cut_off(psf).tolist(), strict=True)
     ]
     return Mtf(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
-def _contrast(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
+def _contrast_statistics(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return root mean square, median and first percentile of the contrast of one band up to
     ``cut`` cycles per pixel.
     """
@@ -144,9 +144,7 @@ def over_clear_peak(psf: Psf, band: int) -> Tensor:
 # The error of a PSF of all bands together that comes from the number of spectral bands.
 
 
-_SIDE = 256  #: pixels; the light within this square about the axis is compared
-_SAMPLES = 256  #: least number of pupil samples across, of which a larger pupil keeps every k-th
-_SCREENS = ("aperture", "amplitude", "height", "path")  #: what a pupil holds for each sample
+_COMPARED_SIDE = 256  #: pixels; the light within this square about the axis is compared
 
 
 @node(rtol=1e-3)
@@ -181,14 +179,14 @@ def spectral_error(
     Source: comparison of two composite rules: Dahlquist and Bjorck, Numerical Methods, section 7.2
             (1974).
     """
-    weights = _weights(bands, illuminant, responses)
+    weights = _band_weights(bands, illuminant, responses)
     if not weights.shape[1] == len(bands.centres) == len(pupil.wavelengths):
         counts = f"{len(pupil.wavelengths)}, {len(bands.centres)} and {weights.shape[1]}"
         raise ValueError(
             f"pupil, bands and weights have {counts} bands: compute all from the same `bands` step"
         )
-    finer_wavelengths, difference = _finer(bands, weights)
-    thinned = _in_double(_thinned(pupil))
+    finer_wavelengths, difference = _finer_wavelengths(bands, weights)
+    thinned = _in_double(thinned_pupil(pupil))
     # the bands in use first, then those between them
     index = torch.cat(
         [thinned.index, _interpolated(pupil.wavelengths, pupil.index, finer_wavelengths)]
@@ -199,31 +197,31 @@ def spectral_error(
     alias_free_pixels = (
         float(thinned.wavelengths.min()) * focal_length / (2 * float(thinned.pitch) * pixel_pitch)
     )
-    side = max(1, min(_SIDE, math.floor(2 * alias_free_pixels)))
+    side = max(1, min(_COMPARED_SIDE, math.floor(2 * alias_free_pixels)))
     lens = {"focal_length": focal_length, "pixel_pitch": pixel_pitch, "sensor": sensor}
     band_psf: Psf = focus(thinned, **lens, shape=(side, side), precision="double")
     light = band_psf.intensity.flatten(1)
     white_norm, error_norm = (
-        _norms(w.to(light) @ light[: w.shape[1]]) for w in (weights, difference)
+        _row_norms(w.to(light) @ light[: w.shape[1]]) for w in (weights, difference)
     )
     is_dark = white_norm <= _DARK
     share: Tensor = torch.where(is_dark, 0.0, error_norm / white_norm.where(~is_dark, 1.0))
     return share
 
 
-def _norms(rows: Tensor) -> Tensor:
+def _row_norms(rows: Tensor) -> Tensor:
     norms: Tensor = torch.linalg.vector_norm(rows.double(), dim=1)
     return norms
 
 
-def _weights(bands: Bands, illuminant: Tensor | None, responses: Tensor | None) -> Tensor:
+def _band_weights(bands: Bands, illuminant: Tensor | None, responses: Tensor | None) -> Tensor:
     """Return the weight of each band in the photons of each channel: (channel, band) float64."""
     if illuminant is None or responses is None:
         return bands.weights.double()[None]
     return responses.double() * illuminant.double() * bands.centres * bands.widths
 
 
-def _finer(bands: Bands, weights: Tensor) -> tuple[Tensor, Tensor]:
+def _finer_wavelengths(bands: Bands, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return further wavelengths, and the weights (channel, wavelength) of the error, centres of
     bands first.
     """
@@ -257,27 +255,9 @@ def _interpolated(points: Tensor, values: Tensor, where: Tensor) -> Tensor:
     return value
 
 
-def _thinned(pupil: Pupil) -> Pupil:
-    """Return every k-th sample of a large pupil, as long as the samples that are left can follow
-    the phase.
-    """
-    step = max(1, len(pupil.height) // _SAMPLES)
-    while step > 1 and pupil_has_large_steps(_every(pupil, step)):
-        step //= 2
-    return _every(pupil, step)
-
-
-def _every(pupil: Pupil, step: int) -> Pupil:
-    """Return every ``step``-th sample of a pupil along both axes."""
-    return pupil._replace(
-        **{name: getattr(pupil, name)[::step, ::step] for name in _SCREENS},
-        pitch=pupil.pitch * step,
-    )
-
-
 def _in_double(pupil: Pupil) -> Pupil:
     """Return the pupil in float64, so that the gradients of all bands add up in float64."""
-    screens = {name: getattr(pupil, name) for name in _SCREENS}
+    screens = {name: getattr(pupil, name) for name in SCREENS}
     refuse_half(**screens)
     return pupil._replace(**{name: screen.double() for name, screen in screens.items()})
 
@@ -296,7 +276,7 @@ def _(result: Tensor, pupil: Pupil, bands: Bands, *_: Any, **__: Any) -> list[Ch
 
 # How well a tri-bar, an edge and a line of text are detected, by the ideal observer.
 
-_FINE = 8  #: samples of a target along each axis of a pixel, whose mean the pixel takes
+_TARGET_SAMPLES = 8  #: samples of a target along each axis of a pixel, whose mean the pixel takes
 _LETTERS = {
     "S": ("01110", "10001", "10000", "01110", "00001", "10001", "01110"),
     "T": ("11111", "00100", "00100", "00100", "00100", "00100", "00100"),
@@ -329,7 +309,7 @@ def _bars(size: float) -> Tensor:
 
     The mean is subtracted: an even grey square of the same light would not be detected.
     """
-    sample_count = round(size * _FINE)
+    sample_count = round(size * _TARGET_SAMPLES)
     columns = torch.arange(sample_count, dtype=torch.float64)
     is_bright = (torch.floor(5 * columns / sample_count) % 2 == 0).double()
     return is_bright.expand(sample_count, sample_count) - is_bright.mean()
@@ -339,7 +319,7 @@ def _edge(size: float) -> Tensor:
     """Return a dark and a bright half of a square of ``size`` pixels, in fine samples, of mean
     0.
     """
-    sample_count = round(size * _FINE)
+    sample_count = round(size * _TARGET_SAMPLES)
     step = torch.where(torch.arange(sample_count) < sample_count // 2, -0.5, 0.5).double()
     return step.expand(sample_count, sample_count) - step.mean()
 
@@ -349,8 +329,8 @@ def _text(size: float) -> Tensor:
     columns = [[[int(dot) for dot in row] + [0] for row in _LETTERS[letter]] for letter in TEXT]
     # a column of space after each letter but the last
     dots = torch.cat([torch.tensor(rows, dtype=torch.float64) for rows in columns], 1)[:, :-1]
-    row_count = round(size * _FINE)
-    column_count = round(size * _FINE * dots.shape[1] / 7)
+    row_count = round(size * _TARGET_SAMPLES)
+    column_count = round(size * _TARGET_SAMPLES * dots.shape[1] / 7)
     rows, dot_columns = (
         torch.arange(n) * k // n for n, k in ((row_count, 7), (column_count, dots.shape[1]))
     )
@@ -362,10 +342,12 @@ def _in_pixels(fine: Tensor) -> Tensor:
     """Return the mean of the fine samples of each pixel, with zeros around a target that ends
     within a pixel.
     """
-    sides = [-(-n // _FINE) * _FINE for n in fine.shape]
+    sides = [-(-n // _TARGET_SAMPLES) * _TARGET_SAMPLES for n in fine.shape]
     padded = torch.zeros(*sides, dtype=torch.float64)
     padded[: fine.shape[0], : fine.shape[1]] = fine
-    pixels: Tensor = padded.reshape(sides[0] // _FINE, _FINE, sides[1] // _FINE, _FINE).mean((1, 3))
+    pixels: Tensor = padded.reshape(
+        sides[0] // _TARGET_SAMPLES, _TARGET_SAMPLES, sides[1] // _TARGET_SAMPLES, _TARGET_SAMPLES
+    ).mean((1, 3))
     return pixels
 
 

@@ -5,7 +5,13 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes.metrics._picture_quality import Filtered, Quality, filtered_picture, quality
-from neusee.nodes.metrics._psf_quality import _SAMPLES, _SIDE, Mtf, encircled, mtf, spectral_error
+from neusee.nodes.metrics._psf_quality import (
+    _COMPARED_SIDE,
+    Mtf,
+    encircled,
+    mtf,
+    spectral_error,
+)
 from neusee.nodes.metrics._sensor_load import (
     Peak,
     Saturated,
@@ -23,6 +29,7 @@ from neusee.nodes.metrics._suppression import (
     peak_bsr,
     protection_bounds,
 )
+from neusee.nodes.optics._pupil import THINNED_SAMPLES
 from neusee.nodes.shape_rules import double, scalars
 from neusee.nodes.values import Bands, Psf, Pupil
 
@@ -96,7 +103,9 @@ def _(
 ) -> tuple[float, float]:
     # bytes of memory during the run, beside inputs and result, and number of operations
     count, pupil_side = len(bands.centres), max(pupil.height.shape)
-    psf_pixels = 2.0 * count * _SIDE**2
-    thinned_side = -(-pupil_side // max(1, pupil_side // _SAMPLES))
+    psf_pixels = 2.0 * count * _COMPARED_SIDE**2
+    thinned_side = -(-pupil_side // max(1, pupil_side // THINNED_SAMPLES))
     wavelengths = 2 * count - 1 if count > 1 else 3
-    return 8.0 * psf_pixels, 0.5 * pupil.height.numel() + wavelengths * (thinned_side**2 + _SIDE**2)
+    return 8.0 * psf_pixels, 0.5 * pupil.height.numel() + wavelengths * (
+        thinned_side**2 + _COMPARED_SIDE**2
+    )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.sensor._digitization import Bits, is_clipped
-from neusee.nodes.sensor._exposure import weighted
+from neusee.nodes.sensor._exposure import weighted_bands
 from neusee.nodes.sensor._saturation import Well, refuse_without_steps, saturation
 from neusee.nodes.units import Efficiency, Exposure, Gain, PixelPitch, Time
 from neusee.nodes.values import Bands, Channels, Psf
@@ -111,7 +111,7 @@ def peak_irradiance(
     Source: NeuSee, Eq. (peak_irrad_coded), which expects damage above 1e6.
     """
     spots, lines = spots or [], lines or []
-    _refuse_unpaired(spots, lines)
+    _refuse_unpaired_spots(spots, lines)
     sensor = {
         "full_well": full_well,
         "quantum_efficiency": quantum_efficiency,
@@ -126,12 +126,12 @@ def peak_irradiance(
     brightest_wells = wells.flatten().take(brightest).double()
     return Peak(
         brightest_wells,
-        _above(brightest_wells, multiple),
-        _of_lasers(spots, brightest, brightest_wells),
+        _exceeds(brightest_wells, multiple),
+        _laser_irradiance(spots, brightest, brightest_wells),
     )
 
 
-def _refuse_unpaired(spots: Sequence[Tensor], lines: Sequence[Bands]) -> None:
+def _refuse_unpaired_spots(spots: Sequence[Tensor], lines: Sequence[Bands]) -> None:
     """Raise ValueError unless each spot has its laser line."""
     if len(spots) != len(lines):
         raise ValueError(
@@ -139,7 +139,7 @@ def _refuse_unpaired(spots: Sequence[Tensor], lines: Sequence[Bands]) -> None:
         )
 
 
-def _above(top: Tensor, multiple: float | None) -> Tensor:
+def _exceeds(top: Tensor, multiple: float | None) -> Tensor:
     """Return 1 where the irradiance exceeds a multiple of saturation, else 0; NaN without a
     multiple.
     """
@@ -148,7 +148,7 @@ def _above(top: Tensor, multiple: float | None) -> Tensor:
     return (top > multiple).double()
 
 
-def _of_lasers(spots: Sequence[Tensor], pixel: Tensor, like: Tensor) -> Tensor:
+def _laser_irradiance(spots: Sequence[Tensor], pixel: Tensor, like: Tensor) -> Tensor:
     """Return the W/m2 that all lasers together send to a pixel, summed over their bands."""
     total = torch.zeros_like(like)
     for spot in spots:
@@ -160,7 +160,7 @@ def _in_wells(irradiance: Tensor | Channels, saturating: Tensor) -> Tensor:
     """Return the irradiance of each pixel in multiples of saturation: the sum of I / I_sat over
     wavelengths.
     """
-    return weighted(irradiance, (1.0 / saturating)[None])[0]
+    return weighted_bands(irradiance, (1.0 / saturating)[None])[0]
 
 
 @peak_irradiance.check
@@ -227,20 +227,20 @@ def heat_ratio(
         )
     y, x = psf.intensity.shape[-2:]
     # twice the window, so that no heat wraps around; width sqrt(4 D t)
-    heat_kernel = _kernel((2 * y, 2 * x), pixel_pitch, math.sqrt(4 * diffusivity * dwell)).to(
+    heat_kernel = _heat_kernel((2 * y, 2 * x), pixel_pitch, math.sqrt(4 * diffusivity * dwell)).to(
         psf.intensity.device
     )
     spectrum = torch.fft.rfft2(heat_kernel)
     hottest_pixels = [
         torch.stack(
-            [_warmed(band_light, spectrum).amax() for band_light in light.intensity.double()]
+            [_heat_of(band_light, spectrum).amax() for band_light in light.intensity.double()]
         )
         for light in (psf, plain_psf)
     ]
     return hottest_pixels[0] / hottest_pixels[1]
 
 
-def _warmed(light: Tensor, spectrum: Tensor) -> Tensor:
+def _heat_of(light: Tensor, spectrum: Tensor) -> Tensor:
     """Return the heat (y, x) of light, but for a factor, by a convolution with the kernel of
     ``spectrum``.
     """
@@ -251,7 +251,7 @@ def _warmed(light: Tensor, spectrum: Tensor) -> Tensor:
     return convolved[:y, :x]
 
 
-def _kernel(shape: tuple[int, int], pitch: float, reach: float) -> Tensor:
+def _heat_kernel(shape: tuple[int, int], pitch: float, reach: float) -> Tensor:
     """Return erfc(r / w) / r over the pixels of an FFT, with the mean over a disc of one pixel's
     area in the middle.
     """

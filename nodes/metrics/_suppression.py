@@ -13,7 +13,13 @@ from torch.nn.functional import conv2d, pad
 from neusee.nodes import Check, node
 from neusee.nodes.metrics._picture_quality import Light
 from neusee.nodes.optics._band_image import light_in_field
-from neusee.nodes.optics._lens import averaging, cut_off, passed_by_notches, round_lens, stop_width
+from neusee.nodes.optics._lens import (
+    averaged_side,
+    cut_off,
+    passed_by_notches,
+    round_lens,
+    stop_width,
+)
 from neusee.nodes.precision import single
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Psf, Pupil
@@ -62,7 +68,7 @@ def limits(psf: Psf) -> Limits:
     bounds_by_band = [_contrast_bound(kernel.double()) for kernel in psf.intensity]
     light, rms, bound = (torch.stack(column) for column in zip(*bounds_by_band, strict=True))
     # all the contrast may lie within the band of the lens
-    lens_band_bound = bound / shares(psf).to(bound).sqrt()
+    lens_band_bound = bound / passed_frequency_shares(psf).to(bound).sqrt()
     return Limits(
         light * least_lsr(psf).to(light),
         rms,
@@ -121,10 +127,10 @@ def most_unsuppressed(psf: Psf) -> Tensor:
     sqrt(LSR).
     """
     clear_peak = psf.clear_peak.double()
-    return (clear_peak / shares(psf).to(clear_peak)).sqrt()
+    return (clear_peak / passed_frequency_shares(psf).to(clear_peak)).sqrt()
 
 
-def shares(psf: Psf) -> Tensor:
+def passed_frequency_shares(psf: Psf) -> Tensor:
     """Return the share of the sampled spatial frequencies below the cut-off of the lens: (band,)
     float64.
     """
@@ -145,7 +151,7 @@ def most_contrast(unsuppressed: float, lsr: Tensor) -> Tensor:
 # Suppression ratios of a mask: laser suppression ratio (LSR) and background suppression ratio
 # (BSR).
 
-_ROUNDED = 1e-4  #: excess of light that sampling and round-off explain
+_ROUNDED_LIGHT = 1e-4  #: excess of light that sampling and round-off explain
 
 
 @node(rtol=1e-6)
@@ -235,7 +241,7 @@ def _(result: Tensor, *inputs: Any) -> list[Check]:
     return [
         Check(
             f"background suppression ratio {low:.3f} to {high:.3f}",
-            bool((result <= 1 + _ROUNDED).all()),
+            bool((result <= 1 + _ROUNDED_LIGHT).all()),
         )
     ]
 
@@ -297,15 +303,17 @@ def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
 def _(result: Tensor, *inputs: Any) -> list[Check]:
     low, high = float(result.min()), float(result.max())
     return [
-        Check(f"{low:.2%} to {high:.2%} of the light falls outside the window", low >= -_ROUNDED)
+        Check(
+            f"{low:.2%} to {high:.2%} of the light falls outside the window", low >= -_ROUNDED_LIGHT
+        )
     ]
 
 
-#: integral of the squared MTF of a round pupil over all frequencies, divided by the peak of its PSF
 # --- bounds beside a grey filter or a smaller stop ------------------------------------------------
 
+#: integral of the squared MTF of a round pupil over all frequencies, divided by the peak of its PSF
 CLEAR = 0.45962
-_ROUNDING = 1e-3  #: relative; the sampled lens band and float32
+_BOUND_ROUNDING = 1e-3  #: relative; the sampled lens band and float32
 
 
 class ProtectionBounds(NamedTuple):
@@ -336,7 +344,7 @@ class ProtectionBounds(NamedTuple):
         return [
             name
             for name, value, bound in pairs
-            if bool((value - bound > _ROUNDING * (1 + bound.abs())).any())
+            if bool((value - bound > _BOUND_ROUNDING * (1 + bound.abs())).any())
         ]
 
 
@@ -370,9 +378,9 @@ def protection_bounds(
     """
     clear_peak = psf.clear_peak.double().cpu()
     peak = psf.intensity.amax((-2, -1)).double().cpu()
-    cut_offs, sides = cut_off(psf).cpu(), averaging(psf).cpu()
+    cut_offs, sides = cut_off(psf).cpu(), averaged_side(psf).cpu()
     contrast_by_band = [
-        _contrast(kernel.double(), float(cut))
+        _contrast_means(kernel.double(), float(cut))
         for kernel, cut in zip(psf.intensity.cpu(), cut_offs, strict=True)
     ]
     power, mean_square, log_contrast = (
@@ -389,8 +397,8 @@ def protection_bounds(
         lsr**1.5 * CLEAR / 4,
     )
     # the filter of the same peak lowers the OTF by its transmittance, LSR
-    filter_neq = _rival(lsr**2 * clear_contrast, lsr, electrons, read_noise)
-    stop_neq = _rival(stop_contrast, stop_width_share.square(), electrons, read_noise)
+    filter_neq = _clear_pupil_neq(lsr**2 * clear_contrast, lsr, electrons, read_noise)
+    stop_neq = _clear_pupil_neq(stop_contrast, stop_width_share.square(), electrons, read_noise)
     largest_contrast = lsr * clear_lens.peak / 4  # mean of |OTF|**2 over the lens band, by Parseval
     mask_neq, mask_bound = (
         electrons**2 * mean_square / noise,
@@ -399,20 +407,21 @@ def protection_bounds(
     better_neq = torch.maximum(filter_neq, stop_neq)
     contrast = mean_square / clear_contrast
     scale = math.log(electrons**2 / noise)
-    indicators = (
-        power,
-        peak,
-        contrast,
-        largest_contrast / clear_contrast,
-        mask_neq / filter_neq,
-        mask_bound / filter_neq,
-        mask_neq / better_neq,
-        mask_bound / better_neq,
+    return ProtectionBounds(
+        power=power,
+        power_bound=peak,
+        contrast=contrast,
+        contrast_bound=largest_contrast / clear_contrast,
+        over_filter=mask_neq / filter_neq,
+        over_filter_bound=mask_bound / filter_neq,
+        over_both=mask_neq / better_neq,
+        over_both_bound=mask_bound / better_neq,
+        log_neq=log_contrast + scale,
+        log_neq_bound=mask_bound.log(),
     )
-    return ProtectionBounds(*indicators, log_contrast + scale, mask_bound.log())
 
 
-def _rival(power: Tensor, passed: Tensor, electrons: float, read_noise: float) -> Tensor:
+def _clear_pupil_neq(power: Tensor, passed: Tensor, electrons: float, read_noise: float) -> Tensor:
     """Return the mean NEQ over the lens band of a clear pupil with the mean |OTF|**2 ``power``."""
     return electrons**2 * power / (electrons * passed + read_noise**2)
 
@@ -432,11 +441,11 @@ def stop_diameter(psf: Psf, lsr: float) -> Tensor:
     Source: the peak of a round pupil goes with its area squared, times what `nodes.optics` says
             pixels leave of it.
     """
-    cuts, sides = cut_off(psf).cpu(), averaging(psf).cpu()
+    cuts, sides = cut_off(psf).cpu(), averaged_side(psf).cpu()
     return stop_width(torch.full_like(cuts, lsr), cuts, sides)
 
 
-def _contrast(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
+def _contrast_means(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean of |OTF|**2 over all frequencies and over the lens band, and the mean of
     its logarithm there.
     """

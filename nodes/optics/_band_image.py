@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from neusee.nodes import Check, node
-from neusee.nodes.optics._transform._fft_transforms import smooth
+from neusee.nodes.optics._transform._fft_transforms import fft_length
 from neusee.nodes.precision import one_by_one
 from neusee.nodes.values import Psf
 
@@ -20,7 +20,7 @@ from neusee.nodes.values import Psf
 Border = Literal["zero", "reflect"]
 Corner = tuple[int, int]
 #: ratio of a scene's root mean square to its typical value, from which float32 is too short
-_DEEP = 100.0
+_FLOAT32_CONTRAST = 100.0
 
 
 @node(rtol=1e-5, bands={"radiance": -3, "psf": 0, "return": -3})
@@ -41,7 +41,7 @@ def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
     scene, kernel, corner = _fitted(radiance, psf.intensity, border)
     size = (radiance.shape[-2], radiance.shape[-1])
     scenes = scene.reshape(-1, *scene.shape[-3:])
-    images = [_by_contrast(scene_of_batch, kernel, corner, size) for scene_of_batch in scenes]
+    images = [_convolved_bands(scene_of_batch, kernel, corner, size) for scene_of_batch in scenes]
     return (
         images[0].reshape(radiance.shape)
         if len(images) == 1
@@ -51,9 +51,7 @@ def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
 
 @image.reference
 def _(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
-    scene, kernel, _ = _fitted(
-        radiance.double(), psf.intensity.double(), "reflect" if border == "reflect" else "zero"
-    )
+    scene, kernel, _ = _fitted(radiance.double(), psf.intensity.double(), border)
     m, n = kernel.shape[-2:]
     if border == "zero":
         scene = pad(scene, (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2))
@@ -90,7 +88,9 @@ def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor
             " bands: compute both from the same `bands` step"
         )
     dtype = torch.promote_types(torch.promote_types(radiance.dtype, intensity.dtype), torch.float32)
-    kernel = reach(reach(intensity, -2, radiance.shape[-2]), -1, radiance.shape[-1]).to(dtype)
+    kernel = within_reach(
+        within_reach(intensity, -2, radiance.shape[-2]), -1, radiance.shape[-1]
+    ).to(dtype)
     m, n = kernel.shape[-2:]
     if border == "zero":
         # pixel (0, 0) lies half a PSF within the full convolution
@@ -109,7 +109,7 @@ def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor
     )
 
 
-def reach(kernel: Tensor, dim: int, size: int) -> Tensor:
+def within_reach(kernel: Tensor, dim: int, size: int) -> Tensor:
     """Crop a PSF along one axis to the samples that are at most one scene width from the centre
     of the PSF.
     """
@@ -118,11 +118,11 @@ def reach(kernel: Tensor, dim: int, size: int) -> Tensor:
     return kernel.narrow(dim, low, high - low)
 
 
-def _by_contrast(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Tensor:
+def _convolved_bands(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Tensor:
     """Convolve each band of the scene with its PSF, in float64 if the contrast of the band is
     too high for float32.
     """
-    needs_float64 = _deep(scene) if scene.dtype == torch.float32 else []
+    needs_float64 = _bands_in_float64(scene) if scene.dtype == torch.float32 else []
     if not any(needs_float64):
         return _convolve(scene, kernel, corner, size)
     if all(needs_float64):
@@ -135,7 +135,7 @@ def _by_contrast(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) ->
     return torch.cat([band.to(scene.dtype) for band in images])
 
 
-def _deep(scene: Tensor) -> list[bool]:
+def _bands_in_float64(scene: Tensor) -> list[bool]:
     """Return, for each band of the scene, True if its bright pixels make float32 round-off hide
     its other pixels.
     """
@@ -144,7 +144,7 @@ def _deep(scene: Tensor) -> list[bool]:
     # mean of the roots, squared: bright pixels hardly count
     typical = sampled.abs().sqrt().mean(1).square()
     root_mean_square = torch.linalg.vector_norm(flat, dim=1) / math.sqrt(flat.shape[1])
-    needs_float64: list[bool] = (root_mean_square > _DEEP * typical).tolist()
+    needs_float64: list[bool] = (root_mean_square > _FLOAT32_CONTRAST * typical).tolist()
     return needs_float64
 
 
@@ -154,7 +154,7 @@ def _convolve(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Te
     """
     length = [
         # longest of the picture, the end of the window, and what would wrap around into it
-        smooth(max(s, a + w, s + k - 1 - a))
+        fft_length(max(s, a + w, s + k - 1 - a))
         for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], corner, size, strict=True)
     ]
     result: Tensor = _Product.apply(
@@ -173,11 +173,15 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     def forward(a: Tensor, b: Tensor, *settings: Any) -> Tensor:
-        at_a, at_b, corner, size, conjugate, length = settings
+        scene_corner, kernel_corner, corner, size, conjugate, length = settings
         plane, result = _Plane(length, a), a.new_empty(len(a), *size)
         for picture, kernel, band_result in zip(a, b, result, strict=True):
             band_result.copy_(
-                plane.window(plane.product(picture, at_a, kernel, at_b, conjugate), corner, size)
+                plane.window(
+                    plane.product(picture, scene_corner, kernel, kernel_corner, conjugate),
+                    corner,
+                    size,
+                )
             )
         return result
 
@@ -190,7 +194,7 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        (a, b), (at_a, at_b, corner, _, conjugate, length), grad = (
+        (a, b), (scene_corner, kernel_corner, corner, _, conjugate, length), grad = (
             ctx.saved_tensors,
             ctx.settings,
             grads[0],
@@ -199,14 +203,28 @@ class _Product(torch.autograd.Function):
         # gradient for a: correlation of grad and b, its window where a lies
         if ctx.needs_input_grad[0]:
             scene_gradient = _Product.apply(
-                grad, b, corner, at_b, at_a, tuple(a.shape[1:]), not conjugate, length
+                grad,
+                b,
+                corner,
+                kernel_corner,
+                scene_corner,
+                tuple(a.shape[1:]),
+                not conjugate,
+                length,
             )  # type: ignore[no-untyped-call]
         if ctx.needs_input_grad[1]:
             first, second, first_corner, second_corner = (
-                (a, grad, at_a, corner) if conjugate else (grad, a, corner, at_a)
+                (a, grad, scene_corner, corner) if conjugate else (grad, a, corner, scene_corner)
             )
             kernel_gradient = _Product.apply(
-                first, second, first_corner, second_corner, at_b, tuple(b.shape[1:]), True, length
+                first,
+                second,
+                first_corner,
+                second_corner,
+                kernel_corner,
+                tuple(b.shape[1:]),
+                True,
+                length,
             )  # type: ignore[no-untyped-call]
         return scene_gradient, kernel_gradient, *(None for _ in ctx.settings)
 
@@ -214,8 +232,11 @@ class _Product(torch.autograd.Function):
     def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
         """Return the change of a product: that by the first factor, and that by the second."""
         first, second = ctx.saved_tensors
-        pairs = [(x, y) for x, y in ((a, second), (first, b)) if x is not None and y is not None]
-        changes = [_Product.apply(x, y, *ctx.settings) for x, y in pairs]  # type: ignore[no-untyped-call]
+        changes = []
+        if a is not None:
+            changes.append(_Product.apply(a, second, *ctx.settings))  # type: ignore[no-untyped-call]
+        if b is not None:
+            changes.append(_Product.apply(first, b, *ctx.settings))  # type: ignore[no-untyped-call]
         return sum(changes[1:], changes[0])
 
     @staticmethod
@@ -238,9 +259,13 @@ class _Plane:
         self.real = like.new_empty(length)
         self.rows = like.new_empty((length[0], length[1] // 2 + 1), dtype=dtype)
 
-    def product(self, a: Tensor, at_a: Corner, b: Tensor, at_b: Corner, conjugate: bool) -> Tensor:
-        first, second = self._spectrum(a, at_a), self._spectrum(b, at_b)
-        product: Tensor = first.mul_(second.conj_physical_() if conjugate else second)
+    def product(
+        self, a: Tensor, scene_corner: Corner, b: Tensor, kernel_corner: Corner, conjugate: bool
+    ) -> Tensor:
+        first, second = self._spectrum(a, scene_corner), self._spectrum(b, kernel_corner)
+        if conjugate:
+            second = second.conj_physical_()
+        product: Tensor = first.mul_(second)
         return product
 
     def _spectrum(self, x: Tensor, corner: Corner) -> Tensor:
@@ -274,7 +299,7 @@ class _Plane:
 # Each PSF sample moves a box of the scene into the field of view.
 
 
-_ROWS = 32  #: rows of the scene whose sums are in float64 at a time
+_FLOAT64_ROWS = 32  #: rows of the scene whose sums are in float64 at a time
 
 
 def light_in_field(intensity: Tensor, radiance: Tensor) -> tuple[Tensor, Tensor]:
@@ -290,23 +315,26 @@ def light_in_field(intensity: Tensor, radiance: Tensor) -> tuple[Tensor, Tensor]
             f"radiance {shape} and PSF {tuple(intensity.shape)} must have the same bands: "
             "compute both from the same `bands` step"
         )
-    kernel, size = reach(reach(intensity, -2, shape[-2]), -1, shape[-1]), (shape[-2], shape[-1])
-    scene, kernel = _alike(radiance, kernel)
+    kernel, size = (
+        within_reach(within_reach(intensity, -2, shape[-2]), -1, shape[-1]),
+        (shape[-2], shape[-1]),
+    )
+    scene, kernel = _in_one_type(radiance, kernel)
     in_field = []
     for planes in scene.reshape(-1, *shape[-3:]):
         for plane, band in zip(planes, kernel, strict=True):
-            light = _boxes(plane, band.shape, size) * band
+            light = _box_sums(plane, band.shape, size) * band
             in_field.append(light.sum(-1).sum(-1, dtype=torch.float64))
     return torch.stack(in_field).reshape(shape[:-2]), scene.sum(-1).sum(-1, dtype=torch.float64)
 
 
-def _alike(scene: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
+def _in_one_type(scene: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
     """Return scene and PSF in the more precise of their types, at least float32."""
     dtype = torch.promote_types(torch.promote_types(scene.dtype, kernel.dtype), torch.float32)
     return scene.to(dtype), kernel.to(dtype)
 
 
-def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
+def _box_sums(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
     """Return, for each PSF sample, the sum (m, n) of a plane over the box that the sample moves
     into the field of view.
 
@@ -315,20 +343,22 @@ def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
     the sums.
     """
     # the product with a lower triangle of ones is a running sum down the rows
-    lower_triangle = torch.ones(_ROWS, _ROWS, dtype=torch.float64, device=plane.device).tril()
+    lower_triangle = torch.ones(
+        _FLOAT64_ROWS, _FLOAT64_ROWS, dtype=torch.float64, device=plane.device
+    ).tril()
     sum_above, blocks = plane.new_zeros(kernel[1], dtype=torch.float64), []
-    for end in range(len(plane), 0, -_ROWS):
-        rows = plane[max(0, end - _ROWS) : end].flip(0, 1).cumsum(1, dtype=torch.float64)
+    for end in range(len(plane), 0, -_FLOAT64_ROWS):
+        rows = plane[max(0, end - _FLOAT64_ROWS) : end].flip(0, 1).cumsum(1, dtype=torch.float64)
         sums = (
-            lower_triangle[: len(rows), : len(rows)] @ _along(rows, 1, kernel[1], size[1])
+            lower_triangle[: len(rows), : len(rows)] @ _sums_along_axis(rows, 1, kernel[1], size[1])
             + sum_above
         )
         sum_above = sums[-1]
         blocks.append(sums.to(plane.dtype))
-    return _along(torch.cat(blocks), 0, kernel[0], size[0])
+    return _sums_along_axis(torch.cat(blocks), 0, kernel[0], size[0])
 
 
-def _along(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:
+def _sums_along_axis(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:
     """Return sums over the boxes along the axis ``dim``, each of which starts or ends at an edge
     of the scene.
     """

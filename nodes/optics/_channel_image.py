@@ -9,19 +9,19 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from neusee.nodes import Check, ErrorBound, TensorStats, node
-from neusee.nodes.optics._band_image import Border, image, reach
+from neusee.nodes.optics._band_image import Border, image, within_reach
 from neusee.nodes.optics._convolution_plan import (
     ImageFacts,
     Mix,
-    Passed,
+    Placement,
     Plan,
-    Where,
-    centred,
-    choose,
-    passed,
-    spread,
+    PsfLight,
+    central_window,
+    cheapest_plan,
+    fft_lengths,
+    mean_psf_light,
+    psf_light,
     summed,
-    transform,
     with_windows,
 )
 from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
@@ -32,8 +32,9 @@ from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
 # the round-off.
 
 
-_CELL = 8  #: pixels along the side of the cells in which the largest error of a pixel is bounded
-_SOME = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in the cache
+#: pixels along the side of the cells in which the largest error of a pixel is bounded
+_CELL_SIDE = 8
+_SLAB_ROWS = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in the cache
 
 
 def convolved(planes: Tensor, intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
@@ -41,10 +42,12 @@ def convolved(planes: Tensor, intensity: Tensor, facts: ImageFacts, plan: Plan) 
     kernels of ``plan``.
     """
     scene = bordered(planes[: plan.planes], facts, plan.window)
-    return summed(scene, _kernels(intensity, facts, plan), plan.mix, _where(facts, plan.window))
+    return summed(
+        scene, _plan_kernels(intensity, facts, plan), plan.mix, _placement(facts, plan.window)
+    )
 
 
-def _where(facts: ImageFacts, window: tuple[int, int]) -> Where:
+def _placement(facts: ImageFacts, window: tuple[int, int]) -> Placement:
     """Return the zero padding of scene and kernel, and the window of their convolution that is
     the image.
     """
@@ -52,45 +55,53 @@ def _where(facts: ImageFacts, window: tuple[int, int]) -> Where:
     # first pixel of the image in the full convolution: half a PSF in, and another half where the
     # scene is padded
     corner = (m - 1, n - 1) if facts.reflect else (m // 2, n // 2)
-    return Where(zero, zero, corner, facts.size, transform(facts, window))
+    return Placement(zero, zero, corner, facts.size, fft_lengths(facts, window))
 
 
-def majorant(off: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
-    """Return an upper bound (y, x) of the image error from an error ``off`` (y, x) in every band
-    of the scene.
+def majorant(scene_error: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
+    """Return an upper bound (y, x) of the image error from an error ``scene_error`` (y, x) in
+    every band of the scene.
     """
-    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, facts)
+    window, kernel = (intensity.shape[1], intensity.shape[2]), _largest_weight_psf(intensity, facts)
     reached = summed(
-        bordered(off[None], facts, window), kernel, Mix(None, None, None), _where(facts, window)
+        bordered(scene_error[None], facts, window),
+        kernel,
+        Mix(None, None, None),
+        _placement(facts, window),
     )
     return reached[0].clamp_min_(0)
 
 
-def majorant_by_cell(off: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
+def majorant_by_cell(scene_error: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
     """Return an upper bound of `majorant` over cells of 8 x 8 pixels: (cell, cell) float64, far
     faster.
 
     A part of the kernel in one cell takes light to the pixels of a cell from four neighbouring
     cells of the scene, and from none of their pixels more than from the one with the largest error.
     """
-    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, facts)[0]
-    corner = _where(facts, window).at
-    padding_before = [-k % _CELL for k in corner]  # so that the middle of the kernel begins a cell
-    padding_after = [-(k + b) % _CELL for k, b in zip(window, padding_before, strict=True)]
+    window, kernel = (
+        (intensity.shape[1], intensity.shape[2]),
+        _largest_weight_psf(intensity, facts)[0],
+    )
+    corner = _placement(facts, window).window_corner
+    padding_before = [
+        -k % _CELL_SIDE for k in corner
+    ]  # so that the middle of the kernel begins a cell
+    padding_after = [-(k + b) % _CELL_SIDE for k, b in zip(window, padding_before, strict=True)]
     padded_kernel = pad(
         kernel.double(), (padding_before[1], padding_after[1], padding_before[0], padding_after[0])
     )
-    cell_light = avg_pool2d(padded_kernel[None], _CELL)[0] * _CELL**2
+    cell_light = avg_pool2d(padded_kernel[None], _CELL_SIDE)[0] * _CELL_SIDE**2
     # the worst of two by two cells, because a shift by part of a cell touches both
     cell_error = max_pool2d(
-        pad(cells(bordered(off[None], facts, window))[None], (1, 1, 1, 1)), 2, 1
+        pad(cells(bordered(scene_error[None], facts, window))[None], (1, 1, 1, 1)), 2, 1
     )[0, 0].to(cell_light)
     length = [a + b for a, b in zip(cell_light.shape, cell_error.shape, strict=True)]
     product = torch.fft.irfft2(
         torch.fft.rfft2(cell_light, length) * torch.fft.rfft2(cell_error, length), length
     )
-    first_cell = [(k + b) // _CELL for k, b in zip(corner, padding_before, strict=True)]
-    y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first_cell, facts.size, strict=True))
+    first_cell = [(k + b) // _CELL_SIDE for k, b in zip(corner, padding_before, strict=True)]
+    y, x = (slice(f, f + -(-n // _CELL_SIDE)) for f, n in zip(first_cell, facts.size, strict=True))
     image_cells: Tensor = product[y, x]
     return image_cells.clamp_min_(0)
 
@@ -99,15 +110,15 @@ def cells(planes: Tensor) -> Tensor:
     """Return the largest number in each cell of planes (k, y, x): (k, cell, cell); the last
     cells may be smaller.
     """
-    largest: Tensor = max_pool2d(planes[None], _CELL, ceil_mode=True)
+    largest: Tensor = max_pool2d(planes[None], _CELL_SIDE, ceil_mode=True)
     return largest[0]
 
 
-def _heaviest(intensity: Tensor, facts: ImageFacts) -> Tensor:
+def _largest_weight_psf(intensity: Tensor, facts: ImageFacts) -> Tensor:
     """Return the PSF (1, y, x) of all bands together, each with its largest weight in any row."""
     heaviest = facts.rows.abs().amax(0).to(intensity)
     weights = heaviest[None] if facts.share is None else heaviest[None] @ facts.share.to(heaviest)
-    return _summed_bands(weights, intensity, facts.passed.signed)
+    return _summed_bands(weights, intensity, facts.light.signed)
 
 
 def bordered(planes: Tensor, facts: ImageFacts, window: tuple[int, int]) -> Tensor:
@@ -123,13 +134,13 @@ def bordered(planes: Tensor, facts: ImageFacts, window: tuple[int, int]) -> Tens
     return padded
 
 
-def _kernels(intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
+def _plan_kernels(intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
     """Return the kernels (kernel, y, x) of a plan: the PSFs themselves, or weighted sums of
     them.
     """
-    stack = centred(intensity, plan.window)
+    stack = central_window(intensity, plan.window)
     if plan.kernels is None:
-        return stack if plan.number == len(stack) else stack[plan.bands.to(stack.device)]
+        return stack if plan.kernel_count == len(stack) else stack[plan.bands.to(stack.device)]
     weights = plan.kernels.new_zeros(len(plan.kernels), len(facts.basis))
     # the columns of omitted bands stay 0
     weights = weights.index_copy_(1, plan.bands, plan.kernels)
@@ -146,31 +157,31 @@ def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Ten
     if stack.requires_grad or (stack.is_contiguous() and not absolute):
         return (weights @ stack.flatten(1)).view(-1, *stack.shape[1:])
     sums = stack.new_empty(len(weights), *stack.shape[1:])
-    for y in range(0, stack.shape[1], _SOME):
-        rows = stack[:, y : y + _SOME]
+    for y in range(0, stack.shape[1], _SLAB_ROWS):
+        rows = stack[:, y : y + _SLAB_ROWS]
         rows = rows.abs() if absolute else rows
-        sums[:, y : y + _SOME] = (weights @ rows.flatten(1)).view(-1, *rows.shape[1:])
+        sums[:, y : y + _SLAB_ROWS] = (weights @ rows.flatten(1)).view(-1, *rows.shape[1:])
     return sums
 
 
-def guessed(planes: Tensor, facts: ImageFacts) -> Tensor:
+def estimated_brightest(planes: Tensor, facts: ImageFacts) -> Tensor:
     """Return an estimate of the brightest pixel of each weighted sum over the image bands.
 
     The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and
     half of an upper bound of the brightest pixel with blur.
     """
-    passed_light = facts.passed.total
+    passed_light = facts.light.total
     brightness, unblurred = planes.new_empty(planes[0].numel()), torch.zeros_like(facts.rows[:, 0])
     for i, weights in enumerate((facts.rows * passed_light @ facts.basis).to(planes)):
         pixel_sum = torch.mv(planes.flatten(1).T, weights, out=brightness)
         unblurred[i] = torch.maximum(pixel_sum.amax(), -pixel_sum.amin())
     band_power = ((facts.basis @ facts.gram) * facts.basis).sum(1).clamp_min(0) * facts.copies
-    blurred = facts.rows.abs() @ (band_power * passed_light * facts.passed.peak).sqrt()
+    blurred = facts.rows.abs() @ (band_power * passed_light * facts.light.peak).sqrt()
     # a quarter and a half of two upper bounds: the estimate that the docstring names
     return torch.minimum(unblurred / 4, blurred / 2)
 
 
-def rounding(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) -> Tensor:
+def fft_round_off(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) -> Tensor:
     """Return an estimate of the largest FFT round-off in each weighted sum over the image bands.
 
     The round-off is close to white: a share eps sqrt(log2 N) / 2 of the power, spread over all N
@@ -178,10 +189,10 @@ def rounding(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) -> Te
     the brightest pixel for errors that are not spread: sums over the bands, planes and rows of a
     PSF, of which five roundings were measured.
     """
-    transform_size = math.prod(transform(facts, plan.window))
+    transform_size = math.prod(fft_lengths(facts, plan.window))
     result_of_term, term_of_plane, term_of_kernel, _ = plan.mix
     plane_norm = facts.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(facts.copies)
-    kernel_norm = (facts.passed.total * facts.passed.peak).sqrt()
+    kernel_norm = (facts.light.total * facts.light.peak).sqrt()
     if plan.kernels is not None:
         kernel_norm = plan.kernels.abs() @ kernel_norm[plan.bands]
     else:  # the band of each PSF, or the band in which a PSF has the weight 1
@@ -204,12 +215,12 @@ def rounding(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) -> Te
 
 Share = Annotated[float, Field(ge=0, le=1)]  #: as a share of the brightest pixel
 #: share of the error up to which the bound of the brightest pixel may come from cells of pixels
-_QUICKLY = 0.25
+_CELLS_ERROR_SHARE = 0.25
 #: expected brightness of the darkest pixel; photographs have 1e-2, scenes at night 2e-5
-_DARKEST = 1e-3
-_LARGE = 512  #: pixels along the sides of an image from which cells of pixels save time
+_DARKEST_PIXEL = 1e-3
+_LARGE_SIDE = 512  #: pixels along the sides of an image from which cells of pixels save time
 #: plans tried: with the brightest pixels estimated, then measured, then with nothing omitted
-_TRIES = 3
+_PLANS_TRIED = 3
 
 
 @node(rtol=1e-5)
@@ -254,17 +265,25 @@ def image_channels(
         if few is None or few.share.shape[0] == few.share.shape[1]
         else few.share.double().cpu()
     )
-    planes, intensity = _fitted(radiance, psf, rows, share)
+    planes, intensity = _planes_and_psf(radiance, psf, rows, share)
     largest_weight = rows.detach().abs().amax(1).double().cpu()
     largest_weight = largest_weight.where(largest_weight > 0, 1.0)
     scaled_rows = rows.detach().double().cpu() / largest_weight[:, None]
-    facts = _given(
-        radiance, planes, scaled_rows, border, spread(passed(intensity.detach()), share), share
+    facts = _image_facts(
+        radiance,
+        planes,
+        scaled_rows,
+        border,
+        mean_psf_light(psf_light(intensity.detach()), share),
+        share,
     )
-    result, bound, sizes = _formed(planes, intensity, facts, 0.0 if largest else within)
+    allowed_error = 0.0 if largest else within
+    result, bound, sizes = _summed_image(planes, intensity, facts, allowed_error)
     # relative error of the brightest pixel, where it is asked for
     brightest_error = (
-        _top(result, radiance, intensity, facts, within * _QUICKLY) if largest else math.inf
+        _brightest_pixel_error(result, radiance, intensity, facts, within * _CELLS_ERROR_SHARE)
+        if largest
+        else math.inf
     )
     brightest = torch.tensor(brightest_error, dtype=torch.float64)
     row_scale = largest_weight.to(result)[:, None, None]
@@ -332,7 +351,7 @@ def _(*inputs: Any, **params: Any) -> tuple[float, float]:
     """Return the range of an image whose brightest pixel counts as 1, as
     `nodes/sensor/_expected_ranges.py` says.
     """
-    return _DARKEST, 1.0
+    return _DARKEST_PIXEL, 1.0
 
 
 @image_channels.check
@@ -348,7 +367,7 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
     return [Check(text, within == 0 or float(result.bound) <= within)]
 
 
-def _fitted(
+def _planes_and_psf(
     radiance: LowRankCube, psf: Psf, rows: Tensor, share: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Return the basis images of the scene (k, y, x), and the part of the PSF that reaches the
@@ -370,17 +389,19 @@ def _fitted(
             " without a batch: compute all three from the same `bands` step"
         )
     planes, dtype = radiance.planes, torch.promote_types(radiance.planes.dtype, psf.intensity.dtype)
-    cropped_psf = reach(reach(psf.intensity, -2, planes.shape[-2]), -1, planes.shape[-1])
+    cropped_psf = within_reach(
+        within_reach(psf.intensity, -2, planes.shape[-2]), -1, planes.shape[-1]
+    )
     dtype = torch.promote_types(dtype, torch.float32)
     return planes.to(dtype), cropped_psf.to(dtype)
 
 
-def _given(
+def _image_facts(
     radiance: LowRankCube,
     planes: Tensor,
     rows: Tensor,
     border: Border,
-    through: Passed,
+    through: PsfLight,
     share: Tensor | None,
 ) -> ImageFacts:
     """Return the facts of scene, PSF and weights from which a plan is chosen, in float64 on the
@@ -417,7 +438,7 @@ def _given(
     )
 
 
-def _formed(
+def _summed_image(
     planes: Tensor, intensity: Tensor, facts: ImageFacts, within: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the summed image, its relative error bound, and the sizes (`Plan.kept`) of the first
@@ -430,23 +451,26 @@ def _formed(
         within / (1 + within) - 16 * eps,
     )
     if within > 0:
-        brightest = guessed(planes.detach(), facts)
+        brightest = estimated_brightest(planes.detach(), facts)
         facts = with_windows(facts, intensity.detach(), brightest, allowed_error)
-    for attempt in range(_TRIES):
-        # the last try omits nothing
-        plan = choose(facts, brightest, allowed_error if attempt < _TRIES - 1 else 0.0)
+    for attempt in range(_PLANS_TRIED):
+        if attempt == _PLANS_TRIED - 1:
+            allowed_error = 0.0  # the last try omits nothing
+        plan = cheapest_plan(facts, brightest, allowed_error)
         result = convolved(planes, intensity, facts, plan)
         brightest_found = result.detach().abs().amax((1, 2)).double().cpu()
-        round_off = rounding(facts, plan, brightest_found, eps)
-        bound = _share(plan.off + round_off, brightest_found)
-        if plan.whole or bound <= within:
+        round_off = fft_round_off(facts, plan, brightest_found, eps)
+        bound = _largest_relative_error(plan.omitted_light + round_off, brightest_found)
+        if plan.complete or bound <= within:
             break
-        brightest = (brightest_found - plan.off - round_off).clamp_min(0)
-        allowed_error = within / (1 + within) - _share(round_off, brightest_found) - eps
+        brightest = (brightest_found - plan.omitted_light - round_off).clamp_min(0)
+        allowed_error = (
+            within / (1 + within) - _largest_relative_error(round_off, brightest_found) - eps
+        )
     return result, torch.tensor(bound, dtype=torch.float64), torch.tensor(plan.kept)
 
 
-def _top(
+def _brightest_pixel_error(
     result: Tensor, radiance: LowRankCube, intensity: Tensor, facts: ImageFacts, quickly: float
 ) -> float:
     """Return the largest relative error of the brightest pixel over all weighted sums of the image
@@ -464,20 +488,24 @@ def _top(
     lowest, highest = (
         torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, image), strict=True)
     )
-    round_off = rounding(
+    round_off = fft_round_off(
         facts,
-        choose(facts, highest, 0.0),
+        cheapest_plan(facts, highest, 0.0),
         torch.maximum(highest, -lowest),
         torch.finfo(image.dtype).eps,
     )
-    if quickly > 0 and min(image.shape[1:]) >= _LARGE:
+    if quickly > 0 and min(image.shape[1:]) >= _LARGE_SIDE:
         highest_possible = (
             (cells(image) + majorant_by_cell(residual, intensity.detach(), facts))
             .amax((1, 2))
             .double()
             .cpu()
         )
-        if (largest_error := _share(highest_possible - highest + round_off, highest)) <= quickly:
+        if (
+            largest_error := _largest_relative_error(
+                highest_possible - highest + round_off, highest
+            )
+        ) <= quickly:
             return largest_error
     residual_image = majorant(residual, intensity.detach(), facts)
     sum_buffer = torch.empty_like(residual_image)
@@ -486,20 +514,21 @@ def _top(
         .double()
         .cpu()
     )
-    return _share(highest_possible - highest + round_off, highest)
+    return _largest_relative_error(highest_possible - highest + round_off, highest)
 
 
-def _share(off: Tensor, peak: Tensor) -> float:
+def _largest_relative_error(error_bound: Tensor, peak: Tensor) -> float:
     """Return the largest relative error of the brightest pixels, given computed values ``peak``
-    and error bounds ``off``.
+    and error bounds ``error_bound``.
     """
     relative_errors = torch.where(
-        off > 0, torch.where(off < peak, off / (peak - off), math.inf), 0.0
+        error_bound > 0,
+        torch.where(error_bound < peak, error_bound / (peak - error_bound), math.inf),
+        0.0,
     )
-    largest_error = (
-        float(relative_errors.amax()) if bool(torch.isfinite(off + peak).all()) else math.inf
-    )
-    return largest_error
+    if not bool(torch.isfinite(error_bound + peak).all()):
+        return math.inf
+    return float(relative_errors.amax())
 
 
 image.channel_sum_form = image_channels

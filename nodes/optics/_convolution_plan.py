@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._transform._fft_transforms import smooth
+from neusee.nodes.optics._transform._fft_transforms import fft_length
 from neusee.nodes.precision import one_by_one
 
 # --- psf energy -----------------------------------------------------------------------------------
@@ -16,12 +16,12 @@ from neusee.nodes.precision import one_by_one
 # The light of a PSF inside and outside of windows about the centre of the PSF.
 
 
-_LADDER = (1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125, 0.015625)
+_WINDOW_SHARES = (1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125, 0.015625)
 #: relative round-off of a float32 sum: a few nested sums of a few dozen additions each
-_ROUNDED = 4e-6
+_SUM_ROUND_OFF = 4e-6
 
 
-class Passed(NamedTuple):
+class PsfLight(NamedTuple):
     """Sums and maxima of the PSF of each band, inside and outside of windows, as float64 tensors
     on the CPU.
     """
@@ -34,59 +34,63 @@ class Passed(NamedTuple):
     signed: bool  #: the PSF is negative somewhere
 
 
-def passed(intensity: Tensor) -> Passed:
+def psf_light(intensity: Tensor) -> PsfLight:
     """Return the sums and maxima of PSFs (band, y, x), with the whole PSF as the only window."""
     # a maximum over several dimensions takes three times as long
     extremes = [torch.aminmax(band) for band in intensity]
     low, high = (torch.stack(columns).double().cpu() for columns in zip(*extremes, strict=True))
     signed = not bool((low >= 0).all())  # True for NaN too
     rows = (intensity.abs() if signed else intensity).sum(2)
-    total = rows.sum(1, dtype=torch.float64).cpu() * (1 + _ROUNDED)
+    total = rows.sum(1, dtype=torch.float64).cpu() * (1 + _SUM_ROUND_OFF)
     zeros = torch.zeros_like(total)[None]
     window = (intensity.shape[1], intensity.shape[2])
-    return Passed([window], total, torch.maximum(high, -low), zeros, zeros, signed)
+    return PsfLight([window], total, torch.maximum(high, -low), zeros, zeros, signed)
 
 
-def by_window(intensity: Tensor, signed: bool) -> Passed:
+def psf_light_by_window(intensity: Tensor, signed: bool) -> PsfLight:
     """Return the sums and maxima of PSFs (band, y, x) for nested windows.
 
     The edges of the windows cut each PSF into pieces, and each piece is read once.
     """
     m, n = intensity.shape[1:]
-    windows = list(dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in _LADDER))
+    windows = list(
+        dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in _WINDOW_SHARES)
+    )
     row_spans, column_spans = (
-        [_inside(length, w[axis]) for w in windows] for axis, length in enumerate((m, n))
+        [_central_span(length, w[axis]) for w in windows] for axis, length in enumerate((m, n))
     )
-    sums, maxima = _pieces(
-        intensity.abs() if signed else intensity, _cuts(row_spans), _cuts(column_spans)
-    )
+    size = intensity.abs() if signed else intensity
+    row_edges, column_edges = _span_edges(row_spans), _span_edges(column_spans)
+    sums, maxima = _piece_sums_and_maxima(size, row_edges, column_edges)
     beyond, above = torch.zeros(2, len(windows), len(intensity), dtype=torch.float64)
     for j, (y, x) in enumerate(zip(row_spans, column_spans, strict=True)):
-        is_outside = ~torch.outer(_covered(y, _cuts(row_spans)), _covered(x, _cuts(column_spans)))
+        is_outside = ~torch.outer(
+            _intervals_inside(y, row_edges), _intervals_inside(x, column_edges)
+        )
         if bool(is_outside.any()):
             beyond[j], above[j] = sums[:, is_outside].sum(1), maxima[:, is_outside].amax(1)
-    return Passed(windows, sums.sum((1, 2)), maxima.amax((1, 2)), beyond, above, signed)
+    return PsfLight(windows, sums.sum((1, 2)), maxima.amax((1, 2)), beyond, above, signed)
 
 
-def spread(of: Passed, share: Tensor | None) -> Passed:
+def mean_psf_light(of: PsfLight, share: Tensor | None) -> PsfLight:
     """Return bounds for bands whose PSFs are weighted means, with weights ``share`` (band, j),
     of the measured PSFs.
     """
     if share is None:
         return of
     beyond, above = of.beyond @ share.T, of.above @ share.T
-    return Passed(of.windows, share @ of.total, share @ of.peak, beyond, above, of.signed)
+    return PsfLight(of.windows, share @ of.total, share @ of.peak, beyond, above, of.signed)
 
 
-def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
+def central_window(stack: Tensor, window: tuple[int, int]) -> Tensor:
     """Return the samples of each PSF in a window about the central sample n // 2."""
     (top, bottom), (left, right) = (
-        _inside(n, w) for n, w in zip(stack.shape[1:], window, strict=True)
+        _central_span(n, w) for n, w in zip(stack.shape[1:], window, strict=True)
     )
     return stack[:, top:bottom, left:right]
 
 
-def _inside(length: int, window: int) -> tuple[int, int]:
+def _central_span(length: int, window: int) -> tuple[int, int]:
     """Return the first and the last sample, exclusive, of a window about the central sample n
     // 2.
     """
@@ -94,17 +98,19 @@ def _inside(length: int, window: int) -> tuple[int, int]:
     return first, first + window
 
 
-def _cuts(spans: list[tuple[int, int]]) -> list[int]:
+def _span_edges(spans: list[tuple[int, int]]) -> list[int]:
     """Return the edges of all spans, in rising order, once each."""
     return sorted(set(chain.from_iterable(spans)))
 
 
-def _covered(span: tuple[int, int], cuts: list[int]) -> Tensor:
+def _intervals_inside(span: tuple[int, int], cuts: list[int]) -> Tensor:
     """Return True for each interval between two neighbouring cuts that lies inside the span."""
     return torch.tensor([span[0] <= cut < span[1] for cut in cuts[:-1]])
 
 
-def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, Tensor]:
+def _piece_sums_and_maxima(
+    size: Tensor, rows: list[int], columns: list[int]
+) -> tuple[Tensor, Tensor]:
     """Return the sum, rounded up, and the maximum of each rectangular piece of a PSF, both (band,
     rows, columns).
 
@@ -117,7 +123,7 @@ def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, 
         for row_parts in zip(*row_sums_and_maxima, strict=True)
     )
     piece_sums = torch.stack([row_sums[..., a:b].sum(-1) for a, b in pairwise(columns)], -1) * (
-        1 + _ROUNDED
+        1 + _SUM_ROUND_OFF
     )
     return piece_sums, torch.stack(
         [row_maxima[..., a:b].amax(-1) for a, b in pairwise(columns)], -1
@@ -138,10 +144,10 @@ def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, 
 
 Corner = tuple[int, int]
 
-_COLUMNS = 16  #: columns of each spectrum at a time; on a GPU all columns
+_COLUMNS_AT_A_TIME = 16  #: columns of each spectrum at a time; on a GPU all columns
 #: rows of a picture at a time: whole pictures would take new memory, which costs more than their
 #: FFTs
-_SOME = 64
+_ROWS_AT_A_TIME = 64
 
 
 class Mix(NamedTuple):
@@ -161,14 +167,14 @@ class Mix(NamedTuple):
         return Mix(u, x, y, self.results)
 
 
-class Where(NamedTuple):
+class Placement(NamedTuple):
     """The positions of pictures and kernels in zero-padded arrays, and the window of the
     convolution to return.
     """
 
-    at_a: Corner
-    at_b: Corner
-    at: Corner
+    picture_corner: Corner
+    kernel_corner: Corner
+    window_corner: Corner
     size: Corner
     length: Corner
     conjugate: bool = False  #: of F(b): correlation instead of convolution
@@ -180,7 +186,7 @@ class Summed(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+    def forward(a: Tensor, b: Tensor, mix: Mix, where: Placement) -> Tensor:
         return _summed(a, b, mix, where)
 
     @staticmethod
@@ -188,32 +194,42 @@ class Summed(torch.autograd.Function):
         """Save the inputs for the backward pass outside of `forward`, as `torch.func` requires."""
         ctx.save_for_backward(*inputs[:2])
         ctx.save_for_forward(*inputs[:2])
-        ctx.how = inputs[2:]
+        ctx.settings = inputs[2:]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        (a, b), (mix, where), grad = ctx.saved_tensors, ctx.how, grads[0]
+        (a, b), (mix, where), grad = ctx.saved_tensors, ctx.settings, grads[0]
         # the transposed matrices mix the gradients
         u, x, y = (m if m is None else m.T for m in mix[:3])
         correlation = not where.conjugate
         picture_gradient = kernel_gradient = None
         if ctx.needs_input_grad[0]:
             gradient_where = where._replace(
-                at_a=where.at, at=where.at_a, size=tuple(a.shape[1:]), conjugate=correlation
+                picture_corner=where.window_corner,
+                window_corner=where.picture_corner,
+                size=tuple(a.shape[1:]),
+                conjugate=correlation,
             )
             picture_gradient = summed(grad, b, Mix(x, u, mix.y), gradient_where)
         if ctx.needs_input_grad[1]:
-            gradient_where = where._replace(at=where.at_b, size=tuple(b.shape[1:]), conjugate=True)
+            gradient_where = where._replace(
+                window_corner=where.kernel_corner, size=tuple(b.shape[1:]), conjugate=True
+            )
             if where.conjugate:
                 kernel_gradient = summed(
-                    a, grad, Mix(y, mix.x, u), gradient_where._replace(at_b=where.at)
+                    a,
+                    grad,
+                    Mix(y, mix.x, u),
+                    gradient_where._replace(kernel_corner=where.window_corner),
                 )
             else:
                 kernel_gradient = summed(
                     grad,
                     a,
                     Mix(y, u, mix.x),
-                    gradient_where._replace(at_a=where.at, at_b=where.at_a),
+                    gradient_where._replace(
+                        picture_corner=where.window_corner, kernel_corner=where.picture_corner
+                    ),
                 )
         return picture_gradient, kernel_gradient, None, None
 
@@ -221,8 +237,11 @@ class Summed(torch.autograd.Function):
     def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
         """Return the change of a product: that by the first factor, and that by the second."""
         first, second = ctx.saved_tensors
-        pairs = [(x, y) for x, y in ((a, second), (first, b)) if x is not None and y is not None]
-        changes = [Summed.apply(x, y, *ctx.how) for x, y in pairs]  # type: ignore[no-untyped-call]
+        changes = []
+        if a is not None:
+            changes.append(Summed.apply(a, second, *ctx.settings))  # type: ignore[no-untyped-call]
+        if b is not None:
+            changes.append(Summed.apply(first, b, *ctx.settings))  # type: ignore[no-untyped-call]
         return sum(changes[1:], changes[0])
 
     @staticmethod
@@ -230,7 +249,7 @@ class Summed(torch.autograd.Function):
         return one_by_one(Summed.apply, info.batch_size, (*in_dims[:2], None, None), inputs)
 
 
-def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+def summed(a: Tensor, b: Tensor, mix: Mix, where: Placement) -> Tensor:
     """Return weighted sums (r, y, x) of convolutions of pictures (k, y, x) with kernels (q, y,
     x).
     """
@@ -238,43 +257,53 @@ def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
     return result
 
 
-def _summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+def _summed(a: Tensor, b: Tensor, mix: Mix, where: Placement) -> Tensor:
     """Return weighted sums (result, y, x) of convolutions, a block of spectrum columns at a
     time.
     """
     mix, (tall_length, wide_length) = mix.to(a), where.length
     columns = wide_length // 2 + 1
-    step = columns if a.is_cuda else min(columns, _COLUMNS)
-    pictures = _Columns(_rows(a, where.at_a[1], wide_length, step), where.at_a[0], tall_length)
-    kernels = _Columns(_rows(b, where.at_b[1], wide_length, step), where.at_b[0], tall_length)
-    result = pictures.room.new_empty(_results(mix, a), where.size[0], columns)
+    step = columns if a.is_cuda else min(columns, _COLUMNS_AT_A_TIME)
+    pictures = _Columns(
+        _row_spectra(a, where.picture_corner[1], wide_length, step),
+        where.picture_corner[0],
+        tall_length,
+    )
+    kernels = _Columns(
+        _row_spectra(b, where.kernel_corner[1], wide_length, step),
+        where.kernel_corner[0],
+        tall_length,
+    )
+    result = pictures.padded.new_empty(_result_count(mix, a), where.size[0], columns)
     for block_number, first_column in enumerate(range(0, columns, step)):
-        picture_spectra, kernel_spectra = (
-            pictures.spectra(block_number),
-            _times(mix.y, kernels.spectra(block_number)),
-        )
-        block = torch.fft.ifft(
-            _mixed(
-                mix, picture_spectra, kernel_spectra.conj() if where.conjugate else kernel_spectra
-            )
-        )
+        picture_spectra = pictures.spectra(block_number)
+        kernel_spectra = _matrix_times(mix.y, kernels.spectra(block_number))
+        if where.conjugate:
+            kernel_spectra = kernel_spectra.conj()
+        block = torch.fft.ifft(_mixed_spectra(mix, picture_spectra, kernel_spectra))
         # only the rows of the window are kept
-        block = block[:, : columns - first_column, where.at[0] : where.at[0] + where.size[0]]
+        block = block[
+            :,
+            : columns - first_column,
+            where.window_corner[0] : where.window_corner[0] + where.size[0],
+        ]
         result[:, :, first_column : first_column + step] = block.transpose(1, 2)
-    return _pixels(result, wide_length, slice(where.at[1], where.at[1] + where.size[1]))
+    return _pictures_of_rows(
+        result, wide_length, slice(where.window_corner[1], where.window_corner[1] + where.size[1])
+    )
 
 
-def _results(mix: Mix, a: Tensor) -> int:
+def _result_count(mix: Mix, a: Tensor) -> int:
     """Return the number of results, from the last matrix that is not the identity."""
     return next(len(m) for m in (mix.u, mix.x, a) if m is not None)
 
 
-def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
+def _mixed_spectra(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
     """Return the spectra of the sums of convolutions, from the spectra ``x`` of pictures and
     ``y`` of kernels.
     """
     if not mix.results:
-        return _times(mix.u, _times(mix.x, x) * y)
+        return _matrix_times(mix.u, _matrix_times(mix.x, x) * y)
     kernels = y.view(mix.results, len(x), *y.shape[1:])
     total = x[0] * kernels[:, 0]
     for k in range(1, len(x)):
@@ -282,7 +311,7 @@ def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
     return total
 
 
-def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
+def _row_spectra(x: Tensor, left: int, wide: int, step: int) -> Tensor:
     """Return the FFT of each picture row, shifted by ``left`` zeros, as (plane, block, row,
     ``step`` columns).
 
@@ -291,7 +320,7 @@ def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
     """
     count, row_count, width = x.shape
     full_blocks, remainder = divmod(wide // 2 + 1, step)
-    chunk = _few_rows(x, row_count)
+    chunk = _rows_at_a_time(x, row_count)
     zero_padded = x.new_zeros(chunk, wide)
     blocks = zero_padded.new_empty(
         count, full_blocks + (remainder > 0), row_count, step, dtype=x.dtype.to_complex()
@@ -314,20 +343,20 @@ def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
     return blocks
 
 
-def _pixels(spectrum: Tensor, wide: int, columns: slice) -> Tensor:
+def _pictures_of_rows(spectrum: Tensor, wide: int, columns: slice) -> Tensor:
     """Return the wanted columns of pictures, given the spectrum of each row."""
     size = spectrum.shape[1]
     pixels = spectrum.real.new_empty(*spectrum.shape[:2], columns.stop - columns.start)
-    chunk = _few_rows(spectrum, size)
+    chunk = _rows_at_a_time(spectrum, size)
     for plane, rows in zip(pixels, spectrum, strict=True):
         for y in range(0, size, chunk):
             plane[y : y + chunk] = torch.fft.irfft(rows[y : y + chunk], n=wide)[:, columns]
     return pixels
 
 
-def _few_rows(x: Tensor, count: int) -> int:
+def _rows_at_a_time(x: Tensor, count: int) -> int:
     """Return how many rows are transformed at a time: as many as fit in the cache; on a GPU all."""
-    return count if x.is_cuda else min(count, _SOME)
+    return count if x.is_cuda else min(count, _ROWS_AT_A_TIME)
 
 
 class _Columns:
@@ -337,18 +366,18 @@ class _Columns:
 
     def __init__(self, blocks: Tensor, top: int, high: int) -> None:
         self.blocks = blocks
-        self.room = blocks.new_zeros(len(blocks), blocks.shape[3], high)
-        self.inside = self.room[..., top : top + blocks.shape[2]]
-        self.found = torch.empty_like(self.room)
+        self.padded = blocks.new_zeros(len(blocks), blocks.shape[3], high)
+        self.padded_picture = self.padded[..., top : top + blocks.shape[2]]
+        self.spectrum = torch.empty_like(self.padded)
 
     def spectra(self, block: int) -> Tensor:
         """Return the FFT along each column of one block of columns: (plane, column, frequency)."""
-        self.inside.copy_(self.blocks[:, block].transpose(1, 2))
-        torch.fft.fft(self.room, out=self.found)
-        return self.found
+        self.padded_picture.copy_(self.blocks[:, block].transpose(1, 2))
+        torch.fft.fft(self.padded, out=self.spectrum)
+        return self.spectrum
 
 
-def _times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
+def _matrix_times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
     """Multiply complex spectra by a real matrix."""
     if matrix is None:
         return spectra
@@ -366,9 +395,9 @@ def _times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
 # error.
 
 
-_SMALL = 0.05  #: share of the error bound that is spent on omitting weak bands
-_FARTHER = 6  #: numbers of planes that are tried, from the least sufficient number on
-_EVERY = 8  #: one band of this many is tested first for a smaller window
+_WEAK_BANDS_SHARE = 0.05  #: share of the error bound that is spent on omitting weak bands
+_TRIED_PLANE_NUMBERS = 6  #: numbers of planes that are tried, from the least sufficient number on
+_TESTED_BAND_STEP = 8  #: one band of this many is tested first for a smaller window
 
 
 class ImageFacts(NamedTuple):
@@ -383,7 +412,7 @@ class ImageFacts(NamedTuple):
     norm: Tensor  #: (k,) the same norm of each plane
     gram: Tensor  #: (k, k) products of the planes
     copies: int  #: the largest number of copies of a scene point: 9 where the border reflects
-    passed: Passed
+    light: PsfLight
     size: tuple[int, int]
     reflect: bool
     #: (band, j) weights of the PSFs in each band, where only few bands have a PSF
@@ -400,27 +429,29 @@ class Plan(NamedTuple):
     window: tuple[int, int]
     kernels: Tensor | None  #: (kernel, bands used); None: each PSF is a kernel
     mix: Mix
-    off: Tensor  #: (row,) upper bound of the omitted light
-    number: int  #: of kernels
+    omitted_light: Tensor  #: (row,) upper bound
+    kernel_count: int
     cost: float  #: estimated seconds on two cores
-    whole: bool  #: nothing but zeros is omitted
+    complete: bool  #: nothing but zeros is omitted
 
     @property
     def kept(self) -> list[int]:
         """Return the numbers of planes, kernels and bands, and the PSF window's size, as in
         `Channels.kept`.
         """
-        return [self.planes, self.number, len(self.bands), *self.window]
+        return [self.planes, self.kernel_count, len(self.bands), *self.window]
 
 
-class Fewer(NamedTuple):
+class FewKernels(NamedTuple):
     """A small set of convolution kernels, brightest first, whose weighted sums approximate a
     larger set of kernels.
     """
 
     kernels: Tensor  #: (q, band)
     mixed: Tensor  #: (row x plane, q)
-    off: Tensor  #: (q - 1, row) upper bound of the light that the first 1, 2, ... kernels omit
+    #: (q - 1, row) upper bound of the light that the first 1, 2, ... kernels omit
+    omitted_light: Tensor
+    limit: Tensor  #: (row,) most light that may be omitted
 
 
 def with_windows(
@@ -430,165 +461,157 @@ def with_windows(
     windows omit too much.
     """
     # a test on few bands avoids the sums of all where no window is small enough
-    some_bands, signed = slice(_EVERY // 2, None, _EVERY), facts.passed.signed
-    if facts.share is None and len(intensity) > _EVERY:
+    some_bands, signed = slice(_TESTED_BAND_STEP // 2, None, _TESTED_BAND_STEP), facts.light.signed
+    if facts.share is None and len(intensity) > _TESTED_BAND_STEP:
         facts_of_some = facts._replace(
             rows=facts.rows[:, some_bands],
             basis=facts.basis[some_bands],
             residual=facts.residual[:, some_bands],
         )
-        if not _narrow(
-            facts_of_some._replace(passed=by_window(intensity[some_bands], signed)),
+        if not _smaller_window_fits(
+            facts_of_some._replace(light=psf_light_by_window(intensity[some_bands], signed)),
             within * brightest,
         ):
             return facts
-    return facts._replace(passed=spread(by_window(intensity, signed), facts.share))
+    return facts._replace(light=mean_psf_light(psf_light_by_window(intensity, signed), facts.share))
 
 
-def _narrow(facts: ImageFacts, limit: Tensor) -> bool:
+def _smaller_window_fits(facts: ImageFacts, limit: Tensor) -> bool:
     """Return True if the second largest PSF window omits little enough light for some number of
     basis images.
     """
     bands, planes = torch.arange(len(facts.basis)), range(1, len(facts.norm) + 1)
-    return len(facts.passed.windows) > 1 and any(
-        bool((facts.rows.abs() @ _tail(facts, bands, k, 1) <= limit).all()) for k in planes
+    return len(facts.light.windows) > 1 and any(
+        bool((facts.rows.abs() @ _tail_light(facts, bands, k, 1) <= limit).all()) for k in planes
     )
 
 
-def choose(facts: ImageFacts, brightest: Tensor, within: float) -> Plan:
+def cheapest_plan(facts: ImageFacts, brightest: Tensor, within: float) -> Plan:
     """Return the cheapest convolution plan that omits at most ``within`` of the brightest pixel,
     or a complete plan.
     """
-    bands, omitted_light = _strong(facts, brightest, within)
+    bands, omitted_light = _strong_bands(facts, brightest, within)
     complete = min(
         _plans(facts, bands, omitted_light, len(facts.norm), 0), key=lambda plan: plan.cost
     )
-    cheapest = complete._replace(whole=True)
+    cheapest = complete._replace(complete=True)
     if within <= 0:
         return cheapest
-    for planes in _enough(facts, bands, omitted_light, brightest, within):
-        fewer = _fewer(facts, bands, planes, brightest)
-        for window_number in range(len(facts.passed.windows)):
-            plans = _plans(
-                facts, bands, omitted_light, planes, window_number, (within * brightest, fewer)
-            )
+    for planes in _sufficient_planes(facts, bands, omitted_light, brightest, within):
+        few = _few_kernels(facts, bands, planes, brightest, within)
+        for window_number in range(len(facts.light.windows)):
+            plans = _plans(facts, bands, omitted_light, planes, window_number, few)
             cheapest = min([cheapest, *plans], key=lambda plan: plan.cost)
     return cheapest
 
 
-def _strong(facts: ImageFacts, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
+def _strong_bands(facts: ImageFacts, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
     """Return the bands to convolve, and an upper bound of the light that the omitted bands add
     to each weighted sum.
     """
-    most_light = facts.rows.abs() * (facts.residual[0] * facts.passed.total)
+    most_light = facts.rows.abs() * (facts.residual[0] * facts.light.total)
     share = torch.where(
         most_light > 0, most_light / brightest.clamp_min(1e-300)[:, None], 0.0
     ).amax(0)
     rising_order = share.argsort()
-    omitted = rising_order[share[rising_order].cumsum(0) <= _SMALL * max(within, 0.0)]
+    omitted = rising_order[share[rising_order].cumsum(0) <= _WEAK_BANDS_SHARE * max(within, 0.0)]
     bands = torch.ones_like(share, dtype=torch.bool).index_fill_(0, omitted, False)
     if not bool(bands.any()):
         bands[int(share.argmax())] = True
     return bands.nonzero()[:, 0], most_light[:, ~bands].sum(1)
 
 
-def _enough(
+def _sufficient_planes(
     facts: ImageFacts, bands: Tensor, lost: Tensor, brightest: Tensor, within: float
 ) -> list[int]:
     """Return how many basis images each picture needs for an error of at most ``within`` times
     the brightest pixel.
     """
     omitted_light = (
-        lost + (facts.residual[:, bands] * facts.passed.total[bands]) @ facts.rows[:, bands].abs().T
+        lost + (facts.residual[:, bands] * facts.light.total[bands]) @ facts.rows[:, bands].abs().T
     )
     fits = [
         k
         for k in range(1, len(facts.norm) + 1)
         if bool((omitted_light[k] <= within * brightest).all())
     ]
-    return fits[:_FARTHER]
+    return fits[:_TRIED_PLANE_NUMBERS]
 
 
 def _plans(
     facts: ImageFacts,
     bands: Tensor,
-    lost: Tensor,
-    k: int,
-    j: int,
-    within: tuple[Tensor, Fewer] | None = None,
+    weak_light: Tensor,
+    planes: int,
+    window_number: int,
+    few: FewKernels | None = None,
 ) -> Iterator[Plan]:
-    """Yield up to three convolution plans that use the first ``k`` basis images and the PSF window
-    number ``j``.
+    """Yield up to three convolution plans that use the first ``planes`` basis images and the PSF
+    window number ``window_number``.
 
     The kernels of the three plans are one for each plane and row, one for each PSF, and fewer
-    kernels to mix.
+    kernels to mix. ``weak_light`` is the light of the bands that are left out.
     """
-    rows, basis, passed_light = (
-        facts.rows[:, bands],
-        facts.basis[bands, :k],
-        facts.passed.total[bands],
+    rows, basis = facts.rows[:, bands], facts.basis[bands, :planes]
+    passed_light = facts.light.total[bands]
+    omitted_light = (
+        weak_light
+        + rows.abs() @ (facts.residual[planes, bands] * passed_light)
+        + rows.abs() @ _tail_light(facts, bands, planes, window_number)
     )
-    off = (
-        lost
-        + rows.abs() @ (facts.residual[k, bands] * passed_light)
-        + rows.abs() @ _tail(facts, bands, k, j)
-    )
-    if within is not None and not bool((off <= within[0]).all()):
+    if few is not None and not bool((omitted_light <= few.limit).all()):
         return
     row_count = len(rows)
-    # terms are (row, plane): each result sums its own k terms, and each term takes its plane
-    result_of_term = torch.eye(row_count, dtype=torch.float64).repeat_interleave(k, 1)
-    plane_of_term = torch.eye(k, dtype=torch.float64).repeat(row_count, 1)
-    kernel_weights = _sums(rows, basis)
+    # terms are (row, plane): each result sums its own terms, and each term takes its plane
+    result_of_term = torch.eye(row_count, dtype=torch.float64).repeat_interleave(planes, 1)
+    plane_of_term = torch.eye(planes, dtype=torch.float64).repeat(row_count, 1)
+    kernel_weights = _kernel_weights(rows, basis)
 
-    def plan(kernels: Tensor | None, mix: Mix, off: Tensor) -> Plan:
-        window = facts.passed.windows[j]
+    def plan(kernels: Tensor | None, mix: Mix, omitted_light: Tensor) -> Plan:
+        window = facts.light.windows[window_number]
         psfs = len(bands) if facts.share is None else facts.share.shape[1]
-        cost = _cost(facts, window, k, psfs, kernels, mix)
+        kernel_count = psfs if kernels is None else len(kernels)
         return Plan(
-            k,
-            bands,
-            window,
-            kernels,
-            mix,
-            off,
-            psfs if kernels is None else len(kernels),
-            cost,
-            False,
+            planes=planes,
+            bands=bands,
+            window=window,
+            kernels=kernels,
+            mix=mix,
+            omitted_light=omitted_light,
+            kernel_count=kernel_count,
+            cost=_expected_seconds(facts, window, planes, psfs, kernels, mix),
+            complete=False,
         )
 
     # a kernel for each plane and row
-    yield plan(kernel_weights, Mix(result_of_term, plane_of_term, None, row_count), off)
+    yield plan(kernel_weights, Mix(result_of_term, plane_of_term, None, row_count), omitted_light)
     if facts.share is None:
         # a kernel for each band, that is, its PSF
-        yield plan(None, Mix(rows, basis, None), off)
+        yield plan(None, Mix(rows, basis, None), omitted_light)
     else:
-        yield plan(
-            None,
-            Mix(result_of_term, plane_of_term, kernel_weights @ facts.share[bands], row_count),
-            off,
-        )
-    if within is not None:
-        limit, few = within
-        # the fewest mixed kernels within the limit
-        for q in (few.off + off <= limit).all(1).nonzero()[:1, 0].tolist():
-            yield plan(
-                few.kernels[: q + 1],
-                Mix(result_of_term, plane_of_term, few.mixed[:, : q + 1], row_count),
-                off + few.off[q],
-            )
+        psf_weights = kernel_weights @ facts.share[bands]
+        mix = Mix(result_of_term, plane_of_term, psf_weights, row_count)
+        yield plan(None, mix, omitted_light)
+    if few is None:
+        return
+    # the fewest mixed kernels within the limit
+    for q in (few.omitted_light + omitted_light <= few.limit).all(1).nonzero()[:1, 0].tolist():
+        mix = Mix(result_of_term, plane_of_term, few.mixed[:, : q + 1], row_count)
+        yield plan(few.kernels[: q + 1], mix, omitted_light + few.omitted_light[q])
 
 
-def _fewer(facts: ImageFacts, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
+def _few_kernels(
+    facts: ImageFacts, bands: Tensor, k: int, brightest: Tensor, within: float
+) -> FewKernels:
     """Return a small set of kernels: singular vectors of the matrix that sums the bands of the
     PSF to kernels.
     """
-    rows, band_light = facts.rows[:, bands], facts.passed.total[bands]
+    rows, band_light = facts.rows[:, bands], facts.light.total[bands]
     plane_scale = torch.where(
         brightest[:, None] > 0, facts.norm[:k] / brightest[:, None], 0.0
     ).flatten()
     # in units of light, so that singular values are errors of the image
-    scaled = plane_scale[:, None] * _sums(rows, facts.basis[bands, :k]) * band_light
+    scaled = plane_scale[:, None] * _kernel_weights(rows, facts.basis[bands, :k]) * band_light
     left_vectors, singular_values, right_vectors = torch.linalg.svd(scaled, full_matrices=False)
     omitted_light = [
         (scaled - (left_vectors[:, :q] * singular_values[:q]) @ right_vectors[:q])
@@ -604,41 +627,40 @@ def _fewer(facts: ImageFacts, bands: Tensor, k: int, brightest: Tensor) -> Fewer
     )
     # a row without weight above
     unknown = torch.where((brightest == 0) & (rows != 0).any(1), math.inf, 0.0)
-    return Fewer(
-        kernels,
-        mixed,
-        torch.stack(omitted_light) * brightest + unknown if omitted_light else brightest[None][:0],
-    )
+    omitted = brightest[None][:0]
+    if omitted_light:
+        omitted = torch.stack(omitted_light) * brightest + unknown
+    return FewKernels(kernels, mixed, omitted, within * brightest)
 
 
-def _sums(rows: Tensor, basis: Tensor) -> Tensor:
+def _kernel_weights(rows: Tensor, basis: Tensor) -> Tensor:
     """Return the weight of each PSF band in the convolution kernel of each weighted sum and each
     basis image.
     """
     return (rows[:, None, :] * basis.T).flatten(0, 1)
 
 
-def _tail(facts: ImageFacts, bands: Tensor, k: int, j: int) -> Tensor:
+def _tail_light(facts: ImageFacts, bands: Tensor, k: int, j: int) -> Tensor:
     """Return, for each band, an upper bound of the light that the PSF outside the window adds to an
     image pixel.
 
     The bound is Young's inequality in three norms.
     """
     basis = facts.basis[bands, :k]
-    beyond, above = facts.passed.beyond[j, bands], facts.passed.above[j, bands]
+    beyond, above = facts.light.beyond[j, bands], facts.light.above[j, bands]
     largest_value = facts.residual[0, bands] + facts.residual[k, bands]
     power = ((basis @ facts.gram[:k, :k]) * basis).sum(1).clamp_min(0) * facts.copies
     # max |scene| x sum |PSF|, or root of (scene power x sum |PSF| x max |PSF|)
     return torch.minimum(largest_value * beyond, (power * beyond * above).sqrt() * (1 + 1e-6))
 
 
-def _cost(
+def _expected_seconds(
     facts: ImageFacts, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix
 ) -> float:
     """Return the seconds that a convolution plan is expected to take on two cores: FFTs,
     products and kernel sums.
     """
-    transform_area = math.prod(transform(facts, window))
+    transform_area = math.prod(fft_lengths(facts, window))
     count = bands if kernels is None else len(kernels)
     terms = len(mix.x) if mix.x is not None else k
     products = terms * (k + len(facts.rows) + (count if mix.y is not None else 0) + 8)
@@ -650,15 +672,15 @@ def _cost(
     )
 
 
-def transform(facts: ImageFacts, window: tuple[int, int]) -> tuple[int, int]:
+def fft_lengths(facts: ImageFacts, window: tuple[int, int]) -> tuple[int, int]:
     """Return the shortest FFT lengths (y, x) for which the convolution has no wrap-around within
     the image.
     """
     if facts.reflect:
-        y, x = (smooth(s + w - 1) for s, w in zip(facts.size, window, strict=True))
+        y, x = (fft_length(s + w - 1) for s, w in zip(facts.size, window, strict=True))
     else:
         y, x = (
-            smooth(max(s + w // 2, s + w - 1 - w // 2))
+            fft_length(max(s + w // 2, s + w - 1 - w // 2))
             for s, w in zip(facts.size, window, strict=True)
         )
     return y, x

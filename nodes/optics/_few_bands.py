@@ -11,10 +11,10 @@ from torch.nn.functional import avg_pool2d, pad
 
 from neusee.nodes import Check, node
 from neusee.nodes.optics._channel_image import Share
-from neusee.nodes.optics._convolution_plan import centred
+from neusee.nodes.optics._convolution_plan import central_window
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._psf_definition import SensorSampling
-from neusee.nodes.optics._pupil import pupil_has_large_steps
+from neusee.nodes.optics._pupil import SCREENS, thinned_pupil
 from neusee.nodes.units import FocalLength, PixelPitch, Shape
 from neusee.nodes.values import FewBands, LowRankCube, Psf, Pupil
 
@@ -23,17 +23,17 @@ from neusee.nodes.values import FewBands, LowRankCube, Psf, Pupil
 # Small PSFs and small parts of a scene, on which the error of fewer bands is estimated.
 
 
-SIDE = 120  #: cells, along each side of a PSF about the axis
-_PART = 240  #: cells, along each side of a part of the scene, with a margin for light from beside
-_BINS = (1, 2, 4)  #: pixels along the side of a cell, the least first
+CELLS_ACROSS = 120  #: cells, along each side of a PSF about the axis
+#: cells, along each side of a part of the scene, with a margin for light from beside
+_PART_CELLS = 240
+_CELL_PIXELS = (1, 2, 4)  #: pixels along the side of a cell, the least first
 #: least ratio of the area of the PSF window to that of the thumbnail, below which a choice saves
 #: nothing
-_GAIN = 4
-_HELD = 0.9  #: share of the light that a window of cells must hold
-_SAMPLES = 256  #: least number of pupil samples across, of which a larger pupil keeps every k-th
-_TILE = 32  #: cells, of the tiles of which the brightest and the one of the most contrast are found
-_PLANES = 4  #: strongest planes of the scene in which the error is estimated
-_SCREENS = ("aperture", "amplitude", "height", "path")  #: what a pupil holds for each sample
+_LEAST_AREA_RATIO = 4
+_LEAST_LIGHT_SHARE = 0.9  #: share of the light that a window of cells must hold
+#: cells, of the tiles of which the brightest and the one of the most contrast are found
+_TILE_CELLS = 32
+_STRONGEST_PLANES = 4  #: strongest planes of the scene in which the error is estimated
 
 Lens = Mapping[str, Any]  #: the parameters of `optics.psf` but its window
 
@@ -54,7 +54,7 @@ def without_gradients(
     pupil: Pupil, radiance: LowRankCube, rows: Tensor
 ) -> tuple[Pupil, LowRankCube, Tensor]:
     """Return the inputs of a choice, which is constant for gradients."""
-    constant_pupil = pupil._replace(**{name: getattr(pupil, name).detach() for name in _SCREENS})
+    constant_pupil = pupil._replace(**{name: getattr(pupil, name).detach() for name in SCREENS})
     return (
         constant_pupil,
         radiance._replace(planes=radiance.planes.detach()),
@@ -76,20 +76,22 @@ class Thumbnail(NamedTuple):
         pupil_of_bands = self.pupil._replace(
             index=self.pupil.index[bands], wavelengths=self.pupil.wavelengths[bands]
         )
-        return binned(
-            focused(pupil_of_bands, (self.pixels * SIDE, self.pixels * SIDE), self.lens),
+        return cell_light(
+            psf_intensity(
+                pupil_of_bands, (self.pixels * CELLS_ACROSS, self.pixels * CELLS_ACROSS), self.lens
+            ),
             self.pixels,
         )
 
 
-def thumbnail(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | None:
+def thumbnail_of(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | None:
     """Return the thumbnail of the PSFs of a pupil in a window of ``shape``.
 
     Return None if no window of cells holds the light, or if the PSFs of ``shape`` take little
     longer.
     """
     # square pixels of a thinned pupil would be too wide
-    thinned, lens = _thinned(pupil), {**lens, "pixel": "point"}
+    thinned, lens = thinned_pupil(pupil), {**lens, "pixel": "point"}
     # the first, the middle and the last band stand for all
     end_bands = torch.tensor(sorted({0, len(pupil.wavelengths) // 2, len(pupil.wavelengths) - 1}))
     pupil_of_ends = thinned._replace(
@@ -104,58 +106,44 @@ def thumbnail(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | N
         thinned.aperture.double().square().sum(),
         thinned.amplitude.double().square().sum(),
     )
-    for pixels in _BINS:
-        side = pixels * SIDE
-        if side > alias_free or side**2 * _GAIN > shape[0] * shape[1]:
+    for pixels in _CELL_PIXELS:
+        side = pixels * CELLS_ACROSS
+        if side > alias_free or side**2 * _LEAST_AREA_RATIO > shape[0] * shape[1]:
             return None
-        if float(focused(pupil_of_ends, (side, side), lens).sum((1, 2)).min()) >= _HELD * float(
-            passed_light / clear_light
-        ):
+        if float(
+            psf_intensity(pupil_of_ends, (side, side), lens).sum((1, 2)).min()
+        ) >= _LEAST_LIGHT_SHARE * float(passed_light / clear_light):
             return Thumbnail(thinned, pixels, lens)
     return None
 
 
-def focused(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Tensor:
+def psf_intensity(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Tensor:
     """Return the PSFs (band, y, x) of a pupil in a window."""
     result: Psf = psf(pupil, **lens, shape=shape)
     return result.intensity
 
 
-def binned(stack: Tensor, pixels: int) -> Tensor:
+def cell_light(stack: Tensor, pixels: int) -> Tensor:
     """Return the light of each cell of ``pixels`` along its side; pixels beyond the last whole
     cell are left out.
     """
     return stack if pixels == 1 else avg_pool2d(stack, pixels) * pixels**2
 
 
-def bins_of(stack: Tensor) -> int:
+def pixels_per_cell(stack: Tensor) -> int:
     """Return the least number of pixels along the side of a cell at which the cells hold the
     light of the PSFs.
     """
     total = stack.sum((1, 2))
-    for pixels in _BINS:
+    for pixels in _CELL_PIXELS:
         if bool(
-            (centred(stack, (pixels * SIDE, pixels * SIDE)).sum((1, 2)) >= _HELD * total).all()
+            (
+                central_window(stack, (pixels * CELLS_ACROSS, pixels * CELLS_ACROSS)).sum((1, 2))
+                >= _LEAST_LIGHT_SHARE * total
+            ).all()
         ):
             break
     return pixels
-
-
-def _thinned(pupil: Pupil) -> Pupil:
-    """Return every k-th sample of a large pupil, as long as the samples that are left can follow
-    the phase.
-    """
-    step = max(1, len(pupil.height) // _SAMPLES)
-    while step > 1 and pupil_has_large_steps(_every(pupil, step)):
-        step //= 2
-    return _every(pupil, step)
-
-
-def _every(pupil: Pupil, step: int) -> Pupil:
-    return pupil._replace(
-        **{name: getattr(pupil, name)[::step, ::step] for name in _SCREENS},
-        pitch=pupil.pitch * step,
-    )
 
 
 def share_of_bands(bands: Tensor, count: int) -> Tensor:
@@ -172,17 +160,17 @@ def share_of_bands(bands: Tensor, count: int) -> Tensor:
     return share.scatter_(1, lower[:, None], 1 - weight).scatter_(1, upper[:, None], weight)
 
 
-def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) -> Parts:
+def scene_parts(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) -> Parts:
     """Return three parts of the scene, about the brightest tile, about the tile of most contrast
     and in the middle.
 
     ``light`` has the PSFs (band, m, n) of all bands in cells of ``pixels`` along each side.
     """
-    # mean over each cell: `binned` returns the sum
-    planes = binned(radiance.planes[:_PLANES], pixels) / pixels**2
-    basis = radiance.basis[:, :_PLANES].detach().double().cpu()
+    # mean over each cell: `cell_light` returns the sum
+    planes = cell_light(radiance.planes[:_STRONGEST_PLANES], pixels) / pixels**2
+    basis = radiance.basis[:, :_STRONGEST_PLANES].detach().double().cpu()
     picture = torch.tensordot((rows.sum(0) @ basis).to(planes), planes, 1)[None]
-    tile_size = (min(_TILE, picture.shape[1]), min(_TILE, picture.shape[2]))
+    tile_size = (min(_TILE_CELLS, picture.shape[1]), min(_TILE_CELLS, picture.shape[2]))
     tile_mean = avg_pool2d(picture[None], tile_size)[0, 0]
     tile_variance = avg_pool2d(picture[None].square(), tile_size)[0, 0] - tile_mean.square()
     tiles = [divmod(int(x.argmax()), x.shape[1]) for x in (tile_mean, tile_variance)]
@@ -192,27 +180,27 @@ def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) ->
     ]
     picture_middle = (picture.shape[1] // 2, picture.shape[2] // 2)
     scene = torch.stack(
-        [_cut(planes, place) for place in dict.fromkeys([*tile_middles, picture_middle])]
+        [_part_about(planes, place) for place in dict.fromkeys([*tile_middles, picture_middle])]
     ).to(light)
     weights = (rows[:, None, :] * basis.T).flatten(0, 1)
     kernels = weights.to(light) @ light.flatten(1)
     spectra = torch.fft.rfft2(scene)
-    image = _imaged(spectra, kernels, light)
+    image = _image_of_parts(spectra, kernels, light)
     return Parts(spectra, weights, kernels, image, image.amax((0, 2, 3)))
 
 
-def _cut(planes: Tensor, place: tuple[int, int]) -> Tensor:
+def _part_about(planes: Tensor, place: tuple[int, int]) -> Tensor:
     """Return a part of the scene about a pixel; a smaller scene is filled up with zeros."""
     part_spans = []
     for middle, size in zip(place, planes.shape[1:], strict=True):
-        side = min(_PART, size)
+        side = min(_PART_CELLS, size)
         first = min(max(middle - side // 2, 0), size - side)
         part_spans.append(slice(first, first + side))
     part = planes[:, part_spans[0], part_spans[1]]
-    return pad(part, (0, _PART - part.shape[2], 0, _PART - part.shape[1]))
+    return pad(part, (0, _PART_CELLS - part.shape[2], 0, _PART_CELLS - part.shape[1]))
 
 
-def estimated(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]:
+def estimated_errors(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]:
     """Return the errors of the image if the PSF of each band is the mean of few PSFs ``light`` by
     weights ``share``.
 
@@ -221,7 +209,7 @@ def estimated(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]
     brightest pixel of all parts.
     """
     kernel_error = (parts.weights @ share).to(light) @ light.flatten(1) - parts.kernels
-    error = _imaged(parts.scene, kernel_error, light)
+    error = _image_of_parts(parts.scene, kernel_error, light)
     scale = parts.top.where(parts.top > 0, 1.0)
     rms = error.square().mean((2, 3)).sqrt() / scale
     change = ((parts.image + error).amax((0, 2, 3)) - parts.top).abs() / scale
@@ -229,15 +217,15 @@ def estimated(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]
     return float(rms.max()), max(float(rms.max()) / 4, float(change.max()))
 
 
-def _imaged(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
+def _image_of_parts(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
     """Return the image (part, row, y, x) of parts of a scene, without the margin to which light
     comes from outside.
     """
     row_kernels = kernels.view(-1, spectra.shape[1], *like.shape[1:])
-    size = (_PART, _PART)
+    size = (_PART_CELLS, _PART_CELLS)
     image = torch.fft.irfft2((spectra[:, None] * torch.fft.rfft2(row_kernels, size)).sum(2), size)
     # what a circular convolution wraps around lies before sample m - 1
-    valid_spans = [slice(m - 1, _PART) for m in like.shape[1:]]
+    valid_spans = [slice(m - 1, _PART_CELLS) for m in like.shape[1:]]
     inner: Tensor = image[..., valid_spans[0], valid_spans[1]]
     return inner
 
@@ -248,10 +236,10 @@ def _imaged(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
 # the picture.
 
 
-_RUNGS = (2, 3, 4, 5, 6, 8, 11, 16, 21)  #: numbers of bands that are tried, the fewest first
-_MOST = 0.7  #: largest share of the bands that is worth a choice
-_FINER = 3  #: least ratio of the bands of a comparison to the bands that are compared
-_SAFETY = 2.0  #: factor on the estimate, for the thumbnail is not the picture
+_BAND_COUNTS = (2, 3, 4, 5, 6, 8, 11, 16, 21)  #: numbers of bands that are tried, the fewest first
+_WORTHWHILE_SHARE = 0.7  #: largest share of the bands that is worth a choice
+_COMPARISON_RATIO = 3  #: least ratio of the bands of a comparison to the bands that are compared
+_ESTIMATE_FACTOR = 2.0  #: factor on the estimate, for the thumbnail is not the picture
 
 
 @node(rtol=1e-5)
@@ -288,7 +276,7 @@ def few_bands(
             section 7.2 (1974).
     """
     count = _same_count(pupil, radiance, rows)
-    rungs = [few for few in _RUNGS if few <= _MOST * count]
+    rungs = [few for few in _BAND_COUNTS if few <= _WORTHWHILE_SHARE * count]
     if not rungs or within <= 0:
         return _all_bands(count)
     pupil, radiance, rows = without_gradients(pupil, radiance, rows)
@@ -298,21 +286,21 @@ def few_bands(
         "pixel": pixel,
         "sensor": sensor,
     }
-    thumb = thumbnail(pupil, shape, lens)
+    thumb = thumbnail_of(pupil, shape, lens)
     if thumb is None:
         return _all_bands(count)
     # PSFs of half the bands decide, unless so many are needed that all must be computed
-    half_bands = _evenly(count // 2 + 1, count)
+    half_bands = _evenly_spaced(count // 2 + 1, count)
     light_of_half = thumb.light(half_bands)
-    light = _interpolated(light_of_half, half_bands, count)
-    rungs_of_half = [few for few in rungs if _FINER * few <= len(half_bands)]
-    choice = _fewest(
-        rungs_of_half, parts_of(radiance, rows, light, thumb.pixels), light, within, largest
+    light = _light_between_bands(light_of_half, half_bands, count)
+    rungs_of_half = [few for few in rungs if _COMPARISON_RATIO * few <= len(half_bands)]
+    choice = _first_within(
+        rungs_of_half, scene_parts(radiance, rows, light, thumb.pixels), light, within, largest
     )
     if choice is None:
-        light = _completed(light_of_half, half_bands, count, thumb)
-        choice = _fewest(
-            rungs, parts_of(radiance, rows, light, thumb.pixels), light, within, largest
+        light = _light_of_all_bands(light_of_half, half_bands, count, thumb)
+        choice = _first_within(
+            rungs, scene_parts(radiance, rows, light, thumb.pixels), light, within, largest
         )
     return choice or _all_bands(count)
 
@@ -328,7 +316,7 @@ def _same_count(pupil: Pupil, radiance: LowRankCube, rows: Tensor) -> int:
     return counts[0]
 
 
-def _interpolated(light: Tensor, some: Tensor, count: int) -> Tensor:
+def _light_between_bands(light: Tensor, some: Tensor, count: int) -> Tensor:
     """Return the PSFs (band, y, x) of all bands from those of some bands, linearly between the
     bands.
     """
@@ -336,28 +324,30 @@ def _interpolated(light: Tensor, some: Tensor, count: int) -> Tensor:
     return planes.view(count, *light.shape[1:])
 
 
-def _completed(light: Tensor, some: Tensor, count: int, small: Thumbnail) -> Tensor:
+def _light_of_all_bands(light: Tensor, some: Tensor, count: int, small: Thumbnail) -> Tensor:
     """Return the PSFs (band, y, x) of all bands, of which those of some bands are there already."""
     other_bands = torch.tensor(sorted({*range(count)} - {*some.tolist()}))
     all_light = torch.cat([light, small.light(other_bands)])
     return all_light[torch.cat([some, other_bands]).argsort()]
 
 
-def _fewest(
+def _first_within(
     rungs: list[int], parts: Parts, light: Tensor, within: float, largest: bool
 ) -> FewBands | None:
     """Return the first number of bands whose estimated error is within the limit, or None."""
     count = len(light)
     for few in rungs:
-        computed = _evenly(few, count)
+        computed = _evenly_spaced(few, count)
         share = share_of_bands(computed, count)
-        error, top_error = (_SAFETY * x for x in estimated(parts, share, light[computed]))
-        if max(error, top_error if largest else 0.0) <= within:
-            return FewBands(share, computed, _number(error), _number(top_error))
+        error, top_error = (
+            _ESTIMATE_FACTOR * x for x in estimated_errors(parts, share, light[computed])
+        )
+        if error <= within and (not largest or top_error <= within):
+            return FewBands(share, computed, _float64(error), _float64(top_error))
     return None
 
 
-def _evenly(few: int, count: int) -> Tensor:
+def _evenly_spaced(few: int, count: int) -> Tensor:
     """Return ``few`` indices of ``count`` bands, the first and the last among them."""
     return torch.linspace(0, count - 1, few, dtype=torch.float64).round().long()
 
@@ -429,23 +419,27 @@ def few_bands_checked(
         "pixel": pixel,
         "sensor": sensor,
     }
-    between_bands, pixels = few._replace(used=torch.tensor(between)), bins_of(psf.intensity)
-    window = (pixels * SIDE, pixels * SIDE)
-    own_light = binned(centred(psf.intensity.detach(), window), pixels)
-    added_light = binned(focused(pupil_of_bands(pupil, between_bands), window, lens), pixels)
+    between_bands, pixels = few._replace(used=torch.tensor(between)), pixels_per_cell(psf.intensity)
+    window = (pixels * CELLS_ACROSS, pixels * CELLS_ACROSS)
+    own_light = cell_light(central_window(psf.intensity.detach(), window), pixels)
+    added_light = cell_light(
+        psf_intensity(pupil_of_bands(pupil, between_bands), window, lens), pixels
+    )
     # by band, those in use and those between them
     order = sorted(range(len(computed) + len(between)), key=[*computed, *between].__getitem__)
     light = torch.cat([own_light, added_light])[order]
     finer_light = share_of_bands(torch.tensor(sorted([*computed, *between])), count).to(
         light
     ) @ light.flatten(1)
-    parts = parts_of(radiance, rows, finer_light.view(count, *light.shape[1:]), pixels)
-    error, top_error = estimated(parts, few.share.cpu(), own_light)
+    parts = scene_parts(radiance, rows, finer_light.view(count, *light.shape[1:]), pixels)
+    error, top_error = estimated_errors(parts, few.share.cpu(), own_light)
     raised_errors = (
-        max(float(old), _SAFETY * new)
+        max(float(old), _ESTIMATE_FACTOR * new)
         for old, new in ((few.error, error), (few.largest, top_error))
     )
-    return few._replace(**dict(zip(("error", "largest"), map(_number, raised_errors), strict=True)))
+    return few._replace(
+        **dict(zip(("error", "largest"), map(_float64, raised_errors), strict=True))
+    )
 
 
 @few_bands_checked.approximation_error
@@ -472,9 +466,9 @@ def _(result: FewBands, few: FewBands, *inputs: object, **params: object) -> lis
 def _all_bands(count: int) -> FewBands:
     """Return the choice of all bands, without an error."""
     return FewBands(
-        torch.eye(count, dtype=torch.float64), torch.arange(count), _number(0.0), _number(0.0)
+        torch.eye(count, dtype=torch.float64), torch.arange(count), _float64(0.0), _float64(0.0)
     )
 
 
-def _number(value: float) -> Tensor:
+def _float64(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)

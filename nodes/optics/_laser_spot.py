@@ -18,9 +18,9 @@ from neusee.nodes.values import Bands, LaserLight, Psf
 # The direction of a laser, given in the recipe or sampled at random as in the paper.
 
 
-_WIDEST = 1.0  #: rad; an angle counts as its direction cosine, which is below 1
+_LARGEST_ANGLE = 1.0  #: rad; an angle counts as its direction cosine, which is below 1
 #: relative difference of an angle and its sine, above which a note says the difference
-_SMALL = 0.01
+_SINE_DIFFERENCE = 0.01
 Rule = Literal["width_over_focal_length", "focal_length_over_width"]
 
 
@@ -53,7 +53,7 @@ def direction(
     if angle is not None:
         return torch.tensor(angle, dtype=torch.float64)
     edges = field_of_view(focal_length, pixel_pitch, shape)
-    return torch.stack([_inside(share * edge / 3, edge / 2, rng) for edge in edges])
+    return torch.stack([_drawn_within(share * edge / 3, edge / 2, rng) for edge in edges])
 
 
 def field_of_view(
@@ -66,7 +66,7 @@ def field_of_view(
     return height, width
 
 
-def _inside(sigma: float, edge: float, rng: Generator) -> Tensor:
+def _drawn_within(sigma: float, edge: float, rng: Generator) -> Tensor:
     """Sample a normal distribution of standard deviation ``sigma``, limited to absolute values
     of at most ``edge``.
     """
@@ -106,7 +106,7 @@ def angle_notes(angle: tuple[float, float]) -> list[str]:
     """
     size = math.hypot(*angle)
     degrees = f"{math.degrees(size):.4g} deg"
-    if size >= _WIDEST:
+    if size >= _LARGEST_ANGLE:
         raise ParameterError(
             "angle",
             f"{degrees} off the axis is {size:.4g} rad, but the model takes an angle in rad as its"
@@ -117,7 +117,7 @@ def angle_notes(angle: tuple[float, float]) -> list[str]:
         f"{degrees} off the axis: the model takes an angle as its direction cosine, and the two"
         f" differ by {relative_difference:.1%}"
     )
-    return [text] if relative_difference > _SMALL else []
+    return [text] if relative_difference > _SINE_DIFFERENCE else []
 
 
 @direction.check
@@ -141,9 +141,11 @@ def _(
 Meaning = Literal["first_channel", "irradiance"]
 
 #: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
-_LSR = 2.2
-_SQUARE = 4 / math.pi  #: largest area of the samples of a coarse pupil grid, relative to their disc
-_UNSEEN = 1e-3  #: relative response below which a channel does not see a line
+_LARGEST_LSR = 2.2
+_COARSE_GRID_AREA = (
+    4 / math.pi
+)  #: largest area of the samples of a coarse pupil grid, relative to their disc
+_UNSEEN_RESPONSE = 1e-3  #: relative response below which a channel does not see a line
 
 
 @node()
@@ -194,7 +196,7 @@ def laser_irradiance(
         irradiance_by_band = (
             strength
             * bands.weights
-            / unit(psf.clear_peak, bands, wells_per_irradiance, responses, meaning)
+            / wells_at_clear_peak(psf.clear_peak, bands, wells_per_irradiance, responses, meaning)
         )
     elif light is not None:
         irradiance_by_band = light.flux / pixel_pitch**2 * bands.weights
@@ -206,7 +208,7 @@ def laser_irradiance(
     return intensity * irradiance_by_band.to(intensity)[:, None, None]
 
 
-def unit(
+def wells_at_clear_peak(
     clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | None, meaning: Meaning
 ) -> Tensor:
     """Return the saturated pixels of one W/m2 per unit of the PSF at the peak of the clear lens: ()
@@ -245,7 +247,7 @@ def _(
         or responses.is_meta
     ):
         return []
-    if float((responses * bands.weights).sum(-1).amax() / bands.weights.sum()) < _UNSEEN:
+    if float((responses * bands.weights).sum(-1).amax() / bands.weights.sum()) < _UNSEEN_RESPONSE:
         raise ParameterError("strength", _no_channel(bands))
     return []
 
@@ -280,7 +282,9 @@ def _(
     """
     if strength is None:
         return (
-            math.inf if light is None else _LSR * _SQUARE * light.max * (bands.max / bands.min) ** 2
+            math.inf
+            if light is None
+            else _LARGEST_LSR * _COARSE_GRID_AREA * light.max * (bands.max / bands.min) ** 2
         )
     if strength == 0:
         return 0.0
@@ -292,7 +296,11 @@ def _(
     saturation_irradiance: Tensor = saturation(
         Bands(shortest_wavelength, shortest_wavelength, shortest_wavelength), **sensor
     )
-    return _LSR * strength * float(saturation_irradiance) / response if response > 0 else math.inf
+    return (
+        _LARGEST_LSR * strength * float(saturation_irradiance) / response
+        if response > 0
+        else math.inf
+    )
 
 
 @laser_irradiance.expected_range
@@ -344,7 +352,8 @@ def _(
         light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
     )
     strength = float(
-        clear_irradiance * unit(psf.clear_peak, bands, wells_per_irradiance, responses, meaning)
+        clear_irradiance
+        * wells_at_clear_peak(psf.clear_peak, bands, wells_per_irradiance, responses, meaning)
     )
     return [
         Check(

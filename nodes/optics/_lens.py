@@ -77,8 +77,8 @@ def passed_by_notches(pupil: Pupil) -> Tensor:
 # PSF alone.
 
 
-_NODES = 96  #: of the radius and of a quarter of the azimuth
-_STEPS = 8  #: of the iteration for the diameter of a stop, each at least 10 times as near
+_QUADRATURE_NODES = 96  #: of the radius and of a quarter of the azimuth
+_STOP_ITERATIONS = 8  #: of the iteration for the diameter of a stop, each at least 10 times as near
 
 
 def cut_off(psf: Psf) -> Tensor:
@@ -93,7 +93,7 @@ def cut_off(psf: Psf) -> Tensor:
     return (psf.clear_peak.double() * (4.0 / math.pi)).sqrt()
 
 
-def averaging(psf: Psf) -> Tensor:
+def averaged_side(psf: Psf) -> Tensor:
     """Return the side in pixels of the square over which each pixel averages, 0 for points:
     (band,) float64.
     """
@@ -125,7 +125,7 @@ def round_lens(frequency: Tensor, side: Tensor) -> RoundLens:
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the
             pupil).
     """
-    nodes, weights = unit_nodes(_NODES)
+    nodes, weights = unit_nodes(_QUADRATURE_NODES)
     # a quadrature over the disc of frequencies: a quarter of it, for symmetry
     radius, azimuth = (nodes + 0.5)[:, None], (nodes + 0.5) * (math.pi / 2)
     # transfer function of a round pupil without aberrations
@@ -149,7 +149,7 @@ def stop_width(lsr: Tensor, frequency: Tensor, side: Tensor) -> Tensor:
     """
     # a first guess: without an average the peak is width^4
     clear_peak, width = round_lens(frequency, side).peak, lsr**0.25
-    for _ in range(_STEPS):
+    for _ in range(_STOP_ITERATIONS):
         width = (lsr * clear_peak / round_lens(width * frequency, side).peak) ** 0.25
     return width
 
@@ -158,7 +158,7 @@ def stop_width(lsr: Tensor, frequency: Tensor, side: Tensor) -> Tensor:
 
 # The brightness of a scene in lux or cd/m2, as the irradiance of a white surface on the sensor.
 
-_EQUAL = 1e-6  #: largest relative difference of widths of bands that count as equal
+_EQUAL_WIDTHS = 1e-6  #: largest relative difference of widths of bands that count as equal
 
 
 @node(rtol=1e-9)
@@ -198,14 +198,14 @@ def white_irradiance(
         luminance_of_white = illuminance / math.pi
     widths = bands.widths.detach().cpu().double()
     radiance = luminance_of_white * luminous_share(bands, kind, temperature)
-    if float(widths.max() / widths.min()) > 1 + _EQUAL:
-        raise ParameterError("illuminance", _WIDTHS)
+    if float(widths.max() / widths.min()) > 1 + _EQUAL_WIDTHS:
+        raise ParameterError("illuminance", _UNEQUAL_WIDTHS)
     return torch.as_tensor(
         radiance * clear_area(stop) / focal_length**2 * lens_transmittance, dtype=torch.float64
     )
 
 
-_WIDTHS = (
+_UNEQUAL_WIDTHS = (
     "the bands differ in width, so that one unit of the image is another power in each: use the"
     " node spectra.bands"
 )
@@ -234,9 +234,9 @@ def _(
     if (
         bands is not None
         and not bands.widths.is_meta
-        and float(bands.widths.max() / bands.widths.min()) > 1 + _EQUAL
+        and float(bands.widths.max() / bands.widths.min()) > 1 + _EQUAL_WIDTHS
     ):
-        raise ParameterError(stated, _WIDTHS)
+        raise ParameterError(stated, _UNEQUAL_WIDTHS)
     if isinstance(kind, Path):
         luminous_share(bands, kind, temperature)
     return []

@@ -29,10 +29,11 @@ from neusee.nodes.values import Pupil
 # passes the band of the intensity and stops its repetitions.
 
 
-_STEP = 0.25  #: samples a pixel are a multiple of this, and whole numbers from `_WHOLE` on
-_WHOLE = 8
-_PERIOD = 4  #: pixels after which the places of the pixels between the samples repeat
-_ROWS = 16  #: pixels whose weights form one dense matrix
+#: samples a pixel are a multiple of this, and whole numbers from `_WHOLE_SAMPLES_FROM` on
+_SAMPLES_STEP = 0.25
+_WHOLE_SAMPLES_FROM = 8
+_PLACE_PERIOD = 4  #: pixels after which the places of the pixels between the samples repeat
+_BLOCK_PIXELS = 16  #: pixels whose weights form one dense matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,23 +68,23 @@ def fine_axis(pixels: int, bandwidth: float, error: float) -> FineAxis:
 
     The grid has more than ``2 bandwidth`` samples a pixel, and at least one.
     """
-    grids = (_grid(pixels, bandwidth, m, error) for m in _samples_per_pixel(2 * bandwidth))
+    grids = (_grid_of(pixels, bandwidth, m, error) for m in _samples_per_pixel(2 * bandwidth))
     return min(grids, key=lambda grid: grid.samples + grid.taps)
 
 
 def _samples_per_pixel(lowest: float) -> list[float]:
     """Return samples per pixel above ``lowest``, from the least on, that are tried for a grid."""
-    step = _STEP if lowest < _WHOLE else 1.0
+    step = _SAMPLES_STEP if lowest < _WHOLE_SAMPLES_FROM else 1.0
     first_multiple = max(math.floor(lowest / step) + 1, math.ceil(1 / step))
     count = 8 + math.ceil(0.5 * lowest / step)
     return [step * (first_multiple + i) for i in range(count)]
 
 
-def _grid(pixels: int, bandwidth: float, per_pixel: float, error: float) -> FineAxis:
+def _grid_of(pixels: int, bandwidth: float, per_pixel: float, error: float) -> FineAxis:
     """Return the grid of a window with a given number of samples per pixel; ``bandwidth`` is in
     cycles a pixel, ``error`` that of the filter.
     """
-    taps = math.ceil(per_pixel * (1 + _width(per_pixel - 2 * bandwidth, error))) + 1
+    taps = math.ceil(per_pixel * (1 + _filter_width(per_pixel - 2 * bandwidth, error))) + 1
     return FineAxis(pixels, bandwidth, per_pixel, error, taps)
 
 
@@ -92,7 +93,7 @@ def _decibels(error: float) -> float:
     return -20 * math.log10(error)
 
 
-def _width(gap: float, error: float) -> float:
+def _filter_width(gap: float, error: float) -> float:
     """Return the width in pixels of a low-pass filter whose pass and stop band are ``gap`` cycles a
     pixel apart.
 
@@ -102,10 +103,10 @@ def _width(gap: float, error: float) -> float:
     return (_decibels(error) - 7.95) / (14.36 * gap)
 
 
-def _weights(grid: FineAxis, away: Tensor) -> Tensor:
+def _filter_weights(grid: FineAxis, away: Tensor) -> Tensor:
     """Return the weights of samples at distances ``away`` in pixels from the middle of a pixel."""
     places, place_shares = unit_nodes(12 + math.ceil(2 * grid.per_pixel))
-    width = _width(grid.per_pixel - 2 * grid.bandwidth, grid.error)
+    width = _filter_width(grid.per_pixel - 2 * grid.bandwidth, grid.error)
     # Kaiser's parameter for this attenuation
     beta = 0.1102 * (_decibels(grid.error) - 8.7)
     distance = away[..., None] + places
@@ -166,16 +167,20 @@ class _AxisFilter:
 @functools.lru_cache(maxsize=256)
 def _axis_filter(grid: FineAxis, dtype: torch.dtype, device: torch.device) -> _AxisFilter:
     """Return the weights of a fine grid in blocks of pixels, in a type and on a device."""
-    pixel_offsets = torch.arange(_ROWS, dtype=torch.float64) - (grid.pixels - 1) / 2
+    pixel_offsets = torch.arange(_BLOCK_PIXELS, dtype=torch.float64) - (grid.pixels - 1) / 2
     middles = (grid.samples - 1) / 2 + grid.per_pixel * pixel_offsets
     first_samples = (middles - grid.taps / 2).ceil()
     samples = first_samples[:, None] + torch.arange(grid.taps, dtype=torch.float64)
-    weights = _weights(grid, (samples[:_PERIOD] - middles[:_PERIOD, None]) / grid.per_pixel)
+    weights = _filter_weights(
+        grid, (samples[:_PLACE_PERIOD] - middles[:_PLACE_PERIOD, None]) / grid.per_pixel
+    )
     first = int(first_samples[0])
-    block = torch.zeros(_ROWS, int(first_samples[-1]) - first + grid.taps, dtype=torch.float64)
+    block = torch.zeros(
+        _BLOCK_PIXELS, int(first_samples[-1]) - first + grid.taps, dtype=torch.float64
+    )
     for row, start in enumerate(first_samples.int().tolist()):
-        block[row, start - first : start - first + grid.taps] = weights[row % _PERIOD]
-    stride = round(_ROWS * grid.per_pixel)
+        block[row, start - first : start - first + grid.taps] = weights[row % _PLACE_PERIOD]
+    stride = round(_BLOCK_PIXELS * grid.per_pixel)
     return _AxisFilter(block.to(device, dtype), first, stride, grid.pixels, grid.samples)
 
 
@@ -276,7 +281,7 @@ class _Averaged(torch.autograd.Function):
 #: clear peak
 FILTER_ERROR = {torch.float32: 5e-10, torch.float64: 5e-15}
 FINE_SAMPLES = 1 << 24  #: of the fine grid at a time, unless one row of pixels needs more
-_STRIPE = 1 << 17  #: samples of the aperture that are converted to float64 at a time
+_STRIPE_SAMPLES = 1 << 17  #: samples of the aperture that are converted to float64 at a time
 
 
 class GridAxis(NamedTuple):
@@ -298,7 +303,7 @@ def turns_per_pixel(pupil: Pupil, camera: Geometry, band: int) -> float:
     )
 
 
-def spot(camera: Geometry) -> list[float]:
+def spot_position(camera: Geometry) -> list[float]:
     """Return the position (y, x) of the spot on the sensor, in pixels."""
     return [
         n // 2 + camera.focal_length * a / camera.pixel_pitch
@@ -306,7 +311,7 @@ def spot(camera: Geometry) -> list[float]:
     ]
 
 
-def view_of(
+def view_on_grid(
     pupil: Pupil,
     camera: Geometry,
     band: int,
@@ -365,7 +370,7 @@ def fine_axes(
     return y, x
 
 
-def strips(rows: FineAxis, columns: FineAxis) -> list[tuple[int, int]]:
+def pixel_strips(rows: FineAxis, columns: FineAxis) -> list[tuple[int, int]]:
     """Return the first and the last row, exclusive, of each strip of pixels whose fine grid is
     computed at a time.
     """
@@ -376,7 +381,7 @@ def strips(rows: FineAxis, columns: FineAxis) -> list[tuple[int, int]]:
     return list(pairwise(ends))
 
 
-class Optics(NamedTuple):
+class IntensityOptions(NamedTuple):
     """How the intensity is computed: type, method of the transform, and whether focal fields are
     stored.
     """
@@ -387,19 +392,21 @@ class Optics(NamedTuple):
 
 
 def band_average(
-    pupil: Pupil, camera: Geometry, band: int, light: float, optics: Optics
+    pupil: Pupil, camera: Geometry, band: int, light: float, optics: IntensityOptions
 ) -> list[Tensor]:
     """Return the share of the light in each pixel of one band, in strips of rows (y, x)."""
     rows, columns = fine_grid(pupil, camera, band, optics.dtype)
     # pixels from the spot to the middle of the window, along both axes
-    middles = [(n - 1) / 2 - place for n, place in zip(camera.shape, spot(camera), strict=True)]
+    middles = [
+        (n - 1) / 2 - place for n, place in zip(camera.shape, spot_position(camera), strict=True)
+    ]
     column_axis = GridAxis(columns.samples, columns.per_pixel, middles[1])
     averages = []
-    for start, stop in strips(rows, columns):
+    for start, stop in pixel_strips(rows, columns):
         strip = rows.part(stop - start)
         offset_of_strip = (start + stop - camera.shape[0]) / 2
         row_axis = GridAxis(strip.samples, strip.per_pixel, middles[0] + offset_of_strip)
-        view = view_of(pupil, camera, band, (row_axis, column_axis), light, optics.dtype)
+        view = view_on_grid(pupil, camera, band, (row_axis, column_axis), light, optics.dtype)
         sampling = Sampling((replace(view, band=0),), optics.dtype, optics.method, optics.keep)
         fine_intensity = intensity_of(pupil.amplitude, pupil.height, pupil.path, sampling)[0]
         averages.append(averaged(fine_intensity, strip, columns))
@@ -428,19 +435,19 @@ def clear_averages(aperture: Tensor, alphas: list[float], square_samples: bool) 
     projections: dict[tuple[int, ...], tuple[list[Tensor], Tensor]] = {}
     averages = []
     for alpha in alphas:
-        degrees = tuple(_degrees(n, alpha) for n in aperture.shape)
+        degrees = tuple(_polynomial_count(n, alpha) for n in aperture.shape)
         if degrees not in projections:
             bases = [
                 _polynomials(n, d, aperture.device)
                 for n, d in zip(aperture.shape, degrees, strict=True)
             ]
-            projections[degrees] = bases, _projected(aperture, *bases)
+            projections[degrees] = bases, _moments(aperture, *bases)
         bases, moments = projections[degrees]
         averages.append(_axis_average(moments, bases, alpha, square_samples))
     return averages
 
 
-def _degrees(samples: int, alpha: float) -> int:
+def _polynomial_count(samples: int, alpha: float) -> int:
     """Return the number of polynomials that hold all phases across a pixel to 1e-13, a multiple
     of 8.
     """
@@ -462,11 +469,11 @@ def _polynomials(samples: int, degrees: int, device: torch.device) -> Tensor:
     return orthonormal
 
 
-def _projected(aperture: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+def _moments(aperture: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     """Return the moments (row degree, column degree) of an aperture in orthonormal polynomials, by
     stripes of rows in float64.
     """
-    step = max(1, _STRIPE // aperture.shape[1])
+    step = max(1, _STRIPE_SAMPLES // aperture.shape[1])
     moments = rows.new_zeros(rows.shape[1], columns.shape[1])
     for start in range(0, len(aperture), step):
         stripe = slice(start, start + step)

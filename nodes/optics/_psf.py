@@ -13,13 +13,13 @@ from neusee.nodes.optics._laser_spot import angle_notes
 from neusee.nodes.optics._lens import passed_by_notches, refuse_impossible_f_number
 from neusee.nodes.optics._pixel_average import (
     GridAxis,
-    Optics,
+    IntensityOptions,
     band_average,
     clear_averages,
     fine_samples,
-    spot,
+    spot_position,
     turns_per_pixel,
-    view_of,
+    view_on_grid,
 )
 from neusee.nodes.optics._psf_definition import Geometry, SensorSampling, by_definition
 from neusee.nodes.optics._transform._intensity import KEPT_FIELD_BYTES, Sampling, intensity_of
@@ -36,7 +36,7 @@ from neusee.nodes.values import Psf, Pupil
 
 #: relative light above that of the pupil, by the type of the PSF, that rounding may add
 GAINED_LIGHT = {torch.float32: 1e-5, torch.float64: 1e-9}
-_FAST = 1.2  #: f-number below which the scalar theory of this PSF needs a note
+_FAST_F_NUMBER = 1.2  #: f-number below which the scalar theory of this PSF needs a note
 
 
 def refuse_aliases(pupil: Pupil, camera: Geometry) -> None:
@@ -49,7 +49,7 @@ def refuse_aliases(pupil: Pupil, camera: Geometry) -> None:
         return
     shortest, pitch = float(pupil.wavelengths.min()), float(pupil.pitch)
     limit = shortest * camera.focal_length / (2 * pitch)
-    for axis, n, spot_place in zip("yx", camera.shape, spot(camera), strict=True):
+    for axis, n, spot_place in zip("yx", camera.shape, spot_position(camera), strict=True):
         reach = max(abs(0 - spot_place), abs(n - 1 - spot_place)) * camera.pixel_pitch
         if reach > limit * (1 + 1e-9):
             raise ValueError(
@@ -81,10 +81,10 @@ def refuse_coarse_points(pupil: Pupil, camera: Geometry) -> None:
         return
     shortest = float(pupil.wavelengths.min())
     widest = float(pupil.pitch) * max(pupil.height.shape)
-    if _coarse(camera, shortest, widest):
+    if _are_coarse_points(camera, shortest, widest):
         # the pupil may be narrower than its grid: look again, because this takes longer
         diameter = min(_diameter(pupil, widest), widest)
-        if _coarse(camera, shortest, diameter):
+        if _are_coarse_points(camera, shortest, diameter):
             f_number = camera.focal_length / diameter
             raise ValueError(
                 f"points {camera.pixel_pitch * 1e6:.3g} um apart miss or repeat the light of a spot"
@@ -117,7 +117,7 @@ def spread_points_notes(pupil: Pupil, camera: Geometry) -> list[str]:
     ]
 
 
-def _coarse(camera: Geometry, wavelength: float, diameter: float) -> bool:
+def _are_coarse_points(camera: Geometry, wavelength: float, diameter: float) -> bool:
     """Return True if pixels are further apart than wavelength x f-number, for lengths in metres."""
     return camera.pixel_pitch * diameter > wavelength * camera.focal_length * (1 + 1e-9)
 
@@ -132,11 +132,11 @@ def _diameter(pupil: Pupil, widest: float) -> float:
     if pupil.aperture.is_meta:
         return 0.0
     is_open = pupil.aperture.detach() != 0
-    sides = [_extent(is_open.any(axis)) for axis in (0, 1)]
+    sides = [_open_samples(is_open.any(axis)) for axis in (0, 1)]
     return float(pupil.pitch) * max(sides)
 
 
-def _extent(open_: Tensor) -> int:
+def _open_samples(open_: Tensor) -> int:
     """Return the number of samples from the first to the last open one, for a line of a stop."""
     open_places = open_.nonzero()
     return int(open_places[-1] - open_places[0]) + 1 if len(open_places) else 0
@@ -146,7 +146,7 @@ def fast_lens_notes(pupil: Pupil, camera: Geometry) -> list[str]:
     """Return a note for a lens of f/1.2 or faster, whose light is too oblique for this model."""
     diameter = 0.0 if pupil.diameter.is_meta else float(pupil.diameter)
     f_number = camera.focal_length / diameter if diameter else math.inf
-    if f_number > _FAST * (1 + 1e-9):
+    if f_number > _FAST_F_NUMBER * (1 + 1e-9):
         return []
     return [
         f"f/{f_number:.3g}: the PSF is that of scalar theory, and the acceptance of microlenses is"
@@ -176,7 +176,7 @@ def refuse_gained_light(intensity: Tensor, lights: list[float], wavelengths: Ten
 # The point-spread function: lens, mask and pixel sampling in one scaled Fourier transform.
 
 
-_PART = 1 << 15  #: samples of the pupil that are summed in the type of the pupil
+_PART_SAMPLES = 1 << 15  #: samples of the pupil that are summed in the type of the pupil
 
 
 class _Camera(Geometry):
@@ -237,7 +237,8 @@ def psf(
             of a lens).
     """
     camera = _Camera(focal_length, pixel_pitch, shape, angle, pixel, sensor).towards(direction)
-    return _focus(pupil, camera, torch.float64 if precision == "double" else torch.float32, "auto")
+    dtype = torch.float64 if precision == "double" else torch.float32
+    return _focus(pupil, camera, dtype, "auto")
 
 
 @psf.reference
@@ -245,7 +246,7 @@ def _(
     pupil: Pupil, direction: Tensor | None = None, *, precision: str = "single", **camera: Any
 ) -> Psf:
     geometry = _Camera(**camera).towards(direction)
-    _agree(pupil)
+    _refuse_unlike_factors(pupil)
     refuse_aliases(pupil, geometry)
     return by_definition(pupil, geometry)
 
@@ -286,32 +287,30 @@ def _(result: Psf, *inputs: object, **params: object) -> list[Check]:
 
 def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) -> Psf:
     """Return the PSF of a pupil in the type ``dtype``, by the named method of the transform."""
-    _agree(pupil)
+    _refuse_unlike_factors(pupil)
     refuse_aliases(pupil, camera)
     refuse_coarse_points(pupil, camera)
-    clear_light, clear_field = _area(pupil.aperture)
+    clear_light, clear_field = _light_and_field(pupil.aperture)
     refuse_not_finite("the PSF cannot be normalised", aperture=clear_light)
     if not clear_light > 0:
         raise ValueError(
             "the aperture is closed everywhere: there is no light to normalise the PSF by"
         )
     lights = (passed_by_notches(pupil) / clear_light).tolist()
-    focused = _averages if camera.sensor == "integrated" else _points
+    focused = _intensity_over_pixels if camera.sensor == "integrated" else _intensity_at_points
     intensity = focused(pupil, camera, lights, dtype, method)
     if not transformed():
         passed_light = (
-            clear_light if pupil.amplitude is pupil.aperture else _area(pupil.amplitude)[0]
+            clear_light
+            if pupil.amplitude is pupil.aperture
+            else _light_and_field(pupil.amplitude)[0]
         )
         refuse_gained_light(
             intensity, [light * passed_light for light in lights], pupil.wavelengths
         )
-    return Psf(
-        intensity,
-        *(
-            values.to(intensity.device)
-            for values in _clear_lens(pupil, camera, clear_light, clear_field)
-        ),
-    )
+    clear_peak, cut_off, averaged = _clear_lens(pupil, camera, clear_light, clear_field)
+    device = intensity.device
+    return Psf(intensity, clear_peak.to(device), cut_off.to(device), averaged.to(device))
 
 
 def _clear_lens(
@@ -333,17 +332,19 @@ def _clear_lens(
     return averaged_peaks / area, cut_off, torch.ones_like(point_peaks)
 
 
-def _points(
+def _intensity_at_points(
     pupil: Pupil, camera: _Camera, lights: list[float], dtype: torch.dtype, method: Method
 ) -> Tensor:
     """Return the intensity (band, y, x) at the middle of each pixel, times the area of a pixel."""
     # pixels from the spot to the middle of the window, along both axes
-    middles = [(n - 1) / 2 - place for n, place in zip(camera.shape, spot(camera), strict=True)]
+    middles = [
+        (n - 1) / 2 - place for n, place in zip(camera.shape, spot_position(camera), strict=True)
+    ]
     row_axis, column_axis = (
         GridAxis(n, 1.0, middle) for n, middle in zip(camera.shape, middles, strict=True)
     )
     views = (
-        view_of(pupil, camera, band, (row_axis, column_axis), light, dtype)
+        view_on_grid(pupil, camera, band, (row_axis, column_axis), light, dtype)
         for band, light in enumerate(lights)
     )
     return intensity_of(
@@ -351,12 +352,12 @@ def _points(
     )
 
 
-def _averages(
+def _intensity_over_pixels(
     pupil: Pupil, camera: _Camera, lights: list[float], dtype: torch.dtype, method: Method
 ) -> Tensor:
     """Return the intensity (band, y, x) averaged over each pixel, times the area of a pixel."""
     field_bytes = 2 * fine_samples(pupil, camera, dtype) * dtype.itemsize
-    optics = Optics(dtype, method, field_bytes <= KEPT_FIELD_BYTES)
+    optics = IntensityOptions(dtype, method, field_bytes <= KEPT_FIELD_BYTES)
     factors = (pupil.amplitude, pupil.height, pupil.path)
     # with gradients every band is a tensor of its own; else all are written into one
     if transformed() or (torch.is_grad_enabled() and any(x.requires_grad for x in factors)):
@@ -371,9 +372,11 @@ def _averages(
     return intensity
 
 
-def _area(amplitude: Tensor) -> tuple[float, float]:
+def _light_and_field(amplitude: Tensor) -> tuple[float, float]:
     """Return the sum of the squares and the sum of all samples of an amplitude in the pupil."""
-    parts = torch.split(amplitude.detach().flatten(), _PART)  # read from memory once for both sums
+    parts = torch.split(
+        amplitude.detach().flatten(), _PART_SAMPLES
+    )  # read from memory once for both sums
     light, field = zip(*((torch.dot(x, x), x.sum()) for x in parts), strict=True)
     total_light, total_field = (
         float(torch.stack(sums).sum(dtype=torch.float64)) for sums in (light, field)
@@ -381,7 +384,7 @@ def _area(amplitude: Tensor) -> tuple[float, float]:
     return total_light, total_field
 
 
-def _agree(pupil: Pupil) -> None:
+def _refuse_unlike_factors(pupil: Pupil) -> None:
     """Raise ValueError for factors of a pupil that differ in shape or type, or that cannot have
     gradients.
     """

@@ -43,7 +43,8 @@ def by_definition(pupil: Pupil, camera: Geometry) -> Psf:
     # peak at a point = area of the pupil in units of (wavelength x f / pixel)^2 = pi / 4 x the
     # square of the cut-off
     cut_off = (torch.stack(point_peaks) * (4 / math.pi)).sqrt()
-    sides = torch.full_like(cut_off, 1.0 if camera.sensor == "integrated" else 0.0)
+    side = 1.0 if camera.sensor == "integrated" else 0.0
+    sides = torch.full_like(cut_off, side)
     return Psf(
         torch.stack([_intensity(pupil, camera, band) for band in band_numbers]),
         torch.stack(peaks),
@@ -58,22 +59,22 @@ def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:
     """
     wavelength, index = float(pupil.wavelengths[band]), float(pupil.index[band])
     amplitude = pupil.amplitude.double()
-    turns = _reduced(pupil.height.double() * (index / wavelength)) + _reduced(
-        pupil.path.double() / wavelength
-    )
-    field = amplitude * torch.exp(2j * math.pi * _reduced(turns))
+    turns = _without_whole_turns(
+        pupil.height.double() * (index / wavelength)
+    ) + _without_whole_turns(pupil.path.double() / wavelength)
+    field = amplitude * torch.exp(2j * math.pi * _without_whole_turns(turns))
     # turns per sample and pixel
     turns_per_sample = float(pupil.pitch) * camera.pixel_pitch / (wavelength * camera.focal_length)
     total = amplitude.new_zeros(camera.shape)
     points = (
-        _points(turns_per_sample * max(field.shape))
+        _pixel_points(turns_per_sample * max(field.shape))
         if camera.sensor == "integrated"
         else [(0.0, 1.0)]
     )
     for y, weight_y in points:
         for x, weight_x in points:
             rows, columns = (
-                _axis(camera, axis, shift, field.shape[axis], turns_per_sample)
+                _phasors_along(camera, axis, shift, field.shape[axis], turns_per_sample)
                 for axis, shift in ((0, y), (1, x))
             )
             total = total + weight_y * weight_x * (rows @ field @ columns.T).abs().square()
@@ -83,7 +84,7 @@ def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:
     return light
 
 
-def _axis(camera: Geometry, axis: int, shift: float, samples: int, reach: float) -> Tensor:
+def _phasors_along(camera: Geometry, axis: int, shift: float, samples: int, reach: float) -> Tensor:
     """Return the phasors (pixel, sample) along one axis, with the sinc envelope of square pupil
     pixels.
     """
@@ -94,16 +95,16 @@ def _axis(camera: Geometry, axis: int, shift: float, samples: int, reach: float)
         + (shift - spot)
     )
     sample = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
-    phasors = torch.exp(-2j * math.pi * _reduced(reach * pixels[:, None] * sample))
+    phasors = torch.exp(-2j * math.pi * _without_whole_turns(reach * pixels[:, None] * sample))
     return phasors * torch.sinc(reach * pixels)[:, None] if camera.pixel == "zoh" else phasors
 
 
-def _reduced(turns: Tensor) -> Tensor:
+def _without_whole_turns(turns: Tensor) -> Tensor:
     """Return the phase without whole turns; the gradient passes through unchanged."""
     return turns - turns.detach().round()
 
 
-def _points(fringes: float) -> list[tuple[float, float]]:
+def _pixel_points(fringes: float) -> list[tuple[float, float]]:
     """Return Gauss-Legendre points across a pixel and weights, exact to 1e-9 for ``fringes``
     turns per pixel.
     """

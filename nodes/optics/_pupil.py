@@ -12,13 +12,13 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.optics._pupil_grid import (
     PupilGrid,
-    axes,
     clear_diameter,
     grid_of,
-    inside,
-    opening,
+    inside_stop,
+    pupil_axes,
     refuse_other_grid,
-    stripes,
+    row_stripes,
+    stop_transmission,
 )
 from neusee.nodes.precision import refuse_half
 from neusee.nodes.units import Count, Height, Waves
@@ -45,7 +45,7 @@ def noll(index: int) -> tuple[int, int]:
     return n, (m if index % 2 == 0 else -m)
 
 
-def _radial(n: int, m: int) -> list[float]:
+def _radial_coefficients(n: int, m: int) -> list[float]:
     """Return the coefficients of the orthonormal radial polynomial R(n, m)(r) / r**m in rising
     powers of r squared.
     """
@@ -61,21 +61,21 @@ def _radial(n: int, m: int) -> list[float]:
     ]
 
 
-def _by_azimuth(coefficients: Mapping[int, float]) -> dict[int, list[float]]:
+def _radial_by_azimuth(coefficients: Mapping[int, float]) -> dict[int, list[float]]:
     """Return one radial polynomial for each signed azimuthal order, summed over the terms of
     that order.
     """
     sums: dict[int, list[float]] = {}
     for index, rms in coefficients.items():
         n, m = noll(index)
-        new_terms, earlier_terms = _radial(n, abs(m)), sums.get(m, [])
+        new_terms, earlier_terms = _radial_coefficients(n, abs(m)), sums.get(m, [])
         term_count = max(len(new_terms), len(earlier_terms))
         padded = [row + [0.0] * (term_count - len(row)) for row in (new_terms, earlier_terms)]
         sums[m] = [rms * a + b for a, b in zip(*padded, strict=True)]
     return sums
 
 
-def _horner(coefficients: list[float], x: Tensor) -> Tensor:
+def _polynomial(coefficients: list[float], x: Tensor) -> Tensor:
     """Return the polynomial with coefficients in rising powers at x, by Horner's rule."""
     value = torch.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
@@ -83,7 +83,7 @@ def _horner(coefficients: list[float], x: Tensor) -> Tensor:
     return value
 
 
-def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
+def zernike_sum(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
     """Return the weighted sum of Zernike polynomials at (v, u), in units of the radius; the weights
     are by Noll number.
 
@@ -91,7 +91,7 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
     special treatment.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976), Eqs. 1 and 2.
     """
-    sums = _by_azimuth(coefficients)
+    sums = _radial_by_azimuth(coefficients)
     square = v.square() + u.square()
     total, cosine, sine = (
         torch.zeros_like(square),
@@ -101,13 +101,13 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
     for order in range(max(map(abs, sums), default=-1) + 1):
         for m, wave in ((order, cosine), (-order, sine)):
             if m in sums and (order or wave is cosine):
-                total.addcmul_(_horner(sums[m], square), wave)
+                total.addcmul_(_polynomial(sums[m], square), wave)
         # (u + i v)^m = r^m exp(i m phi), a power more each time
         cosine, sine = cosine * u - sine * v, cosine * v + sine * u
     return total
 
 
-def surface(
+def zernike_surface(
     coefficients: Mapping[int, float],
     grid: PupilGrid,
     device: torch.device | None = None,
@@ -116,8 +116,8 @@ def surface(
     """Return a weighted sum of Zernike polynomials on the pupil grid (v, u), float64, 0 outside
     the stop.
     """
-    v, u = axes(grid, device)
-    return torch.where(inside(grid, device, rows), combine(coefficients, v[rows], u), 0.0)
+    v, u = pupil_axes(grid, device)
+    return torch.where(inside_stop(grid, device, rows), zernike_sum(coefficients, v[rows], u), 0.0)
 
 
 # --- phase screen ---------------------------------------------------------------------------------
@@ -125,17 +125,17 @@ def surface(
 # Smooth random phase screens over the pupil, the same at every sampling of the pupil.
 
 
-def screen(
+def phase_screen(
     grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None
 ) -> Tensor:
     """Return a random phase screen (v, u), float64: Gaussian noise with variance 1 and correlation
     exp(-(d / scale)**2).
     """
-    rows, columns = factors(grid, scale, rng, device)
+    rows, columns = phase_screen_factors(grid, scale, rng, device)
     return rows @ columns
 
 
-def factors(
+def phase_screen_factors(
     grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return matrices (v, n) and (n, u) whose product is a random phase screen, so that single rows
@@ -150,7 +150,7 @@ def factors(
     half_width = max(0.5, grid.samples * grid.pitch / (2 * grid.diameter)) + 4 * spot_width
     count = 2 * math.ceil(half_width / spot_width) + 1
     white_noise = torch.randn(count, count, generator=rng, device=rng.device, dtype=torch.float64)
-    positions = axes(grid, device)[0] / 2
+    positions = pupil_axes(grid, device)[0] / 2
     centres = (
         torch.arange(count, dtype=torch.float64, device=positions.device) - count // 2
     ) * spot_width
@@ -167,7 +167,9 @@ def factors(
 
 
 LARGE_STEPS = 0.1  #: share of steps above half a turn, from which the pupil counts as aliased
-_ROWS = 256  #: the least number of pupil rows in which phase steps are measured
+THINNED_SAMPLES = 256  #: least number of samples across, of which a larger pupil keeps every k-th
+SCREENS = ("aperture", "amplitude", "height", "path")  #: what a pupil holds for each sample
+_MEASURED_ROWS = 256  #: the least number of pupil rows in which phase steps are measured
 
 
 def phase_steps(pupil: Pupil) -> tuple[float, float]:
@@ -180,7 +182,7 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
     cannot follow the phase.
     """
     steepest_band = int((pupil.index / pupil.wavelengths).argmax())
-    row_step = max(1, len(pupil.height) // _ROWS)
+    row_step = max(1, len(pupil.height) // _MEASURED_ROWS)
     # height, path and whether the stop is open, each row and the next one
     sampled_rows, rows_below = (
         [x[k::row_step] for x in (pupil.height, pupil.path, pupil.aperture > 0)] for k in (0, 1)
@@ -226,6 +228,24 @@ def _steps(pupil: Pupil, band: int, first: list[Tensor], second: list[Tensor]) -
     return steps
 
 
+def thinned_pupil(pupil: Pupil) -> Pupil:
+    """Return every k-th sample of a large pupil, as long as the samples that are left can follow
+    the phase.
+    """
+    step = max(1, len(pupil.height) // THINNED_SAMPLES)
+    while step > 1 and pupil_has_large_steps(_every_sample(pupil, step)):
+        step //= 2
+    return _every_sample(pupil, step)
+
+
+def _every_sample(pupil: Pupil, step: int) -> Pupil:
+    """Return every ``step``-th sample of a pupil along both axes."""
+    return pupil._replace(
+        **{name: getattr(pupil, name)[::step, ::step] for name in SCREENS},
+        pitch=pupil.pitch * step,
+    )
+
+
 def mask_turns(pupil: Pupil, band: int, step: int = 1) -> Tensor:
     """Return the phase of the mask in one band, in turns, float64, at every ``step``-th pupil
     sample.
@@ -242,7 +262,6 @@ def mask_turns(pupil: Pupil, band: int, step: int = 1) -> Tensor:
 
 
 DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
-_PUPIL_ROWS = 512  #: least number of pupil rows in which phase steps are measured
 
 
 @node(additive_inputs=[("dirt",)])
@@ -278,9 +297,9 @@ def pupil(
             66, 207 (1976).
     """
     grid = grid_of(stop)
-    _shapes(height, index, bands, grid, dirt, shade)
+    _refuse_unlike_shapes(height, index, bands, grid, dirt, shade)
     device = height.device
-    clear = opening(grid, height.dtype, device)
+    clear = stop_transmission(grid, height.dtype, device)
     sag = defocus * DEFOCUS_WAVELENGTH + _beam_sag(grid, wavefront, device)
     notches = torch.zeros(0, 3, dtype=torch.float64) if shade is None else shade.notches
     return Pupil(
@@ -336,9 +355,11 @@ def _taper(grid: PupilGrid, taper: Tensor, like: Tensor) -> Tensor:
     """Return the amplitude (v, u) of a Gaussian beam with the ``taper`` (1/m2) of a `Wavefront`."""
     # at the rim of the stop, where v^2 + u^2 = 1
     exponent = taper.to(like.device) * grid.diameter**2 / 4
-    along_v, along_u = (torch.exp(-exponent * line.square()) for line in axes(grid, like.device))
+    along_v, along_u = (
+        torch.exp(-exponent * line.square()) for line in pupil_axes(grid, like.device)
+    )
     amplitude = torch.empty_like(like)
-    for rows in stripes(grid):
+    for rows in row_stripes(grid):
         amplitude[rows] = along_v[rows] * along_u
     return amplitude
 
@@ -353,18 +374,18 @@ def _lens_path(
     if not bool(defocus) and not has_aberrations:
         return None
     path = torch.empty_like(like)
-    v, u = axes(grid, like.device)
-    for rows in stripes(grid):
+    v, u = pupil_axes(grid, like.device)
+    for rows in row_stripes(grid):
         squared_radius = v[rows].square() + u.square()
         # defocus is a paraboloid, of this path at the rim
         surface = defocus * squared_radius
         if has_aberrations:
-            surface = surface + combine(aberrations, v[rows], u)
+            surface = surface + zernike_sum(aberrations, v[rows], u)
         path[rows] = surface.masked_fill_(squared_radius > 1, 0.0)
     return path
 
 
-def _shapes(
+def _refuse_unlike_shapes(
     height: Tensor,
     index: Tensor,
     bands: Bands,
@@ -393,22 +414,21 @@ def _(
     result: Pupil, height: Tensor, index: Tensor, bands: Bands, stop: Stop, *_: Any, **__: Any
 ) -> list[Check]:
     samples, pitch, diameter = grid_of(stop)
-    throughput = _light(result.amplitude) / _light(result.aperture)
+    throughput = _squared_sum(result.amplitude) / _squared_sum(result.aperture)
     median, share = phase_steps(result)
     text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
+    if not share <= LARGE_STEPS:
+        text = f"{text}: aliased, use a finer pupil pitch"
     return [
         Check(
             f"throughput {throughput:.4f} of the clear pupil"
             f" {min(samples * pitch, diameter) * 1e3:#.3g} mm",
             throughput > 0,
         ),
-        Check(
-            text if share <= LARGE_STEPS else f"{text}: aliased, use a finer pupil pitch",
-            share <= LARGE_STEPS,
-        ),
+        Check(text, share <= LARGE_STEPS),
     ]
 
 
-def _light(amplitude: Tensor) -> float:
+def _squared_sum(amplitude: Tensor) -> float:
     """Return the sum of the squared amplitude, by rows, so that float32 sums stay short."""
     return float(torch.bmm(amplitude[:, None, :], amplitude[:, :, None]).sum(dtype=torch.float64))

@@ -19,8 +19,8 @@ from neusee.nodes.values import Stop
 
 
 _ALL = slice(None)
-_STRIPE = 1 << 16  #: samples of the pupil worked on at a time
-_SAME = 1e-9  #: relative difference of two lengths that counts as rounding
+_STRIPE_SAMPLES = 1 << 16  #: samples of the pupil worked on at a time
+_ROUNDED_LENGTH = 1e-9  #: relative difference of two lengths that counts as rounding
 Aperture = Literal["held", "stretched", "inscribed", "clipped"]
 Number = TypeVar("Number", float, Tensor)
 
@@ -55,7 +55,8 @@ def pupil_grid(
             aperture is wider than the grid.
     """
     if pitch is None or (
-        aperture == "stretched" and not math.isclose(samples * pitch, diameter, rel_tol=_SAME)
+        aperture == "stretched"
+        and not math.isclose(samples * pitch, diameter, rel_tol=_ROUNDED_LENGTH)
     ):
         return PupilGrid(samples, diameter / samples, diameter)
     grid_width = samples * pitch
@@ -73,21 +74,19 @@ def pupil_grid(
             f"{millimetres(diameter)} is wider than the pupil grid of {samples} x"
             f" {pitch * 1e6:.4g} um"
         )
-        remedy = (
-            f"give samples: {math.ceil(diameter / pitch * (1 - _SAME))}, leave the pitch out, or"
-            " choose"
-        )
+        samples_across = math.ceil(diameter / pitch * (1 - _ROUNDED_LENGTH))
+        remedy = f"give samples: {samples_across}, leave the pitch out, or choose"
         raise ParameterError(
             "diameter", f"{text} = {millimetres(grid_width)}: {remedy} aperture: stretched"
         )
-    return PupilGrid(
-        samples, pitch, diameter if aperture == "clipped" else min(diameter, grid_width)
-    )
+    if aperture != "clipped":
+        diameter = min(diameter, grid_width)
+    return PupilGrid(samples, pitch, diameter)
 
 
 def is_wider(diameter: float, span: float) -> bool:
     """Return True if an aperture is wider than a grid by more than rounding."""
-    return diameter > span * (1 + _SAME)
+    return diameter > span * (1 + _ROUNDED_LENGTH)
 
 
 def millimetres(length: float) -> str:
@@ -119,7 +118,7 @@ def clear_area(stop: Stop) -> float:
     )
 
 
-def gaussian_over(stop: Stop, width: Number) -> Number:
+def gaussian_integral(stop: Stop, width: Number) -> Number:
     """Return the integral of exp(-(r / width)^2) over the clear pupil in m2, with r from the axis.
 
     The pupil is the disc of the stop, cut by the square of the grid where the disc is wider.
@@ -136,7 +135,7 @@ def gaussian_over(stop: Stop, width: Number) -> Number:
         / 2
         * sum(
             weight * _share_within(edge, width)
-            for edge, weight in _edges(half_width, half_side_angle)
+            for edge, weight in _edge_distances(half_width, half_side_angle)
         )
     )
     curved_part = (math.pi / 4 - half_side_angle) * _share_within(radius, width)
@@ -151,7 +150,7 @@ def _share_within(radius: float, width: Number) -> Number:
     return share
 
 
-def _edges(half: float, corner: float) -> list[tuple[float, float]]:
+def _edge_distances(half: float, corner: float) -> list[tuple[float, float]]:
     """Return the distances of a straight edge of the grid from the axis, up to a corner angle,
     with their weights.
     """
@@ -164,7 +163,7 @@ def _edges(half: float, corner: float) -> list[tuple[float, float]]:
     )
 
 
-def axes(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+def pupil_axes(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Return the coordinates v (samples, 1) and u (1, samples) in units of the stop's radius,
     float64.
     """
@@ -173,36 +172,38 @@ def axes(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, T
     return line[:, None], line[None, :]
 
 
-def polar(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+def polar_coordinates(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Return the radius in units of the stop's radius, and the azimuth from +u towards +v, both
     float64 (v, u).
     """
-    v, u = axes(grid, device)
+    v, u = pupil_axes(grid, device)
     return torch.hypot(v, u), torch.atan2(v.expand(grid.samples, -1), u.expand(grid.samples, -1))
 
 
-def inside(grid: PupilGrid, device: torch.device | None = None, rows: slice = _ALL) -> Tensor:
+def inside_stop(grid: PupilGrid, device: torch.device | None = None, rows: slice = _ALL) -> Tensor:
     """Return True for each sample whose centre lies inside the stop, bool (v, u); ``rows``
     selects some rows.
     """
-    v, u = axes(grid, device)
+    v, u = pupil_axes(grid, device)
     return v[rows].square() + u.square() <= 1
 
 
-def opening(grid: PupilGrid, dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
+def stop_transmission(
+    grid: PupilGrid, dtype: torch.dtype, device: torch.device | None = None
+) -> Tensor:
     """Return the transmission (v, u) of the stop: 1 inside, 0 outside."""
     clear = torch.empty(grid.samples, grid.samples, dtype=dtype, device=device)
-    v, u = (line.square() for line in axes(grid, device))
-    for rows in stripes(grid):
+    v, u = (line.square() for line in pupil_axes(grid, device))
+    for rows in row_stripes(grid):
         clear[rows] = v[rows] + u <= 1
     return clear
 
 
-def stripes(grid: PupilGrid) -> Iterator[slice]:
+def row_stripes(grid: PupilGrid) -> Iterator[slice]:
     """Yield slices of a few pupil rows, short enough that float64 temporaries fit in the CPU's
     cache.
     """
-    step = max(1, _STRIPE // grid.samples)
+    step = max(1, _STRIPE_SAMPLES // grid.samples)
     return (slice(first, first + step) for first in range(0, grid.samples, step))
 
 
@@ -223,7 +224,7 @@ def refuse_other_grid(height: Tensor, grid: PupilGrid) -> None:
 
 #: relative difference of grid and aperture that is not worth a word: a pitch written with four
 #: digits
-_ROUNDED = 1e-3
+_WORTHLESS_DIFFERENCE = 1e-3
 
 
 #: samples of the pupil along an axis; fewer than four are no round aperture
@@ -270,7 +271,7 @@ def _(
     **_: Any,
 ) -> list[str]:
     grid = pupil_grid(samples, pitch, diameter, aperture)
-    if pitch is None or math.isclose(samples * pitch, diameter, rel_tol=_ROUNDED):
+    if pitch is None or math.isclose(samples * pitch, diameter, rel_tol=_WORTHLESS_DIFFERENCE):
         return []
     grid_width = samples * pitch
     grid_text = f"{samples} x {pitch * 1e6:.4g} um = {millimetres(grid_width)}"

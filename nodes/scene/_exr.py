@@ -24,7 +24,7 @@ from neusee.nodes._colour_science import colour_science
 from neusee.nodes.constants import SPEED_OF_LIGHT
 from neusee.nodes.file_headers import exr_needs
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_picture
-from neusee.nodes.scene._picture_changes import Linear, bands_of, enlarged, linear_light
+from neusee.nodes.scene._picture_changes import Decoding, enlargement_notes, linear_light, row_bands
 from neusee.nodes.units import DataFile, Shape
 
 # --- plain exr ------------------------------------------------------------------------------------
@@ -41,7 +41,7 @@ from neusee.nodes.units import DataFile, Shape
 _MAGIC, _VERSION, _LONG_NAMES = 20000630, 2, 0x400
 _HALF, _FLOAT = 1, 2  #: numbers of the types of a channel
 _LARGEST_HALF = 65504.0
-_AT_ONCE = 1 << 23  #: bytes of lines that are written together
+_BYTES_AT_A_TIME = 1 << 23  #: bytes of lines that are written together
 
 
 def write_lines(
@@ -63,9 +63,9 @@ def write_lines(
             f"values beyond {_LARGEST_HALF:.0f} cannot be written as half floats: write float32"
         )
     height, width = cube.shape[-2:]
-    number_type = np.dtype("<f2" if half else "<f4")
+    number_type = np.dtype("<f2") if half else np.dtype("<f4")
     line_bytes = len(names) * width * number_type.itemsize
-    header_bytes = _head([names[i] for i in channel_order], (height, width), header, half)
+    header_bytes = _header_bytes([names[i] for i in channel_order], (height, width), header, half)
     # each line has a number and a size of 4 bytes each before its pixels; the table of offsets has
     # 8 bytes a line
     offsets = accumulate(repeat(8 + line_bytes, height - 1), initial=len(header_bytes) + 8 * height)
@@ -81,7 +81,7 @@ def _write_pixels(file: IO[bytes], planes: Sequence[Any], size: int, kind: Any) 
     once.
     """
     height, width = planes[0].shape
-    rows = max(1, min(height, _AT_ONCE // (8 + size)))
+    rows = max(1, min(height, _BYTES_AT_A_TIME // (8 + size)))
     lines = np.empty((rows, 8 + size), np.uint8)
     line_headers, pixels = (
         lines[:, :8].view("<i4"),
@@ -97,7 +97,7 @@ def _write_pixels(file: IO[bytes], planes: Sequence[Any], size: int, kind: Any) 
         file.write(lines[:count].data)
 
 
-def _head(
+def _header_bytes(
     names: Sequence[str], shape: tuple[int, int], header: Mapping[str, Any], half: bool
 ) -> bytes:
     """Return the bytes of an OpenEXR file before its table of offsets."""
@@ -146,8 +146,10 @@ def _attribute(value: Any) -> tuple[str, bytes]:
 # its import alone takes a second.
 
 
-_NAME = re.compile(r"(S0|T)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p)?(m|Hz)")
-_PREFIX = {
+_CHANNEL_NAME = re.compile(
+    r"(S0|T)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p)?(m|Hz)"
+)
+_PREFIX_EXPONENTS = {
     "": 0, "p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "d": -1, "da": 1, "h": 2, "k": 3,
     "M": 6, "G": 9, "T": 12, "P": 15, "E": 18, "Z": 21, "Y": 24,
 }  # fmt: skip
@@ -288,7 +290,7 @@ def spectral_channels(names: Sequence[str]) -> dict[float, str]:
 
     Reflectance channels are used only if the file has no emission channels.
     """
-    matches = [match for match in map(_NAME.fullmatch, names) if match]
+    matches = [match for match in map(_CHANNEL_NAME.fullmatch, names) if match]
     # a name without a number has no wavelength
     spectral = [match for match in matches if match[2] not in ("", ",")]
     for kind in ("S0", "T"):
@@ -302,7 +304,7 @@ def _wavelength(match: re.Match[str]) -> float:
     """Return the wavelength in m of a matched channel name: its number with the prefix of its
     unit, m or Hz.
     """
-    exponent = _PREFIX[match[3] or ""]
+    exponent = _PREFIX_EXPONENTS[match[3] or ""]
     number = float(match[2].replace(",", "."))
     # a division converts nanometres, so that 550,0nm gives the same float64 as 550 / 1e9
     metres_or_hertz = number / 10.0**-exponent if exponent < 0 else number * 10.0**exponent
@@ -354,7 +356,7 @@ def exr(
 def _(
     *, file: Path, shape: Shape | None = None, part: str | None = None, **params: Any
 ) -> list[str]:
-    _, header, channels = _chosen(file, part)
+    _, header, channels = _picture_part(file, part)
     refuse_large_picture(file, *header.size)
     if problem := _damage(file, part):
         raise ParameterError("file", problem)
@@ -362,14 +364,14 @@ def _(
     ratio = float(header.header.get("pixelAspectRatio", 1.0))
     if abs(ratio - 1) > 1e-3:
         notes += [f"{file.name}: pixels are not square ({ratio:.3f}), but are read as square"]
-    return notes + enlarged(header.size, shape)
+    return notes + enlargement_notes(header.size, shape)
 
 
 @exr.check
 def _(result: Tensor, *, file: Path, part: str | None = None, **params: Any) -> list[Check]:
     pixels, linear = _linear_pixels(file, part)
     negative_count, lowest = 0, math.inf
-    for rows in bands_of(pixels.shape[:2]):
+    for rows in row_bands(pixels.shape[:2]):
         light = linear(pixels[rows])
         negative_count, lowest = (
             negative_count + int((light < 0).sum()),
@@ -393,10 +395,10 @@ def picture_size(file: Path, part_name: str | None) -> tuple[int, int]:
     """Return the numbers of rows and columns of the picture in an OpenEXR file, from the header
     of its part.
     """
-    return _chosen(file, part_name)[1].size
+    return _picture_part(file, part_name)[1].size
 
 
-def _chosen(file: Path, part_name: str | None) -> tuple[int, PartHeader, list[str]]:
+def _picture_part(file: Path, part_name: str | None) -> tuple[int, PartHeader, list[str]]:
     """Return (number of the part, its header, names of the channels to read) of the one part of a
     file that holds a picture.
 
@@ -408,7 +410,7 @@ def _chosen(file: Path, part_name: str | None) -> tuple[int, PartHeader, list[st
     if part_name is not None and not candidates:
         names = _joined_names(parts)
         raise ParameterError("part", f"{file.name} has no part {part_name!r}: name one of {names}")
-    parts_with_picture = _with_picture(candidates)
+    parts_with_picture = _parts_with_picture(candidates)
     if len(parts_with_picture) > 1:
         names_of_parts = _joined_names([header for _, header, _ in parts_with_picture])
         raise ParameterError(
@@ -422,7 +424,7 @@ def _chosen(file: Path, part_name: str | None) -> tuple[int, PartHeader, list[st
     return parts_with_picture[0]
 
 
-def _with_picture(
+def _parts_with_picture(
     parts: Sequence[tuple[int, PartHeader]],
 ) -> list[tuple[int, PartHeader, list[str]]]:
     """Return the numbered parts that have a picture, and the names of its channels."""
@@ -472,7 +474,7 @@ def _pixels(
     file: Path, part_name: str | None
 ) -> tuple[dict[str, Any], list[str], NDArray[np.float32]]:
     """Read (header, channel names, values (channel, y, x)) of the picture in an OpenEXR file."""
-    number, _, names = _chosen(file, part_name)
+    number, _, names = _picture_part(file, part_name)
     with exr_parts(file) as opened_file:
         header, channels = dict(opened_file.header(number)), opened_file.channels(number)
         return (
@@ -482,7 +484,7 @@ def _pixels(
         )
 
 
-def _linear_pixels(file: Path, part_name: str | None) -> tuple[NDArray[np.float32], Linear]:
+def _linear_pixels(file: Path, part_name: str | None) -> tuple[NDArray[np.float32], Decoding]:
     """Read the values (y, x, channel) of an OpenEXR file; return them and their conversion to
     linear sRGB (3, y, x).
     """
@@ -492,12 +494,12 @@ def _linear_pixels(file: Path, part_name: str | None) -> tuple[NDArray[np.float3
     if names == ["Y"]:
         matrix = None
     else:
-        to_srgb = _xyz_to_srgb(header) if names == ["X", "Y", "Z"] else _to_srgb(header)
+        to_srgb = _xyz_to_srgb(header) if names == ["X", "Y", "Z"] else _rgb_to_srgb(header)
         matrix = torch.from_numpy(to_srgb).to(torch.float32)
-    return pixels.transpose(1, 2, 0), partial(_converted, matrix)
+    return pixels.transpose(1, 2, 0), partial(_linear_srgb, matrix)
 
 
-def _converted(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
+def _linear_srgb(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
     """Return linear sRGB (3, y, x) of the values (y, x, channel) of a picture; without a matrix
     its one channel is grey.
     """
@@ -527,7 +529,7 @@ def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     return np.asarray(srgb.matrix_XYZ_to_RGB @ adaptation, dtype=np.float64)
 
 
-def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
+def _rgb_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     """Return the matrix from the primaries of an OpenEXR header to linear sRGB.
 
     Bradford adaptation maps the neutral of the header to D65.

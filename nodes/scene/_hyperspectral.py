@@ -12,7 +12,7 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.file_headers import mat_needs, npy_needs
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_array
 from neusee.nodes.scene._exr import exr_header, read_spectral, spectral_channels
-from neusee.nodes.scene._picture_changes import enlarged, framed
+from neusee.nodes.scene._picture_changes import enlargement_notes, framed_scene
 from neusee.nodes.spectra._cie_tables import Table, require_range
 from neusee.nodes.units import DataFile, Shape, Wavelength
 from neusee.nodes.values import Bands
@@ -23,7 +23,7 @@ from neusee.nodes.values import Bands
 
 
 Layout = Literal["y x band", "band y x"]
-_TYPES = {
+_NUMPY_TYPES = {
     "double": "float64",
     "single": "float32",
     "logical": "bool",
@@ -31,7 +31,7 @@ _TYPES = {
     "cell": "O",
     "struct": "O",
 }
-_SINGLE = 4  #: bytes of a number of the cube that is made
+_NUMBER_BYTES = 4  #: bytes of a number of the cube that is made
 
 
 def cube_and_wavelengths(
@@ -46,7 +46,11 @@ def cube_and_wavelengths(
             f"{file.name} has no wavelengths: give the first and the last wavelength in start and"
             " stop"
         )
-    values = _npy(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
+    values = (
+        _npy_values(file)
+        if file.suffix == ".npy"
+        else _mat_values(file, _cube_name(file, variable))
+    )
     # unsigned whole numbers are shares of the largest one
     scale = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
     band_first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
@@ -59,7 +63,7 @@ def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], st
     if file.suffix == ".npy":
         size, kind = _numpy_header(file)
     elif file.suffix == ".mat":
-        size, kind = _listed(file)[_cube_name(file, variable)]
+        size, kind = _mat_variables(file)[_cube_name(file, variable)]
     else:
         raise ParameterError(
             "file", f"{file.name} is not a .mat, .npy or .exr file: save the cube in such a file"
@@ -86,7 +90,11 @@ def wrong_values(file: Path, variable: str | None) -> str:
         if file.suffix == ".exr":
             values: Any = read_spectral(file)[0].numpy()
         else:
-            values = _npy(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
+            values = (
+                _npy_values(file)
+                if file.suffix == ".npy"
+                else _mat_values(file, _cube_name(file, variable))
+            )
     except ParameterError:
         raise
     except Exception as error:  # scipy raises many kinds of errors for damaged bytes
@@ -100,7 +108,7 @@ def _numpy_header(file: Path) -> tuple[tuple[int, ...], str]:
     """Return the shape and the data type in the header of a .npy file, whose data must be as
     long as stated.
     """
-    npy_needs(file, 1.0, _SINGLE)
+    npy_needs(file, 1.0, _NUMBER_BYTES)
     try:
         array = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, SyntaxError) as error:
@@ -122,13 +130,13 @@ def exr_size(file: Path) -> tuple[int, int]:
     return size
 
 
-def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
+def _mat_variables(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
     """Return the shape and the data type of each variable in a .mat file."""
     from scipy.io import whosmat
 
     mat_needs(file)
     try:
-        return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
+        return {name: (size, _NUMPY_TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
     except Exception:  # scipy raises many kinds of errors for foreign bytes
         raise ParameterError(
             "file",
@@ -141,7 +149,7 @@ def _cube_name(file: Path, variable: str | None) -> str:
     """Return the name of the variable of a .mat file that holds the cube: ``variable``, or the
     only cube.
     """
-    variables = _listed(file)
+    variables = _mat_variables(file)
     # only arrays of three axes
     cubes = [name for name, (size, _) in variables.items() if len(size) == 3]
     if variable in variables:
@@ -156,13 +164,13 @@ def _cube_name(file: Path, variable: str | None) -> str:
     )
 
 
-def _npy(file: Path) -> NDArray[Any]:
-    npy_needs(file, 1.0, _SINGLE)
+def _npy_values(file: Path) -> NDArray[Any]:
+    npy_needs(file, 1.0, _NUMBER_BYTES)
     values: NDArray[Any] = np.load(file, allow_pickle=False)
     return values
 
 
-def _mat(file: Path, variable: str) -> NDArray[Any]:
+def _mat_values(file: Path, variable: str) -> NDArray[Any]:
     from scipy.io import loadmat
 
     mat_needs(file)
@@ -213,7 +221,7 @@ def hyperspectral(
     interpolated = (_interpolation(wavelengths, bands.centres).float() @ cube.flatten(1)).reshape(
         -1, *cube.shape[1:]
     )
-    return framed(interpolated, shape).clamp_min_(0).to(bands.centres.device)
+    return framed_scene(interpolated, shape).clamp_min_(0).to(bands.centres.device)
 
 
 @hyperspectral.preflight
@@ -228,7 +236,7 @@ def _(
 ) -> list[str]:
     if file.suffix != ".exr":
         _refuse_missing_range(file, start, stop)
-    notes = enlarged(rows_and_columns(file, variable, layout), shape)
+    notes = enlargement_notes(rows_and_columns(file, variable, layout), shape)
     if problem := wrong_values(file, variable):
         raise ParameterError("file", problem)
     return notes

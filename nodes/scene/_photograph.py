@@ -28,8 +28,8 @@ from neusee.nodes.scene._picture_changes import (
     Codes,
     DrawnCrop,
     drawn_crop,
-    enlarged,
-    framed,
+    enlargement_notes,
+    framed_scene,
     linear_light,
 )
 from neusee.nodes.units import DataFile, Shape
@@ -40,14 +40,14 @@ from neusee.nodes.units import DataFile, Shape
 
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
-_FIX = (
+_CONVERT_REMEDY = (
     "convert the file to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16"
     " {stem}.png"
 )
 _DAMAGED = "{name} is damaged ({error}): copy the file again, or give another picture"
 _ORIENTATION = 0x0112  #: EXIF tag
-_ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
-_LIGHT = 12  #: bytes of a pixel in linear light
+_QUARTER_TURNED = range(5, 9)  #: EXIF orientations that exchange width and height
+_LINEAR_PIXEL_BYTES = 12  #: bytes of a pixel in linear light
 
 
 @node(rtol=1e-5)
@@ -71,16 +71,16 @@ def photograph(
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """
     if crop is None or shape is None:
-        return linear_light(_codes(file), _linear, shape)
-    return drawn_crop(linear_light(_codes(file), _linear, None), (shape[0], shape[1]), *crop)
+        return linear_light(_codes(file), _decoded_light, shape)
+    return drawn_crop(linear_light(_codes(file), _decoded_light, None), (shape[0], shape[1]), *crop)
 
 
 @photograph.reference
 def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) -> Tensor:
-    codes = _scaled(_codes(file)).double()
+    codes = _codes_to_unit(_codes(file)).double()
     linear = torch.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     if crop is None or shape is None:
-        return framed(linear, shape)
+        return framed_scene(linear, shape)
     return drawn_crop(linear, (shape[0], shape[1]), *crop)
 
 
@@ -103,7 +103,7 @@ def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) 
         if orientation != 1
         else []
     )
-    return notes + enlarged(size, shape)
+    return notes + enlargement_notes(size, shape)
 
 
 def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
@@ -116,14 +116,14 @@ def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
     try:
         with Image.open(file) as image:
             refuse_large_picture(file, image.height, image.width)
-            _refuse(file, image)
-            picture_needs(file, image, _LIGHT)
+            _refuse_other_picture(file, image)
+            picture_needs(file, image, _LINEAR_PIXEL_BYTES)
             orientation = image.getexif().get(_ORIENTATION, 1)
             # the size of Pillow is (columns, rows)
             return (
-                _profile(image),
+                _colour_profile(image),
                 orientation,
-                image.size if orientation in _ROTATED else image.size[::-1],
+                image.size if orientation in _QUARTER_TURNED else image.size[::-1],
             )
     except UnidentifiedImageError:
         raise ParameterError(
@@ -182,11 +182,11 @@ def _(result: Tensor, **params: Any) -> list[Check]:
     ]
 
 
-def _refuse(file: Path, image: Any) -> None:
+def _refuse_other_picture(file: Path, image: Any) -> None:
     """Raise ParameterError for a picture that is no PNG or JPEG, that has transparency, or that is
     not grey or RGB.
     """
-    remedy = _FIX.format(name=file.name, stem=file.stem)
+    remedy = _CONVERT_REMEDY.format(name=file.name, stem=file.stem)
     if image.format not in ("PNG", "JPEG", "MPO"):
         raise ParameterError(
             "file",
@@ -200,7 +200,7 @@ def _refuse(file: Path, image: Any) -> None:
         )
 
 
-def _profile(image: Any) -> str:
+def _colour_profile(image: Any) -> str:
     """Return the name of the colour profile embedded in a photograph, or an empty text for sRGB
     or no profile.
     """
@@ -219,15 +219,15 @@ def _profile(image: Any) -> str:
     return "" if "srgb" in name.lower() else name
 
 
-def _linear(codes: NDArray[Any]) -> Tensor:
+def _decoded_light(codes: NDArray[Any]) -> Tensor:
     """Decode sRGB code values (y, x, 3) to linear light (3, y, x) float32."""
     from kornia.color import rgb_to_linear_rgb
 
-    light: Tensor = rgb_to_linear_rgb(_scaled(codes))
+    light: Tensor = rgb_to_linear_rgb(_codes_to_unit(codes))
     return light
 
 
-class _Rows:
+class _CodeRows:
     """Code values (y, x, 3) of a decoded picture, copied when rows are asked for.
 
     A whole copy beside the result adds up to 0.5 GB to the peak of 64 million pixels: the copy
@@ -244,11 +244,13 @@ class _Rows:
         start, stop, _ = rows.indices(self._image.height)
         cropped = self._image.crop((0, start, self._image.width, stop))
         is_readable = cropped.mode.startswith("I") or cropped.mode == "RGB"
-        values = np.asarray(cropped if is_readable else cropped.convert("RGB"))
+        if not is_readable:
+            cropped = cropped.convert("RGB")
+        values = np.asarray(cropped)
         return values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
 
 
-def _scaled(codes: Codes) -> Tensor:
+def _codes_to_unit(codes: Codes) -> Tensor:
     """Return code values (y, x, 3) as (3, y, x) float32 in [0, 1]."""
     codes = codes[:]
     scale = 255.0 if codes.dtype == np.uint8 else 65535.0
@@ -266,21 +268,22 @@ def _codes(file: Path) -> Codes:
 
     refuse_other_than_file(file)
     with Image.open(file) as image:
-        _refuse(file, image)
-        picture_needs(file, image, _LIGHT)
+        _refuse_other_picture(file, image)
+        picture_needs(file, image, _LINEAR_PIXEL_BYTES)
         orientation = image.getexif().get(_ORIENTATION, 1)
-        if image.mode == "RGB" and _depth(file) == 16:
-            return _words(file, orientation)
-        return _Rows(ImageOps.exif_transpose(image) if orientation != 1 else image)  # a copy
+        if image.mode == "RGB" and _bit_depth(file) == 16:
+            return _sixteen_bit_codes(file, orientation)
+        upright = ImageOps.exif_transpose(image) if orientation != 1 else image  # a copy
+        return _CodeRows(upright)
 
 
-def _depth(file: Path) -> int:
+def _bit_depth(file: Path) -> int:
     """Return the number of bits per channel of a PNG or JPEG file, which is always 8 for JPEG."""
     header = head_of(file, 26)
     return header[24] if header.startswith(b"\x89PNG") else 8
 
 
-def _words(file: Path, turned: int) -> NDArray[Any]:
+def _sixteen_bit_codes(file: Path, turned: int) -> NDArray[Any]:
     """Read a 16-bit RGB PNG file, and turn the picture upright by the EXIF orientation
     ``turned``.
     """
@@ -290,7 +293,7 @@ def _words(file: Path, turned: int) -> NDArray[Any]:
     # 6 bytes of a pixel as it is read, and 12 in linear light
     needs(18.0 * rows * columns, file, f"{columns} x {rows} pixels of 16 bits")
     codes = np.asarray(read_image_png_u16(str(file), "rgb"))
-    codes = codes.transpose(1, 0, 2) if turned in _ROTATED else codes
+    codes = codes.transpose(1, 0, 2) if turned in _QUARTER_TURNED else codes
     # EXIF: 3 is turned by 180 degrees, 2 and 4 are mirrored, 5 to 8 have rows and columns
     # exchanged
     flip_y, flip_x = turned in (3, 4, 7, 8), turned in (2, 3, 6, 7)
@@ -304,14 +307,16 @@ def _words(file: Path, turned: int) -> NDArray[Any]:
 
 
 __depends__ = ["unaffected:_pictures"]  #: what is in memory changes no result
-_PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"})
+_PICTURE_SUFFIXES = frozenset(
+    {".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"}
+)
 #: first bytes of a format -> end mark of a file of this format
-_ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}
+_END_MARKS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}
 #: bytes at the end of a file that must contain the end mark: some cameras write more after it
-_TAIL = 1 << 16
-_ORDER, _DRAW = 0, 2  #: random streams of one seed; the position of a part is another
-_KEPT = 1 << 30  #: bytes of decoded photographs that a process keeps
-_TRIES = 100  #: broken photographs in a row, after which drawing stops with an error
+_TAIL_BYTES = 1 << 16
+_ORDER_STREAM, _DRAW_STREAM = 0, 2  #: random streams of one seed; the position of a part is another
+_KEPT_BYTES = 1 << 30  #: bytes of decoded photographs that a process keeps
+_BROKEN_IN_A_ROW = 100  #: broken photographs in a row, after which drawing stops with an error
 
 Index = int | Sequence[int]  #: the number of a scene, or (stage, number) of a picture for training
 
@@ -323,12 +328,12 @@ def list_photographs(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
     Only the header and the end of each file are read; no picture is decoded. Hidden files, hidden
     folders and files without the suffix of a picture are ignored.
     """
-    reasons = {path: _problem(path) for path in _files(root)}
+    reasons = {path: _unreadable_reason(path) for path in _picture_files(root)}
     broken = [(path, reason) for path, reason in reasons.items() if reason]
     return [path for path, reason in reasons.items() if not reason], broken
 
 
-def _files(root: Path) -> list[Path]:
+def _picture_files(root: Path) -> list[Path]:
     """Return the files with the suffix of a picture below a folder, sorted by path; hidden files
     and folders are left out, and links that lead back to a folder above are not followed.
     """
@@ -341,22 +346,23 @@ def _files(root: Path) -> list[Path]:
         folders_above[folder] = ancestors | {identity}
         # `os.walk` goes into the folders of this list, in its order
         subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
-        pictures += [
-            Path(folder, n)
-            for n in file_names
-            if not n.startswith(".") and Path(n).suffix.lower() in _PICTURES
-        ]
+        pictures += [Path(folder, name) for name in file_names if _is_picture_name(name)]
     return sorted(pictures, key=lambda path: path.relative_to(root).parts)
 
 
-def _problem(path: Path) -> str:
+def _is_picture_name(name: str) -> bool:
+    """Return True for the name of a file that is not hidden and has the suffix of a picture."""
+    return not name.startswith(".") and Path(name).suffix.lower() in _PICTURE_SUFFIXES
+
+
+def _unreadable_reason(path: Path) -> str:
     """Return the reason why a file cannot be read as a photograph, or an empty text."""
     try:
         read_header(path)
         with opened(path) as file:
-            end_mark = _ENDS[file.read(2)]
-            file.seek(max(0, path.stat().st_size - _TAIL))
-            return "" if end_mark in file.read(_TAIL) else f"{path.name} stops before its end"
+            end_mark = _END_MARKS[file.read(2)]
+            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            return "" if end_mark in file.read(_TAIL_BYTES) else f"{path.name} stops before its end"
     except (ParameterError, OSError, KeyError, ValueError, SyntaxError) as error:
         return str(error)
 
@@ -367,7 +373,7 @@ def choose_photograph(paths: Sequence[Path], seed: int, index: int) -> Path:
 
     The order of the photographs is drawn from the seed.
     """
-    order: list[int] = np.random.default_rng([seed, _ORDER]).permutation(len(paths)).tolist()
+    order: list[int] = np.random.default_rng([seed, _ORDER_STREAM]).permutation(len(paths)).tolist()
     return paths[order[index % len(paths)]]
 
 
@@ -378,14 +384,14 @@ def crop_photograph(path: Path, shape: tuple[int, int], seed: int, index: Index)
     A smaller photograph is enlarged first, as `drawn_crop` does. ``scene.photograph`` with ``crop``
     gives the same.
     """
-    return drawn_crop(_decoded(path), shape, seed, index)
+    return drawn_crop(_decoded_photograph(path), shape, seed, index)
 
 
 #: the decoded photographs by version, the last used one last
 _pictures: dict[tuple[int, ...], Tensor] = {}
 
 
-def _decoded(path: Path) -> Tensor:
+def _decoded_photograph(path: Path) -> Tensor:
     """Return a photograph as linear sRGB (3, y, x), from memory if it is one of the last that were
     used.
 
@@ -399,12 +405,12 @@ def _decoded(path: Path) -> Tensor:
     picture: Tensor = _pictures.pop(version) if version in _pictures else photograph(file=path)
     _pictures[version] = picture
     # the first entry is the one that was not used for longest
-    while len(_pictures) > 1 and sum(map(_size, _pictures.values())) > _KEPT:
+    while len(_pictures) > 1 and sum(map(_bytes_of, _pictures.values())) > _KEPT_BYTES:
         del _pictures[next(iter(_pictures))]
     return picture
 
 
-def _size(picture: Tensor) -> int:
+def _bytes_of(picture: Tensor) -> int:
     return picture.numel() * picture.element_size()
 
 
@@ -444,8 +450,8 @@ class Photographs:
         same crop in any order and in any number of processes, whereas the random crops and flips of
         kornia draw from the one random stream of torch.
         """
-        rng = np.random.default_rng([seed, _DRAW, *_indices(index)])
-        for _ in range(_TRIES):
+        rng = np.random.default_rng([seed, _DRAW_STREAM, *_indices(index)])
+        for _ in range(_BROKEN_IN_A_ROW):
             path = self.paths[int(rng.integers(len(self.paths)))]
             try:
                 picture = crop_photograph(path, shape, seed, index)
@@ -455,5 +461,6 @@ class Photographs:
             return (picture.flip(-1) if rng.random() < 0.5 else picture).contiguous()
         path = next(iter(self.broken))
         raise ValueError(
-            f"{_TRIES} photographs in a row cannot be read, such as {path}: {self.broken[path]}"
+            f"{_BROKEN_IN_A_ROW} photographs in a row cannot be read, such as {path}:"
+            f" {self.broken[path]}"
         )

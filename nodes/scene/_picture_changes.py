@@ -25,12 +25,12 @@ from neusee.nodes.units import Shape
 # Scaling and central cropping of a scene to the picture size in a recipe.
 
 
-_PART = 1  #: random stream of a seed, for the position of a part of a picture
-_Whole = Annotated[int, Field(ge=0, lt=2**63)]
-DrawnCrop = tuple[_Whole, _Whole]  #: seed and number of a scene
+_POSITION_STREAM = 1  #: random stream of a seed, for the position of a part of a picture
+_WholeNumber = Annotated[int, Field(ge=0, lt=2**63)]
+DrawnCrop = tuple[_WholeNumber, _WholeNumber]  #: seed and number of a scene
 
 
-def framed(scene: Tensor, shape: Shape | None) -> Tensor:
+def framed_scene(scene: Tensor, shape: Shape | None) -> Tensor:
     """Scale a scene (band, y, x) with equal aspect ratio until the scene covers `shape`, and crop
     the centre.
 
@@ -42,7 +42,7 @@ def framed(scene: Tensor, shape: Shape | None) -> Tensor:
 
     if shape is None or tuple(scene.shape[-2:]) == tuple(shape):
         return scene
-    size = covering((scene.shape[-2], scene.shape[-1]), shape)
+    size = covering_size((scene.shape[-2], scene.shape[-1]), shape)
     scaled = (
         antialiased(scene, size, interpolation="bilinear", antialias=True)
         if size != scene.shape[-2:]
@@ -52,7 +52,7 @@ def framed(scene: Tensor, shape: Shape | None) -> Tensor:
     return scaled[..., top : top + shape[0], left : left + shape[1]].contiguous()
 
 
-def covering(size: tuple[int, int], shape: Shape) -> tuple[int, int]:
+def covering_size(size: tuple[int, int], shape: Shape) -> tuple[int, int]:
     """Return the smallest picture size that covers `shape` and has the same aspect ratio as
     `size`.
     """
@@ -71,15 +71,15 @@ def drawn_crop(
     """
     size = (picture.shape[-2], picture.shape[-1])
     if any(old < new for old, new in zip(size, shape, strict=True)):
-        size = covering(size, shape)
+        size = covering_size(size, shape)
         picture = resize(picture, *size).clamp_min(0.0)
     indices = [index] if isinstance(index, int) else list(index)
-    rng = np.random.default_rng([seed, _PART, *indices])
+    rng = np.random.default_rng([seed, _POSITION_STREAM, *indices])
     top, left = (int(rng.integers(0, old - new + 1)) for old, new in zip(size, shape, strict=True))
     return picture[:, top : top + shape[0], left : left + shape[1]].contiguous()
 
 
-def enlarged(size: tuple[int, int], shape: Shape | None) -> list[str]:
+def enlargement_notes(size: tuple[int, int], shape: Shape | None) -> list[str]:
     """Return a note for the user if a scene of the given size must be enlarged to cover `shape`,
     else an empty list.
     """
@@ -99,10 +99,10 @@ def enlarged(size: tuple[int, int], shape: Shape | None) -> list[str]:
 # little memory.
 
 
-_LARGE = 4_000_000  #: pixels above which a picture is converted and scaled in bands
-_BAND = 1 << 20  #: pixels of a band
+_LARGE_PIXELS = 4_000_000  #: pixels above which a picture is converted and scaled in bands
+_BAND_PIXELS = 1 << 20  #: pixels of a band
 #: pixels of a band beside a whole picture, so that its conversion adds little to the peak memory
-_SMALL_BAND = 1 << 17
+_SMALL_BAND_PIXELS = 1 << 17
 
 
 class Codes(Protocol):
@@ -116,44 +116,44 @@ class Codes(Protocol):
 
 
 #: from code values (y, x, channel) to linear light (channel, y, x)
-Linear = Callable[[NDArray[Any]], Tensor]
+Decoding = Callable[[NDArray[Any]], Tensor]
 
 
-def linear_light(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
+def linear_light(codes: Codes, linear: Decoding, shape: Shape | None) -> Tensor:
     """Return linear light (3, y, x) of the code values (y, x, channel) of a picture, scaled and
-    cropped by `framed`.
+    cropped by `framed_scene`.
 
-    For a large picture the result equals that of `framed` within the round-off of float32.
+    For a large picture the result equals that of `framed_scene` within the round-off of float32.
     """
     if is_large(codes.shape[0] * codes.shape[1]):
         return _in_bands(codes, linear, shape)
-    return framed(linear(codes[:]), shape)
+    return framed_scene(linear(codes[:]), shape)
 
 
 def is_large(pixels: float) -> bool:
     """Return True for a picture that is converted and scaled in bands of rows."""
-    return pixels > _LARGE
+    return pixels > _LARGE_PIXELS
 
 
-def _in_bands(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
+def _in_bands(codes: Codes, linear: Decoding, shape: Shape | None) -> Tensor:
     """Return what `linear_light` returns, for a large picture: band after band of its rows is
     converted, and added to the rows of the result that it reaches.
     """
     size = (codes.shape[0], codes.shape[1])
     if shape is None or size == tuple(shape):
         picture = torch.empty(3, *size)
-        for rows in bands_of(size, _SMALL_BAND):
+        for rows in row_bands(size, _SMALL_BAND_PIXELS):
             picture[:, rows] = linear(codes[rows])
         return picture
-    scaled = covering(size, shape)
+    scaled = covering_size(size, shape)
     antialias = max(old / new for old, new in zip(size, scaled, strict=True)) > 1
     # matrices of resampling, of which only the lines of the central crop are needed
     row_matrix, column_matrix = (
-        resampling(old, new, antialias)[(new - size_of_cut) // 2 :][:size_of_cut]
+        resampling_matrix(old, new, antialias)[(new - size_of_cut) // 2 :][:size_of_cut]
         for old, new, size_of_cut in zip(size, scaled, shape, strict=True)
     )
     result = np.zeros((3, *shape), np.float32)
-    for rows in bands_of(size):
+    for rows in row_bands(size):
         band_matrix = row_matrix[:, rows]
         # lines of a sparse matrix that are not empty
         reached_lines = np.flatnonzero(np.diff(band_matrix.indptr))
@@ -164,15 +164,15 @@ def _in_bands(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
     return torch.from_numpy(result)
 
 
-def bands_of(size: tuple[int, int], pixels: int | None = None) -> list[slice]:
+def row_bands(size: tuple[int, int], pixels: int | None = None) -> list[slice]:
     """Return the rows of each band of a picture of ``size`` rows and columns, of at most
     ``pixels`` pixels a band.
     """
-    step = max(1, (pixels or _BAND) // size[1])
+    step = max(1, (pixels or _BAND_PIXELS) // size[1])
     return [slice(start, start + step) for start in range(0, size[0], step)]
 
 
-def resampling(old: int, new: int, antialias: bool) -> Any:
+def resampling_matrix(old: int, new: int, antialias: bool) -> Any:
     """Return the sparse matrix (new, old) of kornia's bilinear resampling of one axis, float64.
 
     With ``antialias`` a Gaussian precedes it, mirrored at the edges, of 4 standard deviations in
@@ -241,7 +241,9 @@ class Change:
             2.0 * float(rng.random()) - 1.0,
         )
         factor = enlarged ** float(rng.random())
-        return cls(quarters if turned else 0, darker * stops, 1.0 + colour * saturation, factor)
+        if not turned:
+            quarters = 0
+        return cls(quarters, darker * stops, 1.0 + colour * saturation, factor)
 
     def frame(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Return the rows and columns of a photograph that this change turns into a picture of

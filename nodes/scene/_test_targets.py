@@ -11,9 +11,9 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.units import Fraction, Shape
 
 Kind = Literal["flat", "edge", "slanted_edge", "siemens", "points"]
-_TILT = math.radians(5.0)  #: angle of the slanted edge to the columns
-_CYCLES = 36  #: cycles of the star over one full turn
-_SPACING = 64  #: pixels between points
+_EDGE_TILT = math.radians(5.0)  #: angle of the slanted edge to the columns
+_STAR_CYCLES = 36  #: cycles of the star over one full turn
+_POINT_SPACING = 64  #: pixels between points
 
 
 @node(rtol=1e-5)
@@ -32,7 +32,7 @@ def targets(*, kind: Kind, shape: Shape, low: Fraction = 0.0, high: Fraction = 1
     Source: slanted edge and sinusoidal star as in ISO 12233:2017.
     """
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in shape)
-    share = _SHARE[kind](y[:, None], x[None, :]).expand(shape)
+    share = _BRIGHT_SHARE[kind](y[:, None], x[None, :]).expand(shape)
     return (low + (high - low) * share).float().expand(3, *shape).clone()
 
 
@@ -58,7 +58,7 @@ def _slanted(y: Tensor, x: Tensor) -> Tensor:
     """Return the exact fraction of the area of each pixel on the bright side of a slanted edge
     through the axis.
     """
-    cosine, sine = math.cos(_TILT), math.sin(_TILT)
+    cosine, sine = math.cos(_EDGE_TILT), math.sin(_EDGE_TILT)
     distance = x * cosine + y * sine
     far_corner, near_corner = (cosine + sine) / 2, (cosine - sine) / 2
     # the area of a pixel behind the edge: sum of +-(distance of a corner)^2 / 2 over the corners
@@ -69,23 +69,23 @@ def _slanted(y: Tensor, x: Tensor) -> Tensor:
 
 
 def _siemens(y: Tensor, x: Tensor) -> Tensor:
-    """Return the share of the bright grey of a star with `_CYCLES` cycles: (1 + cos(cycles x
+    """Return the share of the bright grey of a star with `_STAR_CYCLES` cycles: (1 + cos(cycles x
     azimuth)) / 2, and 1/2 where a cycle is shorter than two pixels and beyond the largest circle.
     """
     radius = torch.hypot(y, x)
     largest_radius = min(int(y.numel()), int(x.numel())) / 2 - 1
-    resolved_radius = _CYCLES / math.pi  # radius where a cycle is two pixels long
+    resolved_radius = _STAR_CYCLES / math.pi  # radius where a cycle is two pixels long
     star_share = (largest_radius - radius + 0.5).clamp(0, 1) * (
         radius - resolved_radius + 0.5
     ).clamp(0, 1)
-    return 0.5 + 0.5 * star_share * torch.cos(_CYCLES * torch.atan2(y, x))
+    return 0.5 + 0.5 * star_share * torch.cos(_STAR_CYCLES * torch.atan2(y, x))
 
 
 #: share of `high` in each pixel, from the distances y and x to the axis
-_SHARE: dict[Kind, Callable[[Tensor, Tensor], Tensor]] = {
+_BRIGHT_SHARE: dict[Kind, Callable[[Tensor, Tensor], Tensor]] = {
     "flat": lambda y, x: torch.ones_like(y + x),
     "edge": lambda y, x: (x + 0.5 + 0 * y).clamp(0, 1),
     "slanted_edge": _slanted,
     "siemens": _siemens,
-    "points": lambda y, x: ((y % _SPACING == 0) & (x % _SPACING == 0)).double(),
+    "points": lambda y, x: ((y % _POINT_SPACING == 0) & (x % _POINT_SPACING == 0)).double(),
 }

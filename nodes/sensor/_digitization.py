@@ -19,7 +19,7 @@ from neusee.nodes.units import Gain, Shape
 Rounding = Literal["nearest", "dithered_floor", "truncation"]
 #: pixels that are converted at a time, so that their float64 numbers stay in the cache of the
 #: processor
-_BLOCK = 2**18
+_BLOCK_PIXELS = 2**18
 Bits = Annotated[int, Field(ge=1, le=16)]
 
 
@@ -150,8 +150,8 @@ def _whole_numbers(
         )
         dither = dither.to(electrons.device).reshape(-1)
     # in blocks that stay in the cache of the processor
-    for start in range(0, flat_electrons.numel(), _BLOCK):
-        block = slice(start, start + _BLOCK)
+    for start in range(0, flat_electrons.numel(), _BLOCK_PIXELS):
+        block = slice(start, start + _BLOCK_PIXELS)
         values = flat_electrons[block].double() * gain
         values = values if dither is None else values.add_(dither[block])
         values = values.round_() if rounding == "nearest" else values.floor_()
@@ -239,14 +239,14 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
     Raises: ParameterError before the run, or ValueError, for a window larger than the image.
     Source: NeuSee, Eq. (SensorImage).
     """
-    if message := _too_small(image, shape):
+    if message := _small_image_message(image, shape):
         raise ValueError(message)
     # sample m // 2 of the image is the optical axis, and sample n // 2 of the window
     top, left = (m // 2 - n // 2 for n, m in zip(shape, image.shape[-2:], strict=True))
     return image[..., top : top + shape[0], left : left + shape[1]].contiguous()
 
 
-def _too_small(image: Tensor, shape: Shape) -> str:
+def _small_image_message(image: Tensor, shape: Shape) -> str:
     """Return a message if an image is smaller than a window of the given shape, else an empty
     text.
     """
@@ -261,7 +261,7 @@ def _too_small(image: Tensor, shape: Shape) -> str:
 
 @crop.preflight
 def _(*, shape: tuple[int, int], image: Tensor | None = None) -> list[str]:
-    if image is not None and (problem := _too_small(image, shape)):
+    if image is not None and (problem := _small_image_message(image, shape)):
         raise ParameterError("shape", problem)
     return []
 

@@ -20,10 +20,10 @@ from neusee.nodes.values import Bands, Channels
 # Weighted sums of the spectral bands of an image, computed from the bands or from stored sums.
 
 
-_OFF = 1e-9  #: largest relative error of weights that are combined from the rows
+_LARGEST_WEIGHT_ERROR = 1e-9  #: largest relative error of weights that are combined from the rows
 
 
-def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
+def weighted_bands(image: Tensor | Channels, weights: Tensor) -> Tensor:
     """Multiply the spectral bands of an image by ``weights`` (..., band), and return the sum over
     the bands.
 
@@ -32,7 +32,7 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
     """
     if isinstance(image, Channels):
         # the planes of the image are sums over its bands already: combine them
-        plane_weights = _of_rows(weights, image.rows).to(image.planes)
+        plane_weights = _combination_of_rows(weights, image.rows).to(image.planes)
         channels: Tensor = torch.tensordot(plane_weights, image.planes, 1)
         return channels
     image = single(image)
@@ -40,7 +40,7 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
     return flat_channels.reshape(*flat_channels.shape[:-1], *image.shape[-2:])
 
 
-def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
+def _combination_of_rows(weights: Tensor, rows: Tensor) -> Tensor:
     """Return the matrix M with ``weights = M rows``, by least squares in float64.
 
     ``rows`` (row, band) are the weights by which the planes of an image were summed over its bands.
@@ -73,7 +73,7 @@ def _require_combination(exact: Tensor, combined: Tensor) -> None:
         (exact - combined).abs().flatten(0, -2),
         exact.abs().flatten(0, -2).amax(-1),
     )
-    if not bool((errors.amax(-1) <= _OFF * largest).all()):
+    if not bool((errors.amax(-1) <= _LARGEST_WEIGHT_ERROR * largest).all()):
         worst = float((errors.amax(-1) / largest.clamp_min(1e-300)).max())
         raise ValueError(
             "the image was summed over its bands with other weights: the weights of this step"
@@ -128,7 +128,7 @@ def expose(
             f" {weights.shape[1]} bands: compute irradiance, bands and responses from the same"
             " `bands` step"
         )
-    return weighted(irradiance, weights)
+    return weighted_bands(irradiance, weights)
 
 
 @expose.reference
@@ -141,7 +141,7 @@ def _(
 ) -> Tensor:
     weights = channel_weights(bands, responses, level, **sizes)
     if isinstance(irradiance, Channels):
-        return weighted(irradiance._replace(planes=irradiance.planes.double()), weights)
+        return weighted_bands(irradiance._replace(planes=irradiance.planes.double()), weights)
     # in float64, one channel after another
     channels = [
         (row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)
@@ -231,7 +231,7 @@ def level(
     """
     if strength is None:
         if white is None or not bool(white > 0):
-            raise ParameterError("strength", _DARK)
+            raise ParameterError("strength", _UNKNOWN_BRIGHTNESS)
         planes = plain_image.planes if isinstance(plain_image, Channels) else plain_image
         refuse_not_finite(
             "no level can scale this image", plain_image=planes.amin() + planes.amax()
@@ -263,7 +263,7 @@ def level(
     )
 
 
-_DARK = (
+_UNKNOWN_BRIGHTNESS = (
     "the brightness of the scene is not known: give sensor.background, scene.illuminance or"
     " scene.luminance"
 )
@@ -300,7 +300,7 @@ def _(
     has_brightness = white is not None and (white.is_meta or float(white) > 0)
     if strength is None:
         if not has_brightness:
-            raise ParameterError("strength", _DARK)
+            raise ParameterError("strength", _UNKNOWN_BRIGHTNESS)
         if rule == "per_band":
             raise ParameterError(
                 "rule", "lux and cd/m2 are sums over the bands: use rule channel_sum"

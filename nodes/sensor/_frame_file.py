@@ -31,14 +31,14 @@ from neusee.nodes.units import DataFile, Shape
 # numbers.
 
 
-_BYTE = 8  #: bits of the pictures of displays, whose numbers have a tone curve
+_DISPLAY_BITS = 8  #: bits of the pictures of displays, whose numbers have a tone curve
 _LINEAR_GAMMA = 100_000  #: value of the chunk gAMA of a PNG that is proportional to the light
 #: code point of a linear transfer characteristic in the chunk cICP (ITU-T H.273)
 _LINEAR_TRANSFER = 8
 #: factor by which numbers of 8 bits become numbers of 16
-_TO_SIXTEEN = {257: "stretched", 256: "shifted"}
+_SIXTEEN_BIT_FACTORS = {257: "stretched", 256: "shifted"}
 _ICC_PROFILE = 34675  #: tag of a TIFF file
-_FIRST_DIRECTORY = 4096  #: entries of a TIFF directory that are looked at, at most
+_MOST_ENTRIES = 4096  #: entries of a TIFF directory that are looked at, at most
 
 
 def tone_curve_sign(file: Path, values: NDArray[Any], depth: int | None, bits: int) -> str:
@@ -48,10 +48,10 @@ def tone_curve_sign(file: Path, values: NDArray[Any], depth: int | None, bits: i
     ``depth`` are the bits of the numbers in the file, or None if it does not state them; ``bits``
     those of the sensor.
     """
-    if _BYTE in (depth, bits) or values.dtype.itemsize == 1:
+    if _DISPLAY_BITS in (depth, bits) or values.dtype.itemsize == 1:
         return "has 8 bits, as pictures with a tone curve (sRGB, gamma 2.2) have"
     if values.dtype.kind in "ui" and values.any():
-        for factor, change in _TO_SIXTEEN.items():
+        for factor, change in _SIXTEEN_BIT_FACTORS.items():
             if not (values % factor).any():
                 return f"has only multiples of {factor}: numbers of 8 bits that were {change} to 16"
     with suppress(OSError, struct.error):
@@ -66,7 +66,7 @@ def _png_sign(content: bytes) -> str:
     """Return the sign of a tone curve in the chunks of a PNG file (sRGB, gAMA, cICP, iCCP), or an
     empty text.
     """
-    for kind, data in _chunks(content):
+    for kind, data in _png_chunks(content):
         if kind == b"sRGB":
             return "says of itself that it is sRGB encoded, which is a tone curve"
         if kind == b"gAMA" and (gamma := struct.unpack(">I", data[:4])[0]) != _LINEAR_GAMMA:
@@ -81,7 +81,7 @@ def _png_sign(content: bytes) -> str:
     return ""
 
 
-def _chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+def _png_chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Yield the kind and the data of each chunk of a PNG before its pixels."""
     # after the signature; a chunk has its length, its kind, the data and a checksum of 4 bytes
     offset = 8
@@ -105,7 +105,7 @@ def _tiff_sign(content: bytes) -> str:
     (entry_count,) = struct.unpack(
         f"{byte_order}H", content[directory_offset : directory_offset + 2]
     )
-    for entry_number in range(min(entry_count, _FIRST_DIRECTORY)):
+    for entry_number in range(min(entry_count, _MOST_ENTRIES)):
         # entries of 12 bytes follow their number, of 2 bytes
         entry = content[
             directory_offset + 2 + 12 * entry_number : directory_offset + 14 + 12 * entry_number
@@ -127,10 +127,10 @@ def _tiff_sign(content: bytes) -> str:
 #: what a user states of the tone curve of numbers that have a sign of one
 Curve = Literal["linear"]
 _DAMAGED = "{name} is damaged or no picture ({error}): copy the file again"
-_STATE = "frame.curve=linear"
-_COLOURS = {0: 1, 2: 3}  #: channels of a PNG by its colour type
-_SINGLE = 4  #: bytes of a number of the frame that is made
-_ARRAY = "(y, x), (y, x, 3) or (3, y, x)"
+_CURVE_STATEMENT = "frame.curve=linear"
+_PNG_CHANNELS = {0: 1, 2: 3}  #: channels of a PNG by its colour type
+_NUMBER_BYTES = 4  #: bytes of a number of the frame that is made
+_ARRAY_SHAPES = "(y, x), (y, x, 3) or (3, y, x)"
 
 
 @node(rtol=0.0)
@@ -202,7 +202,7 @@ def frame_problem(
         return str(error)
     name, size_of_frame = file.name, values.shape[1:]
     if channels is not None and len(values) != channels:
-        return _other_channels(name, len(values), channels)
+        return _channels_problem(name, len(values), channels)
     if size_of_frame != shape:
         size = f"[{size_of_frame[0]}, {size_of_frame[1]}]"
         return (
@@ -212,13 +212,17 @@ def frame_problem(
             " read out"
         )
     return (
-        _other_depth(name, depth, bits, curve)
-        or _other_numbers(name, values, bits)
-        or ("" if curve == "linear" else _curved(name, tone_curve_sign(file, values, depth, bits)))
+        _depth_problem(name, depth, bits, curve)
+        or _numbers_problem(name, values, bits)
+        or (
+            ""
+            if curve == "linear"
+            else _tone_curve_problem(name, tone_curve_sign(file, values, depth, bits))
+        )
     )
 
 
-def _other_channels(name: str, frame_channels: int, channels: int) -> str:
+def _channels_problem(name: str, frame_channels: int, channels: int) -> str:
     """Return why a frame with ``frame_channels`` channels does not fit a camera with ``channels``
     channels.
     """
@@ -234,14 +238,16 @@ def _other_channels(name: str, frame_channels: int, channels: int) -> str:
     )
 
 
-def _other_depth(name: str, depth: int | None, bits: int, curve: Curve | None) -> str:
+def _depth_problem(name: str, depth: int | None, bits: int, curve: Curve | None) -> str:
     """Return why a frame of 8 bits does not fit a sensor of more bits, or an empty text.
 
     ``depth`` are the bits of the file, None if it does not state them.
     """
     if depth is not None and depth < bits and depth == 8:
         curve_text = (
-            "" if curve == "linear" else f" and {_STATE}, if they have no tone curve (sRGB, gamma)"
+            ""
+            if curve == "linear"
+            else f" and {_CURVE_STATEMENT}, if they have no tone curve (sRGB, gamma)"
         )
         return (
             f"{name} has 8 bits, but sensor.bits is {bits}: save the raw numbers of the camera in"
@@ -250,7 +256,7 @@ def _other_depth(name: str, depth: int | None, bits: int, curve: Curve | None) -
     return ""
 
 
-def _curved(name: str, sign: str) -> str:
+def _tone_curve_problem(name: str, sign: str) -> str:
     """Return why a frame with the ``sign`` of a tone curve is refused, or an empty text for no
     sign.
     """
@@ -258,12 +264,12 @@ def _curved(name: str, sign: str) -> str:
         return ""
     return (
         f"{name} {sign}, but a restoration needs numbers in proportion to the light: save the raw"
-        f" numbers of the camera, without tone curve and white balance; or state {_STATE}, if these"
-        " numbers are linear in the light"
+        " numbers of the camera, without tone curve and white balance; or state"
+        f" {_CURVE_STATEMENT}, if these numbers are linear in the light"
     )
 
 
-def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:
+def _numbers_problem(name: str, values: NDArray[Any], bits: int) -> str:
     """Return why the numbers of a frame are not digital numbers of a converter of ``bits`` bits,
     or an empty text: they must be finite, whole, from 0 to 2^bits - 1, and not all the same.
     """
@@ -332,7 +338,7 @@ def _png(file: Path) -> FrameNumbers:
         )
     # the header has columns in bytes 16 to 19, rows in 20 to 23, bits in 24 and the colour type in
     # 25
-    depth, channels = header[24], _COLOURS.get(header[25], 0)
+    depth, channels = header[24], _PNG_CHANNELS.get(header[25], 0)
     if not channels or depth not in (8, 16):
         text = (
             f"{file.name} has a palette, transparency or {depth} bits: save raw numbers of 8 or 16"
@@ -343,7 +349,7 @@ def _png(file: Path) -> FrameNumbers:
     refuse_large_picture(file, rows, columns)
     needs(
         # bytes of a number in the file, and of the float32 number
-        rows * columns * channels * (depth // 8 + _SINGLE),
+        rows * columns * channels * (depth // 8 + _NUMBER_BYTES),
         file,
         f"{columns} x {rows} pixels in {channels} channels",
     )
@@ -351,9 +357,8 @@ def _png(file: Path) -> FrameNumbers:
     with Image.open(file) as image:
         image.verify()
     reader = io.read_image_png_u16 if depth == 16 else io.read_image_png_u8
-    return FrameNumbers(
-        _first(np.asarray(reader(str(file), "rgb" if channels == 3 else "mono"))), depth
-    )
+    mode = "rgb" if channels == 3 else "mono"
+    return FrameNumbers(_channel_first(np.asarray(reader(str(file), mode))), depth)
 
 
 def _tiff(file: Path) -> FrameNumbers:
@@ -368,12 +373,12 @@ def _tiff(file: Path) -> FrameNumbers:
         (io.read_image_tiff_f32, None),
     )
     # memory: the file once, and three float32 numbers a pixel
-    tiff_needs(file, 1.0, 3 * _SINGLE, first=True)
+    tiff_needs(file, 1.0, 3 * _NUMBER_BYTES, first=True)
     reason = ""
     for reader, depth in readers:
         for mode in ("rgb", "mono"):
             try:  # each reader looks at the kind of pixels first
-                return FrameNumbers(_first(np.asarray(reader(str(file), mode))), depth)
+                return FrameNumbers(_channel_first(np.asarray(reader(str(file), mode))), depth)
             except Exception as error:  # another kind of pixels, or a damaged file
                 reason = str(error).partition("\n")[0]
     text = (
@@ -389,7 +394,7 @@ def _exr(file: Path) -> FrameNumbers:
     """
     import OpenEXR
 
-    exr_needs(file, 4 * _SINGLE)
+    exr_needs(file, 4 * _NUMBER_BYTES)
     with OpenEXR.File(str(file), separate_channels=True) as picture:
         channels = {name: np.array(channel.pixels) for name, channel in picture.channels().items()}
     channel_names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else list(channels)
@@ -408,20 +413,21 @@ def _npy(file: Path) -> FrameNumbers:
     """Read a frame from a NumPy array (y, x), (y, x, channel) or (channel, y, x); raise
     ParameterError for another array.
     """
-    npy_needs(file, 1.0, _SINGLE)
+    npy_needs(file, 1.0, _NUMBER_BYTES)
     array = np.load(file, mmap_mode="r", allow_pickle=False)
     refuse_large_array(file, array.shape)
     if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or not array.size:
         text = (
-            f"{file.name} is {array.dtype} of shape {array.shape}: give numbers of shape {_ARRAY}"
+            f"{file.name} is {array.dtype} of shape {array.shape}: give numbers of shape"
+            f" {_ARRAY_SHAPES}"
         )
         raise ParameterError("file", text)
     if array.ndim == 3 and array.shape[0] in (1, 3):
         return FrameNumbers(np.array(array), None)
-    return FrameNumbers(_first(np.array(array)), None)
+    return FrameNumbers(_channel_first(np.array(array)), None)
 
 
-def _first(pixels: NDArray[Any]) -> NDArray[Any]:
+def _channel_first(pixels: NDArray[Any]) -> NDArray[Any]:
     """Return pixels (y, x) or (y, x, channel) with the channel first."""
     return pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
 

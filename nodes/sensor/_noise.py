@@ -28,10 +28,10 @@ from neusee.nodes.units import (
 # squares of noise.
 
 
-SURE = math.log(1e4)  #: negative logarithm of the probability that a draw exceeds its limit
+RARITY = math.log(1e4)  #: negative logarithm of the probability that a draw exceeds its limit
 
 
-def rare_events(mean: float, sure: float = SURE) -> int:
+def rare_events(mean: float, sure: float = RARITY) -> int:
     """Return the count that a Poisson number of this mean exceeds with a probability of at most
     exp(-``sure``).
 
@@ -65,7 +65,7 @@ def poisson_rms(mean: float, pixels: int) -> float:
     """
     if mean == 0:
         return 0.0
-    sure = SURE + math.log(2.0)
+    sure = RARITY + math.log(2.0)
     rare_number = rare_events(mean, sure + math.log(pixels))
     # of a Poisson number: m + 7 m^2 + 6 m^3 + m^4
     fourth_moment = mean + 7 * mean**2 + 6 * mean**3 + mean**4
@@ -75,7 +75,7 @@ def poisson_rms(mean: float, pixels: int) -> float:
     return min(float(rare_number), math.sqrt((pixels * (mean + mean**2) + sum_excess) / pixels))
 
 
-def chi_square_limit(weights: float, largest: float, sure: float = SURE) -> float:
+def chi_square_limit(weights: float, largest: float, sure: float = RARITY) -> float:
     """Return the limit that a weighted sum of squared normal numbers exceeds with a probability of
     exp(-``sure``).
 
@@ -122,12 +122,12 @@ def amplitude_error(drawn: float, darkest: float) -> float:
 
 Distribution = Literal["gaussian", "poisson"]
 #: elements; torch splits larger arrays among threads, which is slow on a busy machine
-_PART = 1 << 15
+_PART_ELEMENTS = 1 << 15
 #: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
-_DARK = 1e-30
+_DARK_ELECTRONS = 1e-30
 #: largest ratio of a sampled mean of the dark current to the given mean, 8 standard deviations
 #: above
-_MOST = 5.0
+_LARGEST_DRAWN_MEAN = 5.0
 Spread = Annotated[float, Field(ge=0, le=100)]
 
 
@@ -163,7 +163,11 @@ def photon_noise(
 
     def detected(piece: Tensor) -> Tensor:
         counts = piece.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
-        fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
+        fluctuation = (
+            _poisson_deviation(counts, rng)
+            if distribution == "poisson"
+            else _gaussian_noise(counts, rng)
+        )
         noisy_counts = (mean_factor * counts).add_(spread * fluctuation).clamp_min(0)
         return noisy_counts if drawn_in == "electrons" else noisy_counts * quantum_efficiency
 
@@ -230,17 +234,17 @@ def _electrons_error(
     return electrons_error
 
 
-def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
+def _gaussian_noise(counts: Tensor, rng: Generator) -> Tensor:
     """Return normal noise of the standard deviation sqrt(counts), 0 where there is no light."""
-    has_light = ~(counts <= _DARK)  # True for NaN, so that NaN reaches the result
+    has_light = ~(counts <= _DARK_ELECTRONS)  # True for NaN, so that NaN reaches the result
     if not (counts.requires_grad or transformed()):
-        return normal(counts, rng).mul_(counts.where(has_light, 0.0).sqrt_())
+        return standard_normal(counts, rng).mul_(counts.where(has_light, 0.0).sqrt_())
     # at 0, the square root has no finite gradient
     sigma = counts.where(has_light, 1.0).sqrt().where(has_light, 0.0)
-    return sigma * normal(counts, rng)
+    return sigma * standard_normal(counts, rng)
 
 
-def _poisson(counts: Tensor, rng: Generator) -> Tensor:
+def _poisson_deviation(counts: Tensor, rng: Generator) -> Tensor:
     """Return the deviation from their means of Poisson numbers with the means ``counts``; it has
     no gradient.
     """
@@ -259,18 +263,21 @@ def _by_parts(compute: Callable[[Tensor], Tensor], numbers: Tensor, rng: Generat
     if (
         torch.is_grad_enabled()
         or {numbers.device.type, rng.device.type} != {"cpu"}
-        or element_count < 2 * _PART
+        or element_count < 2 * _PART_ELEMENTS
     ):
         return compute(numbers)
     result, flat_numbers = torch.empty(numbers.shape, dtype=numbers.dtype), numbers.reshape(-1)
-    # the last part takes the remainder, so that none is shorter than `_PART`
-    part_ends = [*range(_PART, element_count - _PART, _PART), element_count]
+    # the last part takes the remainder, so that none is shorter than `_PART_ELEMENTS`
+    part_ends = [
+        *range(_PART_ELEMENTS, element_count - _PART_ELEMENTS, _PART_ELEMENTS),
+        element_count,
+    ]
     for start, end in pairwise([0, *part_ends]):
         result.view(-1)[start:end] = compute(flat_numbers[start:end])
     return result
 
 
-def normal(like: Tensor, rng: Generator) -> Tensor:
+def standard_normal(like: Tensor, rng: Generator) -> Tensor:
     """Sample standard normal numbers in the shape of ``like``, with equal numbers in every
     precision.
     """
@@ -339,18 +346,17 @@ def _(
     full_well: float | None = None,
     **params: object,
 ) -> list[str]:
-    refuse_without_room(
-        math.inf if full_well is None else full_well, dark=dark_electrons(mean, exposure)
-    )
+    well = math.inf if full_well is None else full_well
+    refuse_without_room(well, dark=dark_electrons(mean, exposure))
     return []
 
 
 def _sampled_mean(mean: float, rng: Generator) -> float:
     """Return the mean dark electrons of one exposure, drawn with a standard deviation of half the
-    mean and limited to 0 and `_MOST` times the mean.
+    mean and limited to 0 and `_LARGEST_DRAWN_MEAN` times the mean.
     """
     normal_number = torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
-    return mean * max(0.0, min(_MOST, 1.0 + 0.5 * float(normal_number)))
+    return mean * max(0.0, min(_LARGEST_DRAWN_MEAN, 1.0 + 0.5 * float(normal_number)))
 
 
 @dark_current.skip_bound
@@ -363,8 +369,8 @@ def _(
     mean_of: str = "sensor",
 ) -> float:
     total = dark_electrons(mean, exposure)
-    largest_mean = total if mean_of == "sensor" else _MOST * total
-    return _share(largest_mean, math.sqrt(largest_mean), electrons, full_well)
+    largest_mean = total if mean_of == "sensor" else _LARGEST_DRAWN_MEAN * total
+    return _relative_rms(largest_mean, math.sqrt(largest_mean), electrons, full_well)
 
 
 @dark_current.skip_draw
@@ -377,7 +383,7 @@ def _(
     **params: Any,
 ) -> float:
     mean_electrons = dark_electrons(mean, exposure)
-    largest_mean = mean_electrons if mean_of == "sensor" else _MOST * mean_electrons
+    largest_mean = mean_electrons if mean_of == "sensor" else _LARGEST_DRAWN_MEAN * mean_electrons
     usual_rms = math.sqrt(largest_mean + largest_mean**2)
     return (
         poisson_rms(largest_mean, max(1, math.prod(electrons.shape))) / usual_rms
@@ -410,7 +416,7 @@ def read_noise(
     """
 
     def with_read_noise(piece: Tensor) -> Tensor:
-        return piece + normal(piece, rng).mul_(read_noise).add_(offset)
+        return piece + standard_normal(piece, rng).mul_(read_noise).add_(offset)
 
     return _by_parts(with_read_noise, single(electrons), rng)
 
@@ -419,9 +425,8 @@ def read_noise(
 def _(
     *, offset: float, read_noise: float, full_well: float | None = None, **params: object
 ) -> list[str]:
-    refuse_without_room(
-        math.inf if full_well is None else full_well, offset=offset, read_noise=read_noise
-    )
+    well = math.inf if full_well is None else full_well
+    refuse_without_room(well, offset=offset, read_noise=read_noise)
     return []
 
 
@@ -429,14 +434,14 @@ def _(
 def _(
     electrons: TensorStats, *, offset: float, read_noise: float, full_well: float | None
 ) -> float:
-    return _share(offset, read_noise, electrons, full_well)
+    return _relative_rms(offset, read_noise, electrons, full_well)
 
 
 @read_noise.skip_draw
 def _(electrons: TensorStats, *, offset: float, read_noise: float, **params: Any) -> float:
     pixels, variance = max(1, math.prod(electrons.shape)), read_noise**2
     # half of the probability is for the mean of the noise, half for its square
-    sure = SURE + math.log(2.0)
+    sure = RARITY + math.log(2.0)
     mean_term = abs(offset) * read_noise * math.sqrt(2.0 * sure / pixels)
     square_limit = chi_square_limit(pixels * variance, variance, sure) / pixels
     usual_rms = math.hypot(offset, read_noise)
@@ -460,7 +465,9 @@ def _(electrons: ErrorBound, **params: Any) -> float:
     return electrons.rms
 
 
-def _share(shift: float, spread: float, electrons: TensorStats, full_well: float | None) -> float:
+def _relative_rms(
+    shift: float, spread: float, electrons: TensorStats, full_well: float | None
+) -> float:
     """Return the rms of the added electrons, divided by the largest signal or the full well,
     whichever is smaller.
 

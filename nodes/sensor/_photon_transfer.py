@@ -25,7 +25,7 @@ from neusee.nodes.units import (
     Gain,
 )
 
-well_of, read_of = full_well, read_noise  # parameters below have the same names
+limit_to_well, add_read_noise = full_well, read_noise  # parameters below have the same names
 
 
 @node()
@@ -68,19 +68,19 @@ def photon_transfer(
         electrons = photon_noise(
             flat_field, quantum_efficiency=quantum_efficiency, distribution=distribution, rng=rng
         )
-        electrons = read_of(
+        electrons = add_read_noise(
             dark_current(electrons, mean=dark_mean, rng=rng),
             offset=offset,
             read_noise=read_noise,
             rng=rng,
         )
-        electrons = well_of(electrons, capacity=full_well)
+        electrons = limit_to_well(electrons, capacity=full_well)
         numbers: Tensor = digitize(electrons, gain=gain, rounding=rounding, bits=bits, rng=rng)
         return numbers
 
-    photon_levels = _rise(full_well / quantum_efficiency, 1.0 / quantum_efficiency, levels)
+    photon_levels = _photon_levels(full_well / quantum_efficiency, 1.0 / quantum_efficiency, levels)
     pair_statistics = torch.tensor(
-        [_pair(frame(p), frame(p)) for p in photon_levels], dtype=torch.float64
+        [_mean_and_variance(frame(p), frame(p)) for p in photon_levels], dtype=torch.float64
     )
     signal = pair_statistics[:, 0] - pair_statistics[0, 0]
     # DN2: read noise and dark current, and 1/12 of rounding or 1/6 of the dithered floor
@@ -91,7 +91,7 @@ def photon_transfer(
     return torch.stack([signal, pair_statistics[:, 1], dark_variance + gain * signal], 1)
 
 
-def _rise(top: float, first: float, levels: int) -> list[float]:
+def _photon_levels(top: float, first: float, levels: int) -> list[float]:
     """Return the photons of each level: 0, then geometric steps from ``first`` to 1.2 times
     ``top``.
     """
@@ -100,7 +100,7 @@ def _rise(top: float, first: float, levels: int) -> list[float]:
     return [0.0, *(first * ratio ** (i / step_count) for i in range(levels - 1))]
 
 
-def _pair(first: Tensor, second: Tensor) -> tuple[float, float]:
+def _mean_and_variance(first: Tensor, second: Tensor) -> tuple[float, float]:
     """Return the mean of two frames, and the temporal variance from the difference of the
     frames.
     """

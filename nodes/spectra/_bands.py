@@ -13,7 +13,7 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version
 from neusee.nodes.spectra._cie_tables import Table
-from neusee.nodes.spectra._table_files import LENGTHS, Curves, Numbers, curves, refused
+from neusee.nodes.spectra._table_files import LENGTHS, Curves, Numbers, curves, table_error
 from neusee.nodes.units import Count, DataFile, Fraction, Linewidth, Wavelength
 from neusee.nodes.values import Bands
 from neusee.nodes.values import Bands as Samples
@@ -23,8 +23,9 @@ from neusee.nodes.values import Bands as Samples
 # Spectral bands of a scene, and spectral sampling of a laser line.
 
 
-_MOST = 100_000  #: bands, at most; 0.003 nm each from 400 to 700 nm
-_GRID = 10e-9  #: m, spacing of the bands of a scene; the paper samples laser lines on the same grid
+_MOST_BANDS = 100_000  #: bands, at most; 0.003 nm each from 400 to 700 nm
+#: m, spacing of the bands of a scene; the paper samples laser lines on the same grid
+_GRID_SPACING = 10e-9
 
 
 @node(rtol=1e-12, before_run=True)
@@ -64,9 +65,9 @@ def _(*, start: float, stop: float, count: int = 1) -> list[str]:
 
 def _refuse_many(count: int) -> None:
     """Raise ParameterError for more bands than any computation here can use."""
-    if count > _MOST:
+    if count > _MOST_BANDS:
         raise ParameterError(
-            "count", f"{count} bands exceed the limit of {_MOST}: choose fewer bands"
+            "count", f"{count} bands exceed the limit of {_MOST_BANDS}: choose fewer bands"
         )
 
 
@@ -153,7 +154,7 @@ def line(
     """
     sigma = fwhm / (2 * math.sqrt(2 * math.log(2)))
     if sampling == "point":
-        return _points(wavelength, sigma, count, floor)
+        return _grid_points(wavelength, sigma, count, floor)
     width = (3 * fwhm if span is None else span) / count
     edges = width * (torch.arange(count + 1, dtype=torch.float64) - count / 2)
     line_share = torch.erf(edges / (sigma * math.sqrt(2))).diff() / 2
@@ -176,7 +177,7 @@ def _(
     points = params.get("sampling") == "point"
     name, width = ("fwhm", 3 * fwhm) if span is None else ("span", span)
     if points:
-        name, width = "count", _GRID * count
+        name, width = "count", _GRID_SPACING * count
     reach = width / 2
     if wavelength - reach < 100e-9:
         text = (
@@ -202,15 +203,15 @@ def _(result: Samples, *, wavelength: float, **params: Any) -> list[Check]:
     return [Check(text, abs(total - 1) < 0.01)]
 
 
-def _points(wavelength: float, sigma: float, count: int, floor: float) -> Samples:
+def _grid_points(wavelength: float, sigma: float, count: int, floor: float) -> Samples:
     """Return ``count`` points of the 10 nm grid around a line, each with the power density there
     times 10 nm.
     """
-    first_multiple = math.floor(wavelength / _GRID - count / 2 + 1 + 1e-9)
-    centres = _GRID * (first_multiple + torch.arange(count, dtype=torch.float64))
+    first_multiple = math.floor(wavelength / _GRID_SPACING - count / 2 + 1 + 1e-9)
+    centres = _GRID_SPACING * (first_multiple + torch.arange(count, dtype=torch.float64))
     relative_power: Tensor = torch.exp(-(((centres - wavelength) / sigma) ** 2) / 2) + floor
-    weights = relative_power * _GRID / (sigma * math.sqrt(2 * math.pi))
-    return Samples(centres, torch.full_like(centres, _GRID), weights)
+    weights = relative_power * _GRID_SPACING / (sigma * math.sqrt(2 * math.pi))
+    return Samples(centres, torch.full_like(centres, _GRID_SPACING), weights)
 
 
 def mean_wavelength(line: Samples) -> float:
@@ -228,8 +229,9 @@ _COLUMNS = (
     " (mW/nm) for a spectrum, then two columns"
 )
 _PER_LENGTH = re.compile(r"(?:/|per )\s*(?:nm|um|µm|μm|m)\)?$")  #: end of a unit of spectral power
-_LEFT = 1e-3  #: share of the energy of a spectrum that its bands leave out, half of it on each side
-_MANY = 50  #: lines; each of them takes a PSF of its own
+#: share of the energy of a spectrum that its bands leave out, half of it on each side
+_OMITTED_ENERGY = 1e-3
+_MANY_LINES = 50  #: lines; each of them takes a PSF of its own
 
 
 @node(rtol=1e-9, before_run=True)
@@ -254,7 +256,7 @@ def line_table(*, file: DataFile, count: Count = 5) -> Bands:
     laser = laser_table(file)
     table = laser.power.table()
     if laser.widths is None:
-        return _divided(table, count)
+        return _divided_spectrum(table, count)
     widths = torch.from_numpy(laser.widths.copy())
     return Bands(table.wavelengths, widths, table.values[0] / table.values[0].sum())
 
@@ -263,7 +265,7 @@ def line_table(*, file: DataFile, count: Count = 5) -> Bands:
 def _(*, file: Path, count: int = 5) -> list[str]:
     laser = laser_table(file)
     rows = len(laser.power.wavelengths)
-    if laser.widths is not None and rows > _MANY:
+    if laser.widths is not None and rows > _MANY_LINES:
         return [
             f"{file.name}: each of the {rows} lines takes a PSF of its own: keep the strongest"
             " lines to save time"
@@ -276,7 +278,7 @@ def _(result: Bands, *, file: Path, count: int = 5) -> list[Check]:
     laser = laser_table(file)
     table = laser.power.table()
     lines = Bands(table.wavelengths, table.wavelengths, table.values[0])
-    own = _mean(table) if laser.widths is None else mean_wavelength(lines)
+    own = _mean_of_spectrum(table) if laser.widths is None else mean_wavelength(lines)
     mean, band_range = mean_wavelength(result), float(result.centres.max() - result.centres.min())
     text = (
         f"{file.name} in {len(result.centres)} bands: mean {mean * 1e9:.6g} nm, {own * 1e9:.6g} nm"
@@ -297,7 +299,7 @@ def laser_table(file: Path) -> LaserTable:
     try:
         return _laser_table(file)
     except (OSError, ValueError) as error:
-        raise refused("file", _COLUMNS, error) from None
+        raise table_error("file", _COLUMNS, error) from None
 
 
 @once_per_version
@@ -320,7 +322,8 @@ def _laser_table(file: Path) -> LaserTable:
     if spectrum and len(table.wavelengths) < 2:
         raise ValueError(f"{file.name} holds one wavelength: a spectrum needs at least two")
     power_curve = table._replace(columns=(power,), values=table.values[:1])
-    return LaserTable(power_curve, None if spectrum else _widths(table))
+    widths = None if spectrum else _widths(table)
+    return LaserTable(power_curve, widths)
 
 
 def _widths(table: Curves) -> Numbers:
@@ -335,9 +338,12 @@ def _widths(table: Curves) -> Numbers:
     return widths
 
 
-def _divided(table: Table, count: int) -> Bands:
-    """Divide a spectrum into equal bands that hold all but `_LEFT` of its energy."""
-    lowest, highest = _reached(table, _LEFT / 2), _reached(table, 1 - _LEFT / 2)
+def _divided_spectrum(table: Table, count: int) -> Bands:
+    """Divide a spectrum into equal bands that hold all but `_OMITTED_ENERGY` of its energy."""
+    lowest, highest = (
+        _wavelength_of_share(table, _OMITTED_ENERGY / 2),
+        _wavelength_of_share(table, 1 - _OMITTED_ENERGY / 2),
+    )
     edges = torch.linspace(lowest, highest, count + 1, dtype=torch.float64)
     centres, width = (edges[1:] + edges[:-1]) / 2, (highest - lowest) / count
     widths = torch.full_like(centres, width)
@@ -345,7 +351,7 @@ def _divided(table: Table, count: int) -> Bands:
     return Bands(centres, widths, energy / energy.sum())
 
 
-def _reached(table: Table, share: float) -> float:
+def _wavelength_of_share(table: Table, share: float) -> float:
     """Return the wavelength up to which a spectrum has a share of its energy, by bisection."""
     first, low, high = (float(table.wavelengths[i]) for i in (0, 0, -1))
     total = _energy(table, first, high)
@@ -364,7 +370,7 @@ def _energy(table: Table, low: float, high: float) -> float:
     return float(table.over(Bands(centre, width, centre))[0]) * (high - low) if high > low else 0.0
 
 
-def _mean(table: Table) -> float:
+def _mean_of_spectrum(table: Table) -> float:
     """Return the mean wavelength of a spectrum that is linear between its samples, weighted by
     energy.
     """

@@ -11,7 +11,7 @@ from neusee.nodes import Check, node
 from neusee.nodes.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from neusee.nodes.input_files import once_per_version
 from neusee.nodes.spectra._cie_tables import Table, measured_camera, observer
-from neusee.nodes.spectra._table_files import Curves, curves, refused
+from neusee.nodes.spectra._table_files import Curves, curves, table_error
 from neusee.nodes.units import DataFile, Efficiency
 from neusee.nodes.values import Bands
 
@@ -21,10 +21,11 @@ from neusee.nodes.values import Bands
 
 
 Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
-_UNSEEN = 1e-3  #: of the largest sensitivity; a band that every channel sees less counts as unseen
-#: nm, ends of the range in which some channel has more than `_UNSEEN`, with a margin; found without
-#: the table
-_SEEN: dict[str, tuple[float, float]] = {
+#: of the largest sensitivity; a band that every channel sees less counts as unseen
+_UNSEEN_SHARE = 1e-3
+#: nm, ends of the range in which some channel has more than `_UNSEEN_SHARE`, with a margin; found
+#: without the table
+_SEEN_RANGE: dict[str, tuple[float, float]] = {
     "CIE 1931": (375.0, 720.0),
     "Nikon 5100": (405.0, 690.0),
     "Sigma SDMerill": (405.0, 675.0),
@@ -91,19 +92,19 @@ def _(
     if shortest_nm <= float(centres.min()) and float(centres.max()) <= longest_nm:
         return notes  # most recipes: colour-science, whose import takes a second, is not needed
     strongest = responses(bands, camera=camera).amax(0)
-    unseen = centres[strongest < _UNSEEN]
+    unseen = centres[strongest < _UNSEEN_SHARE]
     if not len(unseen):
         return notes
     range_nm = f"{float(unseen.min()):.5g} nm" + (
         f" to {float(unseen.max()):.5g} nm" if len(unseen) > 1 else ""
     )
-    largest = float(strongest[strongest < _UNSEEN].max())
+    largest = float(strongest[strongest < _UNSEEN_SHARE].max())
     return [
         *notes,
         (
             f"no channel of {_name(camera)} sees {len(unseen)} of {len(centres)} bands, {range_nm}:"
-            f" the largest relative response is {largest:.2g}, below {_UNSEEN:g}, so their light is"
-            f" missing from the picture; choose {shortest_nm:g} to {longest_nm:g} nm"
+            f" the largest relative response is {largest:.2g}, below {_UNSEEN_SHARE:g}, so their"
+            f" light is missing from the picture; choose {shortest_nm:g} to {longest_nm:g} nm"
         ),
     ]
 
@@ -135,7 +136,7 @@ def camera_curves(file: Path) -> tuple[Curves, bool]:
     try:
         return _camera_curves(file)
     except (OSError, ValueError) as error:
-        raise refused("camera", _COLUMNS, error) from None
+        raise table_error("camera", _COLUMNS, error) from None
 
 
 def _camera_curves(file: Path) -> tuple[Curves, bool]:
@@ -243,9 +244,9 @@ def seen_range(camera: str | Path) -> tuple[float, float]:
     largest value.
     """
     if not isinstance(camera, Path):
-        return _SEEN[camera]
+        return _SEEN_RANGE[camera]
     table = _from_file(camera)
-    sensitive = table.wavelengths[table.values.amax(0) >= _UNSEEN * table.values.max()] * 1e9
+    sensitive = table.wavelengths[table.values.amax(0) >= _UNSEEN_SHARE * table.values.max()] * 1e9
     return float(sensitive[0]), float(sensitive[-1])
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from neusee.nodes._colour_science import colour_science
 from neusee.nodes.values import Bands
 
-_ROUNDING = 1e-3  #: nm
+_ROUNDING_NM = 1e-3  #: nm
 _CHARTS = ("BabelColor Average", "ColorChecker N Ohta", "PMC", "ISO 17321-1")
 
 
@@ -179,7 +179,7 @@ def require_range(
     low, high, first_nm, last_nm = (
         float(x) * 1e9 for x in (wavelengths.min(), wavelengths.max(), covered[0], covered[-1])
     )
-    if low < first_nm - _ROUNDING or high > last_nm + _ROUNDING:
+    if low < first_nm - _ROUNDING_NM or high > last_nm + _ROUNDING_NM:
         raise ValueError(
             f"the bands reach from {low:.4g} to {high:.4g} nm, but {source} {first_nm:.4g} to"
             f" {last_nm:.4g} nm: {fix}"

@@ -11,7 +11,7 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version
 from neusee.nodes.precision import single
 from neusee.nodes.spectra._cie_tables import Table, daylight, light, observer, require_range
-from neusee.nodes.spectra._table_files import Curves, curves, refused
+from neusee.nodes.spectra._table_files import Curves, curves, table_error
 from neusee.nodes.units import DataFile, Temperature
 from neusee.nodes.values import Bands, LowRankCube
 
@@ -20,9 +20,10 @@ Kind = Literal[
     "LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", "LED-RGB1", "LED-V1", "LED-V2",
 ]  # fmt: skip
 _COLUMNS = "write a header such as wavelength (nm),power (W/nm), then two columns"
-_VISIBLE = 0.99  #: share of the luminous efficiency that a table of light must hold, for lux
+#: share of the luminous efficiency that a table of light must hold, for lux
+_LEAST_EFFICIENCY_SHARE = 0.99
 _LUMENS_PER_WATT = 683.0  #: lm/W at 555 nm
-_LONGER = "give a longer table, or choose bands inside that range"
+_LONGER_TABLE = "give a longer table, or choose bands inside that range"
 
 
 @node(rtol=1e-9)
@@ -46,7 +47,7 @@ def illuminant(
     """
     table = _light(kind, temperature)
     name = _name(kind)
-    edges = _edges(bands)
+    edges = _band_edges(bands)
     require_range(edges, table.wavelengths, f"{name} is tabulated from")
     power = table.over(bands)[0]
     if not float(power.mean()) > 0:
@@ -72,7 +73,10 @@ def _(
         if bands is not None and not bands.centres.is_meta:
             try:
                 require_range(
-                    _edges(bands), table.wavelengths, f"{kind.name} is tabulated from", _LONGER
+                    _band_edges(bands),
+                    table.wavelengths,
+                    f"{kind.name} is tabulated from",
+                    _LONGER_TABLE,
                 )
             except ValueError as error:
                 raise ParameterError("kind", str(error)) from None
@@ -105,7 +109,7 @@ def luminous_share(bands: Bands | None, kind: str | Path, temperature: float) ->
     )
     # the second function of the observer is the luminous efficiency
     efficiency = observer_table.values[1] * in_range
-    if float(efficiency.sum() / observer_table.values[1].sum()) < _VISIBLE:
+    if float(efficiency.sum() / observer_table.values[1].sum()) < _LEAST_EFFICIENCY_SHARE:
         low, high = float(table.wavelengths[0]) * 1e9, float(table.wavelengths[-1]) * 1e9
         text = (
             f"{_name(kind)} is tabulated from {low:.4g} to {high:.4g} nm, which does not reach over"
@@ -135,7 +139,7 @@ def light_curve(file: Path) -> Curves:
     try:
         return _light_curve(file)
     except (OSError, ValueError) as error:
-        raise refused("kind", _COLUMNS, error) from None
+        raise table_error("kind", _COLUMNS, error) from None
 
 
 @once_per_version
@@ -170,7 +174,7 @@ def _name(kind: str | Path) -> str:
     return kind.name if isinstance(kind, Path) else kind
 
 
-def _edges(bands: Bands) -> Tensor:
+def _band_edges(bands: Bands) -> Tensor:
     """Return the lower edges of all bands, then the upper ones, in m."""
     return torch.cat([bands.centres - bands.widths / 2, bands.centres + bands.widths / 2])
 

@@ -27,7 +27,7 @@ from neusee.nodes.spectra._low_rank_cube import (
 from neusee.nodes.units import DataFile
 from neusee.nodes.values import Bands, LowRankCube
 
-_FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of the basis
+_SHORTEST, _LONGEST = 380e-9, 780e-9  #: m, range of the measured reflectances and of the basis
 
 
 @node(rtol=1e-5)
@@ -63,7 +63,7 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
     Raises: ValueError where `lift_mallett` or `spectra.compress` raises ValueError.
     Source: as `lift_mallett`.
     """
-    return _mixed(rgb, _basis(bands), within)
+    return _lifted_low_rank(rgb, _basis(bands), within)
 
 
 @node(rtol=1e-5)
@@ -102,7 +102,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Lo
     Raises: ValueError where `lift_lmmse` or `spectra.compress` raises ValueError.
     Source: as `lift_lmmse`.
     """
-    return _mixed(rgb, _estimator(bands), within)
+    return _lifted_low_rank(rgb, _estimator(bands), within)
 
 
 # --- hooks of both lifts --------------------------------------------------------------------------
@@ -165,7 +165,7 @@ def lift_checks(
     return checks
 
 
-def needs_rgb(rgb: Tensor) -> None:
+def require_rgb(rgb: Tensor) -> None:
     """Raise ValueError unless ``rgb`` is a picture of three channels (3, y, x)."""
     if rgb.ndim != 3 or rgb.shape[0] != 3:
         raise ValueError(
@@ -177,31 +177,37 @@ def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
     """Multiply an RGB picture by a matrix (band, 3), and set negative results to 0 in place to
     save memory.
     """
-    needs_rgb(rgb)
+    require_rgb(rgb)
     rgb = single(rgb)
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 
-def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
+def _lifted_low_rank(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
     """Estimate spectra from an RGB picture by a matrix (band, 3), and return the spectra as a
     low-rank cube.
 
     For a picture that requires a gradient, the full cube is computed, so that the gradient reaches
     the picture.
     """
-    needs_rgb(rgb)
+    require_rgb(rgb)
     flat_picture, matrix_float64 = rgb.detach().flatten(1), matrix.to(rgb.device)
-    if (cube := linear_planes(flat_picture, matrix_float64, within)) is not None:
-        return as_low_rank_cube(cube, _lifted(rgb, matrix) if rgb.requires_grad else rgb)
-    dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
-    source = Source(
-        lambda pixels: (matrix_float64 @ flat_picture[:, pixels].double()).clamp_min_(0),
-        len(matrix_float64),
-        flat_picture.shape[1],
+    cube = linear_planes(flat_picture, matrix_float64, within)
+    if cube is None:
+        cube = few_planes(_blockwise_lift(flat_picture, matrix_float64), within)
+    full_cube_or_picture = _lifted(rgb, matrix) if rgb.requires_grad else rgb
+    return as_low_rank_cube(cube, full_cube_or_picture)
+
+
+def _blockwise_lift(picture: Tensor, matrix: Tensor) -> Source:
+    """Return the spectra of a flat picture (channel, pixel) by a matrix (band, channel), to be
+    computed in blocks of pixels.
+    """
+    dtype = picture.dtype if picture.dtype == torch.float64 else torch.float32
+    return Source(
+        lambda pixels: (matrix @ picture[:, pixels].double()).clamp_min_(0),
+        len(matrix),
+        picture.shape[1],
         dtype,
-    )
-    return as_low_rank_cube(
-        few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb
     )
 
 
@@ -214,11 +220,11 @@ def _basis(bands: Bands) -> Tensor:
 def _estimator(bands: Bands) -> Tensor:
     """Return the matrix (band, 3) of the estimator for bands."""
     inside_charts(bands)
-    return _solved(tuple(float(c) for c in bands.centres))
+    return _estimator_of(tuple(float(c) for c in bands.centres))
 
 
 @functools.lru_cache(maxsize=16)
-def _solved(centres: tuple[float, ...]) -> Tensor:
+def _estimator_of(centres: tuple[float, ...]) -> Tensor:
     """Return the matrix (band, 3) float64 of `lift_lmmse` for bands with the given centre
     wavelengths in m.
     """
@@ -230,7 +236,7 @@ def lift_matrix(measured: Tensor, centres: Tensor) -> Tensor:
     """Return the matrix that estimates reflectance from linear sRGB, fitted to the measured spectra
     ``measured``.
 
-    Shapes: known (spectrum, band) -> (band, 3) float64.
+    Shapes: measured (spectrum, band) -> (band, 3) float64.
     """
     spectra_products, rgb_of_spectra = measured.T @ measured / len(measured), to_srgb(centres)
     rgb_products = rgb_of_spectra @ spectra_products @ rgb_of_spectra.T
@@ -250,7 +256,7 @@ def lift_matrix(measured: Tensor, centres: Tensor) -> Tensor:
 
 def inside_charts(bands: Bands) -> None:
     """Raise ValueError for bands outside 380 to 780 nm, the range of the measured colour charts."""
-    require_range(bands.centres, (_FIRST, _LAST), "reflectances are known from")
+    require_range(bands.centres, (_SHORTEST, _LONGEST), "reflectances are known from")
 
 
 _attach(lift_mallett, lift_mallett_mixture, _basis)
@@ -311,12 +317,12 @@ class Stage(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         features, skips = self.embedding(x), []
-        for attend, shrink in _parts(self.encoder_layers):
+        for attend, shrink in _layers_of(self.encoder_layers):
             skips.append(attend(features))
             features = shrink(skips[-1])
         features = self.bottleneck(features)
         for (grow, fuse, attend), skip in zip(
-            _parts(self.decoder_layers), reversed(skips), strict=True
+            _layers_of(self.decoder_layers), reversed(skips), strict=True
         ):
             features = attend(fuse(torch.cat([grow(features), skip], 1)))
         result: Tensor = self.mapping(features) + x
@@ -333,7 +339,7 @@ class Blocks(nn.Module):
         self.blocks = nn.ModuleList([nn.ModuleList([SpectralAttention(dim), Normed(dim)])])
 
     def forward(self, x: Tensor) -> Tensor:
-        for attend, feed in _parts(self.blocks):
+        for attend, feed in _layers_of(self.blocks):
             x = attend(x) + x
             x = feed(x) + x
         return x
@@ -410,7 +416,7 @@ class FeedForward(nn.Module):
         return result
 
 
-def _parts(layers: nn.ModuleList) -> Iterable[Iterable[nn.Module]]:
+def _layers_of(layers: nn.ModuleList) -> Iterable[Iterable[nn.Module]]:
     return cast(Iterable[Iterable[nn.Module]], layers)
 
 
@@ -451,9 +457,11 @@ def lift_mst_plus_plus(
             network; ValueError unless the bands are 31 from 400 to 700 nm.
     Source: Cai et al., MST++, CVPR Workshops 2022 (NTIRE spectral recovery).
     """
-    needs_rgb(rgb)
+    require_rgb(rgb)
     need_mst_plus_plus_bands(bands)
-    network = _loaded(weights) if weights is not None else _untrained(untrained, rng)
+    network = (
+        _loaded_network(weights) if weights is not None else _untrained_network(untrained, rng)
+    )
     return torch.relu_(lift_pictures(network.to(rgb), rgb[None])[0])
 
 
@@ -475,7 +483,7 @@ def _(
 @lift_mst_plus_plus.preflight
 def _(*, weights: Path | None = None, untrained: str = "refuse", **params: Any) -> list[str]:
     if weights is not None:
-        _fitting(weights)
+        _fitting_tensors(weights)
         return []
     if untrained == "refuse":
         text = (
@@ -517,7 +525,7 @@ def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> M
     around the body then has this matrix, and the last layer starts at 0. Training adds the
     corrections that image structure and a non-linear estimate allow.
     """
-    network = _untrained("allow", rng).requires_grad_(True).train()
+    network = _untrained_network("allow", rng).requires_grad_(True).train()
     if linear is not None:
         with torch.no_grad():
             network.conv_in.weight.zero_()[:, :, 1, 1] = linear.to(network.conv_in.weight)
@@ -537,17 +545,17 @@ def need_mst_plus_plus_bands(bands: Bands) -> None:
         )
 
 
-def _empty() -> MSTPlusPlus:
+def _empty_network() -> MSTPlusPlus:
     return empty(MSTPlusPlus).requires_grad_(False).eval()
 
 
-def _loaded(weights: Path) -> nn.Module:
-    network = _empty()
-    network.load_state_dict(_fitting(weights), assign=True)
+def _loaded_network(weights: Path) -> nn.Module:
+    network = _empty_network()
+    network.load_state_dict(_fitting_tensors(weights), assign=True)
     return network
 
 
-def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
+def _untrained_network(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
     """Return an MST++ network with random orthogonal weights; raise ValueError unless that is
     allowed.
     """
@@ -555,7 +563,7 @@ def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
         raise ValueError(
             "MST++ has no weights: give a checkpoint file in weights, or set untrained: allow"
         )
-    network = _empty().to_empty(device=rng.device)
+    network = _empty_network().to_empty(device=rng.device)
     for name, tensor in network.named_parameters():
         # scales begin at 1, biases at 0
         if name.endswith(("rescale", "norm.weight")):
@@ -567,12 +575,15 @@ def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
     return network
 
 
-def _fitting(weights: Path) -> dict[str, Tensor]:
+def _fitting_tensors(weights: Path) -> dict[str, Tensor]:
     """Read the tensors of a checkpoint file, and raise ParameterError unless they fit MST++ and
     are finite.
     """
-    tensors = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
-    wrong = _not_fitting(tensors)
+    tensors = {
+        name.removeprefix("module."): tensor
+        for name, tensor in _checkpoint_tensors(weights).items()
+    }
+    wrong = _misfits(tensors)
     if wrong:
         text = (
             f"{weights} holds {len(tensors)} tensors, and {len(wrong)} tensors do not fit MST++,"
@@ -585,15 +596,15 @@ def _fitting(weights: Path) -> dict[str, Tensor]:
     return {name: tensor.float() for name, tensor in tensors.items()}
 
 
-def _not_fitting(tensors: Mapping[str, Tensor]) -> list[str]:
+def _misfits(tensors: Mapping[str, Tensor]) -> list[str]:
     """Return the names of tensors that MST++ needs in another shape, or does not have."""
-    expected = _empty().state_dict()
+    expected = _empty_network().state_dict()
     shapes = {name: tensor.shape for name, tensor in tensors.items()}
     wrong_shape = [name for name in expected if shapes.get(name) != expected[name].shape]
     return wrong_shape + [name for name in tensors if name not in expected]
 
 
-def _read(weights: Path) -> dict[str, Tensor]:
+def _checkpoint_tensors(weights: Path) -> dict[str, Tensor]:
     """Read the named tensors of a checkpoint file.
 
     The file is .safetensors or a pickle that holds only tensors, with or without the key

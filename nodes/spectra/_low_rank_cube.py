@@ -15,9 +15,10 @@ from neusee.nodes.values import LowRankCube
 # Principal components of a spectral cube, computed and verified in blocks of pixels.
 
 
-_PIECE = 4096  #: pixels of a block: 31 bands in float64 take 1 MB and stay in the cache
-_FLOOR = 8  #: round-off units of the planes; no smaller error can be guaranteed
-_ROOT = 2e-7  #: relative resolution of a root mean square that is computed from products in float64
+_PIECE_PIXELS = 4096  #: pixels of a block: 31 bands in float64 take 1 MB and stay in the cache
+_LEAST_ROUND_OFFS = 8  #: round-off units of the planes; no smaller error can be guaranteed
+#: relative resolution of a root mean square that is computed from products in float64
+_RMS_RESOLUTION = 2e-7
 
 
 class Source(NamedTuple):
@@ -32,7 +33,10 @@ class Source(NamedTuple):
     dtype: torch.dtype  #: of the planes
 
     def pieces(self) -> list[slice]:
-        return [slice(i, min(i + _PIECE, self.pixels)) for i in range(0, self.pixels, _PIECE)]
+        return [
+            slice(i, min(i + _PIECE_PIXELS, self.pixels))
+            for i in range(0, self.pixels, _PIECE_PIXELS)
+        ]
 
 
 def few_planes(source: Source, within: float) -> LowRankCube:
@@ -50,8 +54,8 @@ def few_planes(source: Source, within: float) -> LowRankCube:
         band_products = _largest_and_products(source, scale)[1]
     axes = torch.linalg.eigh(band_products).eigenvectors.flip(1)
     round_off = torch.finfo(source.dtype).eps
-    target = max(within, _FLOOR * round_off, _ROOT) * scale
-    spread = _spread(band_products / source.pixels, axes, source.bands, round_off) * (
+    target = max(within, _LEAST_ROUND_OFFS * round_off, _RMS_RESOLUTION) * scale
+    spread = _rms_errors(band_products / source.pixels, axes, source.bands, round_off) * (
         scale if scaled else 1.0
     )
     count = max(
@@ -61,7 +65,7 @@ def few_planes(source: Source, within: float) -> LowRankCube:
             source.bands,
         ),
     )
-    planes, largest_by_band, largest_by_pixel = _projected(source, axes[:, :count])
+    planes, largest_by_band, largest_by_pixel = _projection(source, axes[:, :count])
     residual = bound_by_planes(largest, planes, axes[:, :count], largest_by_band)
     # no more than was measured
     spread = torch.cat([spread[:count], torch.minimum(spread[count], residual[count])[None]])
@@ -91,7 +95,7 @@ def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, T
     return largest, band_products
 
 
-def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _projection(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Project a spectral cube on the axes (band, k) of principal components, block by block.
 
     Return the basis images (k, pixel) in the precision of the source, and the largest error of what
@@ -112,7 +116,7 @@ def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return planes, largest_by_band, largest_by_pixel.mul_(1 + 2 * torch.finfo(source.dtype).eps)
 
 
-def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
+def _rms_errors(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
     """Return the rms error of each band if a spectral cube is approximated by its first k principal
     components.
 
@@ -260,9 +264,13 @@ def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list
 # clipped light is measured on every pixel.
 
 
-_PLANES_PIECE = 1 << 14  #: pixels of a block: 31 bands in float32 take 2 MB and stay in the cache
-_SAMPLE = 1 << 14  #: pixels that tell beforehand whether the clipped light is within the error
-_LEAST = 1e-5  #: least error that is tried: float32 alone leaves a few 1e-7
+_LINEAR_PIECE_PIXELS = (
+    1 << 14
+)  #: pixels of a block: 31 bands in float32 take 2 MB and stay in the cache
+_SAMPLED_PIXELS = (
+    1 << 14
+)  #: pixels that tell beforehand whether the clipped light is within the error
+_LEAST_ERROR = 1e-5  #: least error that is tried: float32 alone leaves a few 1e-7
 
 
 class _Axes(NamedTuple):
@@ -286,25 +294,25 @@ def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube
     """
     if (
         picture.dtype != torch.float32
-        or within < _LEAST
+        or within < _LEAST_ERROR
         or not bool(torch.isfinite(picture.sum(1)).all())
     ):
         return None
     axes = _axes(picture, matrix)
-    sampled_cube = matrix @ picture[:, :: max(1, picture.shape[1] // _SAMPLE)].double()
+    sampled_cube = matrix @ picture[:, :: max(1, picture.shape[1] // _SAMPLED_PIXELS)].double()
     allowed_error = within * float(sampled_cube.amax())
     count = next(
         (
             k
             for k in range(1, len(axes.power) + 1)
-            if float(_omitted(axes, k).max()) <= allowed_error
+            if float(_omitted_rms(axes, k).max()) <= allowed_error
         ),
         0,
     )
     # clipped light alone would exceed the error
     if not count or float(sampled_cube.clamp_max(0).square().mean(1).max()) >= allowed_error**2:
         return None
-    cube = _measured(picture, matrix, axes, count)
+    cube = _measured_cube(picture, matrix, axes, count)
     return (
         cube
         if float(cube.residual_rms[-1].max()) <= within * float(cube.residual_max[0].max())
@@ -315,8 +323,8 @@ def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube
 def _axes(picture: Tensor, matrix: Tensor) -> _Axes:
     """Return the principal components of the cube ``matrix @ picture`` before it is clipped."""
     channel_products = matrix.new_zeros(len(picture), len(picture))
-    for start in range(0, picture.shape[1], _PLANES_PIECE):
-        block = picture[:, start : start + _PLANES_PIECE].double()
+    for start in range(0, picture.shape[1], _LINEAR_PIECE_PIXELS):
+        block = picture[:, start : start + _LINEAR_PIECE_PIXELS].double()
         channel_products.addmm_(block, block.T)
     values, vectors = torch.linalg.eigh(channel_products / picture.shape[1])
     # root @ root.T is the mean product of the channels
@@ -325,14 +333,14 @@ def _axes(picture: Tensor, matrix: Tensor) -> _Axes:
     return _Axes(basis, basis.T @ matrix, strength.square())
 
 
-def _omitted(axes: _Axes, count: int) -> Tensor:
+def _omitted_rms(axes: _Axes, count: int) -> Tensor:
     """Return the rms of each band of the unclipped cube that is not in its first ``count``
     components.
     """
     return (axes.basis[:, count:].square() @ axes.power[count:]).sqrt()
 
 
-def _measured(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> LowRankCube:
+def _measured_cube(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> LowRankCube:
     """Return the low-rank cube of the first ``count`` components of ``matrix @ picture``, clipped
     at 0, with the errors that omitted components and clipping leave, measured on every pixel.
     """
@@ -346,8 +354,8 @@ def _measured(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> LowRa
         picture.new_empty(picture.shape[1]),
     )
     block_maxima, block_errors, square_sums = [], [], matrix.new_zeros(len(matrix))
-    for start in range(0, picture.shape[1], _PLANES_PIECE):
-        columns = slice(start, start + _PLANES_PIECE)
+    for start in range(0, picture.shape[1], _LINEAR_PIECE_PIXELS):
+        columns = slice(start, start + _LINEAR_PIECE_PIXELS)
         block = picture[:, columns]
         planes[:, columns] = weights @ block.double()
         bands = matrix_of_all @ block
@@ -365,37 +373,44 @@ def _measured(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> LowRa
             block_errors.append(errors.abs().amax(1))
             square_sums += errors.square().sum(1)
     rms = (square_sums / picture.shape[1]).sqrt()
-    return _bounded(
-        planes, basis, axes, largest_by_pixel, (torch.stack(block_maxima), block_errors, rms)
-    )
+    errors_of_bands = _BandErrors(torch.stack(block_maxima), block_errors, rms)
+    return _bounded_cube(planes, basis, axes, largest_by_pixel, errors_of_bands)
 
 
-def _bounded(
+class _BandErrors(NamedTuple):
+    """What was measured of each band of a cube, block by block of pixels."""
+
+    block_maxima: Tensor  #: (block, band) largest element
+    block_errors: list[Tensor]  #: largest error (band,) of each block with any
+    rms: Tensor  #: (band,) error of the whole cube
+
+
+def _bounded_cube(
     planes: Tensor,
     basis: Tensor,
     axes: _Axes,
-    off: Tensor,
-    measured: tuple[Tensor, list[Tensor], Tensor],
+    largest_by_pixel: Tensor,
+    measured: _BandErrors,
 ) -> LowRankCube:
     """Return the low-rank cube with the bounds of its errors, to which the rounding of float32 is
     added.
 
-    ``off`` is the largest error by pixel; ``measured`` holds the largest elements of each block
-    (block, band), the largest errors of each block with any, and the rms error of each band.
+    ``largest_by_pixel`` is the largest error of each pixel.
     """
-    block_maxima, block_errors, rms = measured
-    largest = block_maxima.amax(0).double().clamp_min(0)
+    largest = measured.block_maxima.amax(0).double().clamp_min(0)
     plane_maxima = torch.maximum(planes.amax(1), -planes.amin(1)).double()
     rounding = 4 * torch.finfo(planes.dtype).eps * float((basis.abs() @ plane_maxima).max())
     largest_by_band = (
-        torch.stack(block_errors).amax(0).double() if block_errors else torch.zeros_like(largest)
+        torch.stack(measured.block_errors).amax(0).double()
+        if measured.block_errors
+        else torch.zeros_like(largest)
     ) + rounding
-    earlier_errors = [_omitted(axes, k) + rms for k in range(planes.shape[0])]
-    rms_errors = torch.stack([*earlier_errors, rms]) + rounding
+    earlier_errors = [_omitted_rms(axes, k) + measured.rms for k in range(planes.shape[0])]
+    rms_errors = torch.stack([*earlier_errors, measured.rms]) + rounding
     return LowRankCube(
         planes,
         basis,
         bound_by_planes(largest, planes, basis, largest_by_band),
         rms_errors,
-        off.add_(rounding),
+        largest_by_pixel.add_(rounding),
     )

@@ -21,7 +21,7 @@ from neusee.nodes.spectra._lift import inside_charts, lift_matrix
 from neusee.nodes.units import Count, DataFiles
 from neusee.nodes.values import Bands
 
-_DARKEST = 1e-6  #: smallest reflectance to which the thickness of a layer is applied
+_DARKEST_LAYER = 1e-6  #: smallest reflectance to which the thickness of a layer is applied
 
 Thickness = Annotated[float, Field(gt=0, le=10)]
 Strength = Annotated[float, Field(ge=0, le=10)]
@@ -69,15 +69,15 @@ def metamers(
     measured = reflectances.double()
     mixture = _mixtures(measured, count, mixed, thickness, rng)
     black = metameric_blacks(
-        measured[_drawn(len(measured), (count,), rng)]
-        - measured[_drawn(len(measured), (count,), rng)],
+        measured[_random_indices(len(measured), (count,), rng)]
+        - measured[_random_indices(len(measured), (count,), rng)],
         measured,
         bands,
     )
     normal = torch.randn(count, 1, generator=rng, device=rng.device, dtype=torch.float64)
     # in proportion to the brightness of each mixture
     share = blacks * normal * mixture.mean(1, keepdim=True) / measured.mean()
-    least_share, greatest_share = _limits(mixture, black)
+    least_share, greatest_share = _factor_limits(mixture, black)
     return (mixture + share.maximum(least_share).minimum(greatest_share) * black).clamp(0.0, 1.0)
 
 
@@ -128,20 +128,22 @@ def _mixtures(
     # squares of exponential numbers differ widely: one dominates
     weights = weights.square()
     weights = weights / weights.sum(1, keepdim=True)
-    mixtures = (weights[..., None] * measured[_drawn(len(measured), (count, mixed), rng)]).sum(1)
+    mixtures = (
+        weights[..., None] * measured[_random_indices(len(measured), (count, mixed), rng)]
+    ).sum(1)
     uniform: Tensor = torch.rand(count, 1, **options)  # type: ignore[call-overload]
     layer_thickness: Tensor = thickness[0] * (thickness[1] / thickness[0]) ** uniform
     # Beer and Lambert: the transmission of a layer to the power of its thickness
-    layers: Tensor = mixtures.clamp(_DARKEST, 1.0) ** layer_thickness
+    layers: Tensor = mixtures.clamp(_DARKEST_LAYER, 1.0) ** layer_thickness
     return layers
 
 
-def _drawn(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
+def _random_indices(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
     """Return random indices below ``of``."""
     return torch.randint(of, shape, generator=rng, device=rng.device)
 
 
-def _limits(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
+def _factor_limits(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
     """Return the smallest and the largest factor that keep each spectrum ``base + factor *
     black`` in [0, 1].
     """
@@ -179,7 +181,7 @@ def csv_spectra(file: Path) -> tuple[Numbers, Numbers]:
     return numbers[:, 0].copy(), numbers[:, 1:].T
 
 
-def wrong_wavelengths(wavelengths: Numbers, values: Numbers) -> str:
+def wavelength_problem(wavelengths: Numbers, values: Numbers) -> str:
     """Return the reason why numbers from a file cannot be wavelengths in nm and their spectra,
     or an empty text.
     """
@@ -203,9 +205,9 @@ def _number(cell: str, file: Path, line: int) -> float:
 # Measured reflectances from colour-science and from the user's files.
 
 
-Set = Literal["charts", "CIE 2017", "CQS"]
-_MOST = 1.5  #: largest reflectance; a file with larger values is probably in percent
-_FILES = (
+MeasuredSet = Literal["charts", "CIE 2017", "CQS"]
+_LARGEST_REFLECTANCE = 1.5  #: largest reflectance; a file with larger values is probably in percent
+_FILE_FORMS = (
     "give .csv (first column wavelength in nm), .npz (wavelengths, reflectances) or .mat (S_name,"
     " sur_name)"
 )
@@ -215,7 +217,7 @@ _FILES = (
 def reflectances(
     bands: Bands,
     *,
-    sets: tuple[Set, ...] = ("charts", "CIE 2017", "CQS"),
+    sets: tuple[MeasuredSet, ...] = ("charts", "CIE 2017", "CQS"),
     files: DataFiles | None = None,
 ) -> Tensor:
     """Return measured reflectances from colour-science and from the user's files, one spectrum in
@@ -237,9 +239,9 @@ def reflectances(
         inside_charts(bands)
     tables: list[Table] = []
     for name in sets:
-        tables += _SETS[name]()
+        tables += _MEASURED_SETS[name]()
     for file in files or ():
-        tables.append(_read(file))
+        tables.append(_spectra_of_file(file))
         fix = "leave the file out, or choose bands inside that range"
         require_range(bands.centres, tables[-1].wavelengths, f"{file.name} holds", fix)
     return (
@@ -250,11 +252,15 @@ def reflectances(
 
 
 @reflectances.preflight
-def _(*, sets: tuple[Set, ...] = ("charts",), files: tuple[Path, ...] | None = None) -> list[str]:
+def _(
+    *, sets: tuple[MeasuredSet, ...] = ("charts",), files: tuple[Path, ...] | None = None
+) -> list[str]:
     if not sets and not files:
-        raise ParameterError("files", f"the parameters sets and files are both empty: {_FILES}")
+        raise ParameterError(
+            "files", f"the parameters sets and files are both empty: {_FILE_FORMS}"
+        )
     for file in files or ():
-        _read(file)
+        _spectra_of_file(file)
     return []
 
 
@@ -269,7 +275,7 @@ def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
     ]
 
 
-_SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
+_MEASURED_SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
     "charts": paints,
     "CIE 2017": lambda: (gamut_samples("CIE 2017"),),
     "CQS": lambda: (gamut_samples("CQS"),),
@@ -280,20 +286,22 @@ _SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
 
 
 @once_per_version
-def _read(file: Path) -> Table:
+def _spectra_of_file(file: Path) -> Table:
     """Read the spectra of a file, or return them from memory while the file is unchanged."""
-    reader = {".csv": csv_spectra, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
+    reader = {".csv": csv_spectra, ".npz": _npz_spectra, ".mat": _mat_spectra}.get(
+        file.suffix.lower()
+    )
     if reader is None:
-        raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")
+        raise ParameterError("files", f"{file.name} holds no reflectances: {_FILE_FORMS}")
     try:
         wavelengths, values = reader(file)
     except ParameterError:
         raise
     except (OSError, KeyError, ValueError, TypeError, BadZipFile, UnicodeDecodeError) as error:
         raise ParameterError(
-            "files", f"{file.name} cannot be read as reflectances ({error}): {_FILES}"
+            "files", f"{file.name} cannot be read as reflectances ({error}): {_FILE_FORMS}"
         ) from None
-    problem = _wrong(wavelengths, values)
+    problem = _reflectance_problem(wavelengths, values)
     if problem:
         raise ParameterError("files", f"{file.name}: {problem}")
     return Table(
@@ -301,7 +309,7 @@ def _read(file: Path) -> Table:
     )
 
 
-def _wrong(wavelengths: Numbers, values: Numbers) -> str:
+def _reflectance_problem(wavelengths: Numbers, values: Numbers) -> str:
     """Return the reason why arrays from a file cannot be wavelengths and reflectances, or an
     empty text if they can.
     """
@@ -315,9 +323,9 @@ def _wrong(wavelengths: Numbers, values: Numbers) -> str:
             f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum,"
             " wavelength)"
         )
-    if wrong := wrong_wavelengths(wavelengths, values):
+    if wrong := wavelength_problem(wavelengths, values):
         return wrong
-    if values.max() > _MOST or values.min() < -0.1:
+    if values.max() > _LARGEST_REFLECTANCE or values.min() < -0.1:
         return (
             f"values from {values.min():.3g} to {values.max():.3g} are not reflectances: write 1"
             " for white, not 100"
@@ -325,14 +333,14 @@ def _wrong(wavelengths: Numbers, values: Numbers) -> str:
     return ""
 
 
-def _npz(file: Path) -> tuple[Numbers, Numbers]:
+def _npz_spectra(file: Path) -> tuple[Numbers, Numbers]:
     """Read wavelengths in nm and reflectances (spectrum, wavelength) from a .npz file."""
     npz_needs(file, 1.0, 8.0, "files")
     with np.load(file, allow_pickle=False) as arrays:
-        return _real(arrays["wavelengths"]), _real(arrays["reflectances"])
+        return _real_numbers(arrays["wavelengths"]), _real_numbers(arrays["reflectances"])
 
 
-def _mat(file: Path) -> tuple[Numbers, Numbers]:
+def _mat_spectra(file: Path) -> tuple[Numbers, Numbers]:
     """Read wavelengths in nm and reflectances (spectrum, wavelength) from a .mat file."""
     from scipy.io import loadmat
 
@@ -347,11 +355,11 @@ def _mat(file: Path) -> tuple[Numbers, Numbers]:
     name = next(
         name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_")
     )
-    start, step, count = _real(variables[f"S_{name}"]).ravel()
-    return start + step * np.arange(int(count)), _real(variables[f"sur_{name}"]).T
+    start, step, count = _real_numbers(variables[f"S_{name}"]).ravel()
+    return start + step * np.arange(int(count)), _real_numbers(variables[f"sur_{name}"]).T
 
 
-def _real(values: Any) -> Numbers:
+def _real_numbers(values: Any) -> Numbers:
     """Return the values as float64; raise ValueError for complex values, whose imaginary part
     would be lost.
     """

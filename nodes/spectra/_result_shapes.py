@@ -18,10 +18,10 @@ from neusee.nodes.spectra._lift import (
 )
 from neusee.nodes.spectra._low_rank_cube import compress
 from neusee.nodes.spectra._plausible_spectra import metamers
-from neusee.nodes.spectra._synthetic_pictures import _FINE, grain, leaves, render
+from neusee.nodes.spectra._synthetic_pictures import _SAMPLES_PER_PIXEL, grain, leaves, render
 from neusee.nodes.values import Bands, LowRankCube
 
-_FEW = 20  #: bands of a laser line, at most
+_MOST_LINE_BANDS = 20  #: bands of a laser line, at most
 
 
 @illuminant.shape
@@ -34,19 +34,19 @@ def _(bands: Bands, *, camera: str | Path = "CIE 1931", **params: Any) -> Tensor
     """Return the responses to bands that no channel sees, which a laser must know before the
     run, or their shape.
     """
-    if known(bands.centres) and _beyond(bands, camera):
+    if known(bands.centres) and _may_be_unseen(bands, camera):
         channels: Tensor = responses(bands, camera=camera, **params)
         return channels
     return double(channel_count(camera), len(bands.centres))
 
 
-def _beyond(bands: Bands, camera: str | Path) -> bool:
+def _may_be_unseen(bands: Bands, camera: str | Path) -> bool:
     """Return True for the few bands of a laser if some channel may not see them; no table is
     read for others.
     """
     shortest_nm, longest_nm = seen_range(camera)
     return (
-        len(bands.centres) < _FEW
+        len(bands.centres) < _MOST_LINE_BANDS
         and not shortest_nm <= float(bands.centres.mean()) * 1e9 <= longest_nm
     )
 
@@ -117,7 +117,7 @@ def _(spectra: Tensor, bands: Bands, *, shape: tuple[int, int], **params: Any) -
 @leaves.work
 def _(result: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
     """Return the work of a picture that is drawn several times as fine, in all bands at once."""
-    sample_count = float(_FINE**2 * result.numel())
+    sample_count = float(_SAMPLES_PER_PIXEL**2 * result.numel())
     return 4.0 * sample_count, sample_count
 
 

@@ -15,9 +15,15 @@ from neusee.nodes.spectra._cie_tables import daylight, light, to_srgb
 from neusee.nodes.units import Fraction, Shape
 from neusee.nodes.values import Bands
 
-_FINE = 2  #: samples per pixel along each axis, so that a pixel on an edge mixes spectra
-_COARSE = 8  #: pixels between the random numbers from which texture and shade are interpolated
-_WARMEST, _COOLEST, _LIGHTS = 4000.0, 15000.0, 24  #: K, K, and the number of distinct daylights
+#: samples per pixel along each axis, so that a pixel on an edge mixes spectra
+_SAMPLES_PER_PIXEL = 2
+#: pixels between the random numbers from which texture and shade are interpolated
+_TEXTURE_PIXELS = 8
+_WARMEST_DAYLIGHT, _COOLEST_DAYLIGHT, _DAYLIGHT_COUNT = (
+    4000.0,
+    15000.0,
+    24,
+)  #: K, K, and the number of distinct daylights
 
 
 @node(rtol=1e-5)
@@ -54,22 +60,22 @@ def leaves(
             f"spectra have shape {tuple(spectra.shape)}, not (leaf, band) with {len(bands.centres)}"
             " bands: compute spectra and bands from the same `bands` step"
         )
-    sample_shape = (_FINE * shape[0], _FINE * shape[1])
-    topmost = _topmost(len(spectra), sample_shape, _FINE * smallest, rng)
+    sample_shape = (_SAMPLES_PER_PIXEL * shape[0], _SAMPLES_PER_PIXEL * shape[1])
+    topmost = _topmost(len(spectra), sample_shape, _SAMPLES_PER_PIXEL * smallest, rng)
     second_leaf = torch.randint(len(spectra), (len(spectra),), generator=rng, device=rng.device)
     # log-uniform from ``darkest`` to 1
-    leaf_brightness = darkest ** _even(rng, len(spectra))
+    leaf_brightness = darkest ** _uniform(rng, len(spectra))
     texture_share, shading = (
-        texture * _smooth(sample_shape, rng),
-        1.0 - shade * _smooth(sample_shape, rng),
+        texture * _smooth_field(sample_shape, rng),
+        1.0 - shade * _smooth_field(sample_shape, rng),
     )
-    leaf_spectra = (spectra.double() * _lights(bands, daylights, rng)).float().T
+    leaf_spectra = (spectra.double() * _daylight_ratio(bands, daylights, rng)).float().T
     cube = (
         leaf_spectra[:, topmost] * (1.0 - texture_share)
         + leaf_spectra[:, second_leaf[topmost]] * texture_share
     )
     cube = cube * (leaf_brightness[topmost] * shading)
-    return F.avg_pool2d(cube[None], _FINE)[0].clamp(0.0, 1.0)
+    return F.avg_pool2d(cube[None], _SAMPLES_PER_PIXEL)[0].clamp(0.0, 1.0)
 
 
 @leaves.check
@@ -85,12 +91,12 @@ def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Gene
     sample (y, x).
     """
     largest = max(min(size) / 2, smallest)
-    uniform = _even(rng, count)
+    uniform = _uniform(rng, count)
     # the number of leaves falls as 1 / radius^3, between the smallest and the largest
     radius = (smallest**-2 * (1 - uniform) + largest**-2 * uniform) ** -0.5
-    long_radius, angle = radius * (1 + _even(rng, count)), torch.pi * _even(rng, count)
+    long_radius, angle = radius * (1 + _uniform(rng, count)), torch.pi * _uniform(rng, count)
     y_from_centre, x_from_centre = (
-        torch.arange(n, device=rng.device) - (n * _even(rng, count))[:, None] for n in size
+        torch.arange(n, device=rng.device) - (n * _uniform(rng, count))[:, None] for n in size
     )
     cosine, sine = angle.cos()[:, None, None], angle.sin()[:, None, None]
     long_axis, short_axis = (
@@ -104,14 +110,17 @@ def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Gene
     return (inside * number).amax(0)
 
 
-def _smooth(size: tuple[int, int], rng: torch.Generator) -> Tensor:
+def _smooth_field(size: tuple[int, int], rng: torch.Generator) -> Tensor:
     """Draw a random field (y, x) of numbers from 0 to 1 that vary slowly over the picture."""
-    grid_shape = (max(2, size[0] // (_FINE * _COARSE)), max(2, size[1] // (_FINE * _COARSE)))
+    grid_shape = (
+        max(2, size[0] // (_SAMPLES_PER_PIXEL * _TEXTURE_PIXELS)),
+        max(2, size[1] // (_SAMPLES_PER_PIXEL * _TEXTURE_PIXELS)),
+    )
     grid = torch.rand(1, 1, *grid_shape, generator=rng, device=rng.device)
     return F.interpolate(grid, size, mode="bilinear", align_corners=True)[0, 0]
 
 
-def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
+def _daylight_ratio(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
     """Return the ratio of a random daylight spectrum to D65 in each band, scaled to a maximum of
     1.
     """
@@ -120,14 +129,14 @@ def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
     if chance >= share:
         return torch.ones_like(centres)
     # evenly in 1 / temperature, as eyes see it
-    per_kelvin = 1 / _WARMEST + (1 / _COOLEST - 1 / _WARMEST) * int(light_fraction * _LIGHTS) / (
-        _LIGHTS - 1
-    )
+    per_kelvin = 1 / _WARMEST_DAYLIGHT + (1 / _COOLEST_DAYLIGHT - 1 / _WARMEST_DAYLIGHT) * int(
+        light_fraction * _DAYLIGHT_COUNT
+    ) / (_DAYLIGHT_COUNT - 1)
     ratio = daylight(1 / per_kelvin).at(centres)[0] / light("D65").at(centres)[0]
     return (ratio / ratio.max()).to(centres)
 
 
-def _even(rng: torch.Generator, count: int) -> Tensor:
+def _uniform(rng: torch.Generator, count: int) -> Tensor:
     """Return ``count`` random numbers from 0 to 1, uniform."""
     return torch.rand(count, generator=rng, device=rng.device)
 

@@ -22,7 +22,10 @@ from neusee.nodes.spectra._cie_tables import Table
 Numbers = NDArray[np.float64]
 
 LENGTHS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "m": 1.0}
-_LEAST, _MOST = 100e-9, 20e-6  #: m, ends of the wavelengths that a recipe can have
+_SHORTEST_WAVELENGTH, _LONGEST_WAVELENGTH = (
+    100e-9,
+    20e-6,
+)  #: m, ends of the wavelengths that a recipe can have
 _HEADING = re.compile(r"(?P<quantity>[^(\[]*?)\s*(?:[(\[](?P<unit>.*)[)\]])?")
 
 
@@ -138,14 +141,14 @@ def curves(file: Path, units: Sequence[str] | None, assumed: str = "", fewest: i
     without_units = assumed and not any(column.unit for column in rows.columns)
     unit = assumed if without_units else first_column.unit
     if unit not in LENGTHS:
-        _refuse_first(file, first_column)
+        _refuse_first_column(file, first_column)
     if units is not None and not without_units:
         for number, column in enumerate(others, 1):
             _refuse_unit(file, number, column, units)
     nm = rows.values[:, 0] * (LENGTHS[unit] / 1e-9)
     if len(nm) < fewest:
         raise ValueError(f"{file.name} holds one wavelength: at least two wavelengths are needed")
-    for problem in _wrong_order(file, rows.lines, nm):
+    for problem in _wavelength_problems(file, rows.lines, nm):
         raise ValueError(problem)
     return Curves(
         file,
@@ -156,7 +159,7 @@ def curves(file: Path, units: Sequence[str] | None, assumed: str = "", fewest: i
     )
 
 
-def refused(parameter: str, form: str, error: Exception) -> ParameterError:
+def table_error(parameter: str, form: str, error: Exception) -> ParameterError:
     """Return the error of a parameter whose file is no table of the needed form, which ``form``
     says.
     """
@@ -192,7 +195,7 @@ def _number(file: Path, line: int, index: int, column: Column, cell: str) -> flo
     return float(cell)
 
 
-def _refuse_first(file: Path, first: Column) -> None:
+def _refuse_first_column(file: Path, first: Column) -> None:
     """Raise ValueError for a first column without wavelengths in a known unit."""
     unit_names = ", ".join(unit for unit in LENGTHS if unit.isascii())
     if not first.unit:
@@ -210,7 +213,7 @@ def _refuse_unit(file: Path, number: int, column: Column, units: Sequence[str]) 
         raise ValueError(f"{file.name}: column {number + 1}, {column.quantity}, {fault}: {fix}")
 
 
-def _wrong_order(file: Path, lines: Sequence[int], nm: Numbers) -> Iterator[str]:
+def _wavelength_problems(file: Path, lines: Sequence[int], nm: Numbers) -> Iterator[str]:
     """Yield what is wrong with the wavelengths of a file, in nm."""
     for line, previous, here in zip(lines[1:], nm, nm[1:], strict=False):
         if here == previous:
@@ -224,7 +227,7 @@ def _wrong_order(file: Path, lines: Sequence[int], nm: Numbers) -> Iterator[str]
                 " rising order"
             )
     for line, here in zip(lines, nm, strict=True):
-        if not _LEAST <= here * 1e-9 <= _MOST:
+        if not _SHORTEST_WAVELENGTH <= here * 1e-9 <= _LONGEST_WAVELENGTH:
             fix = (
                 "check the unit in the header, such as wavelength (um), and give wavelengths from"
                 " 100 nm to 20 um"

@@ -38,7 +38,14 @@ ENGINE = (
 )
 NODE = tuple(
     (_channel_image, name)
-    for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top")
+    for name in (
+        "psf_light",
+        "with_windows",
+        "cheapest_plan",
+        "estimated_brightest",
+        "fft_round_off",
+        "_brightest_pixel_error",
+    )
 )
 LONG = 20.0  #: s, beyond which one run is enough
 

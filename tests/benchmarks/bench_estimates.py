@@ -70,8 +70,8 @@ def line(seed, memo, size):
 def main(count, start, file, small):
     known, size = {}, () if small else random_recipes.LARGE
     if small:
-        _band_thumbnail.SIDE = _few_bands.SIDE = 20
-        _band_thumbnail._PART, _band_thumbnail._TILE = 40, 8
+        _band_thumbnail.CELLS_ACROSS = _few_bands.CELLS_ACROSS = 20
+        _band_thumbnail._PART_CELLS, _band_thumbnail._TILE_CELLS = 40, 8
     if file and Path(file).exists():
         known = {
             each["seed"]: each for each in map(json.loads, Path(file).read_text().splitlines())

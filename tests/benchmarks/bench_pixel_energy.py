@@ -73,7 +73,7 @@ def timed(samples, side, number, focal, pixel, repeats=3):
     camera = _psf._Camera(focal, pixel, (side, side), sensor="point_as_printed")
     light = [1 / float(clear.sum())]
     calls = (
-        lambda: _psf._points(pupil, camera, light, torch.float32, "auto"),
+        lambda: _psf._intensity_at_points(pupil, camera, light, torch.float32, "auto"),
         lambda: _psf._focus(pupil, camera._replace(sensor="integrated"), torch.float32, "auto"),
     )
     least = [np.inf, np.inf]

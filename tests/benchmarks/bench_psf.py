@@ -48,7 +48,7 @@ from prysm.conf import config
 
 from neusee.nodes.optics import psf
 from neusee.nodes.optics._psf import _Camera, _focus
-from neusee.nodes.optics._transform._scaled_transform import transform
+from neusee.nodes.optics._transform._scaled_transform import Grids, transform
 from neusee.nodes.values import Pupil
 
 WAVELENGTH, FOCAL, PIXEL, DIAMETER, INDEX = 550e-9, 0.11, 2.9e-6, 2160 * 3.74e-6, 0.46
@@ -102,8 +102,8 @@ def from_field(f, k):
     """Ours from the same ready complex pupil that the peers get."""
     n, ready = len(f), torch.from_numpy(f)
     alpha, centre = DIAMETER / n * PIXEL / (WAVELENGTH * FOCAL), (n - 1) / 2
-    where = ((k, k), (alpha, alpha), (centre, centre), (k // 2, k // 2))
-    return lambda: power(transform(ready, *where).numpy())
+    grids = Grids((alpha, alpha), (centre, centre), (k // 2, k // 2))
+    return lambda: power(transform(ready, (k, k), grids).numpy())
 
 
 def power(u):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neusee.nodes import doe, flare, losses, metrics, optics, restore, sensor, spectra
-from neusee.nodes.optics._transform._scaled_transform import transform
+from neusee.nodes.optics._transform._scaled_transform import Grids, transform
 from neusee.nodes.precision import refuse_half, refuse_not_finite, single
 from neusee.nodes.values import Bands, Psf, Pupil
 
@@ -351,11 +351,11 @@ def test_black_has_the_slope_of_the_reference(lift):
 def test_every_method_agrees_with_the_plain_sum_at_the_extremes(method, shape, window, alpha, off):
     rng = torch.Generator().manual_seed(1)
     field = torch.complex(*(torch.randn(2, *shape, generator=rng, dtype=torch.float64).unbind(0)))
-    where = {"alpha": (alpha, alpha), "centre_in": (0.0, 0.0), "centre_out": (off, -off)}
-    exact = transform(field, window, **where, method="direct")
+    grids = Grids(alpha=(alpha, alpha), centre_in=(0.0, 0.0), centre_out=(off, -off))
+    exact = transform(field, window, grids, "direct")
     top = float(exact.abs().max())
     for dtype, bound in ((torch.complex128, 1e-11), (torch.complex64, 3e-6)):
-        found = transform(field.to(dtype), window, **where, method=method)
+        found = transform(field.to(dtype), window, grids, method)
         assert float((found - exact).abs().max()) <= bound * top
 
 

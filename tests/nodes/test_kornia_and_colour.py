@@ -22,8 +22,8 @@ from neusee.nodes.losses import charbonnier
 from neusee.nodes.metrics import quality
 from neusee.nodes.resampling import enlarge, resize
 from neusee.nodes.scene import Photographs
-from neusee.nodes.scene._exr import _PREFIX, spectral_channels
-from neusee.nodes.scene._picture_changes import framed
+from neusee.nodes.scene._exr import _PREFIX_EXPONENTS, spectral_channels
+from neusee.nodes.scene._picture_changes import framed_scene
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, lift_mallett, render
 from neusee.nodes.spectra._cie_tables import light, paints
@@ -80,7 +80,7 @@ def test_a_window_of_the_other_parity_has_whole_pixels_and_keeps_the_axis(size, 
     theirs = kornia.geometry.transform.center_crop(image[None], (window, window))[0]
     axis = image[0, size // 2, size // 2]
     assert crop(image, shape=(window, window))[0, window // 2, window // 2] == axis
-    assert torch.isin(framed(image, (window, size)), image).all()
+    assert torch.isin(framed_scene(image, (window, size)), image).all()
     assert not torch.isin(theirs, image).any(), "kornia interpolates between four pixels"
     sliced = kornia.augmentation.CenterCrop((window, window), cropping_mode="slice")(image[None])[0]
     assert (sliced[0, window // 2, window // 2] == axis) == (size % 2 == 1)
@@ -184,7 +184,7 @@ def test_a_picture_is_lifted_at_once_and_with_a_gradient_where_colour_science_li
 
 def test_names_of_spectral_channels_are_read_as_by_colour_science():
     numbers = {"m": ("5,5", "550", "1e-3"), "Hz": ("545,07", "5e2", "3")}
-    for prefix, unit in itertools.product(_PREFIX, numbers):
+    for prefix, unit in itertools.product(_PREFIX_EXPONENTS, numbers):
         for number in numbers[unit]:
             [(found, name)] = spectral_channels([f"T.{number}{prefix}{unit}"]).items()
             assert name == f"T.{number}{prefix}{unit}"

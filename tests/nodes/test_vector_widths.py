@@ -17,7 +17,7 @@ import torch
 
 from neusee.nodes import _cpp_library
 from neusee.nodes.optics._transform import _fused
-from neusee.nodes.optics._transform._fft_transforms import last_work
+from neusee.nodes.optics._transform._fft_transforms import work_by_axis
 from neusee.nodes.optics._transform._fused import fused_axis
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
@@ -187,7 +187,12 @@ def test_the_cases_transform_in_all_three_pairs_of_types():
         for kind, dtype in TYPES:
             view = optics(samples, pixels, kind, dtype)[1][0]
             pairs.add(
-                (dtype, last_type(*last_work(view.rows, view.columns), dtype, _fused._LITTLE))
+                (
+                    dtype,
+                    last_type(
+                        *work_by_axis(view.rows, view.columns), dtype, _fused._FLOAT64_WORK_SHARE
+                    ),
+                )
             )
     assert pairs == set(_fused._NAMES)
 
@@ -290,7 +295,10 @@ def test_another_target_and_compiler_give_the_same_bits(tmp_path, driver, target
     samples, pixels = ((61, 47), (90, 97)) if kinds == (torch.float32,) * 2 else ((70, 83), (9, 7))
     factors, views = optics(samples, pixels, torch.float64, dtype)
     view = views[0]
-    assert last_type(*last_work(view.rows, view.columns), dtype, _fused._LITTLE) == kinds[1]
+    assert (
+        last_type(*work_by_axis(view.rows, view.columns), dtype, _fused._FLOAT64_WORK_SHARE)
+        == kinds[1]
+    )
     data, result = tmp_path / "in", tmp_path / "out"
     data.write_bytes(b"".join(packed(x) for x in arguments(factors, view, *kinds)))
     subprocess.run([*command, data, result], check=True)

@@ -21,6 +21,7 @@ from neusee.nodes.metrics import (
     GlareLevels,
     PictureSpectrum,
     PixelNoise,
+    channel_psf,
     detail_energy,
     glare_levels,
     picture_spectrum,
@@ -355,7 +356,7 @@ def refuse_no_mask(lsr: float) -> None:
 
 
 _ABOUT = {"step": "study protection"}
-_SOURCES = (picture_spectrum, detail_energy, glare_levels)
+_SOURCES = (channel_psf, picture_spectrum, detail_energy, glare_levels)
 
 
 @dataclass(frozen=True)
@@ -448,8 +449,10 @@ class FrontBench:
         camera, settings = self.camera, self.settings
         light_of_scene = camera.illuminant, camera.responses, camera.bands
         assumed_psf, true_psf = self._known(front), self._psf(front, camera.bands, condition)
+        true_channels = channel_psf(true_psf, *light_of_scene)
+        assumed_channels = channel_psf(assumed_psf, *light_of_scene)
         spectrum = picture_spectrum(
-            true_psf, assumed_psf, *light_of_scene, settings.variance, settings.up_to
+            true_channels, assumed_channels, settings.variance, settings.up_to
         )
         radius, square = radial_contrast(true_psf, *light_of_scene)
         measures: dict[str, Tensor] = {

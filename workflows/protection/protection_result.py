@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from neusee.nodes import metrics
-from neusee.nodes.metrics import PixelNoise, attacked_picture, largest_glare
+from neusee.nodes.metrics import Attack, PixelNoise, attacked_picture, largest_glare
 from neusee.workflows.protection.equal_rivals import (
     Candidate,
     Rival,
@@ -304,10 +304,9 @@ def _attacks(
                 measures.spectrum,
                 measures.glare[field_side],
                 pixel,
+                Attack(torch.tensor(STRENGTHS, dtype=torch.float64), measures.colour),
                 electrons=ATTACKED_AT,
                 transmittance=rivals[name].transmittance,
-                colour=measures.colour,
-                strengths=torch.tensor(STRENGTHS, dtype=torch.float64),
             )
             for quantity, values in under_attack._asdict().items():
                 attack[name][quantity].append(values.tolist())
@@ -355,10 +354,9 @@ def _fields(
                 measures.spectrum,
                 glare,
                 pixel,
+                Attack(torch.tensor(STRENGTHS, dtype=torch.float64), measures.colour),
                 electrons=ATTACKED_AT,
-                colour=measures.colour,
                 transmittance=rival.transmittance,
-                strengths=torch.tensor(STRENGTHS, dtype=torch.float64),
             )
             shares.setdefault(name, {})[side] = under_attack.seen.tolist()
     return shares

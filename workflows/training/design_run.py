@@ -425,7 +425,7 @@ def _row(terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]) 
     for name in ("filtered_error", "information"):
         row[name] = float(getattr(losses, name)(psf, *light_and_responses, **{**exposure, **own}))
         row[f"{name} of the stop"], stop_diameter, filter_transmittance = losses.best_stop(
-            terms.plain(), *light_and_responses, **exposure, measure=name
+            terms.plain(), *light_and_responses, losses.ProtectedPicture(**exposure), measure=name
         )
         if name == "filtered_error":
             row |= {"stop": stop_diameter, "filter of the stop": filter_transmittance}

@@ -398,7 +398,7 @@ class Terms:
 
     def exposure(self) -> dict[str, Any]:
         """Return the parameters that `losses.filtered_error`, `losses.information` and
-        `losses.best_stop` share.
+        `losses.ProtectedPicture` share.
         """
         settings = self.settings
         return {

@@ -43,7 +43,7 @@ def _chirps(axis: Axis, dtype: torch.dtype, device: torch.device) -> _Chirps:
     half_signed_alpha = axis.sign * axis.alpha / 2
     input_samples, output_samples = centred(axis.n_in, device), centred(axis.n_out, device)
     lag_count = axis.n_in + axis.n_out - 1
-    length = smooth(lag_count)
+    length = fft_length(lag_count)
     lag = torch.arange(lag_count, dtype=torch.float64, device=device) + (
         output_samples[0] - input_samples[-1]
     )
@@ -91,17 +91,17 @@ def _convolve(lines: Tensor, chirps: _Chirps, axis: Axis, work: Workspace) -> Te
 
 
 @functools.lru_cache(maxsize=256)
-def smooth(n: int, even: bool = False) -> int:
+def fft_length(n: int, even: bool = False) -> int:
     """Return the smallest FFT length of at least ``n`` without prime factors above 5, for which
     FFTs are fast.
     """
     n += even and n % 2
-    while _rough(n):
+    while _has_large_factors(n):
         n += 1 + even
     return n
 
 
-def _rough(n: int) -> bool:
+def _has_large_factors(n: int) -> bool:
     """Return True for a number with prime factors above 5."""
     for prime in (2, 3, 5):
         while n % prime == 0:
@@ -115,7 +115,7 @@ def _rough(n: int) -> bool:
 # product.
 
 
-_SLACK = 8  #: columns of zeros that let blocks of unequal spacing share one stride
+_SLACK_COLUMNS = 8  #: columns of zeros that let blocks of unequal spacing share one stride
 
 
 class _Run(NamedTuple):
@@ -158,9 +158,11 @@ class Banded:
             math.floor(self._at((b + 1) * self.block - 1) + reach) for b in range(self.count)
         ]
         self.width = (
-            max(z - a for a, z in zip(first_columns, last_columns, strict=True)) + 1 + _SLACK
+            max(z - a for a, z in zip(first_columns, last_columns, strict=True))
+            + 1
+            + _SLACK_COLUMNS
         )
-        self.runs = _runs(
+        self.runs = _equal_runs(
             [z + 1 - self.width for z in last_columns], first_columns, step * self.block
         )
         block_starts = list(chain.from_iterable(run.starts for run in self.runs))
@@ -256,7 +258,7 @@ def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
         torch.mm(x, y, out=z)
 
 
-def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
+def _equal_runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
     """Return a few runs of matrix blocks with equally spaced first columns, each column from
     ``low`` to ``high``.
     """
@@ -264,7 +266,10 @@ def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
     first = 0
     while first < len(low):
         run = max(
-            (_longest(low, high, first, stride) for stride in (math.floor(pace), math.ceil(pace))),
+            (
+                _longest_run(low, high, first, stride)
+                for stride in (math.floor(pace), math.ceil(pace))
+            ),
             key=lambda r: r.blocks,
         )
         runs.append(run)
@@ -272,7 +277,7 @@ def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
     return runs
 
 
-def _longest(low: list[int], high: list[int], first: int, stride: int) -> _Run:
+def _longest_run(low: list[int], high: list[int], first: int, stride: int) -> _Run:
     """Return the longest run from block ``first`` on with a stride, whose columns stay from ``low``
     to ``high``.
     """
@@ -326,14 +331,14 @@ class Kernel(NamedTuple):
         return self.width * torch.sinh(root) / root
 
 
-_BLOCK = 16
+_BLOCK_ROWS = 16
 #: the grid divides the input into at least this many parts, however few the window needs
-_WIDEST = 8
+_LEAST_PARTS = 8
 _COLUMN_BLOCKS = 8
 SINGLE, DOUBLE = Kernel(9, 1.75), Kernel(18, 2.0)
 #: work along the last axis for each independent sample of the result, where a pupil sample has work
 #: 1
-_LAST = 10.0
+_LAST_AXIS_WORK = 10.0
 
 
 class Plan(NamedTuple):
@@ -370,14 +375,17 @@ def plan(
     """
     kernel = SINGLE if dtype == torch.float32 else DOUBLE
     point_pitch = min(
-        1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST
+        1 / (axis.alpha * axis.n_out * kernel.oversampling),
+        max(axis.n_in, _LEAST_PARTS) / _LEAST_PARTS,
     )
-    point_count = odd(math.ceil((axis.n_in - 1) / point_pitch) + kernel.width)
-    length = smooth(math.ceil(max(point_count, 2 * _BLOCK) * kernel.oversampling), even=True)
+    point_count = next_odd(math.ceil((axis.n_in - 1) / point_pitch) + kernel.width)
+    length = fft_length(
+        math.ceil(max(point_count, 2 * _BLOCK_ROWS) * kernel.oversampling), even=True
+    )
     spread = _spread(axis, kernel, point_pitch, length)
     # the output must lie within the frequencies of the FFT, margins included
     while spread.n_columns + 2 * spread.margin > length:
-        length = smooth(length + length // 4, even=True)
+        length = fft_length(length + length // 4, even=True)
         spread = _spread(axis, kernel, point_pitch, length)
     gather = _gather(axis, kernel, point_pitch, point_count, length).to(kind or dtype, device)
     frequency_count = spread.n_columns + 2 * spread.margin
@@ -395,12 +403,12 @@ def _gather(axis: Axis, kernel: Kernel, pitch: float, points: int, length: int) 
         middle_sample - pitch * middle_point,
         pitch,
         pitch * kernel.width / 2,
-        _BLOCK,
+        _BLOCK_ROWS,
     )
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
         distance_from_middle = (row - middle_point).clamp_(max=middle_point)
-        scale = alternating(distance_from_middle + length // 2) * (
+        scale = alternating_sign(distance_from_middle + length // 2) * (
             kernel.peak / kernel.transform(distance_from_middle / length)
         )
         return kernel((column - middle_sample) / pitch - distance_from_middle) / kernel.peak * scale
@@ -413,7 +421,7 @@ def _spread(axis: Axis, kernel: Kernel, pitch: float, length: int) -> Banded:
     interpolation before the FFT.
     """
     middle_output, frequencies_per_output = (axis.n_out - 1) / 2, axis.alpha * pitch * length
-    frequency_count = odd(math.ceil((axis.n_out - 1) * frequencies_per_output) + kernel.width)
+    frequency_count = next_odd(math.ceil((axis.n_out - 1) * frequencies_per_output) + kernel.width)
     middle_frequency = (frequency_count - 1) // 2
     band = Banded(
         axis.n_out,
@@ -421,13 +429,13 @@ def _spread(axis: Axis, kernel: Kernel, pitch: float, length: int) -> Banded:
         middle_frequency - frequencies_per_output * middle_output,
         frequencies_per_output,
         kernel.width / 2,
-        2 * _BLOCK,
+        2 * _BLOCK_ROWS,
     )
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
         distance_from_middle = (row - middle_output).clamp_(max=middle_output)
         return (
-            alternating(column - middle_frequency)
+            alternating_sign(column - middle_frequency)
             * kernel(frequencies_per_output * distance_from_middle - (column - middle_frequency))
             / kernel.transform(axis.alpha * pitch * distance_from_middle)
         )
@@ -435,12 +443,12 @@ def _spread(axis: Axis, kernel: Kernel, pitch: float, length: int) -> Banded:
     return band.fill(weigh)
 
 
-def alternating(index: Tensor) -> Tensor:
+def alternating_sign(index: Tensor) -> Tensor:
     """Return (-1)^index, which moves the origin of an FFT to the middle of its grid."""
     return 1 - 2 * index.remainder(2)
 
 
-def odd(n: int) -> int:
+def next_odd(n: int) -> int:
     return n + 1 - n % 2
 
 
@@ -448,7 +456,7 @@ def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: W
     """Compute the scaled Fourier transform by interpolation, a short FFT and interpolation, in
     chunks that fit in a cache.
     """
-    last_kind = last_type(*last_work(rows, columns), work.dtype)
+    last_kind = last_type(*work_by_axis(rows, columns), work.dtype)
     column_plan, row_plan = (
         plan(columns, work.dtype, work.device),
         plan(rows, work.dtype, work.device, last_kind),
@@ -460,11 +468,11 @@ def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: W
     _interpolate(column_plan, row_plan, (rows.n_out, columns.n_out), spectrum, sink, work)
 
 
-def last_work(rows: Axis, columns: Axis) -> tuple[float, float]:
+def work_by_axis(rows: Axis, columns: Axis) -> tuple[float, float]:
     """Return the work along the first and along the last axis, where that of a sample of the
     pupil is 1.
     """
-    return rows.n_in * columns.n_in, _LAST * rows.bandwidth * columns.bandwidth
+    return rows.n_in * columns.n_in, _LAST_AXIS_WORK * rows.bandwidth * columns.bandwidth
 
 
 def _rows_to_frequencies(
@@ -486,7 +494,7 @@ def _rows_to_frequencies(
         blocks = work.take("blocks", x.gather.count, 2 * chunk_rows, x.gather.block)
         x.gather.right(planes.flatten(0, 1), blocks)
         fft_input = work.take("line", chunk_rows, x.length, dtype=complex_type)
-        _place(blocks, fft_input, x)
+        _fill_middle(blocks, fft_input, x)
         frequencies[margin + start : margin + stop] = _fft(fft_input, x.sign)[
             :, x.cropped : x.cropped + x.kept
         ]
@@ -500,7 +508,7 @@ def _zero_margins(x: Tensor, dim: int, margin: int) -> Tensor:
     return x
 
 
-def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
+def _fill_middle(blocks: Tensor, line: Tensor, x: Plan) -> None:
     """Copy blocks of interpolated (re, im) samples to the middle of the complex FFT input, and
     set the rest to zero.
     """
@@ -523,7 +531,7 @@ def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
         else work.take("given", *half.shape, dtype=complex_type).copy_(half)
     )
     columns = work.take("columns", y.length, column_count, dtype=complex_type)
-    y.gather.left(_flat(field), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
+    y.gather.left(_as_real(field), _as_real(columns[y.padded : y.padded + y.gather.n_rows]))
     columns[: y.padded] = 0
     columns[y.padded + y.points :] = 0
     spectrum = work.take("spectrum", column_count, y.kept, dtype=half.dtype)
@@ -543,7 +551,7 @@ def _interpolate(
     for first in range(0, x.spread.count, _COLUMN_BLOCKS):
         stripe = x.spread.part(first, min(first + _COLUMN_BLOCKS, x.spread.count))
         line = work.take("stripe", stripe.n_rows, spectrum.shape[1], dtype=spectrum.dtype)
-        stripe.left(_flat(spectrum), _flat(line))
+        stripe.left(_as_real(spectrum), _as_real(line))
         planes = work.take("stripes", 2, *line.shape).copy_(torch.view_as_real(line).movedim(2, 0))
         blocks = work.take("tiles", y.spread.count, 2 * stripe.n_rows, y.spread.block)
         y.spread.right(planes.flatten(0, 1), blocks)
@@ -553,10 +561,10 @@ def _interpolate(
         )
         # (re and im, block, row in the block, column)
         tiles = blocks.view(y.spread.count, 2, stripe.n_rows, y.spread.block).permute(1, 0, 3, 2)
-        _deliver(tiles[..., : stop - start], slice(start, stop), shape[0], sink)
+        _send_blocks(tiles[..., : stop - start], slice(start, stop), shape[0], sink)
 
 
-def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
+def _send_blocks(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
     """Pass all complete blocks of output rows to ``sink``, then the rows of the incomplete last
     block.
     """
@@ -572,7 +580,7 @@ def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
         )
 
 
-def _flat(x: Tensor) -> Tensor:
+def _as_real(x: Tensor) -> Tensor:
     """Return a complex tensor (r, c) as a real tensor (r, 2 c), so that a real matrix can
     multiply from the left.
     """

@@ -15,10 +15,10 @@ from neusee.nodes.optics._transform._fft_transforms import (
     DOUBLE,
     SINGLE,
     Kernel,
-    alternating,
-    last_work,
-    odd,
-    smooth,
+    alternating_sign,
+    fft_length,
+    next_odd,
+    work_by_axis,
 )
 from neusee.nodes.optics._transform._pupil_field import Screens, View
 from neusee.nodes.optics._transform._sample_axis import (
@@ -38,9 +38,9 @@ from neusee.nodes.optics._transform._sample_axis import (
 
 
 #: the grid divides the input into at least this many parts, however few the window needs
-_WIDEST = 8
-_SHORTEST = 32  #: samples of the shortest FFT
-_FACTORS = (8, 5, 3, 4, 2)  #: of the passes of the FFT
+_LEAST_PARTS = 8
+_SHORTEST_FFT = 32  #: samples of the shortest FFT
+_PASS_FACTORS = (8, 5, 3, 4, 2)  #: of the passes of the FFT
 
 
 class CAxis(ctypes.Structure):
@@ -67,7 +67,9 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
     The weights in front of the FFT are of the type ``gathered``, all else of the type ``kind``.
     """
     kernel = SINGLE if dtype == torch.float32 else DOUBLE
-    point_pitch, point_count, length, frequencies_per_output, frequency_count = _grids(axis, kernel)
+    point_pitch, point_count, length, frequencies_per_output, frequency_count = _axis_grids(
+        axis, kernel
+    )
     middle_sample, middle_output, middle_point, middle_frequency = (
         (axis.n_in - 1) / 2,
         (axis.n_out - 1) / 2,
@@ -77,7 +79,7 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
 
     def gather(row: Tensor, column: Tensor) -> Tensor:
         distance_from_middle = row - middle_point
-        scale = alternating(distance_from_middle + length // 2) * (
+        scale = alternating_sign(distance_from_middle + length // 2) * (
             kernel.peak / kernel.transform(distance_from_middle / length)
         )
         return (
@@ -89,12 +91,12 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
     def spread(row: Tensor, column: Tensor) -> Tensor:
         distance_from_middle, frequency_from_middle = row - middle_output, column - middle_frequency
         return (
-            alternating(frequency_from_middle)
+            alternating_sign(frequency_from_middle)
             * kernel(frequencies_per_output * distance_from_middle - frequency_from_middle)
             / kernel.transform(axis.alpha * point_pitch * distance_from_middle)
         )
 
-    gather_first, gather_weights = _band(
+    gather_first, gather_weights = _band_of_rows(
         point_count,
         axis.n_in,
         middle_sample - point_pitch * middle_point,
@@ -102,7 +104,7 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
         point_pitch * kernel.width / 2,
         gather,
     )
-    spread_first, spread_weights = _band(
+    spread_first, spread_weights = _band_of_rows(
         axis.n_out,
         frequency_count,
         middle_frequency - frequencies_per_output * middle_output,
@@ -152,18 +154,19 @@ def expected_seconds(rows: Axis, columns: Axis) -> float:
 
 def _fft_steps(axis: Axis) -> float:
     """Return the operations of one FFT along an axis, but for a factor."""
-    length = _grids(axis, SINGLE)[2]
+    length = _axis_grids(axis, SINGLE)[2]
     return length * math.log2(length)
 
 
-def _grids(axis: Axis, kernel: Kernel) -> tuple[float, int, int, float, int]:
+def _axis_grids(axis: Axis, kernel: Kernel) -> tuple[float, int, int, float, int]:
     """Return pitch and number of the points before the FFT, the length of the FFT, its samples for
     each output sample, and the number of frequencies that are kept of it.
     """
     pitch = min(
-        1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST
+        1 / (axis.alpha * axis.n_out * kernel.oversampling),
+        max(axis.n_in, _LEAST_PARTS) / _LEAST_PARTS,
     )
-    points = odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
+    points = next_odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
     return pitch, points, *_length(axis, kernel, pitch, math.ceil(points * kernel.oversampling))
 
 
@@ -171,16 +174,18 @@ def _length(axis: Axis, kernel: Kernel, pitch: float, shortest: int) -> tuple[in
     """Return the FFT length, its samples for each output sample, and the frequencies that are
     kept of it.
     """
-    length = smooth(max(shortest, _SHORTEST), even=True)
+    length = fft_length(max(shortest, _SHORTEST_FFT), even=True)
     while True:
         frequencies_per_output = axis.alpha * pitch * length
-        frequency_count = odd(math.ceil((axis.n_out - 1) * frequencies_per_output) + kernel.width)
+        frequency_count = next_odd(
+            math.ceil((axis.n_out - 1) * frequencies_per_output) + kernel.width
+        )
         if frequency_count <= length:
             return length, frequencies_per_output, frequency_count
-        length = smooth(length + length // 4, even=True)
+        length = fft_length(length + length // 4, even=True)
 
 
-def _band(
+def _band_of_rows(
     n_rows: int,
     n_columns: int,
     origin: float,
@@ -203,14 +208,14 @@ def _band(
 def _factors(length: int) -> list[int]:
     """Return the factors of an FFT length, in the order of the passes."""
     factors = []
-    for factor in _FACTORS:
+    for factor in _PASS_FACTORS:
         while length % factor == 0:
             factors.append(factor)
             length //= factor
     return factors
 
 
-def pointer(x: Tensor | None) -> Any:
+def address_of(x: Tensor | None) -> Any:
     """Return the address of the first number of a contiguous tensor, or a null pointer."""
     return ctypes.c_void_p(None if x is None else x.data_ptr())
 
@@ -242,9 +247,9 @@ _NAMES = {
     (torch.float64, torch.float64): "double",
 }
 #: share of the work of the first axis, up to which all from the first FFT on is float64
-_LITTLE = 0.3
+_FLOAT64_WORK_SHARE = 0.3
 #: samples for each further thread: to wake a thread takes as long as to transform a few thousand
-_ALONE = 1 << 18
+_SAMPLES_PER_THREAD = 1 << 18
 
 
 class _Pupil(ctypes.Structure):
@@ -311,7 +316,7 @@ class FusedPupil:
         """Write or add the weighted intensity of one view, and write its focal field, planes
         (re, im) of (y, x).
         """
-        pupil, focal = self._pupil(view), _focal(view, intensity, field, add)
+        pupil, focal = self._pupil(view), _focal_structure(view, intensity, field, add)
         self._call("forward", view.rows, view.columns, pupil.structure, focal.structure)
 
     def add_gradients(
@@ -346,21 +351,27 @@ class FusedPupil:
         self, view: View, field: Tensor, gain: Tensor, sums: Sequence[Tensor | None]
     ) -> None:
         """Add the gradients of one view, by the adjoint transform of ``2 gain U``."""
-        pupil, focal = self._pupil(view), _focal(view, None, field, False)
+        pupil, focal = self._pupil(view), _focal_structure(view, None, field, False)
         axes = view.rows.adjoint(), view.columns.adjoint()
-        added = _Gradients(*(pointer(x) for x in sums))
-        self._call("adjoint", *axes, focal.structure, pointer(gain), pupil.structure, added)
+        added = _Gradients(*(address_of(x) for x in sums))
+        self._call("adjoint", *axes, focal.structure, address_of(gain), pupil.structure, added)
 
-    def _pupil(self, view: View) -> "_Held":
+    def _pupil(self, view: View) -> "_StructureWithArrays":
         """Return the structure of the pupil in one view, with the tilts that it points to."""
         v, u = (
             centred(n, torch.device("cpu")).mul_(tilt)
             for n, tilt in zip(self.height.shape, view.tilt, strict=True)
         )
-        pointers = [pointer(x) for x in (self.amplitude, self.height, self.path)]
+        pointers = [address_of(x) for x in (self.amplitude, self.height, self.path)]
         turns_per_metre = view.turns_height, view.turns_path
-        return _Held(
-            _Pupil(self.kind == torch.float64, *pointers, *turns_per_metre, pointer(v), pointer(u)),
+        return _StructureWithArrays(
+            _Pupil(
+                self.kind == torch.float64,
+                *pointers,
+                *turns_per_metre,
+                address_of(v),
+                address_of(u),
+            ),
             (v, u),
         )
 
@@ -368,7 +379,7 @@ class FusedPupil:
         """Call the C++ function ``name`` for the types of this pupil, with axes, threads, memory
         and arguments.
         """
-        last_type_used = last_type(*last_work(rows, columns), self.dtype, _LITTLE)
+        last_type_used = last_type(*work_by_axis(rows, columns), self.dtype, _FLOAT64_WORK_SHARE)
         row_axis, column_axis = (
             fused_axis(rows, self.dtype, self.dtype, last_type_used),
             fused_axis(columns, self.dtype, last_type_used, last_type_used),
@@ -384,7 +395,7 @@ class FusedPupil:
         ]
         samples = rows.n_in * columns.n_in + rows.n_out * columns.n_out
         # one thread alone for few samples
-        threads = min(torch.get_num_threads(), 1 + samples // _ALONE)
+        threads = min(torch.get_num_threads(), 1 + samples // _SAMPLES_PER_THREAD)
         operator(*structures[:2], ctypes.c_int64(threads), *tiles, *structures[2:])
 
     def _tiles(self, label: str, y: CAxis, n: int, kind: torch.dtype) -> Any:
@@ -396,25 +407,27 @@ class FusedPupil:
             vector // kind.itemsize,
             vector // self.dtype.itemsize,
         )
-        size = 2 * _up(y.kept, numbers_per_vector) * _up(n, columns_per_vector)
+        size = 2 * _rounded_up(y.kept, numbers_per_vector) * _rounded_up(n, columns_per_vector)
         # one vector more than needed, to align its start
         memory = self.work.take(label, size + numbers_per_vector, dtype=kind)
-        return ctypes.c_void_p(_up(memory.data_ptr(), vector))
+        return ctypes.c_void_p(_rounded_up(memory.data_ptr(), vector))
 
 
-class _Held:
+class _StructureWithArrays:
     """A structure for the C++, with the tensors that it points to."""
 
     def __init__(self, structure: ctypes.Structure, arrays: Sequence[Tensor | None]) -> None:
         self.structure, self.arrays = structure, arrays
 
 
-def _focal(view: View, intensity: Tensor | None, field: Tensor | None, add: bool) -> _Held:
+def _focal_structure(
+    view: View, intensity: Tensor | None, field: Tensor | None, add: bool
+) -> _StructureWithArrays:
     """Return the structure of the focal plane of a view, with the tensors that it points to."""
     arrays = (*(view.envelope or (None, None)), intensity, field)
-    return _Held(_Focal(view.weight, *(pointer(x) for x in arrays), add), arrays)
+    return _StructureWithArrays(_Focal(view.weight, *(address_of(x) for x in arrays), add), arrays)
 
 
-def _up(n: int, step: int) -> int:
+def _rounded_up(n: int, step: int) -> int:
     """Return a whole number, rounded up to a multiple of ``step``."""
     return -(-n // step) * step

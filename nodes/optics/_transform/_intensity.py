@@ -12,11 +12,13 @@ from torch import Tensor
 
 from neusee.nodes.optics._transform._fused import FusedPupil, available, operators
 from neusee.nodes.optics._transform._pupil_field import Field, Screens, View, refuse_too_many_turns
-from neusee.nodes.optics._transform._sample_axis import Workspace, borrowed, patch_of
+from neusee.nodes.optics._transform._sample_axis import Workspace, borrowed, patch_view
 from neusee.nodes.optics._transform._scaled_transform import Method, propagate
 from neusee.nodes.precision import one_by_one, transformed
 
-_ONCE = "the PSF has no second derivative here: differentiate without create_graph=True"
+_NO_SECOND_DERIVATIVE = (
+    "the PSF has no second derivative here: differentiate without create_graph=True"
+)
 KEPT_FIELD_BYTES = 1 << 30  #: bytes; focal fields up to this size are kept for back-propagation
 
 
@@ -65,7 +67,7 @@ class PupilIntensity(torch.autograd.Function):
         ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling
     ) -> Tensor:
         screens = Screens.of(amplitude, height, path)
-        intensity, fields = _computed(screens, sampling, any(ctx.needs_input_grad))
+        intensity, fields = _intensity_and_fields(screens, sampling, any(ctx.needs_input_grad))
         # as saved tensors the fields are freed with the graph, even where a result still holds this
         # node
         ctx.save_for_backward(
@@ -77,11 +79,11 @@ class PupilIntensity(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
-            raise RuntimeError(_ONCE)
+            raise RuntimeError(_NO_SECOND_DERIVATIVE)
         amplitude, height, path, *fields = ctx.saved_tensors
         screens = Screens(amplitude, height, path, *ctx.screens)
         fields = fields or [None] * len(ctx.sampling.views)
-        return (*_adjoint(weight, screens, ctx.sampling, fields, ctx.needs_input_grad[:3]), None)
+        return (*_gradients(weight, screens, ctx.sampling, fields, ctx.needs_input_grad[:3]), None)
 
 
 class _Transformed(torch.autograd.Function):
@@ -89,7 +91,7 @@ class _Transformed(torch.autograd.Function):
 
     @staticmethod
     def forward(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
-        return _computed(Screens.of(amplitude, height, path), sampling, False)[0]
+        return _intensity_and_fields(Screens.of(amplitude, height, path), sampling, False)[0]
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -114,7 +116,7 @@ class _Transformed(torch.autograd.Function):
         return one_by_one(_Transformed.apply, info.batch_size, in_dims, inputs)
 
 
-class _Once(torch.autograd.Function):
+class _FirstDerivative(torch.autograd.Function):
     """A first derivative for `torch.func`, of which a further derivative raises an error."""
 
     @staticmethod
@@ -123,28 +125,28 @@ class _Once(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        raise RuntimeError(_ONCE)
+        raise RuntimeError(_NO_SECOND_DERIVATIVE)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Any:
-        raise RuntimeError(_ONCE)
+        raise RuntimeError(_NO_SECOND_DERIVATIVE)
 
 
-class _Tangent(_Once):
+class _Tangent(_FirstDerivative):
     """The change of the PSF intensity for small changes of amplitude, height and path (forward
     mode).
     """
 
     @staticmethod
     def forward(*inputs: Any) -> Tensor:
-        return _pushed(Screens.of(*inputs[:3]), inputs[3:6], inputs[6])
+        return _intensity_change(Screens.of(*inputs[:3]), inputs[3:6], inputs[6])
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
         return one_by_one(_Tangent.apply, info.batch_size, in_dims, inputs)
 
 
-class _Gradient(_Once):
+class _Gradient(_FirstDerivative):
     """The gradients of the PSF intensity for amplitude, height and path (reverse mode)."""
 
     @staticmethod
@@ -153,7 +155,7 @@ class _Gradient(_Once):
     ) -> Any:
         fields = [None] * len(sampling.views)
         return tuple(
-            _adjoint(
+            _gradients(
                 weight, Screens.of(amplitude, height, path), sampling, fields, (True, True, True)
             )
         )
@@ -163,7 +165,7 @@ class _Gradient(_Once):
         return one_by_one(_Gradient.apply, info.batch_size, in_dims, inputs)
 
 
-def _computed(
+def _intensity_and_fields(
     screens: Screens, sampling: Sampling, keep: bool
 ) -> tuple[Tensor, list[Tensor | None]]:
     """Return the PSF intensity, and the focal field of each view, or None instead of fields that
@@ -189,7 +191,7 @@ def _computed(
                 pupil.forward(view, intensity[view.band], view.band == last_band, focal_field)
             else:
                 field = Field(screens, view, sampling.dtype)
-                _power(
+                _write_intensity(
                     field,
                     intensity[view.band],
                     view.band == last_band,
@@ -202,7 +204,7 @@ def _computed(
     return intensity, fields
 
 
-def _adjoint(
+def _gradients(
     weight: Tensor,
     screens: Screens,
     sampling: Sampling,
@@ -225,12 +227,12 @@ def _adjoint(
             return grads
         for view, focal in zip(sampling.views, fields, strict=True):
             field = Field(screens, view, weight.dtype)
-            planes = focal if focal is not None else _focal(field, sampling, work)
+            planes = focal if focal is not None else _focal_field(field, sampling, work)
             _add_gradient(field, planes, weight[view.band], grads, sampling.by_torch, work)
     return grads
 
 
-def _pushed(screens: Screens, tangents: Sequence[Tensor], sampling: Sampling) -> Tensor:
+def _intensity_change(screens: Screens, tangents: Sequence[Tensor], sampling: Sampling) -> Tensor:
     """Return the change of the PSF intensity, 2 Re(U* dU), for changes ``tangents`` of
     amplitude, height and path.
     """
@@ -241,7 +243,7 @@ def _pushed(screens: Screens, tangents: Sequence[Tensor], sampling: Sampling) ->
     with borrowed(sampling.dtype, change.device) as work:
         for view in views:
             field = Field(screens, view, sampling.dtype)
-            planes = _focal(field, sampling, work)
+            planes = _focal_field(field, sampling, work)
             _add_change(field, tangents, planes, change[view.band], sampling.by_torch, work)
     return change
 
@@ -270,15 +272,15 @@ def _add_change(
         torch.mul(phasor[1], amplitude, out=out[1]).addcmul_(phasor[0], phase_change)
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        focal_patch = patch_of(planes.transpose(1, 2), rows, columns, patch)
-        patch_of(change, rows, columns, patch).add_(
-            _scaled(field.view, (2 * focal_patch * patch).sum(0), rows, columns)
+        focal_patch = patch_view(planes.transpose(1, 2), rows, columns, patch)
+        patch_view(change, rows, columns, patch).add_(
+            _weigh(field.view, (2 * focal_patch * patch).sum(0), rows, columns)
         )
 
     propagate(field.view.rows, field.view.columns, source, sink, work, method)
 
 
-def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
+def _weigh(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
     """Multiply ``values`` on one patch of the focal plane, in place, by the weight and the
     envelope of the view.
     """
@@ -292,7 +294,7 @@ def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
     )
 
 
-def _power(
+def _write_intensity(
     field: Field, out: Tensor, add: bool, focal: Tensor | None, method: Method, work: Workspace
 ) -> None:
     """Write the weighted intensity |U|^2 of one window of the focal plane to ``out``, or add it
@@ -301,24 +303,24 @@ def _power(
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         if focal is not None:
-            _keep(focal, rows, columns, patch)
-        intensity = _scaled(
+            _store_focal(focal, rows, columns, patch)
+        intensity = _weigh(
             field.view, patch[0].square().addcmul_(patch[1], patch[1]), rows, columns
         )
-        target = patch_of(out, rows, columns, patch)
+        target = patch_view(out, rows, columns, patch)
         target.add_(intensity) if add else target.copy_(intensity)
 
     propagate(field.view.rows, field.view.columns, field.rows(work), sink, work, method)
 
 
-def _keep(focal: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
+def _store_focal(focal: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
     """Store a patch of the focal field transposed, the memory layout of the fastest transform
     and its adjoint.
     """
-    patch_of(focal.transpose(1, 2), rows, columns, patch).copy_(patch)
+    patch_view(focal.transpose(1, 2), rows, columns, patch).copy_(patch)
 
 
-def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
+def _focal_field(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
     """Compute the focal field of a view again for back-propagation, and return the transposed
     field.
     """
@@ -326,7 +328,7 @@ def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
     planes = work.take("focal", 2, view.columns.n_out, view.rows.n_out)
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        _keep(planes, rows, columns, patch)
+        _store_focal(planes, rows, columns, patch)
 
     propagate(view.rows, view.columns, field.rows(work), sink, work, sampling.by_torch)
     return planes
@@ -351,18 +353,18 @@ def _add_gradient(
     transposed_weight = work.take("gain", *planes.shape[1:]).copy_(weight.T)
 
     def source(start: int, stop: int, out: Tensor) -> None:
-        _scaled(view, transposed_weight[start:stop].mul_(2).T, all_rows, slice(start, stop))
+        _weigh(view, transposed_weight[start:stop].mul_(2).T, all_rows, slice(start, stop))
         torch.mul(planes[:, start:stop], transposed_weight[start:stop], out=out)
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         pupil_patch = work.take("flat", 2, columns.stop - columns.start, rows.stop - rows.start)
-        patch_of(pupil_patch.transpose(1, 2), slice(None), slice(None), patch).copy_(patch)
-        _chain(field, columns, rows, pupil_patch, grads, work)
+        patch_view(pupil_patch.transpose(1, 2), slice(None), slice(None), patch).copy_(patch)
+        _add_factor_gradients(field, columns, rows, pupil_patch, grads, work)
 
     propagate(view.columns.adjoint(), view.rows.adjoint(), source, sink, work, method)
 
 
-def _chain(
+def _add_factor_gradients(
     field: Field,
     rows: slice,
     columns: slice,

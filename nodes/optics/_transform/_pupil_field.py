@@ -15,7 +15,7 @@ from neusee.nodes.precision import refuse_not_finite
 
 _MOST_TURNS = 1e9  #: turns of phase that float64 holds to 2e-7 turn
 #: below this many turns a float32 phase is exact to 5e-7 rad, like a float64 phase after a cast
-_FEW_TURNS = 2.0
+_FLOAT32_TURNS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,9 @@ class Field:
         tilts = zip(screens.height.shape, view.tilt, strict=True)
         v, u = (centred(n, screens.height.device).mul_(tilt) for n, tilt in tilts)
         turns = screens.highest * abs(view.turns_height) + screens.longest * view.turns_path
-        self.few = dtype == torch.float32 and turns + float(v[-1].abs() + u[-1].abs()) < _FEW_TURNS
+        self.few = (
+            dtype == torch.float32 and turns + float(v[-1].abs() + u[-1].abs()) < _FLOAT32_TURNS
+        )
         phase_type = torch.float32 if self.few else torch.float64
         self.tilt_v, self.tilt_u = v.to(phase_type)[:, None], u.to(phase_type)
 
@@ -95,7 +97,9 @@ class Field:
         if self.screens.longest > 0:
             turns.add_(self.screens.path[rows, columns], alpha=self.view.turns_path)
         turns.add_(self.tilt_v[rows])
-        torch.mul(turns if self.few else turns.frac_(), 2 * math.pi, out=angle)
+        if not self.few:
+            turns.frac_()
+        torch.mul(turns, 2 * math.pi, out=angle)
         torch.cos(angle, out=planes[0])
         torch.sin(angle, out=planes[1])
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 
 __depends__ = ("unaffected:_idle",)
-_IDLE_AT_MOST = 2
+_MOST_IDLE_WORKSPACES = 2
 _idle: list["Workspace"] = []
 _lock = threading.Lock()
 
@@ -56,7 +56,7 @@ def borrowed(dtype: torch.dtype, device: torch.device) -> Iterator[Workspace]:
     finally:
         with _lock:
             _idle.append(work)
-            del _idle[:-_IDLE_AT_MOST]
+            del _idle[:-_MOST_IDLE_WORKSPACES]
 
 
 # --- sample axis ----------------------------------------------------------------------------------
@@ -72,7 +72,7 @@ Sink = Callable[[slice, slice, Tensor], None]
 #: unflattened
 
 #: share of the work of the first axis, up to which the last axis is transformed in float64
-LITTLE = 1 / 10
+FLOAT64_WORK_SHARE = 1 / 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,9 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
     return torch.complex(angle.cos(), angle.sin())
 
 
-def last_type(first: float, last: float, dtype: torch.dtype, little: float = LITTLE) -> torch.dtype:
+def last_type(
+    first: float, last: float, dtype: torch.dtype, little: float = FLOAT64_WORK_SHARE
+) -> torch.dtype:
     """Return the number type of the transform along the last axis, given the work along the first
     and the last axis.
 
@@ -128,7 +130,7 @@ def last_type(first: float, last: float, dtype: torch.dtype, little: float = LIT
     return torch.float64 if last <= little * first else dtype
 
 
-def patch_of(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:
+def patch_view(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:
     """Return a view of ``x[..., rows, columns]`` in the shape of the patch ``like``."""
     view = x[..., rows, columns]
     return view.view(*x.shape[:-2], *like.shape[1:])

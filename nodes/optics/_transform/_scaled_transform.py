@@ -1,11 +1,11 @@
 """The scaled Fourier transform: matrix products, and the choice of the fastest method."""
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._transform._fft_transforms import bluestein, kaiser_bessel, smooth
+from neusee.nodes.optics._transform._fft_transforms import bluestein, fft_length, kaiser_bessel
 from neusee.nodes.optics._transform._sample_axis import (
     Axis,
     Sink,
@@ -14,7 +14,7 @@ from neusee.nodes.optics._transform._sample_axis import (
     borrowed,
     centred,
     last_type,
-    patch_of,
+    patch_view,
     radians,
     row_chunks,
     unit_phasor,
@@ -65,17 +65,17 @@ def folded(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspac
     for start, stop in row_chunks(rows.n_in, columns.n_in):
         planes = work.take("planes", 2, stop - start, columns.n_in)
         source(start, stop, planes)
-        even, odd = _fold(planes, columns.n_in)
-        _unfold(
+        even, odd = _even_and_odd(planes, columns.n_in)
+        _write_halves(
             even @ column_kernels[0].T,
             odd @ column_kernels[1].T,
             columns,
             columns_transformed[:, start:stop],
         )
-    even, odd = _fold(columns_transformed.transpose(1, 2).to(last_kind), rows.n_in)
+    even, odd = _even_and_odd(columns_transformed.transpose(1, 2).to(last_kind), rows.n_in)
     for start, stop in row_chunks(columns.n_out, 4 * rows.n_out):
         patch = work.take("patch", 2, stop - start, rows.n_out, dtype=last_kind)
-        _unfold(
+        _write_halves(
             even[:, start:stop] @ row_kernels[0].T,
             odd[:, start:stop] @ row_kernels[1].T,
             rows,
@@ -106,7 +106,7 @@ def _half_kernels(axis: Axis, dtype: torch.dtype, device: torch.device) -> tuple
     return cosine, sine
 
 
-def _fold(field: Tensor, n: int) -> tuple[Tensor, Tensor]:
+def _even_and_odd(field: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """Return the even and the odd part of a field of ``n`` samples along the last axis, on its
     upper half.
     """
@@ -114,7 +114,7 @@ def _fold(field: Tensor, n: int) -> tuple[Tensor, Tensor]:
     return upper_half + mirrored_lower_half, upper_half - mirrored_lower_half
 
 
-def _unfold(even: Tensor, odd: Tensor, axis: Axis, out: Tensor) -> None:
+def _write_halves(even: Tensor, odd: Tensor, axis: Axis, out: Tensor) -> None:
     """Write even(k) + i odd(k) and its mirror image to the halves of ``out``; all tensors are
     (re, im) planes.
     """
@@ -168,9 +168,9 @@ def _expected_seconds(rows: Axis, columns: Axis) -> dict[str, float]:
     """
     n_in, n_out = rows.n_in * columns.n_in, rows.n_out * columns.n_out
     products = rows.n_in * columns.n_out * (columns.n_in + rows.n_out)
-    chirp_samples = rows.n_in * smooth(columns.n_in + columns.n_out) + columns.n_out * smooth(
-        rows.n_in + rows.n_out
-    )
+    chirp_samples = rows.n_in * fft_length(
+        columns.n_in + columns.n_out
+    ) + columns.n_out * fft_length(rows.n_in + rows.n_out)
     information = rows.bandwidth * columns.bandwidth
     few_samples = min(rows.bandwidth, columns.bandwidth) < _FEW_SAMPLES
     return {
@@ -185,14 +185,19 @@ def _expected_seconds(rows: Axis, columns: Axis) -> dict[str, float]:
     }
 
 
+class Grids(NamedTuple):
+    """How the grids of a field and of its transform lie to each other, along both axes."""
+
+    alpha: tuple[float, float]  #: turns per input sample and output sample
+    centre_in: tuple[float, float]  #: samples, of the field; also between or beyond its samples
+    centre_out: tuple[float, float]  #: samples, of the transform
+    sign: int = -1  #: of the exponent
+
+
 def transform(
     field: Tensor,
     shape: tuple[int, int],
-    alpha: tuple[float, float],
-    centre_in: tuple[float, float],
-    centre_out: tuple[float, float],
-    *,
-    sign: int = -1,
+    grids: Grids,
     method: Method = "auto",
 ) -> Tensor:
     """Return ``U = K_y P K_x^T`` with kernels ``exp(sign 2 pi i alpha (j - centre_in) (k -
@@ -202,10 +207,12 @@ def transform(
     samples or outside the grid. Phases are computed in float64 and reduced to half a turn before a
     cast.
     """
-    axes = [Axis(n, k, a, sign) for n, k, a in zip(field.shape, shape, alpha, strict=True)]
+    axes = [
+        Axis(n, k, a, grids.sign) for n, k, a in zip(field.shape, shape, grids.alpha, strict=True)
+    ]
     real_type = field.real.dtype
     # shifts of both centres are phases before and after the transform about the middles
-    phasors_before, phasors_after = _tilts(axes, centre_in, centre_out, real_type, field.device)
+    phasors_before, phasors_after = _centre_phasors(axes, grids, real_type, field.device)
     out = torch.empty(shape, dtype=field.dtype, device=field.device)
 
     def source(start: int, stop: int, into: Tensor) -> None:
@@ -216,25 +223,23 @@ def transform(
         )
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        patch_of(torch.view_as_real(out).movedim(2, 0), rows, columns, patch).copy_(patch)
+        patch_view(torch.view_as_real(out).movedim(2, 0), rows, columns, patch).copy_(patch)
 
     with borrowed(real_type, field.device) as work:
         propagate(axes[0], axes[1], source, sink, work, method)
     return out.mul_(phasors_after[0][:, None]).mul_(phasors_after[1])
 
 
-def _tilts(
-    axes: list[Axis],
-    centre_in: tuple[float, float],
-    centre_out: tuple[float, float],
-    real: torch.dtype,
-    device: torch.device,
+def _centre_phasors(
+    axes: list[Axis], grids: Grids, real: torch.dtype, device: torch.device
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Return the phasors along each axis that move the centre of a Fourier transform to the
     given centres.
     """
     before, after = [], []
-    for axis, input_centre, output_centre in zip(axes, centre_in, centre_out, strict=True):
+    for axis, input_centre, output_centre in zip(
+        axes, grids.centre_in, grids.centre_out, strict=True
+    ):
         input_shift, output_shift = (
             (axis.n_in - 1) / 2 - input_centre,
             (axis.n_out - 1) / 2 - output_centre,

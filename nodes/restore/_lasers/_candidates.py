@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.optics import psf as focus
-from neusee.nodes.optics._transform._fft_transforms import smooth
+from neusee.nodes.optics._transform._fft_transforms import fft_length
 from neusee.nodes.restore._lasers._components import NANOMETRE, Camera
 from neusee.nodes.restore._lasers._frame_likelihood import Data, Filter, Weights
 from neusee.nodes.restore._lasers._line_pattern import Lens, grid_patterns, index_at, response_at
@@ -170,7 +170,7 @@ def clipped_candidates(
 
 def _size(frame: torch.Size, pattern: Tensor) -> list[int]:
     """Return the size of a periodic grid on which a frame and a pattern do not wrap around."""
-    return [smooth(n + k - 1) for n, k in zip(frame, pattern.shape[-2:], strict=True)]
+    return [fft_length(n + k - 1) for n, k in zip(frame, pattern.shape[-2:], strict=True)]
 
 
 def _gain(product: Tensor, norm: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from neusee.nodes.optics import psf as focus
-from neusee.nodes.optics._transform._fft_transforms import smooth
+from neusee.nodes.optics._transform._fft_transforms import fft_length
 from neusee.nodes.restore._inverse._masked_blur import grey_shares
 from neusee.nodes.restore._lasers._line_pattern import (
     Lens,
@@ -68,7 +68,7 @@ def lamp_light(
     """
     kinds = _kinds(illuminant, responses, bands).to(psf.intensity.device, kind)
     finer, (y, x) = _finer(pupil, lens), (lens.shape[0] + _RIM, lens.shape[1] + _RIM)
-    torus = (smooth(2 * y + 1), smooth(2 * x + 1))  # pixels
+    torus = (fft_length(2 * y + 1), fft_length(2 * x + 1))  # pixels
     fine_torus = (finer * torus[0], finer * torus[1])
     spectra = torch.fft.rfft2(_fine_patterns(kinds, pupil, lens, finer), s=fine_torus)
     # the spot from the middle of the window to the first sample

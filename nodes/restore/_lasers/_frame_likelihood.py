@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
-from neusee.nodes.optics._transform._fft_transforms import smooth
+from neusee.nodes.optics._transform._fft_transforms import fft_length
 from neusee.nodes.restore._lasers._components import NANOMETRE, Lamp, Laser
 
 # --- whitening ------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ def _convolved(pictures: Tensor, kernel: Tensor) -> Tensor:
     flat = pictures.reshape(-1, *pictures.shape[-2:])
     rim = len(kernel) // 2
     padded = pad(flat, (rim,) * 4, mode="reflect")
-    size = [smooth(n) for n in padded.shape[-2:]]
+    size = [fft_length(n) for n in padded.shape[-2:]]
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
     y, x = pictures.shape[-2:]
     # the kernel's middle is `rim` in, and the padding another `rim`

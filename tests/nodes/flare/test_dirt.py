@@ -20,8 +20,8 @@ from neusee.nodes.flare._dirt import (
     _scratches,
     stamp,
 )
-from neusee.nodes.optics._pupil import screen, surface
-from neusee.nodes.optics._pupil_grid import grid_of, inside, pupil_grid
+from neusee.nodes.optics._pupil import phase_screen, zernike_surface
+from neusee.nodes.optics._pupil_grid import grid_of, inside_stop, pupil_grid
 
 STOP = optics.stop(samples=128, pitch=10e-6, diameter=1.28e-3)
 FILTHY = {"dust": 30.0, "scratches": 10.0, "grease": 0.2, "smudges": 0.5, "dents": 0.4}
@@ -154,7 +154,7 @@ def test_numbers_and_sizes_are_those_of_wu():
 def test_soft_kinds_have_the_asked_strength():
     drawn = [flare.dirt(STOP, grease=0.2, rng=seeded(k)).path for k in range(40)]
     assert float(torch.stack(drawn).square().mean().sqrt()) == pytest.approx(0.2 * 550e-9, rel=0.05)
-    open_ = inside(grid_of(STOP))
+    open_ = inside_stop(grid_of(STOP))
     bent = flare.dirt(STOP, dents=0.4, rng=seeded()).path[open_]
     assert float(bent.std()) == pytest.approx(0.4 * 550e-9, rel=0.03)
     smeared = flare.dirt(STOP, smudges=0.6, rng=seeded()).amplitude
@@ -164,7 +164,7 @@ def test_soft_kinds_have_the_asked_strength():
 
 def spread(amplitude):
     """Point-spread function on the natural grid, unit sum, axis in the middle."""
-    open_ = inside(pupil_grid(len(amplitude), 1.0, float(len(amplitude))))
+    open_ = inside_stop(pupil_grid(len(amplitude), 1.0, float(len(amplitude))))
     field = torch.fft.fftshift(torch.fft.fft2(amplitude.double() * open_))
     return field.abs().square() / field.abs().square().sum()
 
@@ -223,11 +223,11 @@ def test_dirt_is_made_by_stripes_that_fit_together():
     """A pupil of many stripes: each kind against its formula over the whole plane."""
     stop, rngs = optics.stop(samples=401, pitch=1e-5, diameter=4.01e-3), _generators(5, seeded())
     grid = grid_of(stop)
-    film, patches = screen(grid, 0.05, rngs[2]), screen(grid, 0.15, rngs[3])
+    film, patches = phase_screen(grid, 0.05, rngs[2]), phase_screen(grid, 0.15, rngs[3])
     found = flare.dirt(stop, grease=0.3, smudges=0.4, dents=0.5, rng=seeded())
-    bent = 0.3 * 550e-9 * film + surface(_dents(0.5 * 550e-9, rngs[4]), grid)
+    bent = 0.3 * 550e-9 * film + zernike_surface(_dents(0.5 * 550e-9, rngs[4]), grid)
     assert_close(found.path, bent.float(), rtol=1e-6, atol=1e-13)
     assert_close(found.amplitude, (1 - 0.4 * torch.sigmoid(3 * patches)).float())
     light, _ = flare.dirt.hooks.check(found, stop)
-    inner, open_ = bent.float().double(), inside(grid)
+    inner, open_ = bent.float().double(), inside_stop(grid)
     assert f"by {float(inner[open_].std(correction=0)) / 550e-9:.3g} waves" in light.text

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.losses import best_stop, filtered_error, information
+from neusee.nodes.losses import ProtectedPicture, best_stop, filtered_error, information
 from neusee.nodes.metrics import stop_diameter
 from neusee.nodes.values import Bands, Psf
 
@@ -163,7 +163,7 @@ def test_the_rival_is_no_worse_than_any_stop_and_filter_of_the_fourier_transform
         stopped = Psf(torch.from_numpy(area * psf)[None], clear)
         found.append(float(loss(stopped, *grey, **how, transmittance=area)))
     rival, width, passed = best_stop(
-        Psf(stopped.intensity, clear), *grey, **how, measure=loss.fn.__name__
+        Psf(stopped.intensity, clear), *grey, ProtectedPicture(**how), measure=loss.fn.__name__
     )
     assert rival <= min(found) + 2e-3 * abs(min(found))
     assert rival > min(found) - 0.05 * abs(min(found))
@@ -178,7 +178,9 @@ def test_in_the_dark_the_rival_is_a_stop_without_a_filter_behind_pixels_that_ave
     one = torch.ones(1, dtype=torch.float64)
     lens = Psf(torch.zeros(1, 64, 64, dtype=torch.float64), 0.11 * one, 0.39 * one, one)
     grey = (one, one[None], Bands(550e-9 * one, one, one))
-    _, width, passed = best_stop(lens, *grey, light=3.0, read_noise=10.5, limit=0.01)
+    _, width, passed = best_stop(
+        lens, *grey, ProtectedPicture(light=3.0, read_noise=10.5, limit=0.01)
+    )
     assert passed > 0.999
     assert width == pytest.approx(float(stop_diameter(lens, 0.01)), rel=1e-6)
     assert width < 0.99 * 0.01**0.25

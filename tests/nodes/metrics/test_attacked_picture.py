@@ -8,8 +8,10 @@ import torch
 
 from neusee.nodes import metrics
 from neusee.nodes.metrics import (
+    Attack,
     PixelNoise,
     attacked_picture,
+    channel_psf,
     detail_energy,
     detail_targets,
     detection_snr,
@@ -37,15 +39,16 @@ def spot(width, side=64, light=1.0):
 
 def test_a_picture_under_attack_is_the_mean_over_its_pixels():
     one = spot(2.0)
-    spectrum = picture_spectrum(one, one, ONE, ONE[None], GREEN)
+    channels = channel_psf(one, ONE, ONE[None], GREEN)
+    spectrum = picture_spectrum(channels, channels)
     sensor = PixelNoise(read_noise=5.0, full_well=1e4, prnu=0.01, residual_glare=0.03)
-    given = {"electrons": 200.0, "transmittance": 0.1, "colour": ONE}
     found = attacked_picture(
         spectrum,
         glare_levels(one.intensity[0], float(one.clear_peak)),
         sensor,
-        strengths=torch.tensor([10.0, 1e3]),
-        **given,
+        Attack(torch.tensor([10.0, 1e3]), ONE),
+        electrons=200.0,
+        transmittance=0.1,
     )
     for number, strength in enumerate((10.0, 1e3)):
         glare = 0.1 * strength * 1e4 * (one.intensity[0] / one.clear_peak).flatten()[:, None]
@@ -58,17 +61,17 @@ def test_a_picture_under_attack_is_the_mean_over_its_pixels():
 
 def test_a_laser_too_weak_to_matter_leaves_the_quiet_picture_and_a_strong_one_leaves_none():
     one = spot(2.0)
-    spectrum = picture_spectrum(one, one, ONE, ONE[None], GREEN)
+    channels = channel_psf(one, ONE, ONE[None], GREEN)
+    spectrum = picture_spectrum(channels, channels)
     even = glare_levels(torch.full((8, 8), 1e-4, dtype=torch.float64), 0.1)
     sensor = PixelNoise(5.0, 1e4, 0.0, 0.0)
     found = attacked_picture(
         spectrum,
         even,
         sensor,
+        Attack(torch.tensor([0.0, 1e9]), ONE),
         electrons=50.0,
         transmittance=1.0,
-        strengths=torch.tensor([0.0, 1e9]),
-        colour=ONE,
     )
     quiet = metrics.filtered_picture(one, ONE, ONE[None], GREEN, electrons=50.0, read_noise=5.0)
     assert float(found.error[0]) == pytest.approx(float(quiet.error), rel=1e-3)

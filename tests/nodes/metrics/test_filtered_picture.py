@@ -10,6 +10,7 @@ import torch
 
 from neusee.nodes import doe, metrics, optics
 from neusee.nodes.metrics import (
+    channel_psf,
     information_bits,
     mean_log_neq,
     noise_variance,
@@ -55,7 +56,10 @@ def psf_of(height=None, **given):
 
 
 def spectrum_of(one, known=None):
-    return picture_spectrum(one, known or one, ONE, ONE[None], GREEN)
+    channels, known_channels = (
+        channel_psf(psf, ONE, ONE[None], GREEN) for psf in (one, known or one)
+    )
+    return picture_spectrum(channels, known_channels)
 
 
 def measured(spectrum, amplitude, light_passed):
@@ -149,7 +153,8 @@ def test_the_histogram_agrees_with_the_node_with_and_without_a_filter():
     three = bands(start=450e-9, stop=650e-9, count=3)
     rest = torch.rand(3).double(), torch.rand(2, 3).double(), three
     one = some_psf(side=64)
-    spectrum = picture_spectrum(one, one, *rest)
+    channels = channel_psf(one, *rest)
+    spectrum = picture_spectrum(channels, channels)
     for grey in (1.0, 0.03):
         dim = one._replace(intensity=one.intensity * grey)
         exact = metrics.filtered_picture(dim, *rest, electrons=200.0, read_noise=3.0, glare=5.0)
@@ -167,7 +172,7 @@ def test_the_histogram_agrees_with_the_node_with_and_without_a_filter():
 
 def test_a_filter_that_takes_the_wrong_psf_for_the_true_one_errs_as_a_sum_over_frequencies_says():
     true, known = some_psf(1, 48, 1), some_psf(1, 48, 2)
-    spectrum = picture_spectrum(true, known, ONE, ONE[None], GREEN)
+    spectrum = spectrum_of(true, known)
     h, k = (np.fft.fft2(one.intensity[0].numpy()) for one in (true, known))
     f = np.fft.fftfreq(48)
     square = f[:, None] ** 2 + f**2

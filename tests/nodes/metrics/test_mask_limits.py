@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.metrics import limits, lsr, most_contrast, mtf
-from neusee.nodes.metrics._suppression import least_lsr, most_unsuppressed, shares
+from neusee.nodes.metrics import least_lsr, limits, lsr, most_contrast, most_unsuppressed, mtf
+from neusee.nodes.metrics._suppression import passed_frequency_shares
 from neusee.nodes.values import Psf
 
 
@@ -49,7 +49,7 @@ def test_the_share_of_frequencies_is_that_of_a_disc_cut_by_the_square():
         over = max(r - 0.5, 0.0)
         caps = 4 * (r * r * math.acos(min(0.5 / r, 1.0)) - 0.5 * math.sqrt(over * (r + 0.5)))
         whole = 4 * p0 - caps if r < math.sqrt(0.5) else 1.0
-        assert float(shares(psf(blank, p0))) == pytest.approx(whole, abs=2e-3)
+        assert float(passed_frequency_shares(psf(blank, p0))) == pytest.approx(whole, abs=2e-3)
 
 
 def test_a_lens_whose_cut_off_is_sampled_has_at_most_half_the_contrast_in_root_mean_square():

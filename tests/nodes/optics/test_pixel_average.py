@@ -12,9 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError, optics
-from neusee.nodes.optics import _pixel_average, psf
-from neusee.nodes.optics._lens import cut_off, round_lens
-from neusee.nodes.optics._pixel_average import averaged, fine_axis
+from neusee.nodes.optics import _lens, _pixel_average, psf
 from neusee.nodes.values import Pupil
 from tests.nodes.optics import own_pixel_average as own
 from tests.nodes.optics.random_pixel_cameras import compared, drawn, energy
@@ -111,7 +109,7 @@ def test_strips_change_nothing(monkeypatch):
     monkeypatch.setattr(_pixel_average, "FINE_SAMPLES", 1)
     assert (
         len(
-            _pixel_average.strips(
+            _pixel_average.pixel_strips(
                 *_pixel_average.fine_axes((64, 64), (21, 16), 0.03, torch.float64)
             )
         )
@@ -127,16 +125,16 @@ def test_strips_change_nothing(monkeypatch):
 def test_the_filter_averages_every_fringe_of_the_band(pixels, bandwidth, errors):
     """The mean of exp(2 pi i nu x) over a pixel about k is sinc(nu) exp(2 pi i nu k)."""
     error, most = errors
-    grid = fine_axis(pixels, bandwidth, error)
+    grid = _pixel_average.fine_axis(pixels, bandwidth, error)
     assert grid.per_pixel > 2 * bandwidth
     assert grid.per_pixel >= 1
-    even = fine_axis(1, 0.0, error)
+    even = _pixel_average.fine_axis(1, 0.0, error)
     at = (torch.arange(grid.samples, dtype=torch.float64) - (grid.samples - 1) / 2) / grid.per_pixel
     middle = torch.arange(pixels, dtype=torch.float64) - (pixels - 1) / 2
     for fringe in torch.linspace(0, bandwidth, 7, dtype=torch.float64):
         for wave in (torch.cos, torch.sin):
             light = wave(2 * math.pi * fringe * at)[:, None].expand(-1, even.samples).contiguous()
-            found = averaged(light, grid, even)[:, 0]
+            found = _pixel_average.averaged(light, grid, even)[:, 0]
             expected = wave(2 * math.pi * fringe * middle) * torch.sinc(fringe)
             assert float((found - expected).abs().max()) < most
 
@@ -305,9 +303,9 @@ def test_the_lens_band_of_a_psf_does_not_depend_on_its_sampling(number, pixel):
     found = psf(pupil, **camera)
     area = float(pupil.aperture.sum()) * float(pupil.pitch) ** 2
     expected = math.sqrt(4 * area / math.pi) * pixel / (532e-9 * FOCAL)
-    assert float(cut_off(found)) == pytest.approx(expected, rel=1e-9)
+    assert float(_lens.cut_off(found)) == pytest.approx(expected, rel=1e-9)
     assert found.averaged.tolist() == [1.0]
-    lens = round_lens(found.cut_off, found.averaged)
+    lens = _lens.round_lens(found.cut_off, found.averaged)
     assert float(found.clear_peak) == pytest.approx(
         float(lens.peak) * math.pi / 4 * expected**2, rel=3e-3
     )

@@ -12,9 +12,9 @@ from neusee.nodes import ParameterError, optics
 from neusee.nodes.optics._pupil_grid import (
     clear_area,
     clear_diameter,
-    gaussian_over,
-    inside,
-    polar,
+    gaussian_integral,
+    inside_stop,
+    polar_coordinates,
     pupil_grid,
 )
 
@@ -52,7 +52,7 @@ def test_the_clear_area_is_that_of_the_disc_within_the_square(width):
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_gaussian_over_the_stop_is_its_integral_by_rows(width, beam):
     expected = opened(width, lambda x, y: math.exp(-(x * x + y * y) / beam**2))
-    assert gaussian_over(clipped(width), beam) == pytest.approx(expected, rel=1e-8)
+    assert gaussian_integral(clipped(width), beam) == pytest.approx(expected, rel=1e-8)
 
 
 def test_the_clear_diameter_is_cut_by_the_grid():
@@ -64,9 +64,9 @@ def test_samples_on_the_rim_are_inside_and_the_axis_is_in_the_middle():
     """A disc of two pitches on 3 x 3 samples holds a cross; the corner of an even grid is half a
     pitch away.
     """
-    cross = inside(pupil_grid(3, 1e-3, 2e-3))
+    cross = inside_stop(pupil_grid(3, 1e-3, 2e-3))
     assert cross.tolist() == [[False, True, False], [True, True, True], [False, True, False]]
-    radius, azimuth = polar(pupil_grid(4, 1e-3, 4e-3))
+    radius, azimuth = polar_coordinates(pupil_grid(4, 1e-3, 4e-3))
     assert float(radius.min()) == pytest.approx(math.sqrt(0.5) / 2)
     torch.testing.assert_close(radius, radius.flip(0).flip(1))
     assert float(azimuth[3, 3]) == pytest.approx(math.pi / 4)
@@ -77,7 +77,7 @@ def test_samples_on_the_rim_are_inside_and_the_axis_is_in_the_middle():
 def test_a_stop_between_four_samples_is_refused(samples, diameter, holds):
     """The four samples about the axis of an even grid lie half a diagonal of a pitch from it."""
     if holds:
-        assert bool(inside(pupil_grid(samples, 1.0, diameter)).any())
+        assert bool(inside_stop(pupil_grid(samples, 1.0, diameter)).any())
         return
     with pytest.raises(ParameterError, match=r"holds no pupil sample: give 1[.]41e"):
         pupil_grid(samples, 1.0, diameter)

@@ -12,9 +12,7 @@ import torch
 from PIL import Image
 
 from neusee.nodes import ParameterError, input_files
-from neusee.nodes.scene import _picture_changes as _large_picture
-from neusee.nodes.scene import exr, photograph
-from neusee.nodes.scene._picture_changes import framed
+from neusee.nodes.scene import _picture_changes, exr, photograph
 
 SIZES = [
     ((101, 67), (8, 8)), ((101, 67), (30, 50)), ((67, 101), (67, 100)), ((50, 60), (75, 75)), ((50, 60), (50, 60)),
@@ -30,13 +28,16 @@ def light(codes):
 @pytest.mark.parametrize("band", [1, 500])
 def test_bands_of_rows_give_the_light_of_the_whole_picture(monkeypatch, size, shape, band):
     """Kornia resamples the whole picture in float64; a band of one row is the smallest there is."""
-    monkeypatch.setattr(_large_picture, "_LARGE", 0)
-    monkeypatch.setattr(_large_picture, "_BAND", band)
+    monkeypatch.setattr(_picture_changes, "_LARGE_PIXELS", 0)
+    monkeypatch.setattr(_picture_changes, "_BAND_PIXELS", band)
     codes = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
-    result = _large_picture.linear_light(codes, light, shape)
+    result = _picture_changes.linear_light(codes, light, shape)
     assert result.dtype == torch.float32
     torch.testing.assert_close(
-        result.double(), framed(light(codes).double(), shape), rtol=0, atol=2e-7
+        result.double(),
+        _picture_changes.framed_scene(light(codes).double(), shape),
+        rtol=0,
+        atol=2e-7,
     )
 
 
@@ -56,8 +57,8 @@ def test_a_file_gives_the_same_light_in_bands(monkeypatch, tmp_path, node, name)
         Image.fromarray((255 * values).astype(np.uint8)).save(tmp_path / name)
     whole = [node(file=tmp_path / name, shape=shape) for shape in (None, (16, 20))]
     told = node.hooks.check(whole[0], file=tmp_path / name)
-    monkeypatch.setattr(_large_picture, "_LARGE", 0)
-    monkeypatch.setattr(_large_picture, "_BAND", 300)
+    monkeypatch.setattr(_picture_changes, "_LARGE_PIXELS", 0)
+    monkeypatch.setattr(_picture_changes, "_BAND_PIXELS", 300)
     for one, shape in zip(whole, (None, (16, 20)), strict=True):
         torch.testing.assert_close(node(file=tmp_path / name, shape=shape), one, rtol=0, atol=2e-6)
     assert node.hooks.check(whole[0], file=tmp_path / name) == told

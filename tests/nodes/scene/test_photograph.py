@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from neusee.nodes import ParameterError
-from neusee.nodes.scene import photograph
-from neusee.nodes.scene._picture_changes import covering, framed
+from neusee.nodes.scene import _photograph, _picture_changes, photograph
 
 
 def saved(folder, array, name="a.png", **how):
@@ -91,9 +90,9 @@ def test_turns_upright_by_exif(tmp_path, turned, bits):
     held.save(path, exif=exif)
     assert np.array_equal(np.asarray(ImageOps.exif_transpose(Image.open(path))), upright)
     if bits == 16:
-        from neusee.nodes.scene import _photograph
-
-        values = _photograph._words(words(tmp_path, np.asarray(held).astype(np.uint16)), turned)
+        values = _photograph._sixteen_bit_codes(
+            words(tmp_path, np.asarray(held).astype(np.uint16)), turned
+        )
         assert np.array_equal(values, upright)
     else:
         np.testing.assert_allclose(
@@ -175,19 +174,19 @@ def test_a_foreign_profile_is_named(tmp_path):
 @given(*(st.integers(1, 70) for _ in range(4)))
 def test_frame_has_the_shape_and_no_overshoot(y, x, to_y, to_x):
     scene = torch.rand(3, y, x, generator=torch.Generator().manual_seed(y * x))
-    result = framed(scene, (to_y, to_x))
+    result = _picture_changes.framed_scene(scene, (to_y, to_x))
     assert result.shape == (3, to_y, to_x)
     assert float(result.min()) >= float(scene.min()) - 1e-6
     assert float(result.max()) <= float(scene.max()) + 1e-6
-    size = covering((y, x), (to_y, to_x))
+    size = _picture_changes.covering_size((y, x), (to_y, to_x))
     assert size[0] >= to_y
     assert size[1] >= to_x
 
 
 def test_frame_without_scaling_cuts_the_centre():
     scene = torch.arange(3 * 6 * 4.0).reshape(3, 6, 4)
-    assert torch.equal(framed(scene, (2, 4)), scene[:, 2:4, :])
-    assert framed(scene, None) is scene
+    assert torch.equal(_picture_changes.framed_scene(scene, (2, 4)), scene[:, 2:4, :])
+    assert _picture_changes.framed_scene(scene, None) is scene
 
 
 def test_frame_averages_in_linear_light(tmp_path):

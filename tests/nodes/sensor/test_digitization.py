@@ -72,7 +72,7 @@ def test_blocks_of_pixels_leave_no_trace(rounding, monkeypatch):
         torch.rand(3, 7, 11, generator=torch.Generator().manual_seed(5)).transpose(0, 2) * 26000
     )
     whole = digitize(electrons, gain=1 / 0.37, rounding=rounding, rng=seeded())
-    monkeypatch.setattr("neusee.nodes.sensor._digitization._BLOCK", 10)
+    monkeypatch.setattr("neusee.nodes.sensor._digitization._BLOCK_PIXELS", 10)
     assert torch.equal(digitize(electrons, gain=1 / 0.37, rounding=rounding, rng=seeded()), whole)
     assert whole.shape == (11, 7, 3)
 

@@ -9,7 +9,7 @@ from scipy import stats
 from neusee.nodes import ErrorBound, TensorStats
 from neusee.nodes.sensor import dark_current, digitize, photon_noise, read_noise
 from neusee.nodes.sensor._noise import (
-    SURE,
+    RARITY,
     amplitude_error_drawn,
     chi_square_limit,
     poisson_rms,
@@ -71,7 +71,7 @@ def test_equal_weights_are_the_chi_square_distribution(pixels):
 
 
 def test_the_probability_is_one_in_ten_thousand():
-    assert math.exp(-SURE) == pytest.approx(RARE, rel=1e-12)
+    assert math.exp(-RARITY) == pytest.approx(RARE, rel=1e-12)
 
 
 @pytest.mark.parametrize("mean", [1e-5, 0.01, 0.5, 20.0])

@@ -5,9 +5,7 @@ error is a bound.
 import pytest
 import torch
 
-from neusee.nodes.spectra import _lift as lifts
-from neusee.nodes.spectra import bands, lift_lmmse, lift_lmmse_mixture
-from neusee.nodes.spectra._low_rank_cube import linear_planes
+from neusee.nodes.spectra import _lift, _low_rank_cube, bands, lift_lmmse, lift_lmmse_mixture
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 
@@ -25,7 +23,7 @@ def drawn(seed, negative=0.05):
 def test_stated_errors_are_bounds_and_not_loose(seed, within):
     picture, matrix = drawn(seed)
     cube = (matrix @ picture.double()).clamp_min(0)
-    found = linear_planes(picture, matrix, within)
+    found = _low_rank_cube.linear_planes(picture, matrix, within)
     if found is None:
         assert within < 3e-2, "what is clipped is small in every draw"
         return
@@ -45,7 +43,8 @@ def test_stated_errors_are_bounds_and_not_loose(seed, within):
 def test_a_looser_error_takes_no_more_components():
     picture, matrix = drawn(1, negative=0.0)
     counts = [
-        len(linear_planes(picture, matrix, within).planes) for within in (1e-4, 1e-2, 1e-1, 0.5)
+        len(_low_rank_cube.linear_planes(picture, matrix, within).planes)
+        for within in (1e-4, 1e-2, 1e-1, 0.5)
     ]
     assert counts[0] == 3
     assert counts == sorted(counts, reverse=True)
@@ -54,15 +53,15 @@ def test_a_looser_error_takes_no_more_components():
 
 @pytest.mark.parametrize("within", [1e-6, 1e-5])
 def test_what_is_clipped_more_than_allowed_needs_a_search(within):
-    assert linear_planes(*drawn(0, negative=0.3), within) is None
-    assert linear_planes(drawn(0)[0].double(), drawn(0)[1], 1e-2) is None
+    assert _low_rank_cube.linear_planes(*drawn(0, negative=0.3), within) is None
+    assert _low_rank_cube.linear_planes(drawn(0)[0].double(), drawn(0)[1], 1e-2) is None
 
 
 @pytest.mark.parametrize("within", [1e-2, 1e-3])
 def test_a_lift_uses_them_and_is_the_same_cube_within_its_error(within, monkeypatch):
     rgb = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(3)) * 0.5 + 0.2
     rgb[:, 0, 0] = torch.tensor([0.0, 0.1, 0.0])  # saturated green has negative light
-    monkeypatch.setattr(lifts, "few_planes", None)
+    monkeypatch.setattr(_lift, "few_planes", None)
     found = lift_lmmse_mixture(rgb, SCENE, within=within)
     cube = lift_lmmse(rgb, SCENE)
     off = torch.tensordot(found.basis, found.planes.double(), 1) - cube

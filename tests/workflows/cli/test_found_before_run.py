@@ -206,14 +206,14 @@ def test_inside_the_range_that_needs_no_table_every_wavelength_is_seen(camera):
     """The range stands as two numbers in the program; the table of colour-science is asked here."""
     import colour
 
-    from neusee.nodes.spectra._channel_responses import _SEEN
+    from neusee.nodes.spectra._channel_responses import _SEEN_RANGE
 
     table = (
         colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
         if camera == "CIE 1931"
         else colour.MSDS_CAMERA_SENSITIVITIES[f"{camera} (NPL)"]
     )
-    low, high = _SEEN[camera]
+    low, high = _SEEN_RANGE[camera]
     inside = (table.wavelengths >= low - 5) & (table.wavelengths <= high + 5)
     assert (table.values.max(1) / table.values.max())[inside].min() > 1e-3
 
@@ -687,7 +687,7 @@ def test_the_guide_states_each_limit_as_the_program_has_it():
         yaml_values._LARGEST,
         references._MOST_VALUES,
         yaml_values._MOST_ALIASED,
-        _bands._MOST,
+        _bands._MOST_BANDS,
         input_files.PIXELS,
         input_files.VALUES,
         input_files.ROWS,

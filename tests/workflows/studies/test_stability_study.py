@@ -371,7 +371,7 @@ def test_a_fault_planted_in_the_light_fails_on_a_plate(fault, monkeypatch):
 
     def single(self, screens, view, dtype):
         with monkeypatch.context() as patch:
-            patch.setattr(_pupil_field, "_FEW_TURNS", math.inf)
+            patch.setattr(_pupil_field, "_FLOAT32_TURNS", math.inf)
             usual(self, screens, view, dtype)
 
     if fault == "phase":
@@ -387,13 +387,13 @@ def test_a_fault_planted_in_the_light_fails_on_a_plate(fault, monkeypatch):
         monkeypatch.setattr(_intensity, "KEPT_FIELD_BYTES", 0)
         monkeypatch.setattr(_intensity.PupilIntensity, "backward", staticmethod(wrong))
     else:
-        points = _psf._points
+        points = _psf._intensity_at_points
 
         def off(pupil, camera, lights, dtype, method):
             wrong = 1 + 1e-5 * (dtype == torch.float32)
             return points(pupil, camera, [wrong * light for light in lights], dtype, method)
 
-        monkeypatch.setattr(_psf, "_points", off)
+        monkeypatch.setattr(_psf, "_intensity_at_points", off)
     cell = judge_step(step, [_plate(), None], USUAL, 0)
     assert cell.mark == "fail", cell
     assert (cell.error > cell.bound) == (fault != "backward")

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
-from neusee.nodes.optics._band_image import smooth
+from neusee.nodes.optics._transform._fft_transforms import fft_length
 from neusee.nodes.values import Psf
 
 
@@ -99,4 +99,4 @@ def test_check_says_how_much_light_is_kept():
 
 
 def test_smooth_sizes():
-    assert [smooth(n) for n in (1, 7, 11, 3072, 4095)] == [1, 8, 12, 3072, 4096]
+    assert [fft_length(n) for n in (1, 7, 11, 3072, 4095)] == [1, 8, 12, 3072, 4096]

@@ -10,9 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics import image, image_channels
-from neusee.nodes.optics._convolution_plan import Mix, Where, summed
-from neusee.nodes.optics._few_bands import share_of_bands
+from neusee.nodes.optics import _convolution_plan, _few_bands, image, image_channels
 from neusee.nodes.spectra import (
     bands,
     compress,
@@ -249,7 +247,7 @@ def test_fewer_kernels_where_the_rows_are_alike():
 @pytest.mark.parametrize("largest", [False, True])
 def test_psfs_of_few_bands_are_transformed_once_each_where_sums_of_them_are_more(largest):
     scene, few, weights = mixed(rand(3, 64, 64), rand(31, 3)), as_psf(rand(4, 60, 60)), rand(3, 31)
-    share = share_of_bands(torch.tensor([0, 9, 22, 30]), 31)
+    share = _few_bands.share_of_bands(torch.tensor([0, 9, 22, 30]), 31)
     none = torch.tensor(0.0, dtype=torch.float64)
     chosen = FewBands(share, torch.tensor([0, 9, 22, 30]), none, none)
     found = image_channels(scene, few, weights, chosen, largest=largest)
@@ -314,13 +312,17 @@ def test_gradients_of_planes_and_psf(border, rank):
 
 def test_sums_of_convolutions_have_every_derivative():
     a, b = rand(2, 2, 1).requires_grad_(), rand(2, 1, 2).requires_grad_()
-    where = Where((0, 0), (0, 0), (0, 1), (2, 1), (3, 4))
+    where = _convolution_plan.Placement((0, 0), (0, 0), (0, 1), (2, 1), (3, 4))
     for how, mix in (
-        (where, Mix(rand(1, 3), rand(3, 2), rand(3, 2))),
-        (where._replace(conjugate=True), Mix(None, rand(2, 2), None)),
+        (where, _convolution_plan.Mix(rand(1, 3), rand(3, 2), rand(3, 2))),
+        (where._replace(conjugate=True), _convolution_plan.Mix(None, rand(2, 2), None)),
     ):
-        assert torch.autograd.gradcheck(lambda a, b, m=mix, w=how: summed(a, b, m, w), (a, b))
-        assert torch.autograd.gradgradcheck(lambda a, b, m=mix, w=how: summed(a, b, m, w), (a, b))
+        assert torch.autograd.gradcheck(
+            lambda a, b, m=mix, w=how: _convolution_plan.summed(a, b, m, w), (a, b)
+        )
+        assert torch.autograd.gradgradcheck(
+            lambda a, b, m=mix, w=how: _convolution_plan.summed(a, b, m, w), (a, b)
+        )
 
 
 def test_inputs_of_other_bands_are_refused():

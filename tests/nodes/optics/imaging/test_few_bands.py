@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from neusee.nodes import doe
-from neusee.nodes.optics import _few_bands as _band_thumbnail
 from neusee.nodes.optics import (
+    _few_bands,
     few_bands,
     few_bands_checked,
     image_channels,
@@ -17,7 +17,6 @@ from neusee.nodes.optics import (
     pupil_of_bands,
     stop,
 )
-from neusee.nodes.optics._few_bands import share_of_bands
 from neusee.nodes.spectra import bands, compress, responses, rows
 from neusee.nodes.values import FewBands, Psf
 
@@ -73,12 +72,12 @@ def convolved(scene, kernels):
 
 def test_the_weights_interpolate_between_the_bands_in_use():
     used = torch.tensor([0, 4, 9, 12])
-    share = share_of_bands(used, 13)
+    share = _few_bands.share_of_bands(used, 13)
     for j in range(4):
         np.testing.assert_allclose(
             share[:, j], np.interp(np.arange(13), used.numpy(), np.eye(4)[j]), atol=1e-15
         )
-    assert share_of_bands(torch.tensor([2]), 3).tolist() == [[1.0]] * 3
+    assert _few_bands.share_of_bands(torch.tensor([2]), 3).tolist() == [[1.0]] * 3
 
 
 @pytest.mark.parametrize("within", [3e-3, pytest.param(3e-4, marks=pytest.mark.slow)])
@@ -113,9 +112,9 @@ def test_a_stricter_limit_takes_more_bands(camera):
 def test_a_choice_of_few_bands_is_compared_with_every_second_band(camera, monkeypatch):
     """All bands have PSFs only where few of every second one are not enough."""
     clear, scene = camera
-    counted, focused = [], _band_thumbnail.focused
+    counted, focused = [], _few_bands.psf_intensity
     monkeypatch.setattr(
-        _band_thumbnail, "focused", lambda p, *a: counted.append(len(p.index)) or focused(p, *a)
+        _few_bands, "psf_intensity", lambda p, *a: counted.append(len(p.index)) or focused(p, *a)
     )
     for within, expected in ((1e-2, 16), (1e-4, 31)):
         counted.clear()
@@ -126,7 +125,7 @@ def test_a_choice_of_few_bands_is_compared_with_every_second_band(camera, monkey
 
 def test_an_estimate_that_was_too_low_is_raised(camera):
     clear, scene = camera
-    share = share_of_bands(torch.tensor([0, 30]), 31)
+    share = _few_bands.share_of_bands(torch.tensor([0, 30]), 31)
     nothing = torch.zeros((), dtype=torch.float64)
     wrong = FewBands(share, torch.tensor([0, 30]), nothing, nothing)
     found = psf(pupil_of_bands(clear, wrong), **LENS, shape=SIZE)
@@ -157,7 +156,7 @@ def test_all_bands_are_kept_where_an_estimate_costs_more_or_misses_the_light(cam
 def test_sums_by_few_bands_agree_with_interpolated_psfs():
     rng = torch.Generator().manual_seed(5)
     share, scene = (
-        share_of_bands(torch.tensor([0, 7, 15, 30]), 31),
+        _few_bands.share_of_bands(torch.tensor([0, 7, 15, 30]), 31),
         compress(torch.rand(31, 12, 14, generator=rng)),
     )
     few = FewBands(share, torch.tensor([0, 7, 15, 30]), *torch.zeros(2, dtype=torch.float64))
@@ -184,7 +183,9 @@ def test_different_bands_are_refused(camera):
     with pytest.raises(ValueError, match="30 bands"):
         few_bands(clear, scene, ROWS[:, :30], **LENS, shape=SIZE, within=1e-2)
     few = FewBands(
-        share_of_bands(torch.tensor([0, 15, 30]), 31), torch.tensor([0, 15, 30]), *torch.zeros(2)
+        _few_bands.share_of_bands(torch.tensor([0, 15, 30]), 31),
+        torch.tensor([0, 15, 30]),
+        *torch.zeros(2),
     )
     with pytest.raises(ValueError, match="same bands"):
         image_channels(scene, Psf(torch.rand(4, 9, 9), torch.ones(4)), ROWS, few)

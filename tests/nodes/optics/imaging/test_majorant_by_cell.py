@@ -5,9 +5,7 @@ border.
 import pytest
 import torch
 
-from neusee.nodes.optics._band_image import reach
-from neusee.nodes.optics._channel_image import majorant_by_cell
-from neusee.nodes.optics._convolution_plan import ImageFacts, passed
+from neusee.nodes.optics import _band_image, _channel_image, _convolution_plan
 
 
 def image_of(off, kernel, reflect):
@@ -29,8 +27,16 @@ def given_of(psf, size, reflect):
     rows = torch.tensor([[1.0, 0.2, 0.5], [0.1, 0.7, 0.3]], dtype=torch.float64)
     basis, nothing = torch.ones(3, 1, dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
     gram = torch.ones(1, 1, dtype=torch.float64)
-    return ImageFacts(
-        rows, basis, nothing, gram[0], gram, 9 if reflect else 1, passed(psf), size, reflect
+    return _convolution_plan.ImageFacts(
+        rows,
+        basis,
+        nothing,
+        gram[0],
+        gram,
+        9 if reflect else 1,
+        _convolution_plan.psf_light(psf),
+        size,
+        reflect,
     )
 
 
@@ -45,10 +51,10 @@ def test_no_pixel_is_above_the_bound_of_its_cell(size, window, reflect):
     given = given_of(psf, size, reflect)
     kernel = (
         given.rows.abs().amax(0)[:, None, None]
-        * reach(reach(psf, -2, size[0]), -1, size[1]).double()
+        * _band_image.within_reach(_band_image.within_reach(psf, -2, size[0]), -1, size[1]).double()
     ).sum(0)
     image = image_of(off.double(), kernel, reflect)
-    bound = majorant_by_cell(off, psf, given)
+    bound = _channel_image.majorant_by_cell(off, psf, given)
     assert bound.shape == (-(-size[0] // 8), -(-size[1] // 8))
     above = bound.repeat_interleave(8, 0).repeat_interleave(8, 1)[: size[0], : size[1]]
     assert bool((above * (1 + 1e-6) >= image).all())
@@ -57,6 +63,6 @@ def test_no_pixel_is_above_the_bound_of_its_cell(size, window, reflect):
 def test_the_bound_of_an_even_error_is_the_image_itself():
     psf = torch.rand(3, 24, 24)
     given = given_of(psf, (40, 40), True)
-    bound = majorant_by_cell(torch.full((40, 40), 0.3), psf, given)
+    bound = _channel_image.majorant_by_cell(torch.full((40, 40), 0.3), psf, given)
     light = 0.3 * (given.rows.amax(0)[:, None, None] * psf).sum()
     torch.testing.assert_close(bound, light.expand(5, 5), rtol=1e-6, atol=0.0)

@@ -9,14 +9,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics._convolution_plan import by_window, centred, passed
+from neusee.nodes.optics._convolution_plan import central_window, psf_light, psf_light_by_window
 
 
 def outside(stack, window):
     """Sum and largest of |samples| outside the window, by band."""
     size = stack.double().abs()
     rest = size.clone()
-    centred(rest, window).zero_()
+    central_window(rest, window).zero_()
     return rest.sum((1, 2)), rest.amax((1, 2))
 
 
@@ -33,7 +33,7 @@ def test_each_window_is_as_it_were_measured_alone(y, x, count, negative, seed):
     stack = torch.randn(count, y, x, generator=generator) ** 5
     stack = stack if negative else stack.abs()
     signed = bool((stack < 0).any())
-    found, whole = by_window(stack, signed), passed(stack)
+    found, whole = psf_light_by_window(stack, signed), psf_light(stack)
     assert found.signed == whole.signed == signed
     assert found.windows[0] == (y, x)
     for j, window in enumerate(found.windows):
@@ -56,7 +56,7 @@ def test_of_a_large_stack_the_sum_in_single_precision_is_no_less_than_the_true_o
     tails = torch.rand(2, 2048, 700, generator=torch.Generator().manual_seed(2)) ** 12
     tails[:, 1024, 350] = 1e6
     exact = tails.double().sum((1, 2))
-    for found in (passed(tails), by_window(tails, signed=False)):
+    for found in (psf_light(tails), psf_light_by_window(tails, signed=False)):
         assert bool((found.total >= exact).all())
         torch.testing.assert_close(found.total, exact, rtol=1e-5, atol=0)
 
@@ -65,10 +65,10 @@ def test_of_a_large_stack_the_sum_in_single_precision_is_no_less_than_the_true_o
 def test_what_is_not_a_number_is_seen_and_not_summed_away(wrong):
     stack = torch.ones(2, 16, 16)
     stack[1, 3, 4] = wrong
-    found = by_window(stack, signed=False)
+    found = psf_light_by_window(stack, signed=False)
     assert (
         torch.isfinite(found.total).tolist()
-        == torch.isfinite(passed(stack).total).tolist()
+        == torch.isfinite(psf_light(stack).total).tolist()
         == [True, False]
     )
     assert torch.isfinite(found.beyond[-1]).tolist() == [True, False]

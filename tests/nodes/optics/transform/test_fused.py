@@ -10,14 +10,8 @@ import pytest
 import torch
 
 from neusee.nodes import _cpp_library, doe
-from neusee.nodes.optics import psf, pupil, stop
-from neusee.nodes.optics._psf import _Camera, _focus
-from neusee.nodes.optics._psf_definition import by_definition
-from neusee.nodes.optics._transform import _fused
-from neusee.nodes.optics._transform._fused import fused_axis
-from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
-from neusee.nodes.optics._transform._pupil_field import View
-from neusee.nodes.optics._transform._sample_axis import Axis
+from neusee.nodes.optics import _psf, _psf_definition, psf, pupil, stop
+from neusee.nodes.optics._transform import _fused, _intensity, _pupil_field, _sample_axis
 from neusee.nodes.spectra import bands
 from neusee.nodes.values import Psf, Pupil
 
@@ -47,7 +41,7 @@ def rough(rows, columns, kind=torch.float32, path=0.0, seed=0):
 
 
 def camera(shape, **params):
-    return _Camera(0.11, 2.9e-6, shape, **params)
+    return _psf._Camera(0.11, 2.9e-6, shape, **params)
 
 
 CASES = [
@@ -70,11 +64,11 @@ CASES = [
 def test_it_is_the_torch_path_but_for_round_off(pupil, shape, params, given, dtype):
     light, view = rough(*pupil, **given), camera(shape, **params)
     found, expected = (
-        _focus(light, view, dtype, method).intensity for method in ("fused", "kaiser_bessel")
+        _psf._focus(light, view, dtype, method).intensity for method in ("fused", "kaiser_bessel")
     )
-    truth = by_definition(light, view).intensity
+    truth = _psf_definition.by_definition(light, view).intensity
     averaged = 1e-5 * float(expected.max()) if "sensor" in params else 0.0
-    peak = float(by_definition(light, camera((33, 33))).intensity.max())
+    peak = float(_psf_definition.by_definition(light, camera((33, 33))).intensity.max())
     limit = (2e-6 if dtype == torch.float32 else 1e-12) * peak
     assert found.dtype == dtype
     assert float((found - expected).abs().max()) <= limit
@@ -88,7 +82,7 @@ def test_its_gradients_are_those_of_the_torch_path(dtype):
     def slopes(method):
         parts = [x.clone().requires_grad_() for x in light[1:4]]
         lit = light._replace(amplitude=parts[0], height=parts[1], path=parts[2])
-        light_of = _focus(lit, camera((41, 30), pixel="zoh"), dtype, method).intensity
+        light_of = _psf._focus(lit, camera((41, 30), pixel="zoh"), dtype, method).intensity
         return torch.autograd.grad((light_of * weight).sum(), parts)
 
     for found, expected in zip(slopes("fused"), slopes("kaiser_bessel"), strict=True):
@@ -102,13 +96,15 @@ def test_only_the_gradient_that_is_asked_for_and_none_where_no_light_passes():
     both = light._replace(height=height, amplitude=light.amplitude.clone().requires_grad_())
     (alone,) = torch.autograd.grad(
         (
-            _focus(light._replace(height=height), camera((9, 9)), torch.float32, "fused").intensity
+            _psf._focus(
+                light._replace(height=height), camera((9, 9)), torch.float32, "fused"
+            ).intensity
             * weight
         ).sum(),
         height,
     )
     amplitude, together = torch.autograd.grad(
-        (_focus(both, camera((9, 9)), torch.float32, "fused").intensity * weight).sum(),
+        (_psf._focus(both, camera((9, 9)), torch.float32, "fused").intensity * weight).sum(),
         (both.amplitude, height),
     )
     assert torch.equal(alone, together)
@@ -121,22 +117,24 @@ def test_a_phase_of_many_turns_is_exact(turns):
     """One sample sends |U|^2 = 1; two samples interfere as their phases do, whole turns apart or
     not.
     """
-    axis = Axis(1, 1, 0.1), Axis(2, 1, 0.1)
+    axis = _sample_axis.Axis(1, 1, 0.1), _sample_axis.Axis(2, 1, 0.1)
     height = torch.tensor([[0.0, turns + 0.3]], dtype=torch.float64)
-    sampling = Sampling((View(0, *axis, 1.0, 0.0, (0.0, 0.0), 1.0),), torch.float32, "fused")
-    found = float(intensity_of(torch.ones(1, 2), height, torch.zeros(1, 2), sampling))
+    sampling = _intensity.Sampling(
+        (_pupil_field.View(0, *axis, 1.0, 0.0, (0.0, 0.0), 1.0),), torch.float32, "fused"
+    )
+    found = float(_intensity.intensity_of(torch.ones(1, 2), height, torch.zeros(1, 2), sampling))
     assert found == pytest.approx(4 * math.cos(0.3 * math.pi) ** 2, abs=1e-5)
 
 
 def test_the_bits_depend_on_no_thread(monkeypatch):
-    monkeypatch.setattr(_fused, "_ALONE", 1)
+    monkeypatch.setattr(_fused, "_SAMPLES_PER_THREAD", 1)
     light = rough(150, 150)
     before = torch.get_num_threads()
     try:
         found = []
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            found.append(_focus(light, camera((60, 61)), torch.float32, "fused").intensity)
+            found.append(_psf._focus(light, camera((60, 61)), torch.float32, "fused").intensity)
     finally:
         torch.set_num_threads(before)
     assert torch.equal(*found)
@@ -145,7 +143,7 @@ def test_the_bits_depend_on_no_thread(monkeypatch):
 def test_not_a_number_in_the_amplitude_is_seen():
     light = rough(40, 40)
     light.amplitude[0, 0] = math.nan
-    assert not _focus(light, camera((8, 8)), torch.float32, "fused").intensity.isfinite().any()
+    assert not _psf._focus(light, camera((8, 8)), torch.float32, "fused").intensity.isfinite().any()
 
 
 def test_every_factor_of_the_fft_is_used_by_the_cases():
@@ -154,7 +152,9 @@ def test_every_factor_of_the_fft_is_used_by_the_cases():
         for n, k in zip(samples, shape, strict=True):
             alpha = 8e-3 / max(samples) * 2.9e-6 / (450e-9 * 0.11)
             used |= set(
-                fused_axis(Axis(n, k, alpha), torch.float32, torch.float32, torch.float32)
+                _fused.fused_axis(
+                    _sample_axis.Axis(n, k, alpha), torch.float32, torch.float32, torch.float32
+                )
                 .held[0]
                 .tolist()
             )
@@ -169,12 +169,14 @@ def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_
     with pytest.warns(
         UserWarning, match=r"C\+\+ of the PSF is not compiled and torch computes the PSF"
     ) as said:
-        found = [_focus(light, camera((64, 64)), torch.float32, "auto").intensity for _ in range(2)]
+        found = [
+            _psf._focus(light, camera((64, 64)), torch.float32, "auto").intensity for _ in range(2)
+        ]
     assert len(said) == 1
-    expected = _focus(light, camera((64, 64)), torch.float64, "direct").intensity
+    expected = _psf._focus(light, camera((64, 64)), torch.float64, "direct").intensity
     assert all(float((x - expected).abs().max()) <= 2e-6 * float(expected.max()) for x in found)
     with pytest.raises(_cpp_library.NoCompilerError, match="could not be run"):
-        _focus(light, camera((64, 64)), torch.float32, "fused")
+        _psf._focus(light, camera((64, 64)), torch.float32, "fused")
 
 
 def test_the_digest_of_the_sources_is_that_of_the_sources():
