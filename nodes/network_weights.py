@@ -135,11 +135,10 @@ def _refuse_other_options(
                 f"{weights.name} was trained with {name}: {_as_written(trained[name])}, and this"
                 f" network has {name}: "
             )
-            fix = (
-                "name that class"
-                if name == "class"
-                else f"write {name}: {_as_written(trained[name])}"
-            )
+            fix = {
+                "class": "name that class",
+                "parameters": f"write parameters: {_as_written(trained[name])}",
+            }.get(name, "train the network again")
             raise ParameterError("weights", f"{text}{_as_written(options[name])}; {fix}")
 
 

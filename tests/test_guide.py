@@ -17,8 +17,12 @@ from typer.main import get_command
 
 from neusee.workflows.cli import app, catalogue
 from neusee.workflows.cli.command_frame import split
-from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipelines
-from neusee.workflows.evaluation.run_evaluation import read_settings
+from neusee.workflows.evaluation.pipelines import (
+    NamedRecipe,
+    compose_pipelines,
+    read_pipelines,
+    read_settings,
+)
 from neusee.workflows.placement.machine_file import read_machines
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.sweeps.axes import points, read_words
@@ -113,8 +117,8 @@ def parse_and_load(words: str, folder: Path) -> None:
     if command == "train":
         assert recipe.training or recipe.lifting
     if command == "evaluate":
-        asked = values["pipelines"] or read_settings(name, changes, folder).pipelines
-        compose_pipelines(name, changes, read_pipelines(asked, folder), folder)
+        asked = values["pipelines"] or read_settings(NamedRecipe(name, changes, folder)).pipelines
+        compose_pipelines(NamedRecipe(name, changes, folder), read_pipelines(asked, folder))
 
 
 # --- what pages say -------------------------------------------------------------------------------

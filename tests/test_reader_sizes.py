@@ -88,7 +88,7 @@ NO_SIZE = {
     "workflows/observation/system_calls.py:memory": SYSTEM,
     "workflows/observation/system_calls.py:status": SYSTEM,
     "workflows/explain/change_causes.py:_lines": SOURCE,
-    "workflows/frames/frame_folder.py:_found": "read_table of frames, whose lines `csv_rows` reads",
+    "workflows/frames/frame_folder.py:_read_folder": "read_table of frames, whose lines `csv_rows` reads",
     "workflows/handbook/site_build.py:read_pages": PACKAGED,
     "workflows/keys/module_digest.py:module": SOURCE,
     "workflows/keys/code_digest.py:engine": SOURCE,

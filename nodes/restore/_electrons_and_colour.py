@@ -303,8 +303,8 @@ def _paints(centres: Tensor) -> Tensor:
 
 
 White = Annotated[float, Field(ge=1e-30, le=1e30)]
-_BRIGHT = 0.995  #: quantile of the unclipped pixels that counts as white
-_SAMPLE = 2**22  #: pixels whose quantile is taken, at most
+_WHITE_QUANTILE = 0.995  #: quantile of the unclipped pixels that counts as white
+_QUANTILE_PIXELS = 2**22  #: pixels whose quantile is taken, at most
 
 
 @node(rtol=1e-5)
@@ -375,8 +375,8 @@ def _bright_quantile(brightness: Tensor, clipped: Tensor) -> Tensor:
     """
     unclipped = ~clipped.any(-3)
     pixels = brightness[unclipped] if bool(unclipped.any()) else brightness.flatten()
-    sample = pixels[:: max(1, len(pixels) // _SAMPLE)]
-    return torch.quantile(sample, _BRIGHT).clamp_min(1e-300).cpu()
+    sample = pixels[:: max(1, len(pixels) // _QUANTILE_PIXELS)]
+    return torch.quantile(sample, _WHITE_QUANTILE).clamp_min(1e-300).cpu()
 
 
 def _passed(psf: Psf | MeasuredPsf, bands: Bands, illuminant: Tensor, responses: Tensor) -> Tensor:

@@ -108,7 +108,7 @@ def fitted(pixels: Seen, layout: Layout, count: int, rng: Generator) -> Fit:
         kernels,
         torch.stack(draws),
         state,
-        _chi(weight, residual, linear_model),
+        _reduced_chi_square(weight, residual, linear_model),
         *_support(linear_model, weight),
     )
 
@@ -359,7 +359,7 @@ def _misfit(near: Linear, weight: Tensor, residual: Tensor) -> Tensor:
     return (local_means[0] / (free_share * local_means[1]).clamp_min(1e-9)).clamp_min(1.0).sqrt()
 
 
-def _chi(weight: Tensor, residual: Tensor, near: Linear) -> Tensor:
+def _reduced_chi_square(weight: Tensor, residual: Tensor, near: Linear) -> Tensor:
     """Return chi-square per degree of freedom (channel,)."""
     free_share = 1.0 - _unknowns(near) / float((weight > 0).sum())
     return (weight * residual.square()).sum(1) / ((weight > 0).sum(1) * free_share).clamp_min(1.0)
@@ -414,13 +414,13 @@ _GOOD = 1.5  #: chi-square per pixel above which the model is said not to fit
 _INFLATED = 4.0
 
 
-def _odd(window: tuple[int, int]) -> tuple[int, int]:
+def _require_odd(window: tuple[int, int]) -> tuple[int, int]:
     if any(n % 2 == 0 or n < 5 for n in window):
         raise ValueError(f"{list(window)} must be two odd numbers of at least 5")
     return window
 
 
-Window = Annotated[Shape, AfterValidator(_odd)]
+Window = Annotated[Shape, AfterValidator(_require_odd)]
 Draws = Annotated[int, Field(ge=4, le=1000)]
 
 
@@ -473,7 +473,7 @@ def measured_psf(
             undersampled stars; Papandreou and Yuille, NIPS 23 (2010), for the draws.
     """
     camera = gain, offset, full_well, bits, read_noise
-    layout = Layout(_two(shape), _two(window), _two(zones))
+    layout = Layout(_pair(shape), _pair(window), _pair(zones))
     refuse_bad_frames(files or (), len(responses), layout, camera, curve)
     pixels = read_points(files or (), layout.window, camera)
     fit = fitted(pixels, layout, draws, rng)
@@ -514,7 +514,7 @@ def _(
     refuse_without_steps(full_well, gain=gain, bits=bits)
     camera: Camera = gain, offset, full_well, bits, read_noise
     channels = None if responses is None else len(responses)
-    layout = Layout(_two(shape), _two(window), _two(zones))
+    layout = Layout(_pair(shape), _pair(window), _pair(zones))
     refuse_bad_frames(files, channels, layout, camera, params.get("curve"))
     return []
 
@@ -558,7 +558,7 @@ def _counted(result: MeasuredPsf) -> Check:
     return Check(text + reason, False)
 
 
-def _two(numbers: Sequence[int]) -> tuple[int, int]:
+def _pair(numbers: Sequence[int]) -> tuple[int, int]:
     y, x = numbers
     return y, x
 

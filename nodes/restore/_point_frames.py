@@ -24,13 +24,16 @@ from neusee.nodes.sensor._frame_file import Curve, frame_problem, read_frame
 # around them.
 
 
-_SIGNIFICANT = 8.0  #: standard deviations by which a point stands out of the noise
-_FAINTEST = 0.03  #: of the brightest point of the frame: what is fainter is a lobe or a reflection
-_RIM = 3  #: pixels from the edge of the frame within which a point is not used
-_MOST = 400  #: points of a frame
-_AROUND = 500  #: pixels beyond all windows that a frame must have, because they give its background
-_OUTLIER = 4.0  #: standard deviations beyond which a pixel does not count for the background
-_DARK = "dark"  #: beginning of the name of a file without light
+_SIGNIFICANT_DEVIATIONS = 8.0  #: standard deviations by which a point stands out of the noise
+#: of the brightest point of the frame: what is fainter is a lobe or a reflection
+_FAINTEST_SHARE = 0.03
+_RIM_PIXELS = 3  #: pixels from the edge of the frame within which a point is not used
+_MOST_POINTS = 400  #: points of a frame
+#: pixels beyond all windows that a frame must have, because they give its background
+_LEAST_BACKGROUND = 500
+#: standard deviations beyond which a pixel does not count for the background
+_OUTLIER_DEVIATIONS = 4.0
+_DARK_PREFIX = "dark"  #: beginning of the name of a file without light
 Camera = tuple[float, float, float, int, float]  #: gain, offset, full well, bits, read noise
 
 
@@ -52,7 +55,7 @@ class Seen(NamedTuple):
 
 def lit_and_dark(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Return the frames with points and the dark frames, whose names begin with `dark`."""
-    dark = [file for file in files if file.name.lower().startswith(_DARK)]
+    dark = [file for file in files if file.name.lower().startswith(_DARK_PREFIX)]
     return [file for file in files if file not in dark], dark
 
 
@@ -84,7 +87,7 @@ def refuse_bad_frames(
     _refuse_problems(
         files, [frame_problem(file, channels, shape, bits, curve) for file in [*lit, *dark]]
     )
-    points = {file: _found(file, window, camera) for file in lit}
+    points = {file: _find_points(file, window, camera) for file in lit}
     _refuse_problems(files, [_unusable(file, points[file], shape, window) for file in lit])
     empty = _empty_zones(points.values(), shape, zones)
     if empty:
@@ -118,7 +121,7 @@ def _empty_zones(
 
 def points_in(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> int:
     """Return the number of points in the frames that are not dark."""
-    return sum(len(_found(file, window, camera)) for file in lit_and_dark(files)[0])
+    return sum(len(_find_points(file, window, camera)) for file in lit_and_dark(files)[0])
 
 
 def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> Seen:
@@ -137,11 +140,13 @@ def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) 
         raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
         clipped_pixels = is_clipped(raw, full_well=full_well, gain=gain, bits=bits)
         light = raw / gain - torch.as_tensor(dark_level)
-        places = [place for place, _ in _found(file, window, camera)]
-        frame_pixels.append(_kept(light, clipped_pixels, places, window, number, first_pixel))
+        places = [place for place, _ in _find_points(file, window, camera)]
+        frame_pixels.append(
+            _windows_of_points(light, clipped_pixels, places, window, number, first_pixel)
+        )
         first_pixel += frame_pixels[-1][0].shape[-1]
     (
-        # in the order that `_kept` returns
+        # in the order that `_windows_of_points` returns
         light_by_frame,
         clipped_by_frame,
         frame_by_frame,
@@ -174,7 +179,7 @@ def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) 
     )
 
 
-def _kept(
+def _windows_of_points(
     light: Tensor,
     ends: Tensor,
     places: list[tuple[int, int]],
@@ -198,7 +203,7 @@ def _kept(
     covered = _covered((y, x), places, window).flatten()
     widely_covered = _covered((y, x), places, (2 * window[0], 2 * window[1])).flatten()
     # windows twice as wide leave a better background, if enough pixels remain
-    near_points = widely_covered if int((~widely_covered).sum()) >= _AROUND else covered
+    near_points = widely_covered if int((~widely_covered).sum()) >= _LEAST_BACKGROUND else covered
     pixel_number = covered.cumsum(0) - 1 + first
     window_pixels = torch.where(in_frame, pixel_number[flat_place], -1).flatten(1)
     channels = zip(light.flatten(1), ends.flatten(1), strict=True)
@@ -245,7 +250,7 @@ def _average(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean without outliers, the variance of this mean, and the variance of a pixel."""
     for _ in range(4):
         mean, spread = values.mean(), values.std()
-        values = values[(values - mean).abs() <= _OUTLIER * spread + 1e-12]
+        values = values[(values - mean).abs() <= _OUTLIER_DEVIATIONS * spread + 1e-12]
     return values.mean(), values.var() / len(values), values.var()
 
 
@@ -253,7 +258,7 @@ def _average(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @once_per_version
-def _found(
+def _find_points(
     file: Path, window: tuple[int, int], camera: Camera
 ) -> list[tuple[tuple[int, int], bool]]:
     """Return the middle pixel of each point of a frame, the brightest first, and True for one
@@ -269,11 +274,13 @@ def _found(
     noise = 1.4826 * float((light - light.median()).abs().median())
     noise = max(noise, read_noise * math.sqrt(len(raw)), 1e-6)
     above = median_picture - background
-    is_significant = above > max(_SIGNIFICANT * noise, _FAINTEST * float(above.max()))
+    is_significant = above > max(
+        _SIGNIFICANT_DEVIATIONS * noise, _FAINTEST_SHARE * float(above.max())
+    )
     is_peak = is_significant & (above >= max_pool2d(above[None], 7, 1, 3)[0])
     above = torch.where(is_peak, above, 0.0)
     points = list[tuple[tuple[int, int], bool]]()
-    while len(points) < _MOST and float(above.max()) > 0:
+    while len(points) < _MOST_POINTS and float(above.max()) > 0:
         y, x = divmod(int(above.argmax()), above.shape[1])
         clipped_near = clipped_pixels[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
         points.append(((y, x), not bool(clipped_near.any())))
@@ -289,7 +296,7 @@ def _found(
 def _is_inner(place: tuple[int, int], height: int, width: int) -> bool:
     """Return True if a pixel (y, x) does not lie in the rim of a picture."""
     y, x = place
-    return _RIM <= y < height - _RIM and _RIM <= x < width - _RIM
+    return _RIM_PIXELS <= y < height - _RIM_PIXELS and _RIM_PIXELS <= x < width - _RIM_PIXELS
 
 
 def _median(picture: Tensor) -> Tensor:
@@ -308,13 +315,16 @@ def _unusable(
     if not points:
         return (
             f"{file.name} shows no point source: nothing stands out of the noise by"
-            f" {_SIGNIFICANT:g} deviations (a frame without light needs a name that begins with"
-            " dark)"
+            f" {_SIGNIFICANT_DEVIATIONS:g} deviations (a frame without light needs a name that"
+            " begins with dark)"
         )
-    if (free := int((~_covered(shape, [place for place, _ in points], window)).sum())) < _AROUND:
+    covered = _covered(shape, [place for place, _ in points], window)
+    free = int((~covered).sum())
+    if free < _LEAST_BACKGROUND:
         return (
             f"{file.name} has {free} pixels beyond the windows of its {len(points)} points, but its"
-            f" background needs {_AROUND}: choose a smaller window, or fewer points a frame"
+            f" background needs {_LEAST_BACKGROUND}: choose a smaller window, or fewer points a"
+            " frame"
         )
     return ""
 
@@ -343,8 +353,8 @@ def _without_point(empty: list[tuple[int, int]], zones: tuple[int, int]) -> str:
 # place and signal.
 
 
-_REACH = 12  #: pixels on each side of a pixel that its interpolated value uses
-_BETA = 8.0  #: of the Kaiser window
+_KERNEL_REACH = 12  #: pixels on each side of a pixel that its interpolated value uses
+_KAISER_BETA = 8.0  #: of the Kaiser window
 
 
 class State(NamedTuple):
@@ -393,16 +403,18 @@ def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
     The interpolation is a sinc with a Kaiser window: its error is below 1e-4 for up to 0.4 periods
     in a pixel. The slope of the samples is continued beyond their ends.
     """
-    distance_in_samples = torch.arange(size)[:, None] - torch.arange(size + 2 * _REACH) + _REACH
+    distance_in_samples = (
+        torch.arange(size)[:, None] - torch.arange(size + 2 * _KERNEL_REACH) + _KERNEL_REACH
+    )
     distance = distance_in_samples.double() - offset[:, None, None]
-    inside_square = (1.0 - (distance / (_REACH + 1.0)).square()).clamp_min(0.0)
+    inside_square = (1.0 - (distance / (_KERNEL_REACH + 1.0)).square()).clamp_min(0.0)
     # Kaiser's window, i0(beta sqrt(1 - t^2)) / i0(beta), and below its derivative
     root = inside_square.sqrt()
-    taper = torch.special.i0(_BETA * root) / torch.special.i0(
-        torch.tensor(_BETA, dtype=torch.float64)
+    taper = torch.special.i0(_KAISER_BETA * root) / torch.special.i0(
+        torch.tensor(_KAISER_BETA, dtype=torch.float64)
     )
-    taper_slope = torch.special.i1(_BETA * root) / torch.special.i0(
-        torch.tensor(_BETA, dtype=torch.float64)
+    taper_slope = torch.special.i1(_KAISER_BETA * root) / torch.special.i0(
+        torch.tensor(_KAISER_BETA, dtype=torch.float64)
     )
     sinc, x = torch.sinc(distance), math.pi * distance
     near_zero = distance.abs() < 1e-4
@@ -412,7 +424,9 @@ def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
         -math.pi * x / 3.0,
         (torch.cos(x) - sinc) / torch.where(near_zero, 1.0, distance),
     )
-    taper_change = -_BETA * distance / (_REACH + 1.0) ** 2 * taper_slope / root.clamp_min(1e-6)
+    taper_change = (
+        -_KAISER_BETA * distance / (_KERNEL_REACH + 1.0) ** 2 * taper_slope / root.clamp_min(1e-6)
+    )
     is_outside = inside_square <= 0
     value = (sinc * taper).masked_fill(is_outside, 0.0)
     # by the shift: the distance falls as the shift grows
@@ -424,11 +438,11 @@ def _folded(matrix: Tensor) -> Tensor:
     """Return matrices whose columns beyond the ends act on the samples within, mirrored at the
     ends and turned over.
     """
-    inner = matrix[..., _REACH:-_REACH].clone()
-    reach = min(_REACH, inner.shape[-1] - 1)
+    inner = matrix[..., _KERNEL_REACH:-_KERNEL_REACH].clone()
+    reach = min(_KERNEL_REACH, inner.shape[-1] - 1)
     left_columns, right_columns = (
-        matrix[..., _REACH - reach : _REACH],
-        matrix[..., -_REACH : matrix.shape[-1] - _REACH + reach],
+        matrix[..., _KERNEL_REACH - reach : _KERNEL_REACH],
+        matrix[..., -_KERNEL_REACH : matrix.shape[-1] - _KERNEL_REACH + reach],
     )
     # beyond the end the samples are 2 x end - mirror image
     inner[..., 0] += 2.0 * left_columns.sum(-1)

@@ -25,8 +25,8 @@ from neusee.nodes.restore._inverse._masked_blur import bordered, halvings, torus
 from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import (
-    EACH,
     MAPS,
+    MAPS_OF_CHANNEL,
     PRECISE,
     filter_facts,
     wiener,
@@ -64,7 +64,9 @@ from neusee.nodes.values import (
 # networks.
 
 
-_SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
+_SYSTEM_BYTES = (
+    35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
+)
 #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
 _INVERTED = 0.30
 #: side of a dense system that needs as much memory as an inverted matrix of side 1
@@ -74,10 +76,10 @@ _FILLED = 790.0
 #: transforms, of the size of pupil and window together, that take as long as a band of a PSF
 _FOCUS = 2.0
 #: bytes for each pixel of a pattern that the glare may have: its copies, scaled and weighted
-_MODE = 24.0
+_MODE_BYTES = 24.0
 #: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
-_SEARCHED = 150.0
-_LINES = 61  #: spectral lines that a search tries, each with five transforms
+_SEARCH_BYTES = 150.0
+_LINES_TRIED = 61  #: spectral lines that a search tries, each with five transforms
 #: bytes of inner results of a network that need as much memory as a byte of the usual work of a
 #: node
 _KEPT = 1 / 8
@@ -173,7 +175,7 @@ def _(result: FoundLasers, electrons: Tensor, *others: Any, **params: Any) -> tu
     # a search for each laser, and one that finds no more
     rounds = 1 + len(result.direction)
     # five transforms for each line in each round
-    return _SEARCHED * y * x, 5.0 * _LINES * rounds * transform_operations(2 * y, 2 * x)
+    return _SEARCH_BYTES * y * x, 5.0 * _LINES_TRIED * rounds * transform_operations(2 * y, 2 * x)
 
 
 @found_glare.shape
@@ -220,7 +222,7 @@ def _(
     operations = step_operations + _FILLED * unknowns**2
     largest_system = max(unknowns, _WHITENED * lowest_side)
     nearby_memory = (
-        _MODE
+        _MODE_BYTES
         * sum(
             # others[5] is `nearby`, after illuminant, responses, bands, clipped and glare
             len(patterns_drawn)
@@ -230,7 +232,7 @@ def _(
     )
     # 31 bytes for each pixel of the transforms, or those of the dense system
     return max(
-        31.0 * len(electrons) * y * x, _SYSTEM * largest_system**2
+        31.0 * len(electrons) * y * x, _SYSTEM_BYTES * largest_system**2
     ) + nearby_memory, operations
 
 
@@ -301,8 +303,8 @@ def _(result: WienerProblem, *inputs: Any, **params: Any) -> tuple[float, float]
 def _(electrons: Tensor, *inputs: Any, **params: Any) -> FilterFacts:
     kind = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
     frame, by_channel = tuple(electrons.shape), (len(electrons), 1, 1)
-    # `MAPS` is for three channels: each further channel has `EACH` more
-    maps = (MAPS + EACH * (len(electrons) - 3), *frame[1:])
+    # `MAPS` is for three channels: each further channel has `MAPS_OF_CHANNEL` more
+    maps = (MAPS + MAPS_OF_CHANNEL * (len(electrons) - 3), *frame[1:])
     return FilterFacts._make(
         blank(*shape, dtype=kind) for shape in (frame, frame, maps, by_channel, by_channel)
     )
@@ -428,10 +430,12 @@ def _(
 # The shape of a measured PSF, and the work of measuring it and of restoring with it.
 
 
-_FITS = 6  #: steps of Gauss and Newton that a fit usually takes, each of as much work as a draw
+_FIT_STEPS = (
+    6  #: steps of Gauss and Newton that a fit usually takes, each of as much work as a draw
+)
 #: bytes for each pixel of each window: the points, their slopes and the arrays of a step
 _HELD = 80.0
-_SEEN = 40.0  #: bytes for each pixel of a frame while it is searched for points
+_POINTS_BYTES = 40.0  #: bytes for each pixel of a frame while it is searched for points
 
 
 @measured_psf.shape
@@ -481,8 +485,8 @@ def _(
     rows, columns, channels, y, x = result.kernels.shape
     windows = float(len(result.places) * channels * y * x)
     pixels = float(channels * math.prod(shape))
-    steps = rows * columns * (_FITS + len(result.draws))
-    return _HELD * windows + _SEEN * pixels, steps * windows * (y + x) + len(files) * pixels
+    steps = rows * columns * (_FIT_STEPS + len(result.draws))
+    return _HELD * windows + _POINTS_BYTES * pixels, steps * windows * (y + x) + len(files) * pixels
 
 
 @wiener_by_field.work

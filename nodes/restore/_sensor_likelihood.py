@@ -17,7 +17,7 @@ from neusee.nodes.sensor._digitization import digitize, full_well
 from neusee.nodes.sensor._noise import dark_current, dark_electrons, photon_noise, read_noise
 
 #: standard deviations; further below the expectation, the clip level costs nothing in any precision
-_SURE = -12.0
+_CERTAIN_DEVIATIONS = -12.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class MeasuringSensor:
 def _hazard(z: Tensor) -> Tensor:
     """Return the density of the normal distribution at z over its upper tail beyond z."""
     hazard: Tensor = math.sqrt(2.0 / math.pi) / torch.special.erfcx(
-        z.clamp_min(_SURE) * math.sqrt(0.5)
+        z.clamp_min(_CERTAIN_DEVIATIONS) * math.sqrt(0.5)
     )
     return hazard
 

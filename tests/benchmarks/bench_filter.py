@@ -30,7 +30,7 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.run_training import _photographs
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 
 MASKS, SCENES, STRENGTHS = (
     "flat,half_ring,five_half_rings,demonstration",
@@ -187,7 +187,7 @@ def pictures(count=3):
     """
     recipe = load("train_demonstration", ["train.laser_free=0"], Path())
     photographs = _photographs(recipe, recipe.training, True)
-    stream = TrainingStream(recipe, recipe.training, photographs, Store(), "cpu", recipe)
+    stream = TrainingStream(recipe, recipe.training, PictureSource(photographs, Store()), recipe)
     spent = []
 
     def timed(*args, **how):

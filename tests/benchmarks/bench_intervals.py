@@ -2,7 +2,7 @@
 tests/benchmarks/bench_intervals.py 1000 5 8 20`.
 
 Samples of known mean from four laws, and differences of two methods with skewed errors on the same
-photographs. Beside `paired_intervals.less`, of `neusee evaluate`, stand the bootstrap-t alone and
+photographs. Beside `confidence_intervals.less`, of `neusee evaluate`, stand the bootstrap-t alone and
 Student's t. The share of 1000 samples whose 95 % interval holds the truth has a standard error of
 0.7 %; the median width stands in brackets.
 """
@@ -12,7 +12,7 @@ import sys
 import numpy as np
 from scipy.stats import t as student
 
-from neusee.workflows.evaluation import confidence_intervals as paired_intervals
+from neusee.workflows.evaluation import confidence_intervals
 
 TIMES, *COUNTS = [int(word) for word in sys.argv[1:]] or [1000, 5, 8, 20]
 DRAWS = 2000
@@ -37,10 +37,10 @@ def measure(draw, truth, n, few):
     photographs.
     """
     rng, held, width = np.random.default_rng(n), [], []
-    paired_intervals._SMALL = few
+    confidence_intervals._SMALL = few
     for k in range(TIMES):
         x = draw(rng, n)
-        found = paired_intervals.less(np.zeros(n), x, np.arange(n), k)
+        found = confidence_intervals.less(np.zeros(n), x, np.arange(n), k)
         held.append(found.low <= truth <= found.high)
         width.append(found.high - found.low)
     return np.mean(held), np.median(width)
@@ -57,8 +57,8 @@ def of_student(draw, truth, n):
 
 
 def main():
-    paired_intervals._DRAWS = DRAWS
-    small = paired_intervals._SMALL
+    confidence_intervals._BOOTSTRAP_DRAWS = DRAWS
+    small = confidence_intervals._SMALL
     print("| photographs | law | neusee | bootstrap-t alone | Student's t |\n|---|---|---|---|---|")
     for n in COUNTS:
         for name, (draw, truth) in LAWS.items():

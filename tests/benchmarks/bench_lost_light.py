@@ -31,6 +31,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from neusee.nodes import flare, optics  # noqa: E402
+from neusee.nodes.restore._inverse._wiener import View  # noqa: E402
 from neusee.nodes.restore._lasers import _find_lasers as law  # noqa: E402
 from neusee.nodes.restore._lasers._components import (  # noqa: E402
     Camera,
@@ -106,7 +107,7 @@ def fit_of(frame, mask, laser, lens):
     electrons, clipped, psf, pupil, light, responses, bands = inputs(frame, mask)
     electrons = electrons.double()
     camera = Camera(pupil, responses, bands, lens, LINE)
-    lamp = lamp_light(psf, pupil, light, responses, bands, lens, torch.float64)
+    lamp = lamp_light(View(psf, light, responses, bands), pupil, lens, torch.float64)
     known = Known(
         electrons, (~clipped).to(electrons), camera, lamp, None, own.READ, (1e-9, 5e-9, 10e-9)
     )

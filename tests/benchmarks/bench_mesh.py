@@ -28,7 +28,7 @@ from mesh_processes import DO, _photographs, start
 from neusee.workflows import Store, load
 from neusee.workflows.training.process_mesh import Mesh
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 
 DOUBLE = [
     "train.precision=float64",
@@ -47,7 +47,10 @@ def timed(job: dict[str, Any], mesh: Mesh) -> None:
     learner = Learner(recipe, how, "cpu", mesh=mesh)
     learner.begin(how.stages[1], True)
     samples = TrainingStream(
-        recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh
+        recipe,
+        how,
+        PictureSource(_photographs(recipe, how, True), Store(Path(job["store"])), mesh=mesh),
+        None,
     )
     seconds = []
     for iteration in range(1 + TIMES):

@@ -19,6 +19,7 @@ import torch
 
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import train
 
 SMALL = [
@@ -40,7 +41,13 @@ def rows(name: str, words: list[str], folder: Path, photographs: str) -> list[di
     """The losses of a preset, learned now or found."""
     recipe = load("train_small", [*words, *SMALL, f"train.photographs={photographs}"])
     made = train(
-        recipe, Store(folder / "cache"), folder / name.replace(" ", "_"), ["bench_presets"], print
+        recipe,
+        TrainingSession(
+            Store(folder / "cache"),
+            folder / name.replace(" ", "_"),
+            print,
+            command=["bench_presets"],
+        ),
     )
     with (made / "losses.csv").open(newline="") as file:
         return list(csv.DictReader(file))

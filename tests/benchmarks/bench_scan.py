@@ -55,9 +55,15 @@ def loop(u, dt, A, B, C):
     return torch.stack(rows, 1)
 
 
+def scan_by(backend, *values):
+    """The scan by one of the two backends, as the environment selects it."""
+    os.environ["NEUSEE_SCAN"] = backend
+    return selective_scan(*values)
+
+
 SCANS = {
-    "neusee, C++": partial(selective_scan, backend="cpp"),
-    "neusee, torch": partial(selective_scan, backend="torch"),
+    "neusee, C++": partial(scan_by, "cpp"),
+    "neusee, torch": partial(scan_by, "torch"),
     "mambapy pscan": mambapy,
     "plain loop": loop,
 }

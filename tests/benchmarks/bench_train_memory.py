@@ -32,7 +32,7 @@ from neusee.workflows import Store, load
 from neusee.workflows.training.resumable_loop import export
 from neusee.workflows.training.run_training import frozen
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 
 SIDES, FULL = (128, 192, 256, 384, 512), (2048, 31, 8, 256)
 #: side, bands, batch, side of the network's pictures
@@ -80,7 +80,10 @@ def measured(side, bands, batch, net, stage):
         export(Path(folder), "mask", {"height": learner.height().detach()})
         still = frozen(recipe, how, Path(folder)) if stage == 2 else None
         samples = TrainingStream(
-            recipe, how, Photographs((recipe.steps["scene"].params["file"],)), store, "cpu", still
+            recipe,
+            how,
+            PictureSource(Photographs((recipe.steps["scene"].params["file"],)), store),
+            still,
         )
         learner.begin(how.stages[stage], stage == 1)
         learner.iterate(samples, stage, 0)

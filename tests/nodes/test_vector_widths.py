@@ -23,7 +23,6 @@ from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred, last_type
 from neusee.nodes.restore._networks import _selective_scan
-from neusee.nodes.restore._networks._selective_scan import selective_scan
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")]
 
@@ -224,7 +223,7 @@ def scan_by_loop(u, dt, A, B, C):
 def test_the_scan_and_its_gradient_are_the_loop(compiled, level, dtype):
     compiled(level)
     for d in (1, 3, 4, 7, 16, 17, 40):
-        ours = scan_results(d, 3, dtype, lambda *x: selective_scan(*x, backend="cpp"))
+        ours = scan_results(d, 3, dtype, _selective_scan.selective_scan)
         truth = scan_results(d, 3, torch.float64, scan_by_loop)
         rounding = 4e-6 if dtype == torch.float32 else 1e-13
         for found, expected in zip(ours, truth, strict=True):
@@ -237,7 +236,7 @@ def test_the_scan_has_the_same_bits_at_every_width_with_fma(compiled):
         compiled(level)
         both.append(
             [
-                scan_results(d, 3, t, lambda *x: selective_scan(*x, backend="cpp"))
+                scan_results(d, 3, t, _selective_scan.selective_scan)
                 for d in (5, 16, 45, 100)
                 for t in (torch.float32, torch.float64)
             ]

@@ -24,9 +24,10 @@ import torch
 
 from neusee.workflows import Store, load
 from neusee.workflows.training.process_mesh import Mesh, joined
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import Shared, TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, Shared, TrainingStream
 
 LONGEST = 120.0  #: s, after which a process counts as hanging
 
@@ -38,7 +39,10 @@ def step(job: dict[str, Any], mesh: Mesh) -> None:
     learner = Learner(recipe, how, "cpu", mesh=mesh)
     learner.begin(how.stages[1], True)
     samples = TrainingStream(
-        recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh
+        recipe,
+        how,
+        PictureSource(_photographs(recipe, how, True), Store(Path(job["store"])), mesh=mesh),
+        None,
     )
     losses, _ = learner.iterate(samples, 1, 0)
     if mesh.first:
@@ -54,7 +58,7 @@ def pooled(job: dict[str, Any], mesh: Mesh) -> None:
     recipe = load("train_small", job["words"])
     how, store = recipe.training, Store(Path(job["store"]))
     samples = TrainingStream(
-        recipe, how, _photographs(recipe, how, True), store, "cpu", recipe, mesh
+        recipe, how, PictureSource(_photographs(recipe, how, True), store, mesh=mesh), recipe
     )
     usual, drawn = samples._drawn, []
     samples._drawn = lambda *place: drawn.append(place) or usual(*place)  # type: ignore[method-assign, func-returns-value]
@@ -72,7 +76,10 @@ def pooled(job: dict[str, Any], mesh: Mesh) -> None:
 def learn(job: dict[str, Any], mesh: Mesh) -> None:
     """A training as the command does it."""
     recipe = load("train_small", job["words"])
-    train(recipe, Store(Path(job["store"])), Path(job["runs"]), [], lambda line: None, mesh=mesh)
+    train(
+        recipe,
+        TrainingSession(Store(Path(job["store"])), Path(job["runs"]), lambda line: None, mesh=mesh),
+    )
 
 
 def fail(job: dict[str, Any], mesh: Mesh) -> None:

@@ -137,7 +137,7 @@ def test_twelve_masks_and_twelve_starts_look_different():
     plane = evaluation_figures.plane.__wrapped__({f"mask {i}": mask for i in range(12)}).axes[0]
     assert len(looks(line for line in plane.lines if line.get_label().startswith("mask"))) == 12
     rows = [{"start": i, "iteration": 0, "loss": 1.0} for i in range(12)]
-    assert len(looks(design_run.history.__wrapped__(rows).axes[0].lines)) == 12
+    assert len(looks(design_run.history_figure.__wrapped__(rows).axes[0].lines)) == 12
 
 
 def test_numbers_of_panels_above_each_other_are_apart():

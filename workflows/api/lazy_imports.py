@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neusee.workflows.calibration import run_calibration as run_calibration
     from neusee.workflows.evaluation import run_evaluation as run_evaluation
+    from neusee.workflows.training import lift_training as lift_training
     from neusee.workflows.training import process_mesh as process_mesh
+    from neusee.workflows.training import resumable_loop as resumable_loop
     from neusee.workflows.training import run_training as run_training
 
 #: modules below neusee
@@ -21,6 +23,7 @@ _MODULES = (
     "workflows.evaluation.run_evaluation",
     "workflows.training.lift_training",
     "workflows.training.process_mesh",
+    "workflows.training.resumable_loop",
     "workflows.training.run_training",
 )
 _BY_NAME = {module.rpartition(".")[2]: module for module in _MODULES}

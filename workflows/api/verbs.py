@@ -123,22 +123,14 @@ def train(
     if a loss is NaN or infinite.
     """
     recipe, folder, store = _read(recipe, changes), writable_folder(out), store or open_store()
-    if recipe.lifting is not None:
-        return lazy.lift_training.train_lift(
-            recipe, store, folder, command, progress, device, watch
-        )
-    numbers = stages if stages is not None else recipe.training.learnt if recipe.training else ()
-    return lazy.run_training.train(
-        recipe,
-        store,
-        folder,
-        command,
-        progress,
-        tuple(numbers),
-        device,
-        watch,
-        mesh or lazy.process_mesh.ALONE,
+    session = lazy.resumable_loop.TrainingSession(
+        store, folder, progress, command, device, watch, mesh or lazy.process_mesh.ALONE
     )
+    if recipe.lifting is not None:
+        return lazy.lift_training.train_lift(recipe, session)
+    if stages is None:
+        stages = recipe.training.learnt if recipe.training else ()
+    return lazy.run_training.train(recipe, session, tuple(stages))
 
 
 def evaluate(
@@ -175,23 +167,16 @@ def evaluate(
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     run_evaluation = lazy.run_evaluation
-    working_folder, name, arguments = Path.cwd(), _name(recipe, "evaluate"), _arguments(changes)
-    recipe_settings = run_evaluation.read_settings(name, arguments, working_folder)
-    return run_evaluation.evaluate(
-        name,
-        changes=arguments,
-        **run_evaluation.options_of(
-            recipe_settings, pipelines, scenes, reference, equal_protection, by, working_folder
-        ),
+    named = run_evaluation.NamedRecipe(_name(recipe, "evaluate"), _arguments(changes), Path.cwd())
+    asked = run_evaluation.AskedCamera.of(named, store or open_store(), progress)
+    question = run_evaluation.EvaluationQuestion(
+        **run_evaluation.options_of(asked, pipelines, scenes, reference, equal_protection, by),
         data=None if data is None else Path(data).expanduser(),
-        strengths=run_evaluation.STRENGTHS if strengths is None else strengths,
+        strengths=run_evaluation.STRENGTHS if strengths is None else tuple(strengths),
         small=small,
-        store=store,
-        runs=writable_folder(out),
-        command=command,
-        progress=progress,
-        device=device,
-        folder=working_folder,
+    )
+    return run_evaluation.evaluate(
+        asked, question, runs=writable_folder(out), command=command, device=device
     )
 
 

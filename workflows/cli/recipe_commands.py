@@ -519,9 +519,8 @@ def restore(
 
     with within_memory(memory) as limit, refusing():
         files = lazy.frame_recipes.named_frames(frames, folder)
-        recipes = lazy.frame_recipes.recipes_of(
-            files, camera, mask, changes, folder, first_number, psf
-        )
+        frame_camera = lazy.frame_recipes.FrameCamera(camera, mask, psf)
+        recipes = lazy.frame_recipes.recipes_of(files, frame_camera, changes, folder, first_number)
     store, silent = the_store(), quiet or as_json
     options = option_words({"camera": camera, "mask": mask, "psf": psf})
 

@@ -30,7 +30,7 @@ from neusee.workflows.report.terminal_text import columns
 
 
 _COLUMNS = ("name", "index", "left", "right", "right - left", "relative")
-_NONE = "–"
+_NO_NUMBER = "–"
 
 
 def report(comparison: RunComparison) -> StudyReport:
@@ -104,24 +104,24 @@ def _differ(both: Sequence[NumberDifference]) -> str:
     count_text = _counted(len(both), "number")
     if not differing:
         return f"All {count_text} are the same."
-    return f"{len(differing)} of {count_text} differ{_by(differing)}."
+    return f"{len(differing)} of {count_text} differ{_by_how_much(differing)}."
 
 
 def difference_text(number: NumberDifference) -> list[str]:
     """Return name, index, both sides, difference and relative difference of a number as cells of
     a table.
     """
-    sides = [_NONE if side is None else f"{side:.6g}" for side in (number.left, number.right)]
-    difference_cell = _NONE if number.difference is None else f"{number.difference:+.3g}"
+    sides = [_NO_NUMBER if side is None else f"{side:.6g}" for side in (number.left, number.right)]
+    difference_cell = _NO_NUMBER if number.difference is None else f"{number.difference:+.3g}"
     return [number.name, str(number.index), *sides, difference_cell, _relative(number.relative)]
 
 
 def _relative(value: float) -> str:
     """Return a relative difference as text, or a dash where none is defined."""
-    return f"{value:.2g}" if value < float("inf") else _NONE
+    return f"{value:.2g}" if value < float("inf") else _NO_NUMBER
 
 
-def _by(differ: Sequence[NumberDifference]) -> str:
+def _by_how_much(differ: Sequence[NumberDifference]) -> str:
     """Return by how much numbers differ at most, or nothing where one difference is infinite."""
     largest_relative = max(number.relative for number in differ)
     return (
@@ -236,9 +236,9 @@ def _table(
     cells: list[list[Any]] = [
         [
             row.name,
-            row.left or _NONE,
-            row.right or _NONE,
-            *([row.left_source or _NONE, row.right_source or _NONE] if sources else []),
+            row.left or _NO_NUMBER,
+            row.right or _NO_NUMBER,
+            *([row.left_source or _NO_NUMBER, row.right_source or _NO_NUMBER] if sources else []),
         ]
         for row in rows
     ]
@@ -378,7 +378,7 @@ def _of_file(file: FileDifference) -> dict[str, Any]:
 # A comparison of two runs as lines of text for a terminal.
 
 
-_MOST = 12  #: rows of each table
+_MOST_ROWS = 12  #: rows of each table
 
 
 def lines(comparison: RunComparison) -> list[str]:
@@ -396,7 +396,7 @@ def lines(comparison: RunComparison) -> list[str]:
     }
     for title, rows in blocks.items():
         if rows:
-            printed += ["", title, *_cut(rows)]
+            printed += ["", title, *_first_rows(rows)]
     return printed
 
 
@@ -415,9 +415,9 @@ def _text_table(rows: list[list[str]]) -> list[str]:
     return [f"  {line}" for line in columns(rows, ">")]
 
 
-def _cut(rows: list[str]) -> list[str]:
-    hidden = len(rows) - _MOST
-    return [*rows[:_MOST], f"  and {hidden} more on the page"] if hidden > 0 else rows
+def _first_rows(rows: list[str]) -> list[str]:
+    hidden = len(rows) - _MOST_ROWS
+    return [*rows[:_MOST_ROWS], f"  and {hidden} more on the page"] if hidden > 0 else rows
 
 
 def _value(value: ValueDifference) -> str:

@@ -22,7 +22,7 @@ from neusee.workflows.report.figures.style import canvas, drawn, picture
 
 _MEASURED = frozenset({"engine", "peak memory"})  #: facts of a run that differ each time
 _STATE, _PACKAGE, _SETTINGS, _PYTHON = "state of ", "package ", "settings", "Python"
-_SEVERAL = 6  #: names that a line lists
+_NAMES_OF_LINE = 6  #: names that a line lists
 _NO_VALUE = FinalValue("", "")
 
 
@@ -161,7 +161,8 @@ def code(left: RunRecord, right: RunRecord) -> list[str] | None:
         if left_nodes[node] != right_nodes[node]
     )
     only_one_uses = [
-        f"only the {side} run uses the node {node}" for side, node in _only(left_nodes, right_nodes)
+        f"only the {side} run uses the node {node}"
+        for side, node in _names_of_one_side(left_nodes, right_nodes)
     ]
     nodes = [f"the code of {_listed(changed)} differs"] if changed else []
     return [
@@ -213,7 +214,7 @@ def steps(left: RunRecord, right: RunRecord) -> list[str]:
         *lines,
         *(
             f"only the {side} run has the step {name}"
-            for side, name in _only(left_keys, right_keys)
+            for side, name in _names_of_one_side(left_keys, right_keys)
         ),
     ]
 
@@ -253,29 +254,32 @@ def _changes(
         return
     for label in sorted(left_definitions.keys() | right_definitions.keys()):
         if left_definitions.get(label) != right_definitions.get(label):
-            yield f"{module}: {label} {_how(left_definitions, right_definitions, label)}"
+            change = _definition_change(left_definitions, right_definitions, label)
+            yield f"{module}: {label} {change}"
 
 
-def _how(old: Mapping[str, str], new: Mapping[str, str], label: str) -> str:
+def _definition_change(old: Mapping[str, str], new: Mapping[str, str], label: str) -> str:
     """Return how a definition differs: in both runs, or only in one of them."""
     if label in old and label in new:
         return "differs"
     return f"is only in the {'left' if label in old else 'right'} run"
 
 
-def _only(left: Mapping[str, object], right: Mapping[str, object]) -> Iterator[tuple[str, str]]:
+def _names_of_one_side(
+    left: Mapping[str, object], right: Mapping[str, object]
+) -> Iterator[tuple[str, str]]:
     """Yield (``left`` or ``right``, name) for each name that only one side has."""
     yield from (("left", name) for name in left if name not in right)
     yield from (("right", name) for name in right if name not in left)
 
 
 def _listed(names: list[str]) -> str:
-    """Return names as text, at most `_SEVERAL` of them, and how many more there are."""
-    more_names = len(names) - _SEVERAL
+    """Return names as text, at most `_NAMES_OF_LINE` of them, and how many more there are."""
+    more_names = len(names) - _NAMES_OF_LINE
     return (
         ", ".join(names)
         if more_names <= 0
-        else f"{', '.join(names[:_SEVERAL])} and {more_names} more"
+        else f"{', '.join(names[:_NAMES_OF_LINE])} and {more_names} more"
     )
 
 
@@ -288,8 +292,8 @@ def _listed(names: list[str]) -> str:
 #: figures of one run's times and states, which are no results
 _TIMES = frozenset({"timeline", "graph", "error_time"})
 _COLOURS = 4  #: channels of a data file that is drawn as a picture
-_WIDE = 1.7  #: width over height, above which the two sides stand one above the other
-_BROKEN = "the file is damaged: run the recipe again"
+_WIDE_RATIO = 1.7  #: width over height, above which the two sides stand one above the other
+_DAMAGED = "the file is damaged: run the recipe again"
 
 
 @dataclass(frozen=True)
@@ -414,7 +418,7 @@ def _levels(path: Path) -> Any:
     except ValueError as error:
         raise NotComparable(str(error)) from None
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise NotComparable(f"{path}: {error}: {_BROKEN}") from None
+        raise NotComparable(f"{path}: {error}: {_DAMAGED}") from None
 
 
 def _exr(name: str, left: Path, right: Path) -> FileDifference:
@@ -459,7 +463,7 @@ def _channels(path: Path) -> dict[str, Any]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: channel.pixels for name, channel in file.parts[0].channels.items()}
     except Exception as error:  # OpenEXR raises plain errors of several kinds
-        raise NotComparable(f"{path}: {error}: {_BROKEN}") from None
+        raise NotComparable(f"{path}: {error}: {_DAMAGED}") from None
 
 
 def _form(channels: Mapping[str, Any]) -> str:
@@ -516,7 +520,7 @@ def _loaded(path: Path) -> dict[str, Any]:
         safetensors_need(path, 3.0)
         return {key: value.double().numpy() for key, value in load_file(path).items()}
     except (SafetensorError, OSError, ValueError) as error:
-        raise NotComparable(f"{path}: {error}: {_BROKEN}") from None
+        raise NotComparable(f"{path}: {error}: {_DAMAGED}") from None
 
 
 def _numbers(name: str, left: Any, right: Any) -> FileDifference:
@@ -553,7 +557,7 @@ def drawing(left: Any, right: Any, change: Any, title: str) -> Any:
     """
     height, width = left.shape[:2]
     panels = 2 if change is None else 3
-    is_wide = width / height > _WIDE
+    is_wide = width / height > _WIDE_RATIO
     panel_height, rows, columns = (
         9.6 * min(1.0, height / width) + 0.5,
         panels if is_wide else 1,

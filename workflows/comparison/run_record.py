@@ -20,7 +20,7 @@ from neusee.workflows.report.run_folder import CODE, find_run
 
 M = TypeVar("M", bound=BaseModel)
 
-_OTHER = {
+_OTHER_RESULTS = {
     "sweep.yaml": (
         "a sweep: compare reads folders of `neusee run`; the results of each point are in sweep.csv"
     ),
@@ -29,7 +29,7 @@ _OTHER = {
         " weights"
     ),
 }
-_AGAIN = "the file is damaged, or of another version of neusee: run the recipe again"
+_DAMAGED = "the file is damaged, or of another version of neusee: run the recipe again"
 
 
 class NotComparable(ValueError):
@@ -107,7 +107,7 @@ def read_record(where: str, root: Path) -> RunRecord:
     damaged or of something else than a run.
     """
     for path in (root / where, Path(where)):
-        for file, text in _OTHER.items():
+        for file, text in _OTHER_RESULTS.items():
             if (path / file).is_file():
                 raise NotComparable(f"{path} is the folder of {text}")
     try:
@@ -136,11 +136,13 @@ def _json(path: Path) -> Any:
     try:
         return json.loads(text_of(path))
     except json.JSONDecodeError as error:
-        raise NotComparable(f"{path}:{error.lineno}:{error.colno}: {error.msg}: {_AGAIN}") from None
+        raise NotComparable(
+            f"{path}:{error.lineno}:{error.colno}: {error.msg}: {_DAMAGED}"
+        ) from None
     except NotRegular as error:
         raise NotComparable(str(error)) from None
     except UnicodeDecodeError as error:
-        raise NotComparable(f"{path}: byte {error.start} is not UTF-8: {_AGAIN}") from None
+        raise NotComparable(f"{path}: byte {error.start} is not UTF-8: {_DAMAGED}") from None
     except OSError as error:
         raise NotComparable(f"{path} cannot be read: {error.strerror}") from None
 
@@ -153,7 +155,7 @@ def _checked(path: Path, model: type[M], content: Any) -> M:
         first_mistake = error.errors()[0]
         mistake_path = ".".join(map(str, first_mistake["loc"])) or "the top"
         raise NotComparable(
-            f"{path}: {mistake_path}: {first_mistake['msg'].lower()}: {_AGAIN}"
+            f"{path}: {mistake_path}: {first_mistake['msg'].lower()}: {_DAMAGED}"
         ) from None
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
-FEW = 5  #: smallest number of photographs for the bootstrap
+FEW_PHOTOGRAPHS = 5  #: smallest number of photographs for the bootstrap
 METRICS = (
     "l1",
     "psnr",
@@ -152,7 +152,7 @@ def metric_table(
 # photographs in 81 to 89 instead of 95 of 100 cases.
 
 
-_DRAWS = 10_000  #: sets of photographs that the bootstrap draws
+_BOOTSTRAP_DRAWS = 10_000  #: sets of photographs that the bootstrap draws
 #: photographs below which neither end may lie nearer than that of Student's t distribution
 _SMALL = 30
 _AT_ONCE = 500  #: sets in memory at once
@@ -177,7 +177,7 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
         sums_by_photograph(bottom, photographs),
     )
     ratio_of_sums, count = float(top_sums.sum() / bottom_sums.sum()), len(top_sums)
-    if count < FEW:
+    if count < FEW_PHOTOGRAPHS:
         return Interval(ratio_of_sums, math.nan, math.nan)
     residuals = top_sums - ratio_of_sums * bottom_sums
     standard_error = _standard_error((residuals**2).sum(), bottom_sums.sum(), count)
@@ -229,7 +229,7 @@ def _drawn_errors(residuals: Numbers, b: Numbers, seed: int) -> Numbers:
     # sums that each drawn set needs, so that one product of matrices gives all
     products = np.stack([residuals, b, residuals * residuals, residuals * b, b * b], 1)
     errors: list[Numbers] = []
-    for _ in range(0, _DRAWS, _AT_ONCE):
+    for _ in range(0, _BOOTSTRAP_DRAWS, _AT_ONCE):
         draw_counts = rng.multinomial(count, np.full(count, 1 / count), _AT_ONCE).astype(np.float64)
         residual_sum, denominator_sum, residual_squares, mixed_products, denominator_squares = (
             draw_counts @ products

@@ -57,7 +57,7 @@ _STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when 
 #: marker of a point beside the line style of a curve
 _MARKERS = dict(zip(_STYLES, "osD^", strict=True))
 _GREY = "#777777"
-_LETTERS = 16  #: characters of the longest row name that stays on one line
+_ROW_NAME_LETTERS = 16  #: characters of the longest row name that stays on one line
 
 
 def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -103,7 +103,7 @@ def _broken(name: str) -> str:
     """Return a name in several lines if it is long, for the label of an axis."""
     return (
         name
-        if len(name) <= _LETTERS
+        if len(name) <= _ROW_NAME_LETTERS
         else re.sub(r" ?\+ ?", "\n+ ", name).replace(", ", ",\n").replace("@", "\n@ ")
     )
 
@@ -128,7 +128,7 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
             _places(tick_strengths),
             ["none" if strength == 0 else _power(strength) for strength in tick_strengths],
         )
-        ax.set_ylim(0, _top(tables.values(), metric))
+        ax.set_ylim(0, _axis_end(tables.values(), metric))
     axes[0, 0].set_ylabel("L1 (sRGB, 0 to 1)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
@@ -155,7 +155,7 @@ def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], nam
     ax.fill_between(positions, low_ends, high_ends, color=look["color"], alpha=0.15, linewidth=0)
 
 
-def _top(tables: Iterable[MetricTable], metric: str) -> float:
+def _axis_end(tables: Iterable[MetricTable], metric: str) -> float:
     """Return the end of an axis that shows every mean, and intervals up to three times the
     largest mean.
     """
@@ -330,14 +330,14 @@ def plane(masks: Mapping[str, MaskOptics]) -> Any:
 # The report page of an evaluation of masks and restorers, with tables, pictures and explanations.
 
 
-_EACH = ("mean", "low", "high")
+_STATISTICS = ("mean", "low", "high")
 COLUMNS = (
     "pipeline",
     "mask",
     "restorer",
     "scenes",
-    *map(" ".join, itertools.product(METRICS, _EACH)),
-    *map(" ".join, itertools.product(("l1 less", "l1 gain", "l1 small gain"), _EACH)),
+    *map(" ".join, itertools.product(METRICS, _STATISTICS)),
+    *map(" ".join, itertools.product(("l1 less", "l1 gain", "l1 small gain"), _STATISTICS)),
 )
 #: tolerance of a bound, because a circular aperture is sampled on a square grid of frequencies
 _COARSE = 1.05

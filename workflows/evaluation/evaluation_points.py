@@ -23,6 +23,7 @@ from neusee.workflows.evaluation.pipelines import (
     BEAM,
     NONE,
     WAVELENGTHS,
+    NamedRecipe,
     PipelineRecipes,
     laser_line,
 )
@@ -43,7 +44,6 @@ from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.recipe.blocks.settings_block import Mismatch
 from neusee.workflows.recipe.distributions.shapes import written
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.recipe.uncertain_inputs import Inputs, NothingDrawn
 from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -513,9 +513,7 @@ _WAVELENGTH, _DIRECTION = f"lasers.{BEAM}.wavelength", f"direction[{BEAM}]"
 class PointCommands:
     """What the commands of all points of an evaluation have in common."""
 
-    recipe: str
-    changes: Sequence[str | Override]
-    folder: Path  #: in which the commands are run
+    named: NamedRecipe  #: in whose folder the commands are run
     bench: EvaluationPoints
 
     def commands(
@@ -553,7 +551,7 @@ class PointCommands:
 
     def _command(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
         """Return the command of a point."""
-        return shlex.join(["neusee", "run", self.recipe, *self.words(pipeline, point)])
+        return shlex.join(["neusee", "run", self.named.name, *self.words(pipeline, point)])
 
     def words(
         self, pipeline: PipelineRecipes, point: PointRequest, strength: float | None = None
@@ -565,7 +563,9 @@ class PointCommands:
         recipe = pipeline.recipe(point.lit)
         drawn_values = self._drawn(pipeline, point)
         wavelength = drawn_values.pop(_WAVELENGTH, None)
-        arguments = [change if isinstance(change, str) else change.text for change in self.changes]
+        arguments = [
+            change if isinstance(change, str) else change.text for change in self.named.changes
+        ]
         arguments += [
             *pipeline.words,
             *_scene_words(recipe, scene),
@@ -600,7 +600,7 @@ class PointCommands:
         # the command does not output the contrast by wavelength
         outputs = [name for name in pipeline.pipeline.outputs if name != "bsr[mask]"]
         try:
-            recipe = load(self.recipe, self.words(pipeline, point, 1.0), self.folder)
+            recipe = load(self.named.name, self.words(pipeline, point, 1.0), self.named.folder)
         except RecipeError:
             return False
         scene = point.scene

@@ -30,15 +30,16 @@ from neusee.workflows.evaluation.pipelines import (
     NONE,
     SIX,
     EvaluationRefused,
+    NamedRecipe,
     Pipeline,
     PipelineRecipes,
     compose_pipelines,
+    read_settings,
 )
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_rivals import EqualProtection
 from neusee.workflows.recipe.blocks.settings_block import EvaluateSettings, Mismatch
-from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_report import Progress
 from neusee.workflows.store.result_store import Store, compute_once
 
@@ -297,7 +298,7 @@ def _mismatch_strength(mismatch: Mismatch, strengths: Sequence[float]) -> float:
 def _variants(pipeline: PipelineRecipes, mismatch: Mismatch) -> dict[str, PipelineRecipes]:
     """Return the pipeline with each error in what its restorer is told, by text."""
     errors = errors_of(pipeline.recipe(next(iter(CASES))), mismatch)
-    return {text: _variant(pipeline, text, error) for text, error in errors.items()}
+    return {text: mistold_pipeline(pipeline, text, error) for text, error in errors.items()}
 
 
 def _mistold_points(
@@ -326,7 +327,9 @@ def _mistold_points(
     return points
 
 
-def _variant(pipeline: PipelineRecipes, text: str, error: Mapping[str, Any]) -> PipelineRecipes:
+def mistold_pipeline(
+    pipeline: PipelineRecipes, text: str, error: Mapping[str, Any]
+) -> PipelineRecipes:
     """Return a pipeline whose restorer is told an error (``text`` and values); its camera stays."""
 
     @cache
@@ -363,12 +366,17 @@ def mistold_rows(points: Sequence[MistoldPoint]) -> list[Sequence[Any]]:
 class AskedCamera(NamedTuple):
     """The camera of an evaluation, and where its results are kept."""
 
-    recipe: str
-    changes: Sequence[str | Override]
-    folder: Path
+    named: NamedRecipe
     store: Store
     settings: EvaluateSettings
-    progress: Progress
+    progress: Progress  #: receives a line for each scene
+
+    @classmethod
+    def of(cls, named: NamedRecipe, store: Store, progress: Progress) -> AskedCamera:
+        """Read the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in
+        the recipe.
+        """
+        return cls(named, store, read_settings(named), progress)
 
 
 class Measured(NamedTuple):
@@ -392,15 +400,13 @@ def measure(
     """Return the numbers of all points, those of restorers told with errors, the masks, and the
     pictures to show.
     """
-    points, readable, broken = _points(bench, pipelines, shown, strengths, asked.progress)
+    points, readable, broken = points_of_scenes(bench, pipelines, shown, strengths, asked.progress)
     mistold = told_with_errors(bench, pipelines, readable, strengths, asked.progress)
     optics = masks(pipelines, asked.store, bench.device, points)
     if figure_changes := asked.settings.figure:
         bench.release()
         asked_pipelines = [composed.pipeline for composed in pipelines]
-        pipelines = compose_pipelines(
-            asked.recipe, [*asked.changes, *figure_changes], asked_pipelines, asked.folder
-        )
+        pipelines = compose_pipelines(asked.named.changed(figure_changes), asked_pipelines)
     figure_lasers = SIX if asked.settings.lasers == "drawn" else None
     return Measured(
         points,
@@ -412,7 +418,7 @@ def measure(
     )
 
 
-def _points(
+def points_of_scenes(
     bench: EvaluationPoints,
     pipelines: Sequence[PipelineRecipes],
     shown: Sequence[Scene],

@@ -23,6 +23,7 @@ from neusee.workflows.protection.equal_rivals import (
     shade_equally,
 )
 from neusee.workflows.protection.protection_camera import ProtectionCamera
+from neusee.workflows.recipe.blocks.settings_block import EvaluateSettings
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import compose
 from neusee.workflows.recipe.text.overrides import Override
@@ -60,10 +61,26 @@ WAVELENGTHS = {name: metres for name, metres in SIX.items() if metres is not Non
 _PIPELINE = re.compile(
     r"(?P<mask>[\w-]+)(?:@(?P<height>[^+]+))?\+(?P<restorer>[\w-]+)(?:@(?P<weights>.+))?"
 )
-_HOW = (
+_HOW_TO_WRITE = (
     "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or"
     " pixelwise@mask.npy+nafnet@net.safetensors"
 )
+
+
+class NamedRecipe(NamedTuple):
+    """A recipe as it is named on a command line: a name, changes, and the folder of their paths."""
+
+    name: str
+    changes: Sequence[str | Override]
+    folder: Path
+
+    def changed(self, words: Sequence[str | Override]) -> NamedRecipe:
+        """Return the recipe with further changes."""
+        return self._replace(changes=[*self.changes, *words])
+
+    def load(self) -> Recipe:
+        """Load the recipe; raise `RecipeError` with all mistakes."""
+        return load(self.name, self.changes, self.folder)
 
 
 class EvaluationRefused(ValueError):
@@ -175,7 +192,7 @@ def read_pipelines(text: str, folder: Path, mark: Location | None = None) -> lis
     pipelines = named_apart(pipelines)
     mistakes += [f"{name} is listed twice: remove one" for name in _twice(pipelines)]
     if not pipeline_words:
-        mistakes = [f"there is no pipeline: {_HOW}"]
+        mistakes = [f"there is no pipeline: {_HOW_TO_WRITE}"]
     if mistakes:
         raise EvaluationRefused("\n".join(mistakes))
     return pipelines
@@ -185,7 +202,7 @@ def _pipeline(word: str, folder: Path) -> Pipeline:
     """Return the pipeline that a word names; raise `ValueError` for another form of word."""
     match = _PIPELINE.fullmatch(word)
     if match is None:
-        raise ValueError(_HOW)
+        raise ValueError(_HOW_TO_WRITE)
     height_file, weights_file = (
         _named_file(match[group], folder) for group in ("height", "weights")
     )
@@ -261,19 +278,17 @@ def _shortest_names(files: Sequence[Path]) -> dict[Path | None, str]:
     return names
 
 
-def compose_pipelines(
-    recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
-) -> list[PipelineRecipes]:
+def compose_pipelines(named: NamedRecipe, pipelines: Sequence[Pipeline]) -> list[PipelineRecipes]:
     """Return each pipeline (mask and restorer) with its recipes; raise `EvaluationRefused` with
     all mistakes.
     """
-    own_laser = _own_laser(recipe, changes, folder)
+    own_laser = _own_laser(named)
     composed: list[PipelineRecipes] = []
     mistakes: dict[str, None] = {}
     for pipeline in pipelines:
         try:
-            words = _words(pipeline, partial(_takes, recipe, changes, folder))
-            recipe_of = cache(partial(_with_laser, recipe, [*changes, *words], own_laser, folder))
+            words = _words(pipeline, partial(_takes, named))
+            recipe_of = cache(partial(_with_laser, named.changed(words), own_laser))
             # without a laser and with the first one
             for case in (NONE, next(iter(CASES))):
                 _check(recipe_of(case), pipeline)
@@ -310,16 +325,15 @@ def _words(pipeline: Pipeline, takes: Callable[[str, str], str]) -> list[str]:
     return words + (pipeline.shade.words if pipeline.shade else [])
 
 
-def _takes(
-    recipe: str, changes: Sequence[str | Override], folder: Path, group: str, option: str
-) -> str:
+def _takes(named: NamedRecipe, group: str, option: str) -> str:
     """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if
     there is none.
 
     The option may be packaged, or of the user: beside the recipe, or in a folder that every recipe
     searches.
     """
-    composed = compose(recipe, [*changes, f"{group}={option}"], folder) if option != NONE else None
+    name, changes, folder = named.changed([f"{group}={option}"])
+    composed = compose(name, changes, folder) if option != NONE else None
     if composed and (
         problem := next(
             (
@@ -332,17 +346,15 @@ def _takes(
     ):
         raise EvaluationRefused(problem.message)
     block = composed.root.items.get(group) if composed else None
-    for name in ("file", "weights"):
-        if block is not None and name in block.items:
-            return name
+    for parameter in ("file", "weights"):
+        if block is not None and parameter in block.items:
+            return parameter
     raise EvaluationRefused(f"{option} takes no file: remove @ and the file name")
 
 
 def _with_laser(
-    recipe: str,
-    words: Sequence[str | Override],
+    named: NamedRecipe,
     own: _OwnLaser,
-    folder: Path,
     case: str,
     direction: tuple[float, float] | None = None,
     wavelength: float | None = None,
@@ -359,7 +371,7 @@ def _with_laser(
         )
         angle = "null" if direction is None else f"[{direction[0]!r} rad, {direction[1]!r} rad]"
         laser = f"{BEAM}: {{{laser_text}, strength: 1, angle: {angle}}}"
-    return load(recipe, [*words, f"lasers={{{laser}}}"], folder)
+    return named.changed([f"lasers={{{laser}}}"]).load()
 
 
 def laser_line(wavelength: float, fwhm: float) -> str:
@@ -374,14 +386,14 @@ class _OwnLaser(NamedTuple):
     drawn: str  #: wavelength and width as written in the recipe, with their laws
 
 
-def _own_laser(recipe: str, changes: Sequence[str | Override], folder: Path) -> _OwnLaser:
+def _own_laser(named: NamedRecipe) -> _OwnLaser:
     """Return the first laser of a recipe."""
-    steps = base_recipe(recipe, changes, folder).steps
+    steps = base_recipe(named).steps
     spectral_widths = [
         step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")
     ]
     fwhm = float(spectral_widths[0]) if spectral_widths else 10e-9
-    written_lasers = compose(recipe, changes, folder).root.below(["lasers"])
+    written_lasers = compose(*named).root.below(["lasers"])
     laser = next(iter(written_lasers.items.values()), None) if written_lasers else None
     texts = {"fwhm": f"{fwhm * 1e9:g} nm", **(laser.plain if laser else {})}
     return _OwnLaser(
@@ -394,14 +406,21 @@ def _own_laser(recipe: str, changes: Sequence[str | Override], folder: Path) -> 
     )
 
 
-def base_recipe(recipe: str, changes: Sequence[str | Override], folder: Path) -> Recipe:
+def base_recipe(named: NamedRecipe) -> Recipe:
     """Load the recipe of an evaluation; raise `EvaluationRefused` with all mistakes in it."""
     try:
-        return load(recipe, changes, folder)
+        return named.load()
     except RecipeError as error:
         raise EvaluationRefused(
             "\n".join(dict.fromkeys(map(one_line, error.diagnostics)))
         ) from None
+
+
+def read_settings(named: NamedRecipe) -> EvaluateSettings:
+    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in
+    the recipe.
+    """
+    return base_recipe(named).evaluation or EvaluateSettings()
 
 
 def refuse_fixed_laser(recipe: Recipe) -> None:
@@ -437,7 +456,7 @@ def _check(recipe: Recipe, pipeline: Pipeline) -> None:
 
 # Each pipeline gets the filter and the stop that bring its peak to one share.
 
-_BANDS = 7  #: wavelengths at which stops are compared
+_STOP_BANDS = 7  #: wavelengths at which stops are compared
 PROTECTION_COLUMNS = ("pipeline", "mask alone", "stop", "filter", "exposure", "peak")
 
 
@@ -458,12 +477,10 @@ def read_protection(level: float | None, way: str) -> EqualProtection | None:
 
 
 def protect(
-    recipe: str,
-    changes: Sequence[str | Override],
+    named: NamedRecipe,
     pipelines: Sequence[PipelineRecipes],
     asked: EqualProtection,
     store: Store,
-    folder: Path,
     progress: Progress,
 ) -> list[PipelineRecipes]:
     """Return the pipelines with the filters and stops that bring every peak to the level that is
@@ -479,7 +496,7 @@ def protect(
         if front in shades:
             continue
         try:
-            shades[front] = _shade(recipe, changes, pipeline, asked, store, folder)
+            shades[front] = _shade(named, pipeline, asked, store)
             progress(
                 f"{front}: peak"
                 f" {shades[front].alone:.3g}{shades[front].said or ', without a filter'}"
@@ -489,23 +506,16 @@ def protect(
     if faults:
         raise EvaluationRefused("\n".join(faults))
     return compose_pipelines(
-        recipe,
-        changes,
+        named,
         [
             replace(composed.pipeline, shade=shades[composed.pipeline.front])
             for composed in pipelines
         ],
-        folder,
     )
 
 
 def _shade(
-    recipe: str,
-    changes: Sequence[str | Override],
-    pipeline: PipelineRecipes,
-    asked: EqualProtection,
-    store: Store,
-    folder: Path,
+    named: NamedRecipe, pipeline: PipelineRecipes, asked: EqualProtection, store: Store
 ) -> EqualShade:
     """Return the stop and the filter with which the mask of a pipeline has the wanted peak.
 
@@ -516,11 +526,11 @@ def _shade(
         raise EvaluationRefused(
             "has a filter or a stop of its own: leave it out, because every pipeline gets one"
         )
-    camera = ProtectionCamera.of(without_laser, store, _BANDS)
+    camera = ProtectionCamera.of(without_laser, store, _STOP_BANDS)
 
     def peak_of(shade: EqualShade) -> float:
         shaded = replace(pipeline.pipeline, shade=shade)
-        (shaded_recipes,) = compose_pipelines(recipe, changes, [shaded], folder)
+        (shaded_recipes,) = compose_pipelines(named, [shaded])
         return float(
             run(shaded_recipes.recipe(NONE), store, ["lsr[mask]"]).values["lsr[mask]"].max()
         )

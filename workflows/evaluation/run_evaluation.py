@@ -1,8 +1,10 @@
 """The evaluation of masks and restorers as in the paper, with the same scenes and laser strengths
 for all.
 
-    evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()),
-    data=Path("photographs"))
+    named = NamedRecipe("first_light", [], Path())
+    pipelines = read_pipelines("flat+none, five_half_rings+wiener", Path())
+    question = EvaluationQuestion(pipelines, data=Path("photographs"))
+    evaluate(AskedCamera.of(named, Store(), print), question)
 
 Each point has a scene, a laser strength and a pipeline, and its metrics equal those of a run of the
 recipe to the last bit. A run that cannot prove its tolerance is computed again more strictly; a
@@ -12,7 +14,7 @@ point is computed once. The store keeps all points, so that an interrupted evalu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,7 @@ from neusee.workflows.evaluation.pipelines import (
     DRAWN,
     PROTECTION_COLUMNS,
     EvaluationRefused,
+    NamedRecipe,
     Pipeline,
     PipelineRecipes,
     base_recipe,
@@ -57,22 +60,22 @@ from neusee.workflows.evaluation.pipelines import (
     protection_rows,
     read_pipelines,
     read_protection,
+    read_settings,
     refuse_fixed_laser,
 )
 from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_rivals import EqualProtection
-from neusee.workflows.recipe.blocks.settings_block import EvaluateSettings
-from neusee.workflows.recipe.text.overrides import Override
-from neusee.workflows.report.study_report import CsvTable, Progress, StudyReport, StudyRun, silent
-from neusee.workflows.store.remote_store import open_store
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.report.study_report import CsvTable, Progress, StudyReport, StudyRun
 
 __all__ = [
     "STRENGTHS",
+    "AskedCamera",
+    "EvaluationQuestion",
     "EvaluationRefused",
     "EvaluationResult",
+    "NamedRecipe",
     "evaluate",
     "options_of",
     "read_pipelines",
@@ -84,103 +87,76 @@ STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 SMALL = 256  #: pixels of the shorter side of the pictures that the paper restores
 
 
+@dataclass(frozen=True)
+class EvaluationQuestion:
+    """What an evaluation compares, and over which scenes and laser strengths."""
+
+    pipelines: Sequence[Pipeline]
+    data: Path | None = None  #: folder of photographs; None: the scene of the recipe
+    count: int | None = 20  #: of scenes; None: every photograph once
+    strengths: tuple[float, ...] = STRENGTHS  #: of the laser, in multiples of saturation
+    small: int = SMALL  #: pixels of the shorter side of reduced pictures, which are compared too
+    reference: str = ""  #: pipeline with which all others are compared; empty: the first
+    equal: EqualProtection | None = None  #: peak to which filters and stops bring every pipeline
+
+
 def evaluate(
-    recipe: str,
-    pipelines: Sequence[Pipeline],
-    changes: Sequence[str | Override] = (),
+    asked: AskedCamera,
+    question: EvaluationQuestion,
     *,
-    data: Path | None = None,
-    count: int | None = 20,
-    strengths: Sequence[float] = STRENGTHS,
-    small: int = SMALL,
-    reference: str = "",
-    equal: EqualProtection | None = None,
-    store: Store | None = None,
     runs: Path = Path("runs"),
     command: Sequence[str] = (),
-    progress: Progress = silent,
     device: str = "cpu",
-    folder: Path | None = None,
 ) -> Path:
-    """Evaluate every pipeline on ``count`` scenes at all laser ``strengths``, and return the folder
-    of the results.
+    """Evaluate every pipeline on all scenes at all laser strengths, and return the folder of the
+    results.
 
-    Args: recipe, changes: the camera, as for `load`; its block ``evaluate`` says which lasers the
-            scenes have. data: a
-    folder of photographs, by default the scene of the recipe. count: by default 20, None means
-    every photograph once. small: shorter side of the reduced pictures, which are compared too.
-    reference: the pipeline with which all other pipelines are compared, by default the first
-    pipeline. equal: the peak to which filters and stops bring every pipeline. progress: receives a
-    line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
-    recipe_folder = folder or Path.cwd()
-    base, settings = (
-        base_recipe(recipe, changes, recipe_folder),
-        read_settings(recipe, changes, recipe_folder),
-    )
-    asked_camera = AskedCamera(
-        recipe, changes, recipe_folder, store or open_store(), settings, progress
-    )
-    pipelines = named_apart(pipelines)
+    base = base_recipe(asked.named)
+    pipelines = named_apart(question.pipelines)
     # without the filters and stops of equal protection
-    bare_pipelines = compose_pipelines(recipe, changes, pipelines, recipe_folder)
-    strengths, reference = _strengths(strengths), _reference(reference, pipelines)
-    study_run = StudyRun("evaluate", base, command)
-    if settings.lasers == "drawn":
-        refuse_fixed_laser(base)
-    shown_scenes, unreadable = scenes(
-        base,
-        asked_camera.store,
-        data,
-        count,
-        [DRAWN] if settings.lasers == "drawn" else list(CASES),
+    bare_pipelines = compose_pipelines(asked.named, pipelines)
+    question = replace(
+        question,
+        strengths=_strengths(question.strengths),
+        reference=_reference(question.reference, pipelines),
     )
+    study_run = StudyRun("evaluate", base, command)
+    lasers = list(CASES)
+    if asked.settings.lasers == "drawn":
+        refuse_fixed_laser(base)
+        lasers = [DRAWN]
+    shown_scenes, unreadable = scenes(base, asked.store, question.data, question.count, lasers)
     # one pipeline is enough: all have the same lens and sensor
     refuse_directions(bare_pipelines[0], shown_scenes)
-    final_pipelines, references = _equalled(asked_camera, bare_pipelines, reference, equal)
-    _report_scenes(shown_scenes, unreadable, strengths, final_pipelines, progress)
-    bench = EvaluationPoints(asked_camera.store, small, device)
-    measured = measure(asked_camera, bench, final_pipelines, shown_scenes, strengths)
-    laser_wavelengths = tuple(wavelengths(bare_pipelines[0], measured.scenes))
-    result = _result(
-        base,
-        strengths,
-        small,
-        references,
-        measured,
-        [composed_pipeline.pipeline for composed_pipeline in final_pipelines],
-        equal,
-        unreadable,
-        laser_wavelengths,
+    final_pipelines, references = _equalled(asked, bare_pipelines, question)
+    _report_scenes(shown_scenes, unreadable, question.strengths, final_pipelines, asked.progress)
+    bench = EvaluationPoints(asked.store, question.small, device)
+    measured = measure(asked, bench, final_pipelines, shown_scenes, question.strengths)
+    point_commands = PointCommands(asked.named, bench)
+    result = replace(
+        _result(base, question, measured, final_pipelines, references),
+        broken=[*unreadable, *measured.broken],
+        wavelengths=tuple(wavelengths(bare_pipelines[0], measured.scenes)),
+        commands=point_commands.commands(final_pipelines, measured.scenes, question.strengths),
     )
-    commands = PointCommands(recipe, changes, recipe_folder, bench).commands(
-        final_pipelines, measured.scenes, strengths
-    )
-    result = replace(result, commands=commands)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
 
 
-def read_settings(recipe: str, changes: Sequence[str | Override], folder: Path) -> EvaluateSettings:
-    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in
-    the recipe.
-    """
-    return base_recipe(recipe, changes, folder).evaluation or EvaluateSettings()
-
-
 def options_of(
-    settings: EvaluateSettings,
+    asked: AskedCamera,
     pipelines: str | Sequence[Pipeline] | None,
     scenes: int | None,
     reference: str,
     equal_protection: float | None,
     by: str | None,
-    folder: Path,
 ) -> dict[str, Any]:
-    """Return arguments of `evaluate`: those that are given, and else those of the settings of
-    the recipe.
+    """Return fields of `EvaluationQuestion`: those that are given, and else those of the settings
+    of the recipe.
     """
+    settings, folder = asked.settings, asked.named.folder
     pipelines_text = settings.pipelines if pipelines is None else pipelines
     written_at = (
         Location("evaluate.pipelines", 1, folder=str(folder)) if pipelines is None else None
@@ -197,16 +173,15 @@ def options_of(
 
 
 def _equalled(
-    asked: AskedCamera, bare: list[PipelineRecipes], reference: str, equal: EqualProtection | None
+    asked: AskedCamera, bare: list[PipelineRecipes], question: EvaluationQuestion
 ) -> tuple[list[PipelineRecipes], dict[str, str]]:
     """Return the pipelines, at equal protection if that was asked for, and the name of the
     reference of each.
     """
-    if equal is None:
+    reference = question.reference
+    if question.equal is None:
         return bare, dict.fromkeys((composed.name for composed in bare), reference)
-    shaded_pipelines = protect(
-        asked.recipe, asked.changes, bare, equal, asked.store, asked.folder, asked.progress
-    )
+    shaded_pipelines = protect(asked.named, bare, question.equal, asked.store, asked.progress)
     shaded_reference = {
         bare_pipeline.name: shaded_pipeline.name
         for bare_pipeline, shaded_pipeline in zip(bare, shaded_pipelines, strict=True)
@@ -222,22 +197,19 @@ def _equalled(
 
 def _result(
     base: Recipe,
-    strengths: tuple[float, ...],
-    small: int,
-    references: dict[str, str],
+    question: EvaluationQuestion,
     measured: Measured,
-    pipelines: Sequence[Pipeline],
-    equal: EqualProtection | None,
-    broken: Sequence[tuple[Path, str]],
-    waves: Sequence[float | None],
+    pipelines: Sequence[PipelineRecipes],
+    references: dict[str, str],
 ) -> EvaluationResult:
     """Return the result of an evaluation with its statistics over scenes."""
     photograph_numbers = photographs(measured.scenes)
     tables = {
-        name: metric_table(pipeline_metrics, strengths, photograph_numbers)
+        name: metric_table(pipeline_metrics, question.strengths, photograph_numbers)
         for name, pipeline_metrics in measured.points.items()
     }
     # the reduced pictures are no larger than the true picture
+    small = question.small
     if "truth" in base.steps:
         small = min(small, min(base.steps["truth"].params["shape"]))
     comparisons = {
@@ -247,8 +219,8 @@ def _result(
     return EvaluationResult(
         recipe=base,
         scenes=measured.scenes,
-        broken=[*broken, *measured.broken],
-        strengths=strengths,
+        broken=measured.broken,
+        strengths=question.strengths,
         small=small,
         references=references,
         points=measured.points,
@@ -256,10 +228,9 @@ def _result(
         against=comparisons,
         masks=measured.masks,
         panels=measured.panels,
-        pipelines=pipelines,
+        pipelines=[composed.pipeline for composed in pipelines],
         mistold=measured.mistold,
-        protection=equal,
-        wavelengths=waves,
+        protection=question.equal,
     )
 
 

@@ -187,7 +187,7 @@ def recipe_of_folder(
         # relative light is scaled so that a usual efficiency comes out
         scale = float(fit.efficiency) / _EFFICIENCY
     dark_exposures = len({level.exposure for level in levels.levels if level.dark})
-    model_text = _rest(
+    model_text = _estimate_steps(
         fit, float(fit.efficiency) / scale, dark_exposures, levels.light != "photons"
     )
     return _loaded(name, _read(folder, levels, scale, corrections) + model_text, changes)
@@ -242,7 +242,9 @@ def _described(file: Path, name: str, store: Store, changes: Sequence[str]) -> R
     fit = _fit(recipe, store)
     dark_exposures = len(set(levels.exposure[levels.photons == 0].tolist()))
     return _loaded(
-        name, measured_text + _rest(fit, float(fit.efficiency), dark_exposures, False), changes
+        name,
+        measured_text + _estimate_steps(fit, float(fit.efficiency), dark_exposures, False),
+        changes,
     )
 
 
@@ -311,7 +313,7 @@ def _level(level: FolderLevel, scale: float) -> str:
     )
 
 
-def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> str:
+def _estimate_steps(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> str:
     """Return the steps after the levels, with first estimates; ``times`` is the number of
     exposures of darks.
     """

@@ -250,7 +250,7 @@ def _light(row: Mapping[str, str], column: str) -> float | None:
 #: most difference of two frames: of their signal, and of the brightest signal
 _OFF, _FLOOR = 0.1, 0.01
 
-_CHANCE = 6.0  #: standard errors of a mean, added to the difference
+_CHANCE_ERRORS = 6.0  #: standard errors of a mean, added to the difference
 
 Files = tuple[str, bool, Sequence[Path]]  #: name of a level, True for a dark one, its files
 
@@ -290,10 +290,10 @@ def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
         allowed_difference = _OFF * (0.0 if dark else level_median - darkest) + _FLOOR * (
             brightest - darkest
         )
-        allowed_difference += _CHANCE * max(error for _, _, error in of_level)
+        allowed_difference += _CHANCE_ERRORS * max(error for _, _, error in of_level)
         frames = [(file, mean) for file, mean, _ in of_level]
         if _spread(frames) > allowed_difference:
-            yield _odd(frames, level_median, allowed_difference, folder)
+            yield _misfit_of_level(frames, level_median, allowed_difference, folder)
 
 
 def _of_kind(middles: Sequence[float], levels: Sequence[Files], dark: bool) -> list[float]:
@@ -311,7 +311,9 @@ def _spread(frames: Sequence[tuple[Path, float]]) -> float:
     return max(values) - min(values)
 
 
-def _odd(frames: Sequence[tuple[Path, float]], middle: float, room: float, folder: Path) -> str:
+def _misfit_of_level(
+    frames: Sequence[tuple[Path, float]], middle: float, room: float, folder: Path
+) -> str:
     """Return which frame of a level does not fit the others, or both of a pair."""
     values = [mean for _, mean in frames]
     if len(values) == 2:
@@ -364,11 +366,11 @@ NOT_READ = (
     ".mov",
 )
 _LOSSY = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp")
-_SHOWN = 3  #: files that a message names
+_FILES_SHOWN = 3  #: files that a message names
 #: lit levels: a gain, a bend, a twist and the lamp are told from fewer only by their priors
 _LIT = 4
-_HOW = """name files such as dark_10ms_1.png and lit_10ms_5000ph_1.png (exposure, photons of a
-pixel, number of the frame), or write a table frames.csv with the columns file, exposure and
+_HOW_TO_NAME = """name files such as dark_10ms_1.png and lit_10ms_5000ph_1.png (exposure, photons
+of a pixel, number of the frame), or write a table frames.csv with the columns file, exposure and
 photons, or light for light that is known up to a factor""".replace("\n", " ")
 
 Light = Literal["photons", "relative", "exposure"]  #: how the light of the levels is known
@@ -419,12 +421,12 @@ def find_levels(folder: Path, progress: Progress = silent) -> FolderLevels:
 
     Raises: `FolderRefused` with every reason why they are no measurement.
     """
-    frames, source, problems = _found(folder)
+    frames, source, problems = _read_folder(folder)
     unread_files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in NOT_READ)
     problems += [*_sizes(frames, folder), *_unknown(frames, folder)]
     if problems or not frames:
         raise FolderRefused("\n".join(problems or [_no_frames(folder, unread_files)]))
-    for line in (*_exposures(frames, folder), *_left(unread_files, folder)):
+    for line in (*_exposures(frames, folder), *_unread_line(unread_files, folder)):
         progress(line)
     light = _kind_of_light(frames)
     groups = _groups(frames, light)
@@ -443,7 +445,7 @@ def find_levels(folder: Path, progress: Progress = silent) -> FolderLevels:
 def _no_frames(folder: Path, unread: Sequence[Path]) -> str:
     """Return why a folder has no frames: it is empty, or its pictures are of other kinds."""
     if not unread:
-        return f"{folder}: no frames: {_HOW}"
+        return f"{folder}: no frames: {_HOW_TO_NAME}"
     kinds = "/".join(sorted({path.suffix.lower() for path in unread}))
     are_lossy = all(path.suffix.lower() in _LOSSY for path in unread)
     reason = (
@@ -454,7 +456,7 @@ def _no_frames(folder: Path, unread: Sequence[Path]) -> str:
     return (
         f"{_some(unread, folder)}: {kinds} cannot be calibrated: {reason}; save the raw frames of "
         "one channel as PNG "
-        f"or TIFF of 16 bits, FITS or NumPy, and {_HOW}"
+        f"or TIFF of 16 bits, FITS or NumPy, and {_HOW_TO_NAME}"
     )
 
 
@@ -484,13 +486,13 @@ def _readable(seconds: float) -> str:
     return f"{seconds / 1e-9:.6g} ns"
 
 
-def _left(unread: Sequence[Path], folder: Path) -> Iterator[str]:
+def _unread_line(unread: Sequence[Path], folder: Path) -> Iterator[str]:
     """Yield a line with the pictures of the folder that are of other kinds, if there are any."""
     if unread:
         yield f"not read: {_some(unread, folder)}"
 
 
-def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
+def _read_folder(folder: Path) -> tuple[list[Frame], str, list[str]]:
     """Return the frames of a folder, what told of them, and the problems of single files."""
     try:
         table = find_table(folder)
@@ -605,8 +607,8 @@ def _short(file: Path, folder: Path) -> str:
 
 def _some(files: Sequence[Path], folder: Path) -> str:
     """Return the names of the first files, and how many more there are."""
-    names = ", ".join(_short(file, folder) for file in files[:_SHOWN])
-    return names + f" and {len(files) - _SHOWN} more" * (len(files) > _SHOWN)
+    names = ", ".join(_short(file, folder) for file in files[:_FILES_SHOWN])
+    return names + f" and {len(files) - _FILES_SHOWN} more" * (len(files) > _FILES_SHOWN)
 
 
 def _sizes(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
@@ -635,7 +637,7 @@ def _sizes(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
 def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
     """Yield what is not known of the frames: exposures, darks, or the light of some."""
     if without_exposure := [frame.file for frame in frames if frame.exposure is None]:
-        yield f"{_some(without_exposure, folder)}: the exposure is unknown: {_HOW}"
+        yield f"{_some(without_exposure, folder)}: the exposure is unknown: {_HOW_TO_NAME}"
     lit_frames = [frame for frame in frames if not frame.dark]
     if frames and len(lit_frames) == len(frames):
         yield (
@@ -652,7 +654,7 @@ def _partly_known(name: str, lit: Sequence[Frame], folder: Path) -> Iterator[str
     if 0 < len(missing) < len(lit):
         yield (
             f"{_some(missing, folder)}: no {name}, which {len(lit) - len(missing)} other lit"
-            f" files have: {_HOW}"
+            f" files have: {_HOW_TO_NAME}"
         )
 
 
@@ -737,4 +739,4 @@ def _light_problems(levels: Sequence[FolderLevel], light: Light) -> Iterator[str
         return
     lit_exposures = [level.exposure for level in levels if not level.dark]
     if len(set(lit_exposures)) < len(lit_exposures):
-        yield f"the light of levels of one exposure is unknown: {_HOW}"
+        yield f"the light of levels of one exposure is unknown: {_HOW_TO_NAME}"

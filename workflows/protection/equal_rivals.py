@@ -187,8 +187,8 @@ def colour_shift(measures: FrontMeasures) -> float:
 WAYS = ("best", "filter", "stop")
 _LEAST_SAMPLES = 16  #: of the pupil, along the diameter of the smallest stop
 _HALVINGS = 12  #: of the interval in which the diameter of a stop is looked for
-_OPEN = 0.995  #: transmittance from which a filter is not named
-_RATIO = 0.85  #: between two diameters of stops
+_OPEN_FILTER = 0.995  #: transmittance from which a filter is not named
+_DIAMETER_RATIO = 0.85  #: between two diameters of stops
 
 
 class EqualProtection(NamedTuple):
@@ -214,7 +214,9 @@ class EqualShade:
         effect are left out.
         """
         stop = f" + stop {self.diameter:.3g}" if self.diameter < 1 else ""
-        return stop + (f" + filter {self.transmittance:.2g}" if self.transmittance < _OPEN else "")
+        return stop + (
+            f" + filter {self.transmittance:.2g}" if self.transmittance < _OPEN_FILTER else ""
+        )
 
     @property
     def brightness(self) -> float:
@@ -282,7 +284,7 @@ def best_diameter(camera: ProtectionCamera, store: Store, level: float, electron
     )
     usual_values, smallest = usual_condition(), stop_diameter(camera, level)
     # 40 steps are more than any pupil carries: from the open lens down
-    diameters = [_RATIO**step for step in range(40) if _RATIO**step > smallest]
+    diameters = [_DIAMETER_RATIO**step for step in range(40) if _DIAMETER_RATIO**step > smallest]
     fronts = [Front(True, diameter) for diameter in (*diameters, smallest)]
     measured = [bench.measure(front, usual_values) for front in fronts]
     candidates = [

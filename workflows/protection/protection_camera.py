@@ -134,7 +134,7 @@ _NEEDED = (
     "read[mask]",
     "well[mask]",
 )
-_LEAST_MASK = 0.9  #: laser suppression ratio above which a recipe has no mask to compare
+_NO_MASK_LSR = 0.9  #: laser suppression ratio above which a recipe has no mask to compare
 
 
 @dataclass(frozen=True)
@@ -340,7 +340,7 @@ def _refuse_unsuitable(recipe: Recipe) -> None:
 
 def refuse_no_mask(lsr: float) -> None:
     """Raise ValueError for a mask that lowers the peak too little to compare."""
-    if lsr > _LEAST_MASK:
+    if lsr > _NO_MASK_LSR:
         raise ValueError(
             f"the mask of this recipe lowers the peak of a laser to {lsr:.3g} only: choose a mask,"
             " such as doe=axicon"
@@ -448,7 +448,7 @@ class FrontBench:
         """
         camera, settings = self.camera, self.settings
         light_of_scene = camera.illuminant, camera.responses, camera.bands
-        assumed_psf, true_psf = self._known(front), self._psf(front, camera.bands, condition)
+        assumed_psf, true_psf = self._told_psf(front), self._psf(front, camera.bands, condition)
         true_channels = channel_psf(true_psf, *light_of_scene)
         assumed_channels = channel_psf(assumed_psf, *light_of_scene)
         spectrum = picture_spectrum(
@@ -495,7 +495,7 @@ class FrontBench:
             metrics.heat_ratio(psf, clear_psf, pixel_pitch=pitch, dwell=self.settings.dwell).max(),
         )
 
-    def _known(self, front: Front) -> Psf:
+    def _told_psf(self, front: Front) -> Psf:
         """Return the PSF that the filter knows, without the unknown conditions; it is computed
         once.
         """

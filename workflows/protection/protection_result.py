@@ -42,10 +42,11 @@ STRENGTHS = tuple(float(10.0**k) for k in np.arange(0, 9.76, 0.75))
 ATTACKED_AT = 300.0  #: e- a pixel
 SHOWN_AT = 30.0  #: e- a pixel, of the NEQ by frequency
 DRAWN = ("error", "NEQ", "text")  #: measures that are repeated for each draw
-_RATIO = 0.85  #: between two diameters of stops
+_DIAMETER_RATIO = 0.85  #: between two diameters of stops
 _MASK_STOPS = (1.0, 0.8, 0.6)
-_SMALL = (8, 8)  #: pixels of a PSF of which only the lens counts
-_HALF = 0.5  #: share of the information of the quiet frame below which a picture counts as lost
+_SMALL_PSF = (8, 8)  #: pixels of a PSF of which only the lens counts
+#: share of the information of the quiet frame below which a picture counts as lost
+_LOST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,9 @@ def _diameters(bench: FrontBench, own: float) -> list[float]:
     The best rival is often a stop without a filter, so that each wanted protection has such a stop.
     """
     stops_alone = {_stop_alone(bench, level) for level in (own, *LEVELS)}
-    series = {_RATIO**step for step in range(40) if _RATIO**step > min(stops_alone)}
+    series = {
+        _DIAMETER_RATIO**step for step in range(40) if _DIAMETER_RATIO**step > min(stops_alone)
+    }
     return sorted(stops_alone | series, reverse=True)
 
 
@@ -217,7 +220,7 @@ def _stop_alone(bench: FrontBench, level: float) -> float:
     if bench.settings.dwell is not None:
         # the heat of a spot goes with the third power of the diameter
         return math.pow(level, 1 / 3)
-    small_psf = bench.camera.psf(False, 1.0, bench.camera.laser_bands, shape=_SMALL)
+    small_psf = bench.camera.psf(False, 1.0, bench.camera.laser_bands, shape=_SMALL_PSF)
     return float(metrics.stop_diameter(small_psf, level).min())
 
 
@@ -325,14 +328,14 @@ def _attacks(
 
 
 def _crossing(share: Sequence[float]) -> float:
-    """Return the strength at which a share of information falls below `_HALF`, from the first to
-    the last strength.
+    """Return the strength at which a share of information falls below `_LOST_SHARE`, from the first
+    to the last strength.
     """
-    if share[0] < _HALF:
+    if share[0] < _LOST_SHARE:
         return float(STRENGTHS[0])
     for index in range(1, len(share)):
-        if share[index] < _HALF:
-            fraction = (share[index - 1] - _HALF) / (share[index - 1] - share[index])
+        if share[index] < _LOST_SHARE:
+            fraction = (share[index - 1] - _LOST_SHARE) / (share[index - 1] - share[index])
             # linear in the logarithm of the strength
             return float(
                 STRENGTHS[index - 1] * (STRENGTHS[index] / STRENGTHS[index - 1]) ** fraction

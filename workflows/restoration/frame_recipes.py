@@ -7,6 +7,7 @@ import re
 from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from neusee.nodes.sensor import FRAME_SUFFIXES
 from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
@@ -75,36 +76,45 @@ _WITH_PSF = {"restore=measured": "measured", "restore=search": "measured_search"
 _STEM = re.compile(r"[^\w-]+")
 
 
+class FrameCamera(NamedTuple):
+    """The camera that took frames, in the words of a user; empty for what the user does not say."""
+
+    camera: str  #: a recipe, or the file of a sensor group
+    mask: str = ""  #: an option of the group `doe`, or the file of a height map
+    psf: str = ""  #: a folder of frames of point sources, from which the PSF is measured
+
+
+class _CameraRecipe(NamedTuple):
+    """The recipe of a camera, the folder to which its paths are relative, and the words that
+    choose a sensor, a mask and a PSF.
+    """
+
+    name: str
+    folder: Path
+    words: list[Override]
+
+
 def recipes_of(
-    frames: Iterable[Path],
-    camera: str,
-    mask: str,
-    changes: Sequence[str],
-    folder: Path,
-    first: int,
-    psf: str = "",
+    frames: Iterable[Path], camera: FrameCamera, changes: Sequence[str], folder: Path, first: int
 ) -> list[Recipe]:
     """Return a checked recipe for each frame.
 
-    ``camera`` is a recipe or the file of a sensor group, ``mask`` an option of the group `doe`, a
-    file of a height map, or empty; ``changes`` are the overrides of the user, numbered from
-    ``first``; ``psf`` is a folder of frames of point sources, from which the PSF is measured, or
-    empty. Raises `RecipeError` with the mistakes of all frames, each mistake once.
+    ``changes`` are the overrides of the user, numbered from ``first``. Raises `RecipeError` with
+    the mistakes of all frames, each mistake once.
     """
-    recipe_name, recipe_folder, camera_words = _camera(camera, folder)
-    camera_words += _mask(mask, folder) + _psf(psf, changes, folder, first)
+    camera_recipe = _camera(camera.camera, folder)
+    camera_recipe.words.extend(_mask(camera.mask, folder))
+    camera_recipe.words.extend(_psf(camera.psf, changes, folder, first))
     frames, recipes, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
     # the choice of a restorer for a measured PSF is among the words already
     numbered_changes = [
         (number, text)
         for number, text in enumerate(changes, first)
-        if not psf or text not in _WITH_PSF
+        if not camera.psf or text not in _WITH_PSF
     ]
     for frame in frames:
         try:
-            recipes.append(
-                _one(frame, (recipe_name, recipe_folder, camera_words), numbered_changes, folder)
-            )
+            recipes.append(_recipe_of(frame, camera_recipe, numbered_changes, folder))
         except RecipeError as error:
             problems |= dict.fromkeys(error.diagnostics)
     if problems:
@@ -112,48 +122,38 @@ def recipes_of(
     return recipes
 
 
-def _one(
-    frame: Path,
-    camera: tuple[str, Path, Sequence[Override]],
-    changes: Sequence[tuple[int, str]],
-    folder: Path,
+def _recipe_of(
+    frame: Path, camera: _CameraRecipe, changes: Sequence[tuple[int, str]], folder: Path
 ) -> Recipe:
-    """Return the recipe that restores one frame.
-
-    `camera` is the name of its recipe, the folder of its paths, and the words that choose sensor,
-    mask and PSF. `changes` are the numbered words of the user.
-    """
-    recipe_name, recipe_folder, camera_words = camera
+    """Return the recipe that restores one frame; ``changes`` are the numbered words of the user."""
     overrides = [
         read_override(text, Location(f"argument {number}", folder=str(folder)))
         for number, text in changes
     ]
-    file = _said(
+    file = _program_word(
         "frame", f"frame.file={_quoted(frame)}", folder, shown_as=str(_near(frame, folder))
     )
     # the words of the user come last, so that they win
     recipe = load(
-        recipe_name,
-        [*_prepared(recipe_name, recipe_folder, overrides), *camera_words, file, *overrides],
-        recipe_folder,
+        camera.name,
+        [*_prepared(camera.name, camera.folder, overrides), *camera.words, file, *overrides],
+        camera.folder,
     )
-    title = f"The frame {frame.name}, restored with the camera {recipe_name}"
+    title = f"The frame {frame.name}, restored with the camera {camera.name}"
     return replace(recipe, name=f"restore_{_STEM.sub('_', frame.stem)}", title=title)
 
 
-def _camera(camera: str, folder: Path) -> tuple[str, Path, list[Override]]:
-    """Return the recipe of a camera, the folder to which its paths are relative, and the words
-    that choose a sensor.
-    """
+def _camera(camera: str, folder: Path) -> _CameraRecipe:
+    """Return the recipe of a camera, with the words that choose a sensor."""
     path = folder / Path(camera).expanduser()
     if (
         not camera.endswith((".yaml", ".yml"))
         or not path.is_file()
         or "steps" in (items := _items(path))
     ):
-        return camera, folder, []
+        return _CameraRecipe(camera, folder, [])
     if "sensor" not in items or ("defaults" in items and path.parent.name != "sensor"):
-        return camera, folder, []
+        return _CameraRecipe(camera, folder, [])
     if path.parent.name != "sensor" or path.suffix != ".yaml":
         message = (
             "the file has only a sensor: put it into a folder called sensor, as neusee new sensor"
@@ -161,10 +161,10 @@ def _camera(camera: str, folder: Path) -> tuple[str, Path, list[Override]]:
         )
         raise RecipeError([Diagnostic(Location("--camera"), camera, message)])
     words = [f"sensor={path.stem}", "doe=flat"]
-    return (
+    return _CameraRecipe(
         PLAIN_CAMERA,
         path.absolute().parent.parent,
-        [_said("--camera", word, folder) for word in words],
+        [_program_word("--camera", word, folder) for word in words],
     )
 
 
@@ -182,12 +182,13 @@ def _mask(mask: str, folder: Path) -> list[Override]:
     path = folder / Path(mask).expanduser()
     if path.is_file():
         return [
-            _said("--mask", word, folder) for word in ("doe=pixelwise", f"doe.file={_quoted(path)}")
+            _program_word("--mask", word, folder)
+            for word in ("doe=pixelwise", f"doe.file={_quoted(path)}")
         ]
     if path.suffix or "/" in mask:
         message = "no such file: give a height map, or the name of an option of the group doe"
         raise RecipeError([Diagnostic(Location("--mask"), mask, message)])
-    return [_said("--mask", f"doe={mask}", folder)]
+    return [_program_word("--mask", f"doe={mask}", folder)]
 
 
 def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Override]:
@@ -215,7 +216,7 @@ def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Ove
     points_text = "points.files=[" + ", ".join(map(_quoted, files)) + "]"
     # each word, with the text that messages show in its place
     words = [(f"restore={restorer}", ""), ("steps.level.from.psf=measured", ""), (points_text, psf)]
-    return [_said("--psf", word, folder, shown_as) for word, shown_as in words]
+    return [_program_word("--psf", word, folder, shown_as) for word, shown_as in words]
 
 
 def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
@@ -236,7 +237,7 @@ def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
         words.append("~expect")
     if "outputs" not in overridden:
         words.append("outputs=" + json.dumps(OUTPUTS))
-    return [_said("neusee restore", word, base) for word in words]
+    return [_program_word("neusee restore", word, base) for word in words]
 
 
 def _simulated_steps(root: Value) -> list[str]:
@@ -257,7 +258,7 @@ def _no_laser(groups: Container[str], blocks: Container[str]) -> list[str]:
     return [*words, "lasers={}"] if "lasers" in blocks else words
 
 
-def _said(where: str, text: str, folder: Path, shown_as: str = "") -> Override:
+def _program_word(where: str, text: str, folder: Path, shown_as: str = "") -> Override:
     """Return the override of a word that the program itself adds.
 
     Messages name `where` as its place, and `shown_as` as its text if given.

@@ -31,7 +31,7 @@ from neusee.workflows.recipe.distributions.law_text import ANGLE, Difference
 from neusee.workflows.recipe.distributions.shapes import draw_laws
 from neusee.workflows.recipe.uncertain_inputs import Index, Inputs, put_at
 
-_FAR = 4.5  #: standard deviations up to which the drawn values must be valid
+_FARTHEST_DRAW = 4.5  #: standard deviations up to which the drawn values must be valid
 _AXES = ("y", "x")
 _STREAM = (5, 4)  #: of the draws of a picture
 
@@ -79,7 +79,7 @@ class CameraMismatch:
         Until they are drawn, the true values are the probes, so that no step counts as one without
         effect.
         """
-        changed_names = {name for name in self.moved if _has(recipe, name)}
+        changed_names = {name for name in self.moved if _has_parameter(recipe, name)}
         if not changed_names:
             return recipe, psf
         camera_steps = set(needed(recipe, [FRAME]))
@@ -116,7 +116,9 @@ class CameraMismatch:
             if reader in theta:
                 values[reader] = theta[reader]
                 for index, path in inputs:
-                    true_value = self.differences[path].of(_at(theta[reader], index), drawn[path])
+                    true_value = self.differences[path].of(
+                        _element(theta[reader], index), drawn[path]
+                    )
                     values[reader] = put_at(values[reader], index, true_value)
         return values
 
@@ -187,7 +189,7 @@ def _inputs(recipe: Recipe, mismatch: Mapping[str, Difference]) -> Inputs | None
             difference.of(difference.own, float(difference.law.at(np.array(z))))
             for difference in mismatch.values()
         ]
-        for z in (-_FAR, _FAR)
+        for z in (-_FARTHEST_DRAW, _FARTHEST_DRAW)
     ]
     inputs.checked(np.array(extreme_values))
     return inputs
@@ -231,7 +233,7 @@ def _mistake(mismatch: Mapping[str, Difference], path: str, message: str) -> Rec
     return RecipeError([Diagnostic(mismatch[path].mark, f"{KEY}.mismatch.{path}", message)])
 
 
-def _has(recipe: Recipe, reader: str) -> bool:
+def _has_parameter(recipe: Recipe, reader: str) -> bool:
     step, _, param = reader.rpartition(".")
     return step in recipe.steps and param in recipe.steps[step].params
 
@@ -245,7 +247,7 @@ def _with(step: Step, param: str, value: Any) -> Step:
     return replace(step, params={**step.params, param: value})
 
 
-def _at(value: Any, index: Index) -> Any:
+def _element(value: Any, index: Index) -> Any:
     for key in index:
         value = value[key]
     return value

@@ -58,12 +58,12 @@ from neusee.workflows.training.recorded_inputs import (
     RecordedFile,
     RecordedInputs,
 )
-from neusee.workflows.training.resumable_loop import Progress, StateFile
+from neusee.workflows.training.resumable_loop import Progress, StateFile, TrainingSession
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
 #: files of the program that decide the loss and the steps of the optimisers
-_OPTIMISES = (
+_PROGRAM_FILES = (
     "design_terms",
     "mask_optimisers",
     "design_run",
@@ -118,15 +118,7 @@ def designed(folder: Path) -> bool:
     return (folder / "mask.json").is_file()
 
 
-def design_in(
-    folder: Path,
-    recipe: Recipe,
-    training: Training,
-    store: Store,
-    command: Sequence[str],
-    progress: Progress,
-    device: str,
-) -> None:
+def design_in(folder: Path, recipe: Recipe, training: Training, session: TrainingSession) -> None:
     """Design a mask in the folder of a training, or continue a stopped design.
 
     Raises `DesignError` as `design` does; ValueError if stage 1 has begun to train a mask, or no
@@ -137,7 +129,7 @@ def design_in(
             "train.learn is missing: write the name of the step whose mask is designed"
         )
     if designed(folder):
-        progress("the mask is already designed")
+        session.progress("the mask is already designed")
         return
     if (folder / "state.pt").exists():
         raise ValueError(
@@ -146,7 +138,10 @@ def design_in(
         )
     state = StateFile(folder / "mask.state")
     files = RunFolder(folder, {"began": timestamp()})
-    DesignedMask.of(recipe, training.design, store, state, progress, device).write(files, command)
+    mask = DesignedMask.of(
+        recipe, training.design, session.store, state, session.progress, session.device
+    )
+    mask.write(files, session.command)
     state.path.unlink(missing_ok=True)
     write_crate(folder, folder.name, files.said)
 
@@ -175,7 +170,7 @@ class DesignedMask:
         """Optimise a mask, or continue from the checkpoint ``state``, and compute the figures of
         merit of the mask.
         """
-        design_terms = Terms(_at(recipe, settings), settings, store, device)
+        design_terms = Terms(_during_design(recipe, settings), settings, store, device)
         progress(f"fabrication: {Fabrication.of(recipe, settings)}")
         optimise = evolve if design_terms.settings.kind == "five_half_rings" else descend
         learnt = optimise(design_terms, state, progress)
@@ -188,7 +183,7 @@ class DesignedMask:
         if learnt.diameter is not None:
             progress(f"learnt stop: {learnt.diameter:.3g} of the diameter of the lens")
         if figures["protected"]:
-            progress(line(figures["protected"]))
+            progress(stop_line(figures["protected"]))
         return cls(full_terms, learnt, height, figures)
 
     def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
@@ -228,7 +223,7 @@ class DesignedMask:
 
         terms, history = self.terms, self.learnt.history
         with torch.no_grad():
-            drawings = pictures(terms, self.height.to(terms.device), self.learnt)
+            drawings = design_pictures(terms, self.height.to(terms.device), self.learnt)
         header = list(dict.fromkeys(chain.from_iterable(history)))
         tables = {
             "history.csv": (header, [[row.get(name, "") for name in header] for row in history])
@@ -237,7 +232,7 @@ class DesignedMask:
             f"{terms.recipe.name}: a mask designed without images",
             summary_line(self.figures),
         )
-        page_sections = sections(self.figures, terms.fabrication, drawings)
+        page_sections = design_sections(self.figures, terms.fabrication, drawings)
         size_facts = size_metadata(float(terms.stop.pitch))
         files = {"mask.safetensors": save({"height": self.height}, size_facts)}
         return StudyReport(
@@ -263,7 +258,7 @@ def _full(
     )
 
 
-def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
+def _during_design(recipe: Recipe, settings: MaskTraining) -> Recipe:
     """Return the recipe with the parameters that apply only during a mask optimisation, such as
     coarser sampling.
     """
@@ -288,13 +283,15 @@ def design_inputs(recipe: Recipe, settings: MaskTraining, code: Code) -> Recorde
     if settings.at:
         # values under `at` give the design a second recipe
         camera = camera.joined(
-            CameraInputs.of(_at(recipe, settings), outputs, code).named("in the design: ")
+            CameraInputs.of(_during_design(recipe, settings), outputs, code).named(
+                "in the design: "
+            )
         )
     design_settings = settings.model_dump(mode="json", exclude={"save_every", "start", "at"})
     node_digests = {module: code.digest(module) for module in sorted(_LEARNT_WITH)}
     folder = Path(__file__).parent
     program_files = {
-        f"neusee/workflows/training/{name}.py": folder / f"{name}.py" for name in _OPTIMISES
+        f"neusee/workflows/training/{name}.py": folder / f"{name}.py" for name in _PROGRAM_FILES
     }
     return RecordedInputs(
         kind="mask",
@@ -365,10 +362,10 @@ def summary_line(figures: Mapping[str, Any]) -> str:
 # the same limit.
 
 
-_LIGHTS = (10.0, 30.0, 100.0, 300.0, 1000.0)  #: e- in a pixel, beside that of the design
+_SCENE_LIGHTS = (10.0, 30.0, 100.0, 300.0, 1000.0)  #: e- in a pixel, beside that of the design
 # the figures are natural logarithms of ratios of powers
 _DECIBELS = 10 / math.log(10)
-_COLUMNS = (
+_STOP_COLUMNS = (
     "light (e-)",
     "error, mask (dB)",
     "error, stop (dB)",
@@ -402,8 +399,11 @@ def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
             **terms.passed(),
             "limit": None if peak_limit is None else peak_limit * peaks[0] / highest_peak,
         }
-        lights = sorted({*_LIGHTS, exposure["light"]})
-        rows = [_row(terms, psf, {**exposure, "light": light}, mask_exposure) for light in lights]
+        lights = sorted({*_SCENE_LIGHTS, exposure["light"]})
+        rows = [
+            _against_best_stop(terms, psf, {**exposure, "light": light}, mask_exposure)
+            for light in lights
+        ]
     # a pupil without a shade has no stop of its own
     stop = 1.0 if terms.shade is None else terms.recipe.steps[terms.shade.step].params["diameter"]
     return {
@@ -415,7 +415,9 @@ def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
     }
 
 
-def _row(terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]) -> dict[str, float]:
+def _against_best_stop(
+    terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]
+) -> dict[str, float]:
     """Return error and information of a mask, and of the best stop, at one light of the scene.
 
     `own` has the parameters of the mask: its transmittance, and a limit lowered by what is
@@ -432,7 +434,7 @@ def _row(terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]) 
     return row
 
 
-def section(facts: dict[str, Any]) -> Section:
+def stop_section(facts: dict[str, Any]) -> Section:
     """Return the section of the report page that compares a mask with the best stop at the same
     peak limit.
     """
@@ -461,10 +463,10 @@ def section(facts: dict[str, Any]) -> Section:
         more_bits = Marked(mask_bits - stop_bits, "pass" if mask_bits > stop_bits else "fail")
         last_cells = (row["stop"], row["filter of the stop"], mask_bits, stop_bits, more_bits)
         table_rows.append((row["light"], mask_decibels, stop_decibels, gain, *last_cells))
-    return Section("Behind a peak limit", text, _COLUMNS, table_rows)
+    return Section("Behind a peak limit", text, _STOP_COLUMNS, table_rows)
 
 
-def line(facts: dict[str, Any]) -> str:
+def stop_line(facts: dict[str, Any]) -> str:
     """Return the gain of a mask over the best stop by light of the scene as a line of text."""
     gains = ", ".join(
         f"{_DECIBELS * (row['filtered_error of the stop'] - row['filtered_error']):+.2f} dB at"
@@ -492,7 +494,7 @@ _DESIGN_COLUMNS = (
 )
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, BLACK, "#CC79A7", "#56B4E9", "#777777")
 _STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
-_NAMES = (
+_TERM_NAMES = (
     "lsr",
     "energy_floor",
     "bsr",
@@ -503,7 +505,7 @@ _NAMES = (
 )
 
 
-def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, bytes]:
+def design_pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, bytes]:
     """Draw the height map, PSF, laser suppression and losses of a designed mask, and return the
     PNG files by name.
     """
@@ -517,11 +519,11 @@ def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, byte
             lsr=metrics.lsr(psf), bands=terms.bands, psf=psf, bsr=bsr
         ),
     }
-    return drawings | ({"history": history(learnt.history)} if learnt.history else {})
+    return drawings | ({"history": history_figure(learnt.history)} if learnt.history else {})
 
 
 @drawn
-def history(rows: Sequence[Mapping[str, float]]) -> Any:
+def history_figure(rows: Sequence[Mapping[str, float]]) -> Any:
     """Draw the loss of a mask design and the loss terms over the iterations, with a curve for
     each optimisation.
     """
@@ -561,14 +563,17 @@ def _draw_term(
     )
 
 
-def sections(
+def design_sections(
     figures: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]
 ) -> list[Section]:
     """Return the sections of the report page of a designed mask: pictures, figures of merit and
     fabrication limits.
     """
     bands = figures["bands"]
-    columns = [[1e9 * value for value in bands["wavelength"]], *(bands[name] for name in _NAMES)]
+    columns = [
+        [1e9 * value for value in bands["wavelength"]],
+        *(bands[name] for name in _TERM_NAMES),
+    ]
     bounds = (
         "`even light` is the LSR of light that is spread evenly over the window of the PSF. The sum"
         " of the squares of a PSF equals the sum of the squares of its contrast (Parseval), so that"
@@ -591,7 +596,7 @@ def sections(
         Section("By wavelength", bounds, _DESIGN_COLUMNS, list(zip(*columns, strict=True))),
     ]
     if figures["protected"]:
-        page_sections.insert(1, section(figures["protected"]))
+        page_sections.insert(1, stop_section(figures["protected"]))
     if "history" in shown:
         text = (
             "The loss is the weighted sum of its terms. Each term is a mean over the bands of an"

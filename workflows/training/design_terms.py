@@ -26,7 +26,7 @@ from neusee.workflows.store.result_store import Store
 
 # a prime above any number of iterations keeps the seeds of all draws apart
 _PRIME = 1_000_003
-_FAR = 3**0.5  #: standard deviations at which the outer points of a law lie
+_OUTER_POINT = 3**0.5  #: standard deviations at which the outer points of a law lie
 
 #: defocus, wavelength, direction on y and on x, in standard deviations
 State = tuple[float, float, float, float]
@@ -118,7 +118,7 @@ class CameraLaws:
         # unscented points: the centre, and sqrt(3) standard deviations up and down each axis
         points = [(NOMINAL, 1 - len(uncertain) / 3)]
         for position in uncertain:
-            for distance in (-_FAR, _FAR):
+            for distance in (-_OUTER_POINT, _OUTER_POINT):
                 state = [0.0] * len(self.spreads)
                 state[position] = distance
                 points.append(((state[0], state[1], state[2], state[3]), 1 / 6))

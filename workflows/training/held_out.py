@@ -168,8 +168,8 @@ class Validation:
             picture = sample.picture.to(self.device)
             truth = sample.truth.to(self.device)
             for source, estimate in (("held_out", net(picture, *sample.given)), ("input", picture)):
-                # as `_by_photograph` and `summary` read it: the number of the picture, a space, the
-                # column
+                # as `means_by_photograph` and `summary` read it: the number of the picture, a
+                # space, the column
                 numbers |= {
                     f"{i} {source}_{name}": x for name, x in _quality(estimate, truth).items()
                 }
@@ -177,7 +177,7 @@ class Validation:
         repeats, count = samples.repeats, len(self.photographs)
         names = [f"{i} {name}" for i, name in product(range(count * repeats), _OF_PICTURE)]
         return summary(
-            _by_photograph(self.mesh.numbers(numbers, names, self.device), repeats), count
+            means_by_photograph(self.mesh.numbers(numbers, names, self.device), repeats), count
         )
 
     def _pictures(
@@ -203,7 +203,7 @@ class Validation:
         self._kept = pictures if fixed else None
 
 
-def _by_photograph(numbers: Mapping[str, float], repeats: int) -> dict[str, float]:
+def means_by_photograph(numbers: Mapping[str, float], repeats: int) -> dict[str, float]:
     """Return the means over the ``repeats`` pictures of a photograph, from numbers named such as
     ``0 held_out_PSNR``.
     """
@@ -324,7 +324,7 @@ def score_of(losses: Losses) -> float:
     return float(f"{losses[_SCORE]:.6g}")
 
 
-def said(losses: Losses, better: bool) -> str:
+def validation_line(losses: Losses, better: bool) -> str:
     """Return one line of text about a validation."""
 
     def shown(name: str) -> str:

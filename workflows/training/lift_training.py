@@ -49,9 +49,8 @@ from neusee.workflows.training.recorded_inputs import (
 from neusee.workflows.training.resumable_loop import (
     DOCUMENT,
     Losses,
-    Progress,
     ResumableLoop,
-    Watch,
+    TrainingSession,
     averaged,
     export,
     require_finite,
@@ -201,7 +200,7 @@ def _rmse(estimate: Tensor, truth: Tensor) -> float:
 
 
 _SHOWN = ("MRAE", "RMSE", "rate")
-_LOOKS = {"mst_plus_plus": {"color": BLUE}, "linear": {"color": ORANGE, "linestyle": "--"}}
+_LINE_LOOKS = {"mst_plus_plus": {"color": BLUE}, "linear": {"color": ORANGE, "linestyle": "--"}}
 
 
 @drawn
@@ -254,7 +253,7 @@ def lifted_spectra(
                 cube[:, row, column].cpu().numpy(),
                 linewidth=1.2,
                 label=name,
-                **_LOOKS[name],
+                **_LINE_LOOKS[name],
             )
         ax.set_title(f"pixel {number}")
         ax.set_ylim(bottom=0)
@@ -275,21 +274,13 @@ def lifted_spectra(
 
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
 #: files of the program that decide the pairs and the steps of the optimiser
-_PROGRAM = {
+_PROGRAM_FILES = {
     "neusee/workflows/training/lift_training.py": __file__,
     "neusee/workflows/training/resumable_loop.py": resumable_loop.__file__,
 }
 
 
-def train_lift(
-    recipe: Recipe,
-    store: Store,
-    runs: Path,
-    command: Sequence[str],
-    progress: Progress,
-    device: str = "cpu",
-    watch: Watch | None = None,
-) -> Path:
+def train_lift(recipe: Recipe, session: TrainingSession) -> Path:
     """Train the network MST++ to estimate spectra from RGB, or continue a stopped training; return
     the result folder.
 
@@ -304,16 +295,14 @@ def train_lift(
         raise ValueError(
             f"{recipe.name} has no block `train_lift`: start from the recipe train_lift"
         )
-    pairs = Pairs(recipe, settings, store, device)
-    code = Code(store.code_memo)
+    pairs = Pairs(recipe, settings, session.store, session.device)
+    code = Code(session.store.code_memo)
     inputs = lift_inputs(recipe, settings, code)
     code.save()
-    folder = folder_of(runs, recipe.name, inputs)
-    prepare_folder(folder, inputs, recipe, store, progress)
-    learner = LiftLearner(settings, pairs, recipe.seed, device)
-    _LiftLoop(settings, learner, inputs, folder, progress, device, watch).run_to_end(
-        recipe, command
-    )
+    folder = folder_of(session.runs, recipe.name, inputs)
+    prepare_folder(folder, inputs, recipe, session.store, session.progress)
+    learner = LiftLearner(settings, pairs, recipe.seed, session.device)
+    _LiftLoop(settings, learner, inputs, folder, session).run_to_end(recipe)
     return folder
 
 
@@ -325,7 +314,7 @@ def lift_inputs(recipe: Recipe, settings: LiftTraining, code: Code) -> RecordedI
         f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}")
         for name in ("losses", "spectra")
     }
-    program_files = {name: Path(file).read_bytes() for name, file in _PROGRAM.items()}
+    program_files = {name: Path(file).read_bytes() for name, file in _PROGRAM_FILES.items()}
     return RecordedInputs(
         kind="lift",
         recipe=recipe.name,
@@ -349,17 +338,13 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         learner: LiftLearner,
         inputs: RecordedInputs,
         folder: Path,
-        progress: Progress,
-        device: str,
-        watch: Watch | None,
+        session: TrainingSession,
     ) -> None:
-        super().__init__(
-            folder, settings, learner, _COLUMNS, progress, device, watch, inputs=inputs.digest
-        )
+        super().__init__(folder, settings, learner, _COLUMNS, session, inputs.digest)
         self.settings = settings
         self.resume()
 
-    def run_to_end(self, recipe: Recipe, command: Sequence[str]) -> None:
+    def run_to_end(self, recipe: Recipe) -> None:
         """Train the network to the last iteration, and write the results; do nothing if the
         training is finished.
         """
@@ -372,7 +357,6 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         self.close(
             lift_curves(self.rows.rows),
             recipe.name,
-            command,
             train_lift=self.settings.model_dump(mode="json"),
             reflectances=len(self.learner.pairs.measured),
             judged=self.learner.validate(),

@@ -168,7 +168,9 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
     best = shape_of(terms, state["best"]["start"])
     best.load_state_dict(state["best"]["shape"])
     diameter = float(best.round.diameter().detach()) if isinstance(best, Stopped) else None
-    return LearntMask(best, state["best"]["loss"], _few(best), state["history"], diameter)
+    return LearntMask(
+        best, state["best"]["loss"], _parameters_by_name(best), state["history"], diameter
+    )
 
 
 def _one_start(
@@ -240,7 +242,7 @@ def _losses_line(row: dict[str, float]) -> str:
     )
 
 
-def _few(shape: nn.Module) -> dict[str, Any]:
+def _parameters_by_name(shape: nn.Module) -> dict[str, Any]:
     """Return the parameters of a mask as lists by name, without matrices and vectors of more
     than 1000 numbers.
     """

@@ -406,11 +406,11 @@ def _photographs(old: RecordedInputs, new: RecordedInputs) -> Iterator[str]:
     is no change.
     """
     files_before, files_after = [*old.photographs, *old.held_out], [*new.photographs, *new.held_out]
-    new_names = [photograph.name for photograph in _beyond(files_after, files_before)]
-    gone_names = [photograph.name for photograph in _beyond(files_before, files_after)]
+    new_names = [photograph.name for photograph in _unmatched(files_after, files_before)]
+    gone_names = [photograph.name for photograph in _unmatched(files_before, files_after)]
     yield from _came_and_went(new_names, gone_names)
     same_files = not new_names and not gone_names
-    if same_files and _beyond(new.held_out, old.held_out):
+    if same_files and _unmatched(new.held_out, old.held_out):
         yield "other photographs are held out"
 
 
@@ -422,7 +422,7 @@ def _came_and_went(came: Sequence[str], went: Sequence[str]) -> Iterator[str]:
     yield from (f"photograph {name} is gone" for name in went if name not in changed)
 
 
-def _beyond(files: Sequence[RecordedFile], others: Sequence[RecordedFile]) -> list[RecordedFile]:
+def _unmatched(files: Sequence[RecordedFile], others: Sequence[RecordedFile]) -> list[RecordedFile]:
     """Return the files whose content the others do not have, each as often as it is missing
     there.
     """

@@ -23,6 +23,8 @@ from neusee.nodes.input_files import lines_of
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
 from neusee.workflows.report.run_crate import remove_crate, write_crate
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.process_mesh import ALONE, Mesh
 
 # --- checkpoint -----------------------------------------------------------------------------------
 
@@ -30,8 +32,8 @@ from neusee.workflows.report.run_crate import remove_crate, write_crate
 
 
 _FORMAT = 1  #: format of a state; a state of another format is refused
-_CELLS = 24.0  #: bytes in memory for each byte of a table of losses
-_NAMES = {"relief": "mask"}  #: names in a state of version 0.1, with the present names
+_BYTES_OF_TABLE = 24.0  #: bytes in memory for each byte of a table of losses
+_PRESENT_NAMES = {"relief": "mask"}  #: names in a state of version 0.1, with the present names
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -79,7 +81,8 @@ class StateFile:
                 raise ValueError(f"the training state has format {state['edition']}, not {_FORMAT}")
             if "parts" in state:
                 state["parts"] = {
-                    _NAMES.get(name, name): member for name, member in state["parts"].items()
+                    _PRESENT_NAMES.get(name, name): member
+                    for name, member in state["parts"].items()
                 }
         except (
             RuntimeError,
@@ -111,7 +114,7 @@ class Rows:
         later iterations.
         """
         if self._path.exists():
-            lines = csv.DictReader(lines_of(self._path, _CELLS))
+            lines = csv.DictReader(lines_of(self._path, _BYTES_OF_TABLE))
             self.rows = [row for row in lines if _place(row) < (stage, iteration)]
         self._kept = 0
         if write:
@@ -181,6 +184,27 @@ Watch = Callable[[int, int, Mapping[str, float]], None]
 DOCUMENT = "training.json"  #: the file that a training writes last
 
 
+@dataclass(frozen=True)
+class TrainingSession:
+    """One start of a training: where it computes and writes, and whom it tells of its progress.
+
+    Nothing in it changes a trained network, but for rounding.
+    """
+
+    store: Store
+    runs: Path  #: folder in which each training has a folder of its own
+    progress: Progress
+    command: Sequence[str] = ()  #: that started it, for the document of the training
+    device: str = "cpu"
+    watch: Watch | None = None
+    mesh: Mesh = ALONE
+
+    @property
+    def writes(self) -> bool:
+        """Return True in the only process that writes files and tells of the progress."""
+        return self.mesh.first
+
+
 class NotFinite(ArithmeticError):
     """Error for a loss or a gradient that is NaN or infinite."""
 
@@ -199,8 +223,7 @@ class ResumableLoop(ABC, Generic[L]):
     """A training loop that writes a checkpoint, a table of losses, pictures and a final document
     into a folder.
 
-    Among several processes, only the process with ``writes`` writes files. A training without
-    stages is in stage 0.
+    Among several processes, only the first writes files. A training without stages is in stage 0.
     """
 
     def __init__(
@@ -209,19 +232,12 @@ class ResumableLoop(ABC, Generic[L]):
         settings: Training | LiftTraining,
         learner: L,
         columns: Sequence[str],
-        progress: Progress,
-        device: str,
-        watch: Watch | None,
-        writes: bool = True,
+        session: TrainingSession,
         inputs: str = "",
     ) -> None:
-        self.folder, self.learner, self.progress, self.device = folder, learner, progress, device
-        self.keep_every, self.show_every, self.watch, self.writes = (
-            settings.keep,
-            settings.show,
-            watch,
-            writes,
-        )
+        self.folder, self.learner, self.session = folder, learner, session
+        self.progress, self.device, self.writes = session.progress, session.device, session.writes
+        self.keep_every, self.show_every = settings.keep, settings.show
         self.rows, self.state = Rows(folder / "losses.csv", columns), StateFile(folder / "state.pt")
         self.stage, self.iteration, self.batch, self.began = 0, 0, 1, timestamp()
         self.inputs = inputs  #: digest of all that decides the training
@@ -322,8 +338,8 @@ class ResumableLoop(ABC, Generic[L]):
 
     def note(self, losses: Losses) -> None:
         """Pass the losses of the last training iteration to the callback function ``watch``."""
-        if self.watch is not None:
-            self.watch(self.stage, self.iteration, losses)
+        if self.session.watch is not None:
+            self.session.watch(self.stage, self.iteration, losses)
 
     def keep(self) -> None:
         """Write the loss table of a training to disk, and then the checkpoint.
@@ -340,7 +356,7 @@ class ResumableLoop(ABC, Generic[L]):
         (self.folder / "pictures").mkdir(exist_ok=True)
         write_whole(self.folder / "pictures" / f"{name}.png", picture)
 
-    def close(self, curves: bytes, recipe: str, command: Sequence[str], **facts: Any) -> None:
+    def close(self, curves: bytes, recipe: str, **facts: Any) -> None:
         """Write the loss curves, and then the document with the settings and the results of the
         training.
         """
@@ -348,7 +364,7 @@ class ResumableLoop(ABC, Generic[L]):
         write_whole(self.folder / "curves.png", curves)
         seconds = sum(float(row["seconds"]) for row in self.rows.rows)
         document = {
-            "command": list(command),
+            "command": list(self.session.command),
             "recipe": recipe,
             **facts,
             "seconds": seconds,

@@ -28,7 +28,7 @@ from neusee.workflows.training import held_out
 from neusee.workflows.training.camera_mismatch import CameraMismatch
 from neusee.workflows.training.design_run import MASK, design_in, design_inputs, designed
 from neusee.workflows.training.held_out import Best, Split, Validation
-from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
+from neusee.workflows.training.process_mesh import Mesh, MeshError
 from neusee.workflows.training.recorded_inputs import (
     CAMERA,
     CameraInputs,
@@ -39,14 +39,13 @@ from neusee.workflows.training.recorded_inputs import (
 )
 from neusee.workflows.training.resumable_loop import (
     Losses,
-    Progress,
     ResumableLoop,
-    Watch,
+    TrainingSession,
     export,
 )
 from neusee.workflows.training.training_iteration import Learner, WarmStart
 from neusee.workflows.training.training_page import curves, png, strip, write_page
-from neusee.workflows.training.training_pictures import require_alone, samples_of
+from neusee.workflows.training.training_pictures import PictureSource, require_alone, samples_of
 
 # --- run training ---------------------------------------------------------------------------------
 
@@ -73,17 +72,7 @@ _COLUMNS = (
 )
 
 
-def train(
-    recipe: Recipe,
-    store: Store,
-    runs: Path,
-    command: Sequence[str],
-    progress: Progress,
-    stages: Sequence[int] = (1, 2),
-    device: str = "cpu",
-    watch: Watch | None = None,
-    mesh: Mesh = ALONE,
-) -> Path:
+def train(recipe: Recipe, session: TrainingSession, stages: Sequence[int] = (1, 2)) -> Path:
     """Train mask and restoration network in stages, or continue a stopped training, and return the
     result folder.
 
@@ -104,21 +93,20 @@ def train(
             f"{recipe.name} has no block `train`: add `train: recommended` to its defaults"
         )
     with_pictures = [number for number in stages if number != MASK]
-    _require_fitting_mesh(recipe, settings, stages, mesh)
+    _require_fitting_mesh(recipe, settings, stages, session.mesh)
     CameraMismatch.of(recipe, settings)  # raises its mistakes before any work
-    if not mesh.first:
-        # only the first process prints
-        progress, watch = (lambda line: None), None
-    begun = BegunTraining.of(recipe, settings, store, runs, bool(with_pictures))
+    if not session.writes:
+        session = replace(session, progress=lambda line: None, watch=None)
+    begun = BegunTraining.of(recipe, settings, session.store, session.runs, bool(with_pictures))
     folder = begun.folder
-    if mesh.first:
-        prepare_folder(folder, begun.inputs, recipe, store, progress)
+    if session.writes:
+        prepare_folder(folder, begun.inputs, recipe, session.store, session.progress)
     if MASK in stages:
-        design_in(folder, recipe, settings, store, command, progress, device)
+        design_in(folder, recipe, settings, session)
     if with_pictures:
-        loop = _TrainingLoop(recipe, settings, begun, store, progress, device, watch, mesh)
+        loop = _TrainingLoop(recipe, settings, begun, session)
         with loop.board or nullcontext():
-            loop.run_stages(with_pictures, command)
+            loop.run_stages(with_pictures)
     return folder
 
 
@@ -198,42 +186,21 @@ class _TrainingLoop(ResumableLoop[Learner]):
         recipe: Recipe,
         settings: Training,
         begun: BegunTraining,
-        store: Store,
-        progress: Progress,
-        device: str,
-        watch: Watch | None,
-        mesh: Mesh,
+        session: TrainingSession,
     ) -> None:
         folder, photograph_split, warm_start = begun.folder, begun.parts, begun.start
+        mesh, progress = session.mesh, session.progress
         self.designed = designed(folder)
-        learner = Learner(recipe, settings, device, self.designed, mesh, warm_start)
+        learner = Learner(recipe, settings, session.device, self.designed, mesh, warm_start)
         require_exports(learner.net, settings)
-        super().__init__(
-            folder,
-            settings,
-            learner,
-            _COLUMNS,
-            progress,
-            device,
-            watch,
-            mesh.first,
-            begun.inputs.digest,
+        super().__init__(folder, settings, learner, _COLUMNS, session, begun.inputs.digest)
+        self.recipe, self.settings, self.mesh = recipe, settings, mesh
+        self.split = photograph_split
+        self.source = PictureSource(
+            photograph_split.trained, session.store, session.device, mesh, photograph_split.judged
         )
-        self.recipe, self.settings, self.split, self.store = (
-            recipe,
-            settings,
-            photograph_split,
-            store,
-        )
-        self.photographs, self.validation = (
-            photograph_split.trained,
-            Validation(photograph_split, mesh, device),
-        )
-        self.mesh, self.stage, self.best = (
-            mesh,
-            2 if self.designed else min(settings.learnt),
-            Best(),
-        )
+        self.validation, self.best = Validation(photograph_split, mesh, session.device), Best()
+        self.stage = 2 if self.designed else min(settings.learnt)
         self.start = warm_start
         self.read_again = UnchangedFiles.of(
             [*photograph_split.trained.paths, *photograph_split.judged]
@@ -262,7 +229,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
             self.settings.stages.get(self.stage, Stage(iterations=0)), self.stage == 1
         )
 
-    def run_stages(self, stages: Sequence[int], command: Sequence[str]) -> None:
+    def run_stages(self, stages: Sequence[int]) -> None:
         """Run the given stages of the training (1: mask and network, 2: network alone), and
         write the results.
         """
@@ -288,7 +255,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
             if number == self.stage:
                 self._run_stage()
         if self.rows.rows and self.writes:
-            self._close(command)
+            self._close()
 
     @property
     def _iterations_of_all_stages(self) -> int:
@@ -309,8 +276,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         fixed_recipe = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
         if fixed_recipe is not None:
             self._require_same_mask()
-        pictures_of = self.recipe, self.settings, self.photographs, self.store, self.device
-        self.samples = samples_of(*pictures_of, fixed_recipe, self.mesh, self.split.judged)
+        self.samples = samples_of(self.recipe, self.settings, self.source, fixed_recipe)
         self.best = Best.of(self.rows.rows, self.stage)
         self.run(self._length, self.settings.stages[self.stage].batch)
         if counts := self.samples.pool_counts:
@@ -384,7 +350,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
                 self.folder, "best", network.stored.state_dict(), file_metadata(self.learner.net)
             )
         self.progress(
-            f"stage {self.stage}, iteration {iterations}: {held_out.said(losses, is_best)}"
+            f"stage {self.stage}, iteration {iterations}:"
+            f" {held_out.validation_line(losses, is_best)}"
         )
         return losses
 
@@ -453,17 +420,17 @@ class _TrainingLoop(ResumableLoop[Learner]):
             return "the recipe's own"
         return "designed without images" if self.designed else "learnt in stage 1"
 
-    def _close(self, command: Sequence[str]) -> None:
+    def _close(self) -> None:
         """Write the exports, the page and the document of the training."""
         rows, loss_curves = self.rows.rows, curves(self.rows.rows)
         facts: dict[str, Any] = {
             "mask": self._mask_source,
             "train": self.settings.model_dump(mode="json"),
-            "photographs": len(self.photographs.paths),
+            "photographs": len(self.split.trained.paths),
             **held_out.facts(self.split, rows, self.settings.patience),
             "mesh": str(self.mesh),
             **({"start": self.start.facts} if self.start else {}),
-            "broken": {str(path): reason for path, reason in self.photographs.broken.items()},
+            "broken": {str(path): reason for path, reason in self.split.trained.broken.items()},
             "iterations": {
                 str(stage): sum(int(r["stage"]) == stage for r in rows)
                 for stage in self.settings.stages
@@ -472,7 +439,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         }
         write_exports(self.folder, self.learner.net, self.settings)
         write_page(self.folder, self.recipe.name, rows, loss_curves, facts)
-        self.close(loss_curves, self.recipe.name, command, **facts)
+        self.close(loss_curves, self.recipe.name, **facts)
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:

@@ -332,9 +332,9 @@ class Learner:
             samples.batch(shared, stage, iteration * batch_size, batch_size), batch_samples
         )
         # each picture, or on a GPU all of one size at once, is restored and propagated back
-        for numbers, sample in together(pictures, self._whole):
+        for numbers, sample in together(pictures, self._batch_goes_whole):
             terms, truth, estimate = self._restoration_terms(sample)
-            truth_and_estimate |= _apart(numbers, truth, estimate)
+            truth_and_estimate |= pictures_by_number(numbers, truth, estimate)
             batch_share = len(numbers) / batch_size
             _backward([weight * term * batch_share for weight, term in terms.values() if weight])
             _add_terms(loss_sums, terms, batch_share)
@@ -358,7 +358,7 @@ class Learner:
         return loss_sums, batch_samples
 
     @property
-    def _whole(self) -> bool:
+    def _batch_goes_whole(self) -> bool:
         """Return True where the pictures of a batch go through the network together: on a GPU,
         behind a fixed mask.
 
@@ -547,7 +547,7 @@ def _add_terms(
         sums[name] = sums.get(name, 0.0) + float(term.detach()) * share
 
 
-def _apart(
+def pictures_by_number(
     numbers: Sequence[int], truth: Scales, estimate: Scales
 ) -> dict[int, tuple[Scales, Scales]]:
     """Return the true and the restored picture of each number, of pictures that went through the

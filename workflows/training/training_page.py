@@ -110,7 +110,7 @@ def _draw_training(ax: Any, rows: Sequence[Mapping[str, str]], first: int) -> No
     `first` is the number of iterations of stage 1.
     """
     name = "reconstruction" if any(row["reconstruction"] for row in rows) else "L1"
-    loss = [(float(_at(row, first)), float(row[name])) for row in rows if row[name]]
+    loss = [(float(_iterations_so_far(row, first)), float(row[name])) for row in rows if row[name]]
     iterations, values = zip(*loss, strict=True)
     ax.plot(iterations, values, color=BLUE, alpha=0.25, linewidth=0.7)
     ax.plot(iterations, running_median(values), color=BLUE, linewidth=1.5)
@@ -123,7 +123,7 @@ def _draw_held_out(ax: Any, judged: Sequence[Mapping[str, str]], first: int) -> 
 
     `judged` are the rows of the loss table with a validation.
     """
-    iterations = [_at(row, first) for row in judged]
+    iterations = [_iterations_so_far(row, first) for row in judged]
     for source, colour, curve_label in (
         ("held_out", VERMILION, "network"),
         ("input", BLACK, "input of the network"),
@@ -146,7 +146,7 @@ def _draw_held_out(ax: Any, judged: Sequence[Mapping[str, str]], first: int) -> 
     )
     interval_label = "90 % interval of the mean over photographs"
     ax.fill_between(
-        [_at(row, first) for row in with_ends],
+        [_iterations_so_far(row, first) for row in with_ends],
         low_ends,
         high_ends,
         color=VERMILION,
@@ -155,7 +155,7 @@ def _draw_held_out(ax: Any, judged: Sequence[Mapping[str, str]], first: int) -> 
     )
 
 
-def _at(row: Mapping[str, str], first: int) -> int:
+def _iterations_so_far(row: Mapping[str, str], first: int) -> int:
     """Return the number of iterations of both stages after the iteration of a row."""
     return int(row["iteration"]) + 1 + first * (row["stage"] == "2")
 

@@ -366,6 +366,17 @@ def _leaf(x: Tensor) -> Tensor:
     return x.detach().requires_grad_(x.requires_grad)
 
 
+@dataclass(frozen=True)
+class PictureSource:
+    """From what the pictures of a training are computed, and where."""
+
+    photographs: Photographs
+    store: Store
+    device: str = "cpu"
+    mesh: Mesh = ALONE
+    held_out: Sequence[Path] = ()  #: photographs that only the validation sees
+
+
 class TrainingStream:
     """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask
     of ``frozen``.
@@ -377,17 +388,14 @@ class TrainingStream:
         self,
         recipe: Recipe,
         settings: Training,
-        photographs: Photographs,
-        store: Store,
-        device: str,
+        source: PictureSource,
         frozen: Recipe | None = None,
-        mesh: Mesh = ALONE,
-        held_out: Sequence[Path] = (),
     ) -> None:
         learn = None if frozen else settings.learn
         learnt_steps = {learn} if learn else set[str]()
-        self.settings, self.photographs, self.device = settings, photographs, device
-        self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
+        self.settings, self.seed = settings, recipe.seed
+        self.photographs, self.held_out = source.photographs, source.held_out
+        self.device, self.mesh = source.device, source.mesh
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
         outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
@@ -406,7 +414,7 @@ class TrainingStream:
         outputs = (*self._made, self.psf)
         recipe = with_substitutions(replace(recipe, estimates=False), outputs, learnt_steps)
         order = needed(recipe, outputs)
-        self._stored = self._stored_pool(recipe, store)
+        self._stored = self._stored_pool(recipe, source.store)
         self._lasers = _parameters_of_lasers(recipe, order)
         self._readers = self._read(believed, order)
         # steps that draw noise for each picture, and all steps that change with each picture
@@ -417,7 +425,7 @@ class TrainingStream:
         shared_outputs = [
             name for name in order if name in (steps_behind_mask - picture_steps) & read_by_pictures
         ]
-        self._divide(recipe, learn, shared_outputs, noise_steps, store)
+        self._divide(recipe, learn, shared_outputs, noise_steps, source.store)
 
     def _stored_pool(self, recipe: Recipe, store: Store) -> StoredPool | None:
         """Return the pictures of a pool in the store, or None if there is no pool to keep."""
@@ -468,7 +476,7 @@ class TrainingStream:
             for name in (*drawn_names, *believed_names, *self._mismatch.moved)
             if name.rpartition(".")[0] in step_names
         ]
-        return {name: _given(believed, name.removeprefix(TOLD)) for name in changing}
+        return {name: _parameter(believed, name.removeprefix(TOLD)) for name in changing}
 
     def _divide(
         self,
@@ -662,7 +670,7 @@ def _parameters_of_lasers(recipe: Recipe, order: Sequence[str]) -> list[str]:
     return [f"{name}.{_LASER[1]}" for name in lasers]
 
 
-def _given(recipe: Recipe, name: str) -> Any:
+def _parameter(recipe: Recipe, name: str) -> Any:
     """Return the value of a parameter, from a name such as ``psf[mask].angle``."""
     step, _, param = name.rpartition(".")
     return recipe.steps[step].params[param]
@@ -688,32 +696,16 @@ class SeveralCameras:
 
     shared = None  #: no mask is trained, so that no result depends on one
 
-    def __init__(
-        self,
-        recipe: Recipe,
-        settings: Training,
-        photographs: Photographs,
-        store: Store,
-        device: str,
-        held_out: Sequence[Path],
-    ) -> None:
+    def __init__(self, recipe: Recipe, settings: Training, source: PictureSource) -> None:
         recipes = (recipe, *recipe.cameras)
         self.repeats, self._pool = len(recipes), settings.pool
         # each held-out photograph once for each camera
         repeated_photographs: list[Path] = []
-        for path in held_out:
+        for path in source.held_out:
             repeated_photographs += [path] * len(recipes)
+        source_of_each = replace(source, held_out=repeated_photographs)
         self._streams = [
-            TrainingStream(
-                camera,
-                settings,
-                photographs,
-                store,
-                device,
-                frozen=camera,
-                held_out=repeated_photographs,
-            )
-            for camera in recipes
+            TrainingStream(camera, settings, source_of_each, frozen=camera) for camera in recipes
         ]
         self.psf = self._streams[0].psf
 
@@ -746,19 +738,12 @@ Samples = TrainingStream | SeveralCameras
 
 
 def samples_of(
-    recipe: Recipe,
-    settings: Training,
-    photographs: Photographs,
-    store: Store,
-    device: str,
-    frozen: Recipe | None,
-    mesh: Mesh,
-    held_out: Sequence[Path],
+    recipe: Recipe, settings: Training, source: PictureSource, frozen: Recipe | None
 ) -> Samples:
     """Return the pictures of a training, of one camera or of several in turn."""
     if frozen is not None and frozen.cameras:
-        return SeveralCameras(frozen, settings, photographs, store, device, held_out)
-    return TrainingStream(recipe, settings, photographs, store, device, frozen, mesh, held_out)
+        return SeveralCameras(frozen, settings, source)
+    return TrainingStream(recipe, settings, source, frozen)
 
 
 def require_alone(recipe: Recipe, mesh: Mesh) -> None:

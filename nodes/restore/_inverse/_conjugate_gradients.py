@@ -27,12 +27,13 @@ from neusee.nodes.restore._inverse._masked_blur import (
 # wrong by that factor; this inverse is right.
 
 
-_LEAST = 1e-11  #: times the largest diagonal number of the matrix: its round-off in float64
+#: times the largest diagonal number of the matrix: its round-off in float64
+_LEAST_DIAGONAL = 1e-11
 #: real unknowns of each channel for up to three channels; more channels share the total of three.
 MODES = 500
 #: The time of the matrix grows with its cube: 1000 took three quarters of the filter and left
 #: nearly the same error
-_ROWS = 256  #: rows of the inverse that are read at a time
+_INVERSE_ROWS = 256  #: rows of the inverse that are read at a time
 SHARE = 24  #: grid points for each unknown, at least, on a small torus
 
 
@@ -60,11 +61,13 @@ class Lowest:
         root_gain[:, 0] *= 0.5**0.5  # the mean is its own mirror image
         root_gain = torch.cat([root_gain, root_gain[:, 1:]], 1).flatten()
         matrix = self._matrix(problem).mul_(root_gain[:, None]).mul_(root_gain)
-        matrix.diagonal().add_(_LEAST * matrix.diagonal().max())
+        matrix.diagonal().add_(_LEAST_DIAGONAL * matrix.diagonal().max())
         inverse_factor = _inverse(torch.linalg.cholesky(matrix)).mul_(root_gain)
         # lower triangular: numbers beyond `end` are 0
-        ends = range(_ROWS, len(inverse_factor) + _ROWS, _ROWS)
-        self.whiten = [inverse_factor[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
+        ends = range(_INVERSE_ROWS, len(inverse_factor) + _INVERSE_ROWS, _INVERSE_ROWS)
+        self.whiten = [
+            inverse_factor[end - _INVERSE_ROWS : end, :end].to(gain, copy=True) for end in ends
+        ]
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:
         """Add a step, the inverse normal matrix times the gradient `slope`, to `onto`.
@@ -124,7 +127,9 @@ class Lowest:
         frequencies; ``weight`` is the spectrum of the weights, ``through`` the transfer at the
         lowest frequencies.
         """
-        difference_part, sum_part = (self._at(weight, s) * through.conj()[:, None] for s in (-1, 1))
+        difference_part, sum_part = (
+            self._at_frequency_pairs(weight, s) * through.conj()[:, None] for s in (-1, 1)
+        )
         difference_part, sum_part = difference_part * through, sum_part * through.conj()
         real_rows = torch.cat(
             [difference_part.real + sum_part.real, (sum_part.imag - difference_part.imag)[:, 1:]], 1
@@ -137,7 +142,7 @@ class Lowest:
         )
         return matrix
 
-    def _at(self, spectrum: Tensor, sign: int) -> Tensor:
+    def _at_frequency_pairs(self, spectrum: Tensor, sign: int) -> Tensor:
         """Return the spectrum at the sums (`sign` 1) or differences (`sign` -1) of all pairs of
         lowest frequencies.
         """
@@ -223,7 +228,7 @@ def _lowest(size: Size, count: int) -> tuple[Tensor, Tensor]:
 
 
 LOWEST = 512  #: pixels a side, up to which each step solves the lowest frequencies exactly
-_PIECE = 2**18  #: numbers of a spectrum worked on at a time, which fit in the cache
+_PIECE_NUMBERS = 2**18  #: numbers of a spectrum worked on at a time, which fit in the cache
 
 
 def descend(
@@ -260,14 +265,14 @@ def descend(
 
 def pieces(spectrum: Tensor) -> Iterator[slice]:
     """Return slices that cut half a spectrum into blocks of a few rows, which fit in the cache."""
-    return _few(spectrum.shape[-2], len(spectrum) * spectrum.shape[-1])
+    return _cache_blocks(spectrum.shape[-2], len(spectrum) * spectrum.shape[-1])
 
 
-def _few(count: int, numbers: int) -> Iterator[slice]:
+def _cache_blocks(count: int, numbers: int) -> Iterator[slice]:
     """Return slices that divide `count` array lines of `numbers` values each into blocks that
     fit in the cache.
     """
-    step = max(1, _PIECE // numbers)
+    step = max(1, _PIECE_NUMBERS // numbers)
     return (slice(i, i + step) for i in range(0, count, step))
 
 
@@ -277,9 +282,9 @@ def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
     """
     rows, columns = pixels.shape
     column_transforms = spectrum.new_empty(rows, spectrum.shape[1])
-    for block in _few(spectrum.shape[1], torus[0]):
+    for block in _cache_blocks(spectrum.shape[1], torus[0]):
         column_transforms[:, block] = torch.fft.ifft(spectrum[:, block], dim=0)[:rows]
-    for block in _few(rows, torus[1]):
+    for block in _cache_blocks(rows, torus[1]):
         pixels[block] = torch.fft.irfft(column_transforms[block], n=torus[1])[:, :columns]
 
 

@@ -283,11 +283,11 @@ def _mean_around(picture: Tensor) -> Tensor:
 
 
 RADII = (4, 16, 64)  #: pixels, over which light is scattered
-_TIMES = 3  #: running means one after another, which are nearly a Gaussian
+_RUNNING_MEANS = 3  #: running means one after another, which are nearly a Gaussian
 #: of the light of a pattern, scattered over each radius, in the median of lenses
 _SHARES = (0.1, 0.01, 0.02)
 _FACTORS = (3.0, 3.0, 2.0)  #: of one standard deviation of these shares
-_STRENGTH = 0.5  #: standard deviation of the logarithm of a strength that was found
+_STRENGTH_DEVIATION = 0.5  #: standard deviation of the logarithm of a strength that was found
 #: part of the variance of speckle two pixels wide that differs from the mean of the 3 x 3 pixels
 #: around
 _SHARP = 0.5
@@ -297,10 +297,10 @@ _ALIKE = 4.0
 _GRAINY = 2.0
 #: standard deviations of scattered light and of a pattern, over their light
 _SMOOTH, _SIZE = 1.0, 0.3
-_COLOUR = 0.1  #: variance of speckle that differs between channels, over that of all
-_BRIGHT = 0.01  #: probability that something else than the patterns fills a pixel
+_SPECKLE_COLOUR = 0.1  #: variance of speckle that differs between channels, over that of all
+_FILLED_BY_OTHERS = 0.01  #: probability that something else than the patterns fills a pixel
 _GLARE_SAMPLE = 1 << 15  #: pixels of a frame that tell of speckle
-_FEW = 300  #: pixels known in all channels, fewer of which do not tell
+_FEW_PIXELS = 300  #: pixels known in all channels, fewer of which do not tell
 _EVALUATIONS = 160  #: of the likelihood
 
 
@@ -345,8 +345,8 @@ def with_smooth(glare: Glare) -> Glare:
 def _spread(pattern: Tensor, radius: int) -> Tensor:
     """Return a pattern spread over about ``radius`` pixels; beyond the picture is no light."""
     spread = pattern.double()
-    for _ in range(_TIMES):
-        spread = square_mean(spread, max(1, round(radius / _TIMES**0.5)))
+    for _ in range(_RUNNING_MEANS):
+        spread = square_mean(spread, max(1, round(radius / _RUNNING_MEANS**0.5)))
     return spread.to(pattern)
 
 
@@ -432,7 +432,7 @@ def _prior(logs: Sequence[float]) -> float:
         (log - logs[0] - math.log(share)) / math.log(factor)
         for log, share, factor in zip(logs[1:], _SHARES, _FACTORS, strict=True)
     ]
-    return -0.5 * ((logs[0] / _STRENGTH) ** 2 + sum(x * x for x in ratios))
+    return -0.5 * ((logs[0] / _STRENGTH_DEVIATION) ** 2 + sum(x * x for x in ratios))
 
 
 def _likelihood(
@@ -521,8 +521,8 @@ def _pixels(
     dark_noise = noise(torch.zeros_like(average(electrons, torch.ones_like(electrons))))
     known_in_all_channels = use.all(0)
     # pixels known in all channels tell more, by their colour; else those of any channel
-    joint = int(known_in_all_channels.sum()) >= _FEW
-    if not joint and int(use.sum()) < _FEW:
+    joint = int(known_in_all_channels.sum()) >= _FEW_PIXELS
+    if not joint and int(use.sum()) < _FEW_PIXELS:
         return None
     sample = slice(
         None, None, max(1, int((known_in_all_channels if joint else use).sum()) // _GLARE_SAMPLE)
@@ -555,7 +555,7 @@ def _log_density(
         return -0.5 * float((variance.log() + error.square() / variance).sum())
     # covariance of a pixel's channels: D + s s', for s the root of the speckle's variance. Its
     # inverse by Sherman and Morrison: D^-1 - D^-1 s s' D^-1 / (1 + s' D^-1 s)
-    inverse_variance, colour = 1.0 / (noise + _COLOUR * speckle + scene), speckle.sqrt()
+    inverse_variance, colour = 1.0 / (noise + _SPECKLE_COLOUR * speckle + scene), speckle.sqrt()
     grey = grey.expand_as(error)
 
     def products(a: Tensor, b: Tensor) -> Tensor:
@@ -588,7 +588,7 @@ def _log_full(hidden: _Hidden, amounts: Tensor, mean: Tensor) -> float:
     probability_below_full = torch.special.ndtr(
         -excess / (scattered.square() + 2.0 * straight * scattered + scene.square()).sqrt()
     )
-    return float(torch.log1p(-(1.0 - _BRIGHT) * probability_below_full).sum())
+    return float(torch.log1p(-(1.0 - _FILLED_BY_OTHERS) * probability_below_full).sum())
 
 
 def _average(values: Tensor, weights: Tensor) -> Tensor:

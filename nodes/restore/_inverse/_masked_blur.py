@@ -74,7 +74,8 @@ def grey_white(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 # A PSF on the periodic grid of a picture, and how far it reaches.
 
 
-_LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
+#: share of the light that the unknown border around the picture is wide enough for
+_BORDER_LIGHT = 0.999
 
 
 def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
@@ -90,7 +91,11 @@ def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
             profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
         )
         radii.append(
-            min(int((light_within < _LIGHT * light_within[-1]).sum()), max(256, size // 2), size)
+            min(
+                int((light_within < _BORDER_LIGHT * light_within[-1]).sum()),
+                max(256, size // 2),
+                size,
+            )
         )
     return radii[0], radii[1]
 
@@ -130,7 +135,7 @@ Map = Callable[[Tensor], Tensor]
 
 #: added to products of patterns of norm 1, so that equal patterns have a Cholesky factor
 _ALIKE = 1e-13
-_PIECE = 2**18  #: pixels of all patterns that are converted to float64 at a time
+_PIECE_PIXELS = 2**18  #: pixels of all patterns that are converted to float64 at a time
 
 
 @dataclass(frozen=True)
@@ -214,7 +219,7 @@ def weighing(problem: Blurred) -> Map:
     products = with_bounds(weighted_patterns.double() @ flat_patterns.double().T, problem.bounded)
     if problem.bounded:  # similar patterns: differences of large sums would lose digits in float32
         # the outer products of these combinations hold the inverse already
-        weighted_patterns, inverse = _apart(weighted_patterns, products), None
+        weighted_patterns, inverse = _whitened_patterns(weighted_patterns, products), None
     else:
         inverse = torch.linalg.pinv(products, hermitian=True).to(flat_patterns)
 
@@ -243,7 +248,7 @@ def with_bounds(products: Tensor, bounded: int) -> Tensor:
     return products + certain.diag()
 
 
-def _apart(weighted: Tensor, products: Tensor) -> Tensor:
+def _whitened_patterns(weighted: Tensor, products: Tensor) -> Tensor:
     """Return combinations of patterns whose outer products add up to those of the ``weighted``
     patterns through the inverse of their ``products``.
 
@@ -256,7 +261,9 @@ def _apart(weighted: Tensor, products: Tensor) -> Tensor:
         len(scaled_products), dtype=scaled_products.dtype, device=scaled_products.device
     )
     lower_factor = torch.linalg.cholesky(scaled_products)
-    pieces = (scale[:, None] * patterns.double() for patterns in torch.split(weighted, _PIECE, 1))
+    pieces = (
+        scale[:, None] * patterns.double() for patterns in torch.split(weighted, _PIECE_PIXELS, 1)
+    )
     return torch.cat(
         [
             torch.linalg.solve_triangular(lower_factor, piece, upper=False).to(weighted)

@@ -43,9 +43,9 @@ from neusee.nodes.values import Bands, Psf
 # it has any.
 
 
-_DETAIL = 5  #: pixels a side; what differs from its mean over such a square is a detail
-_NEAR = 11  #: pixels a side of the square around a pixel whose details tell of this pixel
-_SMOOTH = 7  #: pixels a side of the square over which the variance of few draws is averaged
+_DETAIL_SIDE = 5  #: pixels a side; what differs from its mean over such a square is a detail
+_NEAR_SIDE = 11  #: pixels a side of the square around a pixel whose details tell of this pixel
+_SMOOTH_SIDE = 7  #: pixels a side of the square over which the variance of few draws is averaged
 #: share of known pixels around a pixel, below which nothing around it tells of details
 _KNOWN = 0.02
 #: mean square of errors of photographs averaged over 11 x 11 pixels, over that of scenes of their
@@ -87,9 +87,9 @@ def frame_deviation(
     # a lack of details means little where none could be seen
     detail_ratio = detail_ratio.where(detail_ratio > 1.0, detail_ratio**scenes_found.told)
     coarse_square = _COARSE * law.low * scenes_found.coarse + noise_square
-    total: Tensor = detail_ratio * _around(scenes_found.fine, _SMOOTH) + detail_ratio.clamp_min(
-        1.0
-    ) * _around(coarse_square, _SMOOTH)
+    total: Tensor = detail_ratio * _around(
+        scenes_found.fine, _SMOOTH_SIDE
+    ) + detail_ratio.clamp_min(1.0) * _around(coarse_square, _SMOOTH_SIDE)
     return total.sqrt()
 
 
@@ -113,7 +113,7 @@ class _Scenes(NamedTuple):
         )
         restored = true_details = torch.zeros_like(coarse_square[0])
         for error, contrast in drawn:
-            smooth = _around(error, _NEAR)
+            smooth = _around(error, _NEAR_SIDE)
             coarse_square = coarse_square + _square(smooth, matrix) / count
             fine_square = fine_square + _square(error - smooth, matrix) / count
             restored = restored + _details(contrast) / count
@@ -121,7 +121,7 @@ class _Scenes(NamedTuple):
                 true_details + _details(contrast + error * scaled.share / scaled.scale) / count
             )
         resolved = (
-            _around(restored, _NEAR) / (_SHOWN * _around(true_details, _NEAR) + _DARK)
+            _around(restored, _NEAR_SIDE) / (_SHOWN * _around(true_details, _NEAR_SIDE) + _DARK)
         ).clamp(max=1.0)
         return cls(coarse_square, fine_square, restored, resolved)
 
@@ -210,7 +210,7 @@ def _square(error: Tensor, matrix: Tensor) -> Tensor:
 
 def _details(contrast: Tensor) -> Tensor:
     """Return the energy (y, x) of details of a picture, in the mean of its channels."""
-    energy: Tensor = (contrast - _around(contrast, _DETAIL)).square().mean(0)
+    energy: Tensor = (contrast - _around(contrast, _DETAIL_SIDE)).square().mean(0)
     return energy
 
 
@@ -219,10 +219,10 @@ def _ratio(energy: Tensor, drawn: Tensor, weight: Tensor) -> Tensor:
     nothing tells.
     """
     unclipped = (weight > 0).all(0).to(energy)
-    ratio = (_around(energy * unclipped, _NEAR) + _DARK) / (
-        _around(drawn * unclipped, _NEAR) + _DARK
+    ratio = (_around(energy * unclipped, _NEAR_SIDE) + _DARK) / (
+        _around(drawn * unclipped, _NEAR_SIDE) + _DARK
     )
-    return ratio.where(_around(unclipped, _NEAR) > _KNOWN, 1.0)
+    return ratio.where(_around(unclipped, _NEAR_SIDE) > _KNOWN, 1.0)
 
 
 def _around(pictures: Tensor, side: int) -> Tensor:

@@ -20,7 +20,7 @@ from neusee.nodes.values import Bands, Psf
 #: share of the light of a scene pixel that reaches known pixels, below which the share counts as
 #: this
 _UNSEEN = 1e-3
-_DARK = 1e-6  #: e-, least expected count, because the expectation is a divisor
+_LEAST_EXPECTED = 1e-6  #: e-, least expected count, because the expectation is a divisor
 #: e-, light below which a scene pixel stays dark; its gradient would grow with each step and
 #: overflow
 _GONE = 1e-30
@@ -68,7 +68,7 @@ def richardson_lucy(
     refuse_other_pictures(electrons, psf, responses, clipped, glare)
     frame = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
-    unclipped = _known(clipped, electrons)
+    unclipped = _unclipped_weight(clipped, electrons)
     patterns = []
     for light in glare:
         pattern = crop(light.to(electrons), shape=frame)
@@ -96,7 +96,7 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Ch
     ]
 
 
-def _known(clipped: Tensor, like: Tensor) -> Tensor:
+def _unclipped_weight(clipped: Tensor, like: Tensor) -> Tensor:
     """Return 1 for each pixel that is not clipped and 0 for the others; a channel without known
     pixels has only 1.
     """
@@ -148,7 +148,7 @@ def _climb(
         for strength, pattern in zip(strengths, patterns, strict=True):
             expected = expected + strength * pattern
         # the step of Richardson and Lucy: scene times the blurred-back ratio of data to model
-        ratio = shifted_counts / expected.clamp_min(_DARK)
+        ratio = shifted_counts / expected.clamp_min(_LEAST_EXPECTED)
         scene = torch.where(
             scene <= _GONE, 0.0, scene * (blur.gathered(ratio) / seen_share).clamp_min(0)
         )

@@ -521,10 +521,10 @@ def unpacked(value: WienerProblem) -> Blurred:
 
 
 _OCTAVES = 5  #: of frequency, below half a cycle per pixel
-_BRIGHT = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
-_GAMMA = 1 / 2.2  #: of a display, so that dark parts are seen
-EACH = 9  #: maps of each channel
-MAPS = 3 * EACH + _OCTAVES  #: of a picture of three channels
+_GLARE_GAIN = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
+_DISPLAY_GAMMA = 1 / 2.2  #: of a display, so that dark parts are seen
+MAPS_OF_CHANNEL = 9  #: maps of each channel
+MAPS = 3 * MAPS_OF_CHANNEL + _OCTAVES  #: of a picture of three channels
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
@@ -604,12 +604,12 @@ def maps(
     # divisors bring each map to about 1 for a network
     channel_maps = [
         answer,
-        brightness.sign() * brightness.abs().clamp_min(1e-12).pow(_GAMMA),
+        brightness.sign() * brightness.abs().clamp_min(1e-12).pow(_DISPLAY_GAMMA),
         problem.picture.asinh(),
         (inverse_deviation * (problem.picture - blurred)).asinh(),
         problem.weight.log1p() / 10.0,
         unclipped,
-        (_BRIGHT / glare.detach().amax().clamp_min(1e-30) * glare).asinh() / 5.0,
+        (_GLARE_GAIN / glare.detach().amax().clamp_min(1e-30) * glare).asinh() / 5.0,
         (100.0 * doubt).log1p() / 10.0,
         deviation.log() / 5.0,
     ]

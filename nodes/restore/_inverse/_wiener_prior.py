@@ -121,12 +121,12 @@ _EXPOSED, _EXPOSURE = 0.15, math.log(3.0)
 _CONTRAST, _CONTRASTS = 0.8, 0.5
 _COLOUR = 0.3  #: deviation of the mean of a channel, over what it sees of a grey scene
 _TINT = 0.2  #: deviation of the contrast of a channel, over what it sees of a grey scene
-_ALONE = 0.1  #: part of the variance of an error that is not the same in all channels
-_ROUGH = 0.1  #: relative error of a variance that is estimated from one picture
-_GRID = 241  #: logarithms that are tried
-_WIDE = 4.0  #: deviations of the prior, over which they are tried
+_ONE_CHANNEL_SHARE = 0.1  #: part of the variance of an error that is not the same in all channels
+_VARIANCE_ERROR = 0.1  #: relative error of a variance that is estimated from one picture
+_GRID_POINTS = 241  #: logarithms that are tried
+_GRID_DEVIATIONS = 4.0  #: deviations of the prior, over which they are tried
 _BLOTCHES = 0.3  #: deviation of scattered light over blotches, over that of a pixel of it
-_BLOTCH = 16  #: pixels from one blotch to the next
+_BLOTCH_PIXELS = 16  #: pixels from one blotch to the next
 
 
 class Told(NamedTuple):
@@ -208,7 +208,7 @@ def level_and_variance(
     log_variance = 2.0 * (log_exposure + math.log(_CONTRAST))
     log_variance_deviation = 2.0 * math.hypot(log_deviation, _CONTRASTS)
     variance_level, _, _ = _likely(
-        variance, grey.square(), log_variance, log_variance_deviation, 2.0 * _TINT, _ROUGH
+        variance, grey.square(), log_variance, log_variance_deviation, 2.0 * _TINT, _VARIANCE_ERROR
     )
     return level, variance_level
 
@@ -230,8 +230,10 @@ def _hats(size: int) -> Tensor:
     up to 1.
     """
     # triangles, 1 at the middle of a blotch and 0 at the next ones
-    position = torch.arange(size) / _BLOTCH
-    hats = (1.0 - (position - torch.arange(size // _BLOTCH + 2)[:, None]).abs()).clamp_min(0.0)
+    position = torch.arange(size) / _BLOTCH_PIXELS
+    hats = (1.0 - (position - torch.arange(size // _BLOTCH_PIXELS + 2)[:, None]).abs()).clamp_min(
+        0.0
+    )
     return hats / hats.square().sum(0).sqrt()
 
 
@@ -249,9 +251,18 @@ def _likely(
     error_covariance = errors.T @ errors
     # a part of each error is that of its channel alone; 1 e- so that the matrix has a Cholesky
     # factor
-    error_covariance = error_covariance + (_ALONE * error_covariance.diagonal() + 1.0).diag()
+    error_covariance = (
+        error_covariance + (_ONE_CHANNEL_SHARE * error_covariance.diagonal() + 1.0).diag()
+    )
     logs = (
-        torch.linspace(-_WIDE, _WIDE, _GRID, dtype=torch.float64, device=value.device) * width
+        torch.linspace(
+            -_GRID_DEVIATIONS,
+            _GRID_DEVIATIONS,
+            _GRID_POINTS,
+            dtype=torch.float64,
+            device=value.device,
+        )
+        * width
         + middle
     )
     expected = logs.exp()[:, None] * grey
@@ -292,13 +303,13 @@ _SLOPES = (2.0, 4.0, 9)
 _POWERS = (-7.0, 1.0, 25)  #: of e, times the variance that explains the whole frame
 #: times the variance of the noise that the filter assumes
 _NOISES = tuple(2.0**n for n in range(8))
-_MOST = 20_000  #: frequencies that count, at most
+_MOST_FREQUENCIES = 20_000  #: frequencies that count, at most
 _LOWEST = 3.0  #: cycles in the picture, below which the window mixes frequencies
-_SURE = 0.75  #: quantile of the weights of pixels, above which a pixel counts fully
-_SAMPLE = 1 << 20  #: pixels from which this quantile is taken, at most
+_FULL_WEIGHT_QUANTILE = 0.75  #: quantile of the weights of pixels, above which a pixel counts fully
+_QUANTILE_PIXELS = 1 << 20  #: pixels from which this quantile is taken, at most
 #: standard deviation of the logarithm of the variance of a scene, over that of the filter
 _PRIOR = 1.0
-_ALIKE = 4.0  #: frequencies of a window that tell the same
+_LIKE_FREQUENCIES = 4.0  #: frequencies of a window that tell the same
 
 
 class FrameLaw(NamedTuple):
@@ -331,7 +342,7 @@ def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
     )
     # without the frequencies that the window mixes with the mean
     counted = _squared(size).to(window) > (_LOWEST / min(size)) ** 2
-    step = max(1, int(counted.sum()) * len(window) // _MOST)
+    step = max(1, int(counted.sum()) * len(window) // _MOST_FREQUENCIES)
     periodogram = _sampled(torch.fft.rfft2(contrast * window).abs().square() / area, counted, step)
     variance = torch.where(problem.weight > 0, 1.0 / problem.weight.clamp_min(1e-30), 0.0).detach()
     noise = (window.square() * variance).sum((-2, -1), keepdim=True) / area
@@ -348,7 +359,7 @@ def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
             periodogram,
             scale * expected,
             noise_level,
-            _before(problem, doubt, exponent) - math.log(scale),
+            _expected_strength(problem, doubt, exponent) - math.log(scale),
         )
         if loss < best:
             best, slope, strength, factor = (
@@ -358,13 +369,13 @@ def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
                 noise_factor,
             )
     power = strength * _law(problem, slope)
-    low = max(1.0, math.exp(_before(problem, doubt, slope)) / max(strength, 1e-30))
+    low = max(1.0, math.exp(_expected_strength(problem, doubt, slope)) / max(strength, 1e-30))
     # the mean of the scene has its own doubt
     power[0, 0] += doubt.mean * problem.torus[0] * problem.torus[1] if doubt else 0.0
     return FrameLaw(power, factor, low)
 
 
-def _before(problem: Blurred, doubt: SceneDoubt | None, slope: float) -> float:
+def _expected_strength(problem: Blurred, doubt: SceneDoubt | None, slope: float) -> float:
     """Return the logarithm of the strength of a law that gives a scene the variance it is
     expected to have.
     """
@@ -374,7 +385,7 @@ def _before(problem: Blurred, doubt: SceneDoubt | None, slope: float) -> float:
 
 def _window(problem: Blurred) -> Tensor:
     """Return the window (channel, y, x) of the periodogram: it falls to 0 at the edges and where
-    the weight of a pixel is far below the quantile `_SURE` of its channel.
+    the weight of a pixel is far below the quantile `_FULL_WEIGHT_QUANTILE` of its channel.
     """
     y, x = problem.picture.shape[-2:]
     weight = problem.weight.detach()
@@ -383,7 +394,9 @@ def _window(problem: Blurred) -> Tensor:
     for channel_weight in weight:
         unclipped = channel_weight[channel_weight > 0]
         certain_weights.append(
-            torch.quantile(unclipped[:: max(1, len(unclipped) // _SAMPLE)], _SURE)
+            torch.quantile(
+                unclipped[:: max(1, len(unclipped) // _QUANTILE_PIXELS)], _FULL_WEIGHT_QUANTILE
+            )
         )
     relative_weight = weight / torch.stack(certain_weights)[:, None, None]
     rows, columns = edge_windows
@@ -437,7 +450,7 @@ def _likeliest(
     Whittle's, the mean of log(expected) + periodogram / expected, plus the prior of the strength.
     """
     best_of_all = (float("inf"), 0.0, 1.0)
-    independent_count = len(periodogram) / _ALIKE
+    independent_count = len(periodogram) / _LIKE_FREQUENCIES
     for factor in _NOISES:
         best_of_factor = (float("inf"), 0.0, factor)
         for strength in torch.linspace(*_POWERS[:2], int(_POWERS[2])).exp().tolist():

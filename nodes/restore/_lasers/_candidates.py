@@ -21,10 +21,10 @@ from neusee.nodes.values import Bands, Pupil
 # Where a pattern may lie: its likelihood at every place of the frame at once, by fast correlations.
 
 
-_STEP = 5e-9  #: m between the wavelengths that are tried
-_REACH = 192  #: pixels from the spot, as far as a pattern is compared before it is fitted
-_MORE = (1.0, 2.0)  #: clipped pixels of a pattern that are tried, over those of the frame
-_APART = (1.5, 8e-9)  #: pixels and m, by which two candidates differ at least
+_WAVELENGTH_STEP = 5e-9  #: m between the wavelengths that are tried
+_PATTERN_REACH = 192  #: pixels from the spot, as far as a pattern is compared before it is fitted
+_CLIPPED_RATIOS = (1.0, 2.0)  #: clipped pixels of a pattern that are tried, over those of the frame
+_LEAST_SEPARATION = (1.5, 8e-9)  #: pixels and m, by which two candidates differ at least
 
 
 class Candidate(NamedTuple):
@@ -49,7 +49,7 @@ class Templates(NamedTuple):
 def line_templates(pupil: Pupil, responses: Tensor, bands: Bands, lens: Lens) -> Templates:
     """Return the patterns of spectral lines over the range of the bands."""
     low, high = float(bands.centres.min()), float(bands.centres.max())
-    count = max(2, math.ceil((high - low) / _STEP) + 1)
+    count = max(2, math.ceil((high - low) / _WAVELENGTH_STEP) + 1)
     wavelengths = torch.linspace(low, high, count, dtype=torch.float64)
     line_responses = torch.stack(
         [response_at(x, responses.cpu().double(), bands) for x in wavelengths]
@@ -64,7 +64,9 @@ def line_templates(pupil: Pupil, responses: Tensor, bands: Bands, lens: Lens) ->
         # pixels to half the alias-free field, beyond which a pattern repeats itself
         float(wavelengths.min()) * lens.focal_length / (2 * float(pupil.pitch) * lens.pixel_pitch)
     )
-    window_sides = tuple(2 * min(n - 1, int(half_field) - 1, _REACH) + 1 for n in lens.shape)
+    window_sides = tuple(
+        2 * min(n - 1, int(half_field) - 1, _PATTERN_REACH) + 1 for n in lens.shape
+    )
     line_pupil = pupil._replace(
         wavelengths=wavelengths.to(pupil.wavelengths), index=index.to(pupil.index)
     )
@@ -112,7 +114,7 @@ def candidates(
             frame,
             count,
         )
-    return _apart(sorted(peaks, reverse=True), count)
+    return _distinct(sorted(peaks, reverse=True), count)
 
 
 def clipped_candidates(
@@ -121,9 +123,9 @@ def clipped_candidates(
     """Return candidates for a pattern that the sensor clips, in a frame with clipped pixels at
     ``full``.
 
-    Each pattern is so strong that as many of its pixels are clipped as in the frame, or `_MORE`
-    times as many, of which some lie beyond the frame. Each channel is clipped by itself: those that
-    hardly see a wavelength show more of its pattern.
+    Each pattern is so strong that as many of its pixels are clipped as in the frame, or
+    `_CLIPPED_RATIOS` times as many, of which some lie beyond the frame. Each channel is clipped by
+    itself: those that hardly see a wavelength show more of its pattern.
     """
     # the pattern must clip about as many pixels: that tells its strength
     clipped = int((picture >= 0.98 * full).any(0).sum())
@@ -139,7 +141,7 @@ def clipped_candidates(
     )
     peaks: list[Candidate] = []
     for (line, pattern, line_response), margin in itertools.product(
-        zip(*templates, strict=True), _MORE
+        zip(*templates, strict=True), _CLIPPED_RATIOS
     ):
         relative_response, clip_value = (
             (line_response / line_response.max()).to(picture),
@@ -165,7 +167,7 @@ def clipped_candidates(
             frame,
             count,
         )
-    return _apart(sorted(peaks, reverse=True), count)
+    return _distinct(sorted(peaks, reverse=True), count)
 
 
 def _size(frame: torch.Size, pattern: Tensor) -> list[int]:
@@ -214,10 +216,10 @@ def _peaks(
                 value, (y - frame[0] // 2, x - frame[1] // 2), line, float(strength_within[y, x])
             )
         )
-    return _apart(spots, count)
+    return _distinct(spots, count)
 
 
-def _apart(ranked: list[Candidate], count: int) -> list[Candidate]:
+def _distinct(ranked: list[Candidate], count: int) -> list[Candidate]:
     """Return the first candidates of a list that differ from all earlier ones in place or
     wavelength.
     """
@@ -230,7 +232,9 @@ def _apart(ranked: list[Candidate], count: int) -> list[Candidate]:
 
 def _differ(a: Candidate, b: Candidate) -> bool:
     distance = math.dist(a.spot, b.spot)
-    return distance > _APART[0] or abs(a.wavelength - b.wavelength) > _APART[1]
+    return (
+        distance > _LEAST_SEPARATION[0] or abs(a.wavelength - b.wavelength) > _LEAST_SEPARATION[1]
+    )
 
 
 # --- nearest --------------------------------------------------------------------------------------
@@ -245,7 +249,7 @@ _HALVES, _NEAR = (-0.6, -0.3, 0.0, 0.3, 0.6), (-3.0, -1.5, 0.0, 1.5, 3.0)
 FAR = tuple(1.5 * n for n in range(-10, 11))
 #: pixels around a tile, and of the tiles
 _COARSE, _TILES = (-0.5, 0.0, 0.5), (-3.0, -1.5, 0.0, 1.5, 3.0)
-_AROUND = 256  #: pixels a side of the window in which these are compared
+_COMPARED_SIDE = 256  #: pixels a side of the window in which these are compared
 
 
 def nearest_of_many(camera: Camera, data: Data, residual: Tensor, start: Candidate) -> Candidate:
@@ -329,7 +333,7 @@ def _window(
     """
     window, middle = [], []
     for n, spot_place in zip(frame.shape[-2:], spot, strict=True):
-        side = min(n, _AROUND)
+        side = min(n, _COMPARED_SIDE)
         first = min(max(round(spot_place) + n // 2 - side // 2, 0), n - side)
         window.append(slice(first, first + side))
         middle.append(first + side // 2 - n // 2)

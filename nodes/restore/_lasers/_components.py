@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 from neusee.nodes.optics import psf as focus
 from neusee.nodes.optics._transform._fft_transforms import fft_length
 from neusee.nodes.restore._inverse._masked_blur import grey_shares
+from neusee.nodes.restore._inverse._wiener import View
 from neusee.nodes.restore._lasers._line_pattern import (
     Lens,
     deviation,
@@ -21,15 +22,18 @@ from neusee.nodes.restore._lasers._line_pattern import (
     line_pattern,
     response_at,
 )
-from neusee.nodes.values import Bands, Psf, Pupil
+from neusee.nodes.values import Bands, Pupil
 
 # --- lamp light -----------------------------------------------------------------------------------
 
 # The light that a point source of many wavelengths adds to each channel, over the whole frame.
 
 
-_TILT = 50e-9  #: m, the scale of the tilt and the bend of a lamp's spectrum
-_FINEST, _MOST = 4, 4096  #: samples a pixel, and samples a side of a pattern, at most
+_TILT_SCALE = 50e-9  #: m, the scale of the tilt and the bend of a lamp's spectrum
+_FINEST_SAMPLING, _MOST_SAMPLES = (
+    4,
+    4096,
+)  #: samples a pixel, and samples a side of a pattern, at most
 #: pixels beyond the farthest of the frame, over which a pattern fades, for a step rings when it is
 #: moved
 _RIM = 10
@@ -49,24 +53,17 @@ class LampLight(NamedTuple):
     patterns: Tensor  #: (channel, y, x) of the even spectrum, in pixels
 
 
-def lamp_light(
-    psf: Psf,
-    pupil: Pupil,
-    illuminant: Tensor,
-    responses: Tensor,
-    bands: Bands,
-    lens: Lens,
-    kind: torch.dtype,
-) -> LampLight:
+def lamp_light(view: View, pupil: Pupil, lens: Lens, dtype: torch.dtype) -> LampLight:
     """Return what a lamp adds to each channel, from a spot anywhere in the frame to every pixel.
 
-    A lamp that clips the sensor adds light farther from its spot than the window of ``psf``
+    A lamp that clips the sensor adds light farther from its spot than the window of the PSF
     reaches, and its spot lies between pixels, where a pattern that is sampled by pixels cannot be
     moved to. So the pattern is computed from ``pupil``, as that of a laser is, over the whole frame
-    and on a finer grid. What ``psf`` has beyond it within its window, such as stray light, is
+    and on a finer grid. What the PSF has beyond it within its window, such as stray light, is
     added.
     """
-    kinds = _kinds(illuminant, responses, bands).to(psf.intensity.device, kind)
+    psf, illuminant, responses, bands = view
+    kinds = _kinds(illuminant, responses, bands).to(psf.intensity.device, dtype)
     finer, (y, x) = _finer(pupil, lens), (lens.shape[0] + _RIM, lens.shape[1] + _RIM)
     torus = (fft_length(2 * y + 1), fft_length(2 * x + 1))  # pixels
     fine_torus = (finer * torus[0], finer * torus[1])
@@ -112,7 +109,7 @@ def _kinds(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
     channel, band).
     """
     shares, centres = grey_shares(illuminant, responses, bands), bands.centres.cpu()
-    tilt = (centres - (shares * centres).sum(-1, keepdim=True)) / _TILT
+    tilt = (centres - (shares * centres).sum(-1, keepdim=True)) / _TILT_SCALE
     return torch.stack([shares, shares * tilt, shares * tilt.square()])
 
 
@@ -127,7 +124,12 @@ def _finer(pupil: Pupil, lens: Lens) -> int:
     samples_needed = (
         2.0 * lens.pixel_pitch * pupil_width / (float(pupil.wavelengths.min()) * lens.focal_length)
     )
-    return max(1, min(math.ceil(samples_needed), _FINEST, _MOST // (2 * max(lens.shape) + 1)))
+    return max(
+        1,
+        min(
+            math.ceil(samples_needed), _FINEST_SAMPLING, _MOST_SAMPLES // (2 * max(lens.shape) + 1)
+        ),
+    )
 
 
 def _fine_patterns(kinds: Tensor, pupil: Pupil, lens: Lens, finer: int) -> Tensor:
@@ -223,8 +225,8 @@ def _framed(picture: Tensor, sides: tuple[int, ...]) -> Tensor:
 NANOMETRE = 1e-9
 #: nm^2, standard deviation of the variance of a line, or that variance itself where it is more
 _WIDTH = 0.5
-_WIDEST = 50.0  #: nm^2, most that is added to the variance of a line
-_KNOWN = 0.03  #: relative standard deviation of the response of a channel to one line
+_WIDEST_VARIANCE = 50.0  #: nm^2, most that is added to the variance of a line
+_RESPONSE_ERROR = 0.03  #: relative standard deviation of the response of a channel to one line
 #: the same as a share of the largest response, for a channel that hardly sees the line
 _BLIND = 0.003
 
@@ -326,7 +328,7 @@ class Laser:
             values[i] = values[i].clamp(-0.5 * shape[i] - 1, 0.5 * shape[i] + 1)
         values[2] = values[2].clamp(float(centres.min()), float(centres.max()))
         values[3] = values[3].clamp_min(1e-3 * self.values[3].abs())
-        values[4] = values[4].clamp(-self._variance(), _WIDEST)
+        values[4] = values[4].clamp(-self._variance(), _WIDEST_VARIANCE)
         return replace(self, values=values)
 
     def channel_slopes(self) -> Tensor:
@@ -343,7 +345,7 @@ class Laser:
     def _response(self, nm: Tensor) -> tuple[Tensor, Tensor]:
         """Return the response (channel,) at a wavelength in nm, and its standard deviation."""
         response = response_at(nm * NANOMETRE, self.camera.responses, self.camera.bands)
-        return response, _KNOWN * response + _BLIND * self.camera.responses.max()
+        return response, _RESPONSE_ERROR * response + _BLIND * self.camera.responses.max()
 
     def _response_slope(self) -> Tensor:
         """Return the change of each channel's electrons with wavelength, by nm: a central

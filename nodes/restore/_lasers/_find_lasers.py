@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.precision import refuse_not_finite, single
 from neusee.nodes.restore._inverse._glare import Patterns
-from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
+from neusee.nodes.restore._inverse._wiener import View, refuse_other_pictures
 from neusee.nodes.restore._lasers._candidates import line_templates
 from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser, lamp_light
 from neusee.nodes.restore._lasers._frame_likelihood import NORMAL, spreads
@@ -41,20 +41,21 @@ from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 
 
 #: growth of a standard deviation by the scatter of a residual, up to which a clean lens explains it
-_PLAIN = 1.05
+_CLEAN_LENS_GROWTH = 1.05
 #: pixels a side of the frame for which a scatter counts, and of the largest frame of which all
 #: pixels tell of it
-_SIDE, _MOST = 64, 128
+_SCATTER_SIDE, _SAMPLED_SIDE = 64, 128
 #: relative scatter of electrons behind a dirty lens: median, factor of one deviation
-_USUAL, _FACTOR = 0.004, 2.0
+_USUAL_SCATTER, _SCATTER_FACTOR = 0.004, 2.0
 #: of the median logarithm that is lost: its value at scatter 1, the power of scatter, and its
 #: growth with clipping
-_LOST, _POWER, _CLIPPED = 2.10, 0.74, 2.15
+_LOST_LOGARITHM, _SCATTER_POWER, _CLIPPING_GROWTH = 2.10, 0.74, 2.15
 #: standard deviations of the logarithm of it, where the frame tells the scatter, and where not
-_WIDTHS = (0.7, 1.2)
-_ALL = 10.0  #: logarithm, beyond which nothing of a laser follows its pattern
-_NODES = 256  #: quantiles that stand for a law
-_ENDS = (0.5, 0.05, 0.95)  #: probabilities of an estimate and of the ends of a 90 % interval
+_LOST_DEVIATIONS = (0.7, 1.2)
+_ALL_LOST = 10.0  #: logarithm, beyond which nothing of a laser follows its pattern
+_LAW_QUANTILES = 256  #: quantiles that stand for a law
+#: probabilities of an estimate and of the ends of a 90 % interval
+_INTERVAL_PROBABILITIES = (0.5, 0.05, 0.95)
 _HALVINGS = 60
 
 
@@ -71,31 +72,35 @@ def at_the_aperture(
     Units:  e-.
     """
     # the scatter is a mean over the frame, so that it falls as 1 / side
-    side = min(unclipped[0].numel() ** 0.5, _MOST)
+    side = min(unclipped[0].numel() ** 0.5, _SAMPLED_SIDE)
     clipped = 1.0 - unclipped.mean((-2, -1)).to(straight)
-    electrons = torch.maximum(straight, spread).clamp_min(1e-30) * (_SIDE / side)
+    electrons = torch.maximum(straight, spread).clamp_min(1e-30) * (_SCATTER_SIDE / side)
     scatter = (spread.square() - ideal.square()).clamp_min(0.0).sqrt() / electrons
-    # the least scatter that shows: it lets the deviation grow by `_PLAIN`
-    least_scatter = math.sqrt(_PLAIN**2 - 1.0) * ideal / electrons
+    # the least scatter that shows: it lets the deviation grow by `_CLEAN_LENS_GROWTH`
+    least_scatter = math.sqrt(_CLEAN_LENS_GROWTH**2 - 1.0) * ideal / electrons
     measurable = scatter > least_scatter
     # a dirty lens whose scatter does not show, over a clean one; both as likely before
-    dirty_odds = torch.special.ndtr((least_scatter / _USUAL).log() / math.log(_FACTOR))
+    dirty_odds = torch.special.ndtr(
+        (least_scatter / _USUAL_SCATTER).log() / math.log(_SCATTER_FACTOR)
+    )
     dirty_probability = (
         torch.ones_like(electrons) if bool(measurable.any()) else dirty_odds / (1.0 + dirty_odds)
     )
-    scatter = torch.where(measurable, scatter, least_scatter.clamp_max(_USUAL))
-    width = torch.where(measurable, _WIDTHS[0], _WIDTHS[1])
+    scatter = torch.where(measurable, scatter, least_scatter.clamp_max(_USUAL_SCATTER))
+    width = torch.where(measurable, _LOST_DEVIATIONS[0], _LOST_DEVIATIONS[1])
     # see the law above: a power of the scatter, an exponential of the clipped share
-    log_of_median = math.log(_LOST) + _POWER * scatter.log() + _CLIPPED * clipped
+    log_of_median = (
+        math.log(_LOST_LOGARITHM) + _SCATTER_POWER * scatter.log() + _CLIPPING_GROWTH * clipped
+    )
     log_loss = torch.exp(
         log_of_median[:, None] + width[:, None] * _normal_quantiles().to(electrons)
-    ).clamp_max(_ALL)
+    ).clamp_max(_ALL_LOST)
     return _quantiles(straight, spread, log_loss, dirty_probability)
 
 
 def _normal_quantiles() -> Tensor:
     quantiles: Tensor = torch.special.ndtri(
-        (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES
+        (torch.arange(_LAW_QUANTILES, dtype=torch.float64) + 0.5) / _LAW_QUANTILES
     )
     return quantiles
 
@@ -114,7 +119,7 @@ def _quantiles(
     probability_of_strength = torch.cat(
         [1.0 - dirty[:, None], (dirty / lost.shape[1])[:, None].expand_as(lost)], 1
     )
-    probabilities = torch.tensor(_ENDS).to(strengths).expand(len(strengths), -1)
+    probabilities = torch.tensor(_INTERVAL_PROBABILITIES).to(strengths).expand(len(strengths), -1)
     low = (strengths.amin(1) - 8.0 * spread)[:, None].expand_as(probabilities)
     high = (strengths.amax(1) + 8.0 * spread)[:, None].expand_as(probabilities)
     # bisection: the distribution is a mixture of normal ones, without an inverse
@@ -136,7 +141,7 @@ def _quantiles(
 # The node that finds lasers in one frame of a known camera, without any knowledge of the lasers.
 
 
-_WIDEST = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
+_WIDEST_INTERVAL = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
 #: log likelihood by which the fit exceeds one at another place or wavelength, to identify
 _RIVAL = 5.0
 _CHANNELS, _SMALLEST = (1, 3), 20
@@ -144,7 +149,7 @@ _COLOURS = (
     "lasers are found in a frame of 3 colour channels (3, y, x), or of one: give such a camera, or"
     " restore without a search, as `restore=wiener_blind` does"
 )
-_PRECISE = 256  #: pixels a side, up to which all is computed in float64
+_PRECISE_SIDE = 256  #: pixels a side, up to which all is computed in float64
 
 
 Widths = Annotated[tuple[PositiveLength, ...], Field(min_length=1, max_length=8)]
@@ -213,7 +218,7 @@ def find_lasers(
     _refuse(electrons, clipped, psf, pupil, responses, bands)
     lens = Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor)
     with torch.no_grad():
-        small_frame = max(electrons.shape[-2:]) <= _PRECISE
+        small_frame = max(electrons.shape[-2:]) <= _PRECISE_SIDE
         frame = electrons.detach().to(torch.float64 if small_frame else torch.float32)
         constant_pupil = Pupil(*(x.detach() for x in pupil))
         frame_and_camera = Known(
@@ -226,7 +231,7 @@ def find_lasers(
                 lens,
                 torch.tensor(widths[0], dtype=torch.float64),
             ),
-            lamp_light(psf, constant_pupil, illuminant, responses, bands, lens, frame.dtype),
+            lamp_light(View(psf, illuminant, responses, bands), constant_pupil, lens, frame.dtype),
             line_templates(constant_pupil, responses, bands, lens),
             read_noise,
             widths,
@@ -244,7 +249,7 @@ def _(*, responses: Any = None, **_: Any) -> list[str]:
     """
     if responses is not None and len(responses) not in _CHANNELS:
         raise ParameterError(
-            "responses.camera", f"the camera has {_told(len(responses))}: {_COLOURS}"
+            "responses.camera", f"the camera has {_channel_count(len(responses))}: {_COLOURS}"
         )
     return []
 
@@ -302,7 +307,7 @@ def _refuse(
     )
 
 
-def _told(channels: int) -> str:
+def _channel_count(channels: int) -> str:
     return f"{channels} channel{'s' * (channels != 1)}"
 
 
@@ -343,11 +348,15 @@ def _table(search_result: Found, frame: Known, rows: int) -> FoundLasers:
         result.strength[row], result.strength_interval[row] = at_the_aperture(
             *strength_and_deviations, frame.seen.cpu()
         )
-        # the intervals of place and wavelength must also be narrow, see `_WIDEST`
+        # the intervals of place and wavelength must also be narrow, see `_WIDEST_INTERVAL`
         choice = search_result.choices[laser_indices[n]]
         without_rival = choice.rival > _RIVAL
-        result.identifiable[row, 0] = without_rival and float(half_interval[:2].max()) < _WIDEST[0]
-        result.identifiable[row, 1] = without_rival and float(half_interval[2]) < _WIDEST[1]
+        result.identifiable[row, 0] = (
+            without_rival and float(half_interval[:2].max()) < _WIDEST_INTERVAL[0]
+        )
+        result.identifiable[row, 1] = (
+            without_rival and float(half_interval[2]) < _WIDEST_INTERVAL[1]
+        )
         result.gain[row] = torch.tensor([choice.gain, choice.margin])
         result.correlation[row] = covariance / torch.outer(
             half_interval / NORMAL, half_interval / NORMAL

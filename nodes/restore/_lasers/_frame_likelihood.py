@@ -23,12 +23,12 @@ from neusee.nodes.restore._lasers._components import NANOMETRE, Lamp, Laser
 # scene, and each pixel is divided by what its neighbourhood says of noise and of details of the
 # scene. The same filter acts on every pattern, so that filling makes no error of its own.
 
-_RADIUS = 8  #: pixels, of the filter
-_AROUND = 9  #: pixels a side, over which the variance of details is averaged
-_MEAN = 5  #: pixels a side, over which the mean that photon noise follows is averaged
-_UNSEEN = 1e12  #: e-^2, variance that stands for a pixel that is not seen
-LOST = 0.3  #: variance of a filled pixel, as a share of that of the channel
-_LEAST = 0.05  #: variance of details at a pixel, as a share of that of the frame
+_FILTER_RADIUS = 8  #: pixels, of the filter
+_DETAIL_WINDOW = 9  #: pixels a side, over which the variance of details is averaged
+_NOISE_WINDOW = 5  #: pixels a side, over which the mean that photon noise follows is averaged
+_UNSEEN_VARIANCE = 1e12  #: e-^2, variance that stands for a pixel that is not seen
+FILLED_VARIANCE = 0.3  #: variance of a filled pixel, as a share of that of the channel
+_LEAST_DETAIL = 0.05  #: variance of details at a pixel, as a share of that of the frame
 
 
 class Weights(NamedTuple):
@@ -135,7 +135,7 @@ def _from_coarse(pictures: Tensor, unclipped: Tensor) -> Tensor:
     return torch.where(unclipped > 0, pictures, filled_from_coarse[..., :y, :x])
 
 
-def box(pictures: Tensor, side: int) -> Tensor:
+def square_means(pictures: Tensor, side: int) -> Tensor:
     """Return the mean over squares of ``side`` pixels, an odd number; beyond the edge there is
     nothing.
     """
@@ -164,7 +164,7 @@ def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
     # a scene has the power strength / f^3, and the powers of a periodogram are exponential, with a
     # median of ln 2 times the mean
     scene_strength = ((power - noise_level) * frequency**3)[middle_frequencies].median() / 0.69
-    side = 2 * _RADIUS + 1
+    side = 2 * _FILTER_RADIUS + 1
     kernel_frequencies = torch.fft.fftfreq(64).to(grey)
     kernel_frequency = torch.hypot(kernel_frequencies[:, None], torch.fft.rfftfreq(64).to(grey))
     # 1 / sqrt(strength / f^3 + noise): what makes the sum white
@@ -172,7 +172,9 @@ def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
         kernel_frequency**3
         / (scene_strength.clamp_min(1e-6 * noise_level) + noise_level * kernel_frequency**3)
     ).sqrt()
-    kernel = torch.fft.irfft2(spectrum, s=(64, 64)).roll((_RADIUS, _RADIUS), (0, 1))[:side, :side]
+    kernel = torch.fft.irfft2(spectrum, s=(64, 64)).roll((_FILTER_RADIUS, _FILTER_RADIUS), (0, 1))[
+        :side, :side
+    ]
     taper = torch.hann_window(side + 2, periodic=False, dtype=grey.dtype, device=grey.device)[1:-1]
     taper = taper[:, None] * taper
     kernel = kernel * taper
@@ -183,7 +185,7 @@ def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
 
 def noise_of(electrons: Tensor, unclipped: Tensor, read_noise: float) -> Tensor:
     """Return the variance of the noise of each pixel: its local mean, and the read noise."""
-    return box(filled(electrons, unclipped), _MEAN).clamp_min(1.0) + read_noise**2
+    return square_means(filled(electrons, unclipped), _NOISE_WINDOW).clamp_min(1.0) + read_noise**2
 
 
 def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) -> Weights:
@@ -192,7 +194,7 @@ def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) ->
     """
     unclipped = use.seen
     spread = masked_variance(picture, unclipped)
-    noise_variance = use.squared(noise) + LOST * spread * use.squared(1.0 - unclipped)
+    noise_variance = use.squared(noise) + FILLED_VARIANCE * spread * use.squared(1.0 - unclipped)
     scene_colour = (picture * unclipped).sum((-2, -1)) / unclipped.sum((-2, -1)).clamp_min(1.0)
     scene_colour = (scene_colour / scene_colour.abs().max().clamp_min(1e-9)).clamp_min(0.05)[
         :, None, None
@@ -210,10 +212,13 @@ def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) ->
     )
     detail_variance = detail_variance.clamp_min(0.0)
     detail_variance = torch.maximum(
-        detail_variance, _LEAST * (detail_variance * any_seen).sum() / any_seen.sum().clamp_min(1.0)
+        detail_variance,
+        _LEAST_DETAIL * (detail_variance * any_seen).sum() / any_seen.sum().clamp_min(1.0),
     )
     colour_variance = _around((filtered - scene_colour * grey_details).square(), unclipped)
-    variance = torch.where(unclipped > 0, torch.maximum(noise_variance, colour_variance), _UNSEEN)
+    variance = torch.where(
+        unclipped > 0, torch.maximum(noise_variance, colour_variance), _UNSEEN_VARIANCE
+    )
     diagonal = variance.rsqrt()
     shared_deviation = scene_colour * detail_variance.sqrt() * diagonal
     shared_square = shared_deviation.square().sum(0, keepdim=True)
@@ -224,9 +229,9 @@ def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) ->
 
 def _around(values: Tensor, unclipped: Tensor) -> Tensor:
     """Return the mean over the pixels of a square around each pixel that are not clipped."""
-    return box(values * unclipped, _AROUND) / box(unclipped.expand_as(values), _AROUND).clamp_min(
-        1e-9
-    )
+    return square_means(values * unclipped, _DETAIL_WINDOW) / square_means(
+        unclipped.expand_as(values), _DETAIL_WINDOW
+    ).clamp_min(1e-9)
 
 
 def masked_variance(picture: Tensor, unclipped: Tensor) -> Tensor:
@@ -245,9 +250,10 @@ def masked_variance(picture: Tensor, unclipped: Tensor) -> Tensor:
 # photons and of what the neighbours do not tell.
 
 
-_BRIGHT = 0.01  #: probability that the scene alone clips a pixel, so that no laser must explain it
+#: probability that the scene alone clips a pixel, so that no laser must explain it
+_SCENE_CLIPS = 0.01
 #: of a pixel, because pixels within about three share the error of what their neighbours tell
-_WORTH = 1 / 9
+_CLIPPED_WEIGHT = 1 / 9
 
 
 class Censored(NamedTuple):
@@ -285,19 +291,19 @@ class Censored(NamedTuple):
 
 
 def _root(over: Tensor) -> tuple[Tensor, Tensor]:
-    """Return numbers whose half square is `_WORTH` times the misfit of clipped pixels, and how they
-    fall with ``over``.
+    """Return numbers whose half square is `_CLIPPED_WEIGHT` times the misfit of clipped pixels, and
+    how they fall with ``over``.
 
     ``over`` is by how many standard deviations the light of a pixel exceeds what fills it. The
     misfit is -log(1 - p), where p is the probability that the pixel is not full, and the scene
     alone does not fill it.
     """
-    below_full = (1.0 - _BRIGHT) * torch.special.ndtr(-over)
+    below_full = (1.0 - _SCENE_CLIPS) * torch.special.ndtr(-over)
     root = (-2.0 * torch.log1p(-below_full)).sqrt()
     density = torch.exp(-0.5 * over.square()) / (2.0 * torch.pi) ** 0.5
     # derivative of sqrt(-2 log(1 - p)) with respect to the deviations
-    slope = (1.0 - _BRIGHT) * density / ((1.0 - below_full) * root.clamp_min(1e-6))
-    return _WORTH**0.5 * root, _WORTH**0.5 * slope
+    slope = (1.0 - _SCENE_CLIPS) * density / ((1.0 - below_full) * root.clamp_min(1e-6))
+    return _CLIPPED_WEIGHT**0.5 * root, _CLIPPED_WEIGHT**0.5 * slope
 
 
 def censored(
@@ -308,7 +314,11 @@ def censored(
     """
     if bool(unclipped.all()):
         return None
-    variance = electrons.clamp_min(1.0) + read_noise**2 + LOST * masked_variance(scene, unclipped)
+    variance = (
+        electrons.clamp_min(1.0)
+        + read_noise**2
+        + FILLED_VARIANCE * masked_variance(scene, unclipped)
+    )
     return Censored(unclipped, variance[unclipped == 0].sqrt())
 
 
@@ -319,9 +329,9 @@ def censored(
 
 Parts = tuple[Laser | Lamp, ...]
 #: factors of the diagonal, tried in this order until a step lowers the misfit
-_DAMPED = (0.0, 1e-3, 1e-1, 10.0)
-_PIECE = 1 << 16  #: numbers at a time whose float64 copies fit in the cache
-_ENOUGH = 0.02  #: log likelihood, a smaller gain of which ends the steps
+_DAMPINGS = (0.0, 1e-3, 1e-1, 10.0)
+_PIECE_NUMBERS = 1 << 16  #: numbers at a time whose float64 copies fit in the cache
+_LEAST_GAIN = 0.02  #: log likelihood, a smaller gain of which ends the steps
 
 
 class Data(NamedTuple):
@@ -371,7 +381,7 @@ def _walked(data: Data, now: Parts, steps: int) -> tuple[Parts, Tensor, Tensor, 
         # next_fit is (parts, remainder, residual, misfit)
         gain = misfit - next_fit[3]
         now, remainder, white_residual, misfit = next_fit
-        if gain < _ENOUGH:
+        if gain < _LEAST_GAIN:
             break
     return now, remainder, white_residual, misfit
 
@@ -387,7 +397,7 @@ def _step(
     prior_pull = torch.cat([component.values * component.precision for component in now])
     slope = columns @ white_residual - prior_pull
     sizes = [len(component.values) for component in now]
-    for damping in _DAMPED:
+    for damping in _DAMPINGS:
         step = solved(normal + damping * normal.diagonal().diag(), slope).to(slope)
         moved = tuple(
             component.moved(own_step)
@@ -429,8 +439,8 @@ def products(columns: Tensor) -> Tensor:
     smaller than that.
     """
     total = torch.zeros(len(columns), len(columns), dtype=torch.float64, device=columns.device)
-    for first in range(0, columns.shape[1], _PIECE):
-        piece = columns[:, first : first + _PIECE].double()
+    for first in range(0, columns.shape[1], _PIECE_NUMBERS):
+        piece = columns[:, first : first + _PIECE_NUMBERS].double()
         total += piece @ piece.T
     return total
 
@@ -470,7 +480,7 @@ def _misfit(data: Data, parts: Parts) -> tuple[Tensor, Tensor, float]:
 
 
 NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % interval
-_BLOCK = 8  #: pixels a side of blocks whose residuals count as independent of one another
+_BLOCK_SIDE = 8  #: pixels a side of blocks whose residuals count as independent of one another
 #: pixels, pixels and nm, standard deviations of what dirt and defocus change
 _MODEL = (0.0036, 0.0036, 0.08)
 #: the same over the root of the number of pixels seen, whose scattered light is random
@@ -506,11 +516,11 @@ def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
         ]  # a clipped pixel has no residual
     scores = pictures.sum(1)
     # up to whole blocks
-    rows_missing, columns_missing = (-n % _BLOCK for n in unclipped.shape[-2:])
+    rows_missing, columns_missing = (-n % _BLOCK_SIDE for n in unclipped.shape[-2:])
     blocks = (
         pad(scores, (0, columns_missing, 0, rows_missing))
-        .unfold(1, _BLOCK, _BLOCK)
-        .unfold(2, _BLOCK, _BLOCK)
+        .unfold(1, _BLOCK_SIDE, _BLOCK_SIDE)
+        .unfold(2, _BLOCK_SIDE, _BLOCK_SIDE)
         .sum((-2, -1))
         .flatten(1)
     )

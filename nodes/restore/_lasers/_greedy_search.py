@@ -40,18 +40,20 @@ from neusee.nodes.restore._lasers._frame_likelihood import (
 # The search: one more laser or lamp at a time, as long as it explains much more of the frame.
 
 
-_AHEAD = 10.0  #: log likelihood by which a laser is ahead of a lamp at least
-_SAME = (2.0, 25.0)  #: pixels and nm, within which two lasers are one
-_FEW = 4  #: clipped pixels, fewer of which need no explanation
-_TRIED = 2  #: candidates that are fitted before one of them is chosen
+_LASER_LEAD = 10.0  #: log likelihood by which a laser is ahead of a lamp at least
+_SAME_LASER = (2.0, 25.0)  #: pixels and nm, within which two lasers are one
+_FEW_CLIPPED = 4  #: clipped pixels, fewer of which need no explanation
+_CANDIDATES_TRIED = 2  #: candidates that are fitted before one of them is chosen
 #: share of the clipped pixels that no part explains, from which on one more is sought farther away
-_LEFT = 0.25
+_UNEXPLAINED_SHARE = 0.25
 #: sum of squares of the errors of three responses, which one laser in ten exceeds by chance
-_ODD = 6.25
-_CLIPPED = 4  #: candidates for clipped pixels, whose surroundings are searched before any is fitted
-_BEHIND = 0.25  #: share of a gain, candidates below which are not fitted
-_WIDER = 1.5  #: times the first width, up to which a fitted width is not compared with others
-_FIRST, _LAST = 5, 12  #: steps of a fit of one part, and of all parts
+_ODD_RESPONSES = 6.25
+#: candidates for clipped pixels, whose surroundings are searched before any is fitted
+_CLIPPED_CANDIDATES = 4
+_LEAST_GAIN_SHARE = 0.25  #: share of a gain, candidates below which are not fitted
+#: times the first width, up to which a fitted width is not compared with others
+_WIDEST_RATIO = 1.5
+_STEPS_OF_ONE, _STEPS_OF_ALL = 5, 12  #: steps of a fit of one part, and of all parts
 
 
 class Known(NamedTuple):
@@ -96,7 +98,7 @@ def search(
     while True:
         # filter and weights follow the scene that is left without the parts
         data = _data(frame, parts)
-        fit = fitted(data, parts, _LAST) if parts else _empty(data)
+        fit = fitted(data, parts, _STEPS_OF_ALL) if parts else _empty(data)
         parts = fit.parts
         best = _best(frame, fit, data, smallest_gain, margin)
         if (
@@ -119,7 +121,9 @@ def _pruned(search_result: Found, smallest_gain: float) -> Found:
         misfit = misfit_of(data, parts, 1)[1]
         parts_without_one = [parts[:n] + parts[n + 1 :] for n in range(len(parts))]
         # the gain of a part beside the rest is the misfit that its absence costs
-        costs = [misfit_of(data, remaining, _FIRST)[1] - misfit for remaining in parts_without_one]
+        costs = [
+            misfit_of(data, remaining, _STEPS_OF_ONE)[1] - misfit for remaining in parts_without_one
+        ]
         choices = tuple(
             choice._replace(gain=cost) for choice, cost in zip(choices, costs, strict=True)
         )
@@ -131,7 +135,7 @@ def _pruned(search_result: Found, smallest_gain: float) -> Found:
             choices[:least_needed] + choices[least_needed + 1 :],
         )
     fit = (
-        fitted(search_result.data, parts, _LAST)
+        fitted(search_result.data, parts, _STEPS_OF_ALL)
         if len(parts) < len(search_result.fit.parts)
         else search_result.fit
     )
@@ -212,12 +216,12 @@ def _best(frame: Known, fit: Fit, data: Data, smallest_gain: float, margin: floa
         nearest(remainder.known.camera, remainder.data, residual, start) for start in clipped
     ]
     # the first ones alone: each is fitted, which takes long
-    starts += sorted(nearest_starts, reverse=True)[:_TRIED]
+    starts += sorted(nearest_starts, reverse=True)[:_CANDIDATES_TRIED]
     grown_choices = _all_grown(remainder, sorted(starts, reverse=True))
     if clipped and _leaves_dark(frame, fit.parts, grown_choices):
         nearest_of_tiles = [
             nearest_of_many(remainder.known.camera, remainder.data, residual, start)
-            for start in clipped[:_TRIED]
+            for start in clipped[:_CANDIDATES_TRIED]
         ]
         grown_choices = _with_more(remainder, grown_choices, nearest_of_tiles)
     # colours that do not fit ask for another wavelength
@@ -232,7 +236,7 @@ def _unclipped_starts(left: _Left, residual: Tensor, lines: Templates) -> list[C
     use, weights, lamp = left.data.use, left.data.weights, left.known.lamp
     spot = Templates(torch.zeros(1).double(), lamp.patterns[None], lamp.colour[None])
     return [
-        *candidates(residual, use, weights, lines, _TRIED),
+        *candidates(residual, use, weights, lines, _CANDIDATES_TRIED),
         *candidates(residual, use, weights, spot, 1),
     ]
 
@@ -241,10 +245,10 @@ def _with_far_wavelengths(left: _Left, grown: list[Choice], residual: Tensor) ->
     """Return what was grown with what grows farther away, as long as the best laser has unlikely
     responses.
     """
-    for _ in range(_TRIED):
+    for _ in range(_CANDIDATES_TRIED):
         best_laser = next((choice.part for choice in grown if isinstance(choice.part, Laser)), None)
         # values[5:] are the errors of the responses, in standard deviations
-        if best_laser is None or float(best_laser.values[5:].square().sum()) < _ODD:
+        if best_laser is None or float(best_laser.values[5:].square().sum()) < _ODD_RESPONSES:
             break
         start = nearest(left.known.camera, left.data, residual, _start(best_laser), near=FAR)
         grown = _with_more(left, grown, [start])
@@ -280,7 +284,7 @@ def _ahead(
     lamps += _all_grown(left, [Candidate(0.0, (y, x), 0.0, float(best_laser.part.values[3]))])
     lamps.sort(key=lambda choice: -choice.gain)
     gain_ahead = best_laser.gain - (lamps[0].gain if lamps else 0.0)
-    if lamps and gain_ahead < max(margin * best_laser.gain, _AHEAD):
+    if lamps and gain_ahead < max(margin * best_laser.gain, _LASER_LEAD):
         return lamps[0]._replace(margin=-gain_ahead)
     rival_gain = max(
         (laser.gain for laser in lasers[1:] if _elsewhere(best_laser.part, laser.part)), default=0.0
@@ -304,7 +308,7 @@ def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
     """
     grown: list[Choice] = []
     for start in starts:
-        if start.gain >= _BEHIND * max((choice.gain for choice in grown), default=0.0):
+        if start.gain >= _LEAST_GAIN_SHARE * max((choice.gain for choice in grown), default=0.0):
             grown += filter(None, [_grown(left, start)])
     return sorted(grown, key=lambda choice: -choice.gain)
 
@@ -328,12 +332,12 @@ def _widened(left: _Left, laser: Choice) -> Choice:
     """
     best, widths = laser, left.known.widths
     assert isinstance(laser.part, Laser)
-    if float(laser.part.fwhm) < _WIDER * widths[0]:
+    if float(laser.part.fwhm) < _WIDEST_RATIO * widths[0]:
         return laser
     for width in widths[1:]:
         camera = left.known.camera._replace(fwhm=left.known.camera.fwhm.new_tensor(width))
         assert isinstance(best.part, Laser)
-        parts, misfit = misfit_of(left.data, (replace(best.part, camera=camera),), _FIRST)
+        parts, misfit = misfit_of(left.data, (replace(best.part, camera=camera),), _STEPS_OF_ONE)
         if left.before - misfit > best.gain:
             best = best._replace(part=parts[0], gain=left.before - misfit)
     return best
@@ -345,7 +349,7 @@ def _known_already(component: Laser | Lamp, parts: Parts) -> bool:
         if isinstance(component, Laser) and isinstance(other, Laser):
             distances = (component.values[:3] - other.values[:3]).abs().tolist()
             # y and x in pixels, then nm
-            if max(distances[:2]) < _SAME[0] and distances[2] < _SAME[1]:
+            if max(distances[:2]) < _SAME_LASER[0] and distances[2] < _SAME_LASER[1]:
                 return True
     return False
 
@@ -367,7 +371,7 @@ def _leaves_dark(frame: Known, parts: Parts, grown: list[Choice]) -> bool:
     that gains most.
     """
     strongest = [_precise(choice.part, frame).electrons() for choice in grown[:1]]
-    return _dark(frame, sum(strongest, _light(frame, parts))) > _LEFT * int(
+    return _dark(frame, sum(strongest, _light(frame, parts))) > _UNEXPLAINED_SHARE * int(
         (frame.seen == 0).any(0).sum()
     )
 
@@ -377,16 +381,16 @@ def _clipped_starts(frame: Known, parts: Parts, use: Filter) -> list[Candidate]:
     explained.
     """
     full_light, light = _full_well(frame), _light(frame, parts)
-    if _dark(frame, light) < _FEW:
+    if _dark(frame, light) < _FEW_CLIPPED:
         return []
     picture = frame.electrons - torch.minimum(light, full_light.where(full_light > 0, torch.inf))
     all_pixels = Filter(torch.ones_like(frame.seen), use.kernel)
     noise = noise_of(frame.electrons, all_pixels.seen, frame.read_noise)
     weights = weights_of(all_pixels(picture), all_pixels, noise, picture)
     starts = clipped_candidates(
-        picture, float(full_light.max()), all_pixels, weights, frame.lines, _CLIPPED
+        picture, float(full_light.max()), all_pixels, weights, frame.lines, _CLIPPED_CANDIDATES
     )
-    return [start for start in starts if start.gain >= _BEHIND * starts[0].gain]
+    return [start for start in starts if start.gain >= _LEAST_GAIN_SHARE * starts[0].gain]
 
 
 def _laser(frame: Known, start: Candidate, like: Tensor) -> Laser:
@@ -421,7 +425,7 @@ def _grown(left: _Left, start: Candidate) -> Choice | None:
         component = Lamp(
             frame.lamp, frame.camera.lens.shape, torch.cat([spot, light_by_kind.flatten()])
         )
-    parts, misfit = misfit_of(left.data, (component,), _FIRST)
+    parts, misfit = misfit_of(left.data, (component,), _STEPS_OF_ONE)
     gain = left.before - misfit
     return Choice(parts[0], gain, 0.0, 0.0) if gain > 0 else None
 

@@ -18,8 +18,8 @@ from neusee.nodes.values import Bands, Pupil
 Sensor = SensorSampling
 
 #: widths of a line in m, each with the number of its parts; then the most
-_COUNTS, _MOST = ((2.5e-9, 3), (6e-9, 5)), 7
-_NARROW = 0.1e-9  #: m, width of a line, below which slopes are those of a line so wide
+_LINE_SAMPLES, _MOST_LINE_SAMPLES = ((2.5e-9, 3), (6e-9, 5)), 7
+_NARROW_WIDTH = 0.1e-9  #: m, width of a line, below which slopes are those of a line so wide
 _FILTER_ERROR = 1e-8  #: of the average over a pixel, relative to the brightest pixel
 
 
@@ -68,7 +68,10 @@ def _parts(fwhm: Tensor) -> tuple[list[float], list[float]]:
     (Gauss and Hermite).
     """
     nodes, weights = hermegauss(
-        next((count for limit, count in _COUNTS if float(fwhm.detach()) < limit), _MOST)
+        next(
+            (count for limit, count in _LINE_SAMPLES if float(fwhm.detach()) < limit),
+            _MOST_LINE_SAMPLES,
+        )
     )
     return nodes.tolist(), (weights / weights.sum()).tolist()
 
@@ -166,7 +169,7 @@ def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm:
     The slopes with wavelength and variance are means over the line too, by parts of the integral
     over a Gaussian line.
     """
-    line_width = fwhm.clamp_min(_NARROW)
+    line_width = fwhm.clamp_min(_NARROW_WIDTH)
     sigma, sums = deviation(line_width), [torch.zeros(1)] * 5
     for offset, share in zip(*_parts(line_width), strict=True):
         pattern, down, right = _moves(pupil, spot, wavelength + offset * sigma, lens)

@@ -2,8 +2,9 @@
 
 import functools
 import math
+from collections.abc import Mapping
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -114,24 +115,12 @@ def _decay(A_log: Tensor) -> Tensor:
 # the picture.
 
 
-Directions = Literal[2, 4]  #: 2: a block scans rows or columns; 4: both
-#: the numbers that represent a spectrum in a scan and in its gate
-Form = Literal["complex", "amp_phase"]
-SMALL = 1e-4  #: added to the square of an amplitude, so that gradients stay finite
-
-
 class Spatial(nn.Module):
-    """A layer that applies selective scans along the rows or columns of a picture, or both, and
-    gates the result.
+    """A layer that applies selective scans along the rows or columns of a picture, and gates the
+    result.
     """
 
-    def __init__(
-        self,
-        width: int,
-        states: int,
-        by_columns: bool,
-        directions: Directions = 2,
-    ) -> None:
+    def __init__(self, width: int, states: int, by_columns: bool) -> None:
         """Build a layer for ``width`` channels, twice as many inside, with ``states`` numbers each
         in a scan.
         """
@@ -140,7 +129,6 @@ class Spatial(nn.Module):
         self.enter = nn.Conv2d(width, 2 * inner, 1)
         self.mix = nn.Conv2d(inner, inner, 3, padding=1, groups=inner)
         self.scan = BothWays(inner, states, -(-width // 16))
-        self.across = BothWays(inner, states, -(-width // 16)) if directions == 4 else None
         self.norm = nn.LayerNorm(inner)
         self.leave = nn.Conv2d(inner, width, 1)
 
@@ -148,8 +136,6 @@ class Spatial(nn.Module):
         value, gate = self.enter(x).chunk(2, 1)
         value = F.silu(self.mix(value))
         scanned = _along(self.scan, value, self.by_columns)
-        if self.across is not None:
-            scanned = scanned + _along(self.across, value, not self.by_columns)
         scanned = self.norm(scanned.movedim(1, -1)).movedim(-1, 1)
         result: Tensor = self.leave(scanned * F.silu(gate))
         return result
@@ -164,21 +150,6 @@ def _along(scan: nn.Module, value: Tensor, by_columns: bool) -> Tensor:
         scan(value.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, value.shape[-2:])
     )
     return scanned.mT if by_columns else scanned
-
-
-class _Phase(torch.autograd.Function):
-    """The angle of a complex number z, with a finite gradient: |z|**2 + `SMALL` replaces |z|**2."""
-
-    @staticmethod
-    def forward(ctx: Any, real: Tensor, imaginary: Tensor) -> Tensor:
-        ctx.save_for_backward(real, imaginary)
-        return torch.atan2(imaginary, real)
-
-    @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, Tensor]:
-        real, imaginary = ctx.saved_tensors
-        slope = slopes[0] / (real.square() + imaginary.square() + SMALL)
-        return -slope * imaginary, slope * real
 
 
 @functools.lru_cache(maxsize=32)
@@ -206,17 +177,15 @@ class Frequency(nn.Module):
     """A layer that multiplies the spectrum of a picture by a gate, computed by selective scans over
     frequency.
 
-    The gate uses real and imaginary parts, because phase has no gradient at 0. Amplitude and phase,
-    ``amp_phase``, are for comparison. At the start of training the gate is close to 1 and the
-    picture passes almost unchanged.
+    The gate uses real and imaginary parts, because phase has no gradient at 0. At the start of
+    training the gate is close to 1 and the picture passes almost unchanged.
     """
 
-    def __init__(self, width: int, states: int, form: Form = "complex") -> None:
+    def __init__(self, width: int, states: int) -> None:
         """Build a layer for ``width`` channels, whose real and imaginary parts enter side by
         side.
         """
         super().__init__()
-        self.form = form
         self.norm = nn.LayerNorm(2 * width)
         self.enter = nn.Linear(2 * width, 2 * width)
         self.scan = BothWays(width, states, -(-width // 16))
@@ -233,33 +202,15 @@ class Frequency(nn.Module):
         with torch.autocast(x.device.type, enabled=False):  # FFTs need full precision
             spectrum = torch.fft.rfft2(x, norm="ortho")
             by_radius = spectrum.flatten(2).index_select(2, order)
-            features = self.norm(torch.cat(self._parts(by_radius), 1).transpose(1, 2))
+            parts = torch.cat([by_radius.real, by_radius.imag], 1)
+            features = self.norm(parts.transpose(1, 2))
         scan_input, gate = self.enter(features).chunk(2, -1)
         changes = single(self.leave(self.scanned(self.scan(F.silu(scan_input))) * F.silu(gate)))
-        real_or_amplitude, imaginary_or_phase = (
-            changes.transpose(1, 2).index_select(2, rank).chunk(2, 1)
-        )
+        real, imaginary = changes.transpose(1, 2).index_select(2, rank).chunk(2, 1)
         with torch.autocast(x.device.type, enabled=False):
-            factor = self._factor(real_or_amplitude, imaginary_or_phase).view_as(spectrum)
+            factor = (1 + self.strength * torch.complex(real, imaginary)).view_as(spectrum)
             result: Tensor = torch.fft.irfft2(spectrum * factor, s=size, norm="ortho")
         return result
-
-    def _parts(self, spectrum: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the spectrum as real and imaginary part, or as amplitude and phase."""
-        real, imaginary = spectrum.real, spectrum.imag
-        if self.form == "complex":
-            return real, imaginary
-        phase: Tensor = _Phase.apply(real, imaginary)  # type: ignore[no-untyped-call]
-        return (real.square() + imaginary.square() + SMALL).sqrt(), phase
-
-    def _factor(self, first: Tensor, second: Tensor) -> Tensor:
-        """Return the factor near 1 that multiplies the spectrum, in complex form or from
-        amplitude and phase.
-        """
-        if self.form == "complex":
-            return 1 + self.strength * torch.complex(first, second)
-        amplitude, turn = 1 + self.strength * first, self.strength * second
-        return torch.complex(amplitude * turn.cos(), amplitude * turn.sin())
 
 
 class Block(nn.Module):
@@ -267,19 +218,12 @@ class Block(nn.Module):
     feed-forward layer.
     """
 
-    def __init__(
-        self,
-        width: int,
-        states: int,
-        by_columns: bool,
-        directions: Directions = 2,
-        form: Form = "complex",
-    ) -> None:
+    def __init__(self, width: int, states: int, by_columns: bool) -> None:
         """Build a block for ``width`` channels; its feed-forward layer has four times as many."""
         super().__init__()
         self.norm, self.second_norm = ChannelNorm(width), ChannelNorm(width)
-        self.spatial = Spatial(width, states, by_columns, directions)
-        self.frequency = Frequency(width, states, form)
+        self.spatial = Spatial(width, states, by_columns)
+        self.frequency = Frequency(width, states)
         self.weigh = nn.Conv2d(2 * width, width, 1)
         self.widen = nn.Conv2d(width, 4 * width, 1)
         self.mix = nn.Conv2d(4 * width, 4 * width, 3, padding=1, groups=4 * width)
@@ -308,48 +252,33 @@ class FFTMamba(PictureRestorer):
     half and full size.
 
     The first pass computes a coarse estimate, from which the second pass computes a fine estimate.
-    With ``directions`` 4 every block scans rows and columns. With ``pyramid`` the network runs
-    once, and the coarse estimate is the reduced fine estimate. Eight blocks, two scales and the
-    modules are those of the paper. The sizes and connections of the modules are our choice.
+    Eight blocks, two scales and the modules are those of the paper. The sizes and connections of
+    the modules are our choice.
     """
 
+    #: what a file of weights says beside its tensors. Earlier versions had other values, with
+    #: tensors of the same shapes, so a file that says otherwise is refused.
+    options: Mapping[str, Any] = {"directions": 2, "pyramid": False, "frequency": "complex"}
+
     def __init__(
-        self,
-        width: int = 64,
-        blocks: int = 8,
-        states: int = 16,
-        shuffle: int = 2,
-        directions: Directions = 2,
-        pyramid: bool = False,
-        frequency: Form = "complex",
+        self, width: int = 64, blocks: int = 8, states: int = 16, shuffle: int = 2
     ) -> None:
         """Build the network: ``width`` channels, ``blocks`` of scans with ``states`` numbers for
         each channel.
 
-        ``shuffle`` is the side of the squares of pixels that become channels; ``pyramid`` computes
-        only the full size and reduces it for the coarse estimate.
+        ``shuffle`` is the side of the squares of pixels that become channels.
         """
         super().__init__()
-        self.shuffle, self.multiple, self.one_pass = shuffle, 2 * shuffle, pyramid
-        self.options = {
-            "directions": directions,
-            "pyramid": pyramid,
-            "frequency": frequency,
-        }
+        self.shuffle, self.multiple = shuffle, 2 * shuffle
         # channels of a shuffled colour picture
         inside = 3 * shuffle**2
         self.enter = nn.Conv2d(2 * inside, width, 3, padding=1)
-        self.blocks = nn.Sequential(
-            *(Block(width, states, bool(i % 2), directions, frequency) for i in range(blocks))
-        )
+        self.blocks = nn.Sequential(*(Block(width, states, bool(i % 2)) for i in range(blocks)))
         self.leave = nn.Conv2d(width, width, 3, padding=1)
         self.last = nn.Conv2d(width, inside, 3, padding=1)
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         y, x = picture.shape[-2:]
-        if self.one_pass:
-            fine = self.improved(picture, picture)
-            return resize(fine, y // 2, x // 2), fine
         half_picture = resize(picture, y // 2, x // 2)
         coarse = self.improved(half_picture, half_picture)
         return coarse, self.improved(picture, resize(coarse, y, x))
@@ -372,9 +301,6 @@ def fft_mamba(
     blocks: Layers = 8,
     states: Layers = 16,
     shuffle: Count = 2,
-    directions: Directions = 2,
-    pyramid: bool = False,
-    frequency: Form = "complex",
     tile: Tile | None = None,
     reduce: Count = 1,
     detail: bool = False,
@@ -388,9 +314,7 @@ def fft_mamba(
     training pictures, because a network is less accurate on longer scans. ``reduce``: the picture
     is reduced by this factor first and enlarged again afterwards, for an element behind which finer
     detail is lost. ``detail``: the finer detail is added unchanged, for a deconvolved picture, in
-    which finer detail is not lost. ``directions`` 4: each block scans rows and
-    columns. ``pyramid``: one pass, at the full size. ``frequency`` amp_phase, for comparison: the
-    gate is computed from amplitude and phase, and changes amplitude and phase.
+    which finer detail is not lost.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
     Units:  linear sRGB, as in the training of the weights.
@@ -400,7 +324,7 @@ def fft_mamba(
     Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023; sizes and connections
             are ours.
     """
-    kind = partial(FFTMamba, width, blocks, states, shuffle, directions, pyramid, frequency)
+    kind = partial(FFTMamba, width, blocks, states, shuffle)
     return restored(picture, kind, weights, tile, reduce, detail)
 
 

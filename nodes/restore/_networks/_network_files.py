@@ -508,11 +508,15 @@ def network(
     Source: the author of the network.
     """
     return restored_by(
-        lambda: _ready(architecture, parameters, weights, multiple), picture, tile, reduce, detail
+        lambda: _loaded_network(architecture, parameters, weights, multiple),
+        picture,
+        tile,
+        reduce,
+        detail,
     )
 
 
-def _ready(
+def _loaded_network(
     architecture: Architecture | type[nn.Module] | None,
     parameters: dict[str, Any] | None,
     weights: Path | None,

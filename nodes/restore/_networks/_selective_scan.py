@@ -8,7 +8,7 @@ import ctypes
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,7 +24,6 @@ __depends__ = (
     "unaffected:ctypes",
     "unaffected:torch.get_num_threads",
 )
-Backend = Literal["torch", "cpp"]
 
 
 def selective_scan(
@@ -34,16 +33,14 @@ def selective_scan(
     B: Tensor,
     C: Tensor,
     D: Tensor | None = None,
-    *,
-    backend: Literal["auto", "torch", "cpp"] = "auto",
 ) -> Tensor:
     """Run the scan h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0, and return y_t = <C_t, h_t>
     + D u_t.
 
     ``A`` is negative and ``dt`` positive: decays are at most 1 and are only multiplied, so nothing
-    overflows at any length. ``backend`` "auto" is C++ on a CPU with a compiler, and torch in all
-    other cases. ``NEUSEE_SCAN=torch`` selects torch everywhere. The scan is differentiable once: a
-    gradient of its gradient raises an error.
+    overflows at any length. The scan runs in C++ on a CPU with a compiler, and in torch in all
+    other cases; ``NEUSEE_SCAN=torch`` selects torch everywhere. The scan is differentiable once:
+    a gradient of its gradient raises an error.
 
     Shapes: u, dt (batch, length, d), A (d, n), B, C (batch, length, n), D (d) -> (batch, length,
             d).
@@ -51,17 +48,17 @@ def selective_scan(
     Error:  float32, also from half precision and under autocast: of the largest |y|, over 65 536
             steps and for dt |A| from 1e-6 to 200, 2e-7 in C++, 7e-7 in torch. float64 if any input
             is float64: 1e-12.
-    Raises: ValueError for shapes that do not fit and for a backend that these tensors, or this
-            machine, do not support.
+    Raises: ValueError for shapes that do not fit, and for another value of NEUSEE_SCAN than torch
+            and cpp.
     Source: Gu and Dao, Mamba: Linear-Time Sequence Modeling with Selective State Spaces, 2023,
             algorithm 2.
     """
     _check_shapes(u, dt, A, B, C, D)
-    kind = _common_dtype(u, dt, A, B, C)
-    backend_used = _backend_for(u) if backend == "auto" else backend
+    dtype = _common_dtype(u, dt, A, B, C)
+    scan = CppScan if _runs_in_cpp(u) else TorchScan
     with torch.autocast(u.device.type, enabled=False):
-        y = _run(backend_used, *(x.to(kind) for x in (u, dt, A, B, C)))
-        return y if D is None else torch.addcmul(y, D.to(kind), u.to(kind))
+        y: Tensor = scan.apply(*(x.to(dtype) for x in (u, dt, A, B, C)))  # type: ignore[no-untyped-call]
+        return y if D is None else torch.addcmul(y, D.to(dtype), u.to(dtype))
 
 
 def reference(
@@ -127,27 +124,14 @@ def _common_dtype(*tensors: Tensor) -> torch.dtype:
     return torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
 
 
-def _backend_for(u: Tensor) -> Backend:
-    """Return the backend that the variable NEUSEE_SCAN names, else the C++ one on a CPU if it can
-    be compiled.
+def _runs_in_cpp(u: Tensor) -> bool:
+    """Return True on a CPU where the C++ scan can be compiled, unless the variable NEUSEE_SCAN
+    says torch.
     """
     backend_named = os.environ.get("NEUSEE_SCAN") or ""
-    if backend_named not in ("", *get_args(Backend)):
+    if backend_named not in ("", "torch", "cpp"):
         raise ValueError(f"NEUSEE_SCAN is {backend_named!r}: write torch or cpp")
-    if backend_named == "torch" or u.device.type != "cpu":
-        return "torch"
-    return "cpp" if compiled() else "torch"
-
-
-def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
-    """Return the scan (batch, length, d) without the term of D, by the named backend."""
-    if backend not in get_args(Backend):
-        raise ValueError(f"backend is {backend!r}: write auto, {', '.join(get_args(Backend))}")
-    if backend == "cpp" and u.device.type != "cpu":
-        raise ValueError(f"the backend cpp is for the CPU, but u is on {u.device}")
-    scan = CppScan if backend == "cpp" and compiled() else TorchScan
-    y: Tensor = scan.apply(u, dt, A, B, C)  # type: ignore[no-untyped-call]
-    return y
+    return backend_named != "torch" and u.device.type == "cpu" and compiled()
 
 
 def refuse_twice() -> None:

@@ -103,7 +103,6 @@ def informed(
     balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
-    scatter: bool = False,
     read_noise: Electrons,
 ) -> Tensor:
     """Deconvolve a picture by `restore.wiener`, and correct the answer by a network that sees what
@@ -112,8 +111,7 @@ def informed(
     A small NAFNet sees the maps of `restore.filter_facts`: the answer and its brightness, the
     residual, which pixels are clipped and how certain they are, the glare and what is not known of
     it, and what the frame tells of each pixel and each octave of frequency. So one network serves
-    several masks, lasers and noises. Without ``weights`` the restorer is the filter. ``scatter`` as
-    `restore.wiener`; the weights that ship were trained without it.
+    several masks, lasers and noises. Without ``weights`` the restorer is the filter.
 
     Shapes: as `restore.wiener`, of three channels -> (channel, y, x).
     Units:  as `restore.wiener`.
@@ -132,7 +130,7 @@ def informed(
             " needs 3"
         )
     view = View(psf, illuminant, responses, bands)
-    settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
+    settings = Settings(balance, read_noise, doubt, least_doubt)
     filtered = facts(pose(electrons, clipped, view, light, settings))
     result = filtered.answer * filtered.scale
     if weights is not None:
@@ -183,10 +181,10 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Ch
 
 
 Steps = Annotated[Count, Field(le=16)]
-_MAPS = 15  #: maps that a prior sees: five of each of three channels
+_MAPS_OF_PRIOR = 15  #: maps that a prior sees: five of each of three channels
 #: of what a network says, at first, and the range of its logarithm to either side
-_PRECISION, _REACH = 10.0, 5.0
-_BRIGHT = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
+_PRECISION, _PRECISION_REACH = 10.0, 5.0
+_GLARE_GAIN = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
 
 
 class Unrolled(Restorer):
@@ -198,12 +196,11 @@ class Unrolled(Restorer):
     precision 0 leaves the filter's answer.
     """
 
-    def __init__(self, width: int = 16, steps: int = 2, iterations: int = PULLED_STEPS) -> None:
+    def __init__(self, width: int = 16, steps: int = 2) -> None:
         """Build ``steps`` networks of ``width`` channels at full size, one for each step."""
         super().__init__()
-        self.iterations = iterations  #: of the conjugate gradients in each step
         self.priors = nn.ModuleList(
-            NAFNet(width, (1, 1, 1), 1, inputs=_MAPS, outputs=6) for _ in range(steps)
+            NAFNet(width, (1, 1, 1), 1, inputs=_MAPS_OF_PRIOR, outputs=6) for _ in range(steps)
         )
         self.multiple = 8
 
@@ -230,12 +227,14 @@ class Unrolled(Restorer):
         """
         change = blurred_change = torch.zeros_like(answer)
         for prior in self.priors:
-            pull, precision = _found(prior, problem, answer + change, blurred + blurred_change)
-            change, blurred_change = pulled(problem, change + pull, precision, self.iterations)
+            pull, precision = _prior_of(prior, problem, answer + change, blurred + blurred_change)
+            change, blurred_change = pulled(problem, change + pull, precision, PULLED_STEPS)
         return change
 
 
-def _found(prior: nn.Module, problem: Blurred, x: Tensor, blurred: Tensor) -> tuple[Tensor, Tensor]:
+def _prior_of(
+    prior: nn.Module, problem: Blurred, x: Tensor, blurred: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return the change of the picture of the step before that a network wants, and its
     precision (channel, y, x).
     """
@@ -245,7 +244,7 @@ def _found(prior: nn.Module, problem: Blurred, x: Tensor, blurred: Tensor) -> tu
     change, precision_logarithm = prior.change(maps)[0, :, :rows, :columns].to(x).split(3)  # type: ignore[operator]
     return change, _PRECISION * torch.exp(
         # one precision for a channel, within exp(-5) to exp(5) of the first
-        _REACH * torch.tanh(precision_logarithm.mean((-2, -1), keepdim=True))
+        _PRECISION_REACH * torch.tanh(precision_logarithm.mean((-2, -1), keepdim=True))
     ).expand_as(change)
 
 
@@ -268,7 +267,7 @@ def _maps(problem: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
             residual.asinh(),
             certainty,
             unclipped.to(residual),
-            (_BRIGHT / brightest * glare).asinh(),
+            (_GLARE_GAIN / brightest * glare).asinh(),
         ]
     )
 

@@ -13,6 +13,7 @@ from neusee.workflows.api import verbs
 from neusee.workflows.calibration import run_calibration
 from neusee.workflows.studies import run_study
 from neusee.workflows.training import lift_training, run_training
+from neusee.workflows.training.resumable_loop import TrainingSession
 
 SMALL = {
     "optics": {"samples": 96, "pitch": "84.15 um", "bands": 5, "window": [24, 24]},
@@ -138,14 +139,14 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
     assert neusee.train(recipe, store=store, out="o", progress=progress, watch=watch) == Path(
         "made/train"
     )
-    assert asked["train"][0][:5] == (recipe, store, Path("o"), (), progress)
-    assert asked["train"][0][5:8] == (tuple(recipe.training.learnt), "cpu", watch)
+    session = TrainingSession(store, Path("o"), progress, (), "cpu", watch)
+    assert asked["train"] == ((recipe, session, tuple(recipe.training.learnt)), {})
     losses = []
     lift = neusee.load("train_lift")
     assert neusee.train(lift, store=store, watch=lambda *found: losses.append(found)) == Path(
         "made/lift"
     )
-    asked["lift"][0][-1](0, 7, {"MRAE": 0.5})
+    asked["lift"][0][1].watch(0, 7, {"MRAE": 0.5})
     assert losses == [(0, 7, {"MRAE": 0.5})]
 
 

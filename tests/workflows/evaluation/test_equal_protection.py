@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import neusee
 from neusee.nodes import metrics
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
@@ -18,11 +19,11 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation.pipelines import (
     NONE,
     EvaluationRefused,
+    NamedRecipe,
     compose_pipelines,
     protect,
     read_pipelines,
 )
-from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.protection.equal_rivals import EqualProtection
 from neusee.workflows.store.result_store import Store
 
@@ -39,8 +40,10 @@ def store(tmp_path_factory):
 
 
 def protected(store, level, way="filter", text=PAIR, said=print):
-    each = compose_pipelines("first_light", SMALL, read_pipelines(text, HERE), HERE)
-    return protect("first_light", SMALL, each, EqualProtection(level, way), store, HERE, said)
+    each = compose_pipelines(NamedRecipe("first_light", SMALL, HERE), read_pipelines(text, HERE))
+    return protect(
+        NamedRecipe("first_light", SMALL, HERE), each, EqualProtection(level, way), store, said
+    )
 
 
 def values(pipeline, store, *names):
@@ -166,15 +169,20 @@ def test_a_wrong_option_is_refused_by_the_command(words, said, tmp_path, monkeyp
 @pytest.mark.slow
 def test_the_table_the_page_and_the_document_compare_at_equal_protection(store, tmp_path):
     how = {
-        "count": 1,
+        "scenes": 1,
         "strengths": [1e4],
         "small": 16,
         "store": store,
         "reference": "five_half_rings+none",
     }
-    asked = read_pipelines(PAIR, HERE)
-    folder = evaluate(
-        "first_light", asked, SMALL, runs=tmp_path, equal=EqualProtection(5e-4, "filter"), **how
+    folder = neusee.evaluate(
+        "first_light",
+        pipelines=PAIR,
+        changes=SMALL,
+        out=tmp_path,
+        equal_protection=5e-4,
+        by="filter",
+        **how,
     )
     document = json.loads((folder / "provenance.json").read_text())
     equal = document["equal protection"]

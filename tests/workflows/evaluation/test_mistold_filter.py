@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import neusee
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation.evaluation_points import (
@@ -17,8 +18,12 @@ from neusee.workflows.evaluation.evaluation_points import (
 )
 from neusee.workflows.evaluation.evaluation_result import told_with_errors
 from neusee.workflows.evaluation.evaluation_scenes import scenes
-from neusee.workflows.evaluation.pipelines import CASES, compose_pipelines, read_pipelines
-from neusee.workflows.evaluation.run_evaluation import evaluate
+from neusee.workflows.evaluation.pipelines import (
+    CASES,
+    NamedRecipe,
+    compose_pipelines,
+    read_pipelines,
+)
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.recipe_graph import TOLD
 from neusee.workflows.recipe.blocks.settings_block import Mismatch
@@ -43,7 +48,9 @@ def store(tmp_path_factory):
 
 
 def composed(text, *more):
-    return compose_pipelines("first_light", [*SMALL, *more], read_pipelines(text, HERE), HERE)
+    return compose_pipelines(
+        NamedRecipe("first_light", [*SMALL, *more], HERE), read_pipelines(text, HERE)
+    )
 
 
 def green(*more, light="strength: 1e4"):
@@ -178,9 +185,9 @@ def test_points_are_those_of_the_recipe_with_the_error(store):
 
 @pytest.mark.slow
 def test_an_evaluation_has_the_rows_and_a_recipe_can_leave_them_out(store, tmp_path):
-    run_it = {"count": 1, "strengths": [1e4], "store": store, "runs": tmp_path, "folder": HERE}
-    lines = read_pipelines("flat+none, flat+wiener", HERE)
-    folder = evaluate("first_light", lines, SMALL, **run_it)
+    run_it = {"scenes": 1, "strengths": [1e4], "store": store, "out": tmp_path}
+    run_it["pipelines"] = read_pipelines("flat+none, flat+wiener", HERE)
+    folder = neusee.evaluate("first_light", changes=SMALL, **run_it)
     rows = list(csv.DictReader((folder / "mistold.csv").read_text().splitlines()))
     assert [(row["pipeline"], row["told"]) for row in rows] == [
         ("flat+wiener", told)
@@ -192,7 +199,8 @@ def test_an_evaluation_has_the_rows_and_a_recipe_can_leave_them_out(store, tmp_p
         )
     ]
     assert "What the restorer is not told" in next(folder.glob("*.html")).read_text()
-    folder = evaluate("first_light", lines, [*SMALL, "+evaluate.mismatch=null"], **run_it)
+    without_rows = [*SMALL, "+evaluate.mismatch=null"]
+    folder = neusee.evaluate("first_light", changes=without_rows, **run_it)
     assert "What the restorer is not told" not in next(folder.glob("*.html")).read_text()
 
 

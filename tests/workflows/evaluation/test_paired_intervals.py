@@ -11,7 +11,7 @@ import pytest
 from scipy.special import ndtr, ndtri
 from scipy.stats import t as student
 
-from neusee.workflows.evaluation import confidence_intervals as paired_intervals
+from neusee.workflows.evaluation import confidence_intervals
 from neusee.workflows.evaluation.confidence_intervals import (
     MetricTable,
     gain,
@@ -29,7 +29,7 @@ OWNER = np.repeat(np.arange(PHOTOGRAPHS), PICTURES)
 @pytest.fixture
 def quick(monkeypatch):
     """A tenth of the draws, because an interval is computed hundreds of times."""
-    monkeypatch.setattr(paired_intervals, "_DRAWS", 1000)
+    monkeypatch.setattr(confidence_intervals, "_BOOTSTRAP_DRAWS", 1000)
 
 
 def alike(rng, between=1.0, within=0.5):

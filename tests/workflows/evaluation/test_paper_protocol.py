@@ -21,17 +21,18 @@ from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation import evaluation_scenes
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
-from neusee.workflows.evaluation.evaluation_result import _points, _variant
+from neusee.workflows.evaluation.evaluation_result import mistold_pipeline, points_of_scenes
 from neusee.workflows.evaluation.evaluation_scenes import photographs, scenes, wavelengths
 from neusee.workflows.evaluation.pipelines import (
     DRAWN,
     SIX,
     EvaluationRefused,
+    NamedRecipe,
     compose_pipelines,
     read_pipelines,
+    read_settings,
     refuse_fixed_laser,
 )
-from neusee.workflows.evaluation.run_evaluation import read_settings
 from neusee.workflows.recipe.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 
@@ -59,7 +60,9 @@ def folder(tmp_path_factory):
 
 
 def pipeline(text, *more):
-    (one,) = compose_pipelines("paper_protocol", [*SMALL, *more], read_pipelines(text, HERE), HERE)
+    (one,) = compose_pipelines(
+        NamedRecipe("paper_protocol", [*SMALL, *more], HERE), read_pipelines(text, HERE)
+    )
     return one
 
 
@@ -132,7 +135,7 @@ def test_a_restorer_that_is_told_an_error_of_zero_sees_the_drawn_values(store, f
         EvaluationPoints(store, 16),
         pipeline("half_ring+wiener"),
     )
-    same = _variant(true, "nothing", {"pupil[mask].defocus": 0.0})
+    same = mistold_pipeline(true, "nothing", {"pupil[mask].defocus": 0.0})
     assert bench.point(same, PointRequest(scene, 1e3)) == bench.point(
         true, PointRequest(scene, 1e3)
     )
@@ -150,7 +153,7 @@ def test_a_photograph_that_cannot_be_decoded_costs_its_scene_and_no_other(
 
     monkeypatch.setattr(evaluation_scenes, "crop_photograph", damaged)
     shown, said = drawn(store, folder), list[str]()
-    points, kept, broken = _points(
+    points, kept, broken = points_of_scenes(
         EvaluationPoints(store, 16), [pipeline("flat+none")], shown, (0.0,), said.append
     )
     assert sorted(scene.name for scene in kept) == ["a.png", "c.png"]
@@ -166,7 +169,7 @@ def test_a_laser_without_a_law_is_refused():
     ):
         refuse_fixed_laser(load("paper_protocol", [*SMALL, "laser=green"]))
     with pytest.raises(EvaluationRefused, match=r"evaluate\.scenes"):
-        read_settings("paper_protocol", [*SMALL, "evaluate.scenes=some"], HERE)
+        read_settings(NamedRecipe("paper_protocol", [*SMALL, "evaluate.scenes=some"], HERE))
 
 
 # --- the whole ------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from neusee.workflows.evaluation.evaluation_points import (
 from neusee.workflows.evaluation.evaluation_scenes import photographs, scenes
 from neusee.workflows.evaluation.pipelines import (
     CASES,
+    NamedRecipe,
     Pipeline,
     compose_pipelines,
     named_apart,
@@ -81,10 +82,12 @@ def assert_same(pipeline, found, run):
 )
 def test_the_command_of_a_point_gives_its_numbers(store, folder, name, law, place):
     changes = [*SMALL, *law]
-    each = compose_pipelines("first_light", changes, read_pipelines(name, folder), folder.parent)
+    each = compose_pipelines(
+        NamedRecipe("first_light", changes, folder.parent), read_pipelines(name, folder)
+    )
     shown, _ = scenes(load("first_light", changes), store, folder, 2, list(CASES))
     bench = EvaluationPoints(store, 16)
-    listed = PointCommands("first_light", changes, folder.parent, bench).commands(
+    listed = PointCommands(NamedRecipe("first_light", changes, folder.parent), bench).commands(
         each, shown, (0.0, 1e4)
     )
     found = bench.point(each[0], PointRequest(shown[place], 1e4))
@@ -97,14 +100,20 @@ def test_the_command_behind_a_filter_of_equal_protection_has_its_filter_and_its_
     store, folder
 ):
     bare = compose_pipelines(
-        "first_light", SMALL, read_pipelines("flat+none", folder), folder.parent
+        NamedRecipe("first_light", SMALL, folder.parent), read_pipelines("flat+none", folder)
     )
     each = protect(
-        "first_light", SMALL, bare, EqualProtection(0.01, "filter"), store, folder.parent, print
+        NamedRecipe("first_light", SMALL, folder.parent),
+        bare,
+        EqualProtection(0.01, "filter"),
+        store,
+        print,
     )
     shown, _ = scenes(load("first_light", SMALL), store, None, 1, list(CASES))
     bench = EvaluationPoints(store, 16)
-    listed = PointCommands("first_light", SMALL, folder.parent, bench).commands(each, shown, (1e4,))
+    listed = PointCommands(NamedRecipe("first_light", SMALL, folder.parent), bench).commands(
+        each, shown, (1e4,)
+    )
     found = bench.point(each[0], PointRequest(shown[0], 1e4))
     assert_same(each[0], found, numbers_of(listed[each[0].name][0][1e4]))
 
@@ -117,10 +126,12 @@ def test_where_a_random_part_of_the_camera_has_the_seed_of_the_evaluation_there_
     """
     dirty = [*SMALL, "flare=dirty_windshield"]
     each = compose_pipelines(
-        "first_light", dirty, read_pipelines("flat+none", folder), folder.parent
+        NamedRecipe("first_light", dirty, folder.parent), read_pipelines("flat+none", folder)
     )
     shown, _ = scenes(load("first_light", dirty), store, folder, 2, list(CASES))
-    listed = PointCommands("first_light", dirty, folder.parent, EvaluationPoints(store, 16))
+    listed = PointCommands(
+        NamedRecipe("first_light", dirty, folder.parent), EvaluationPoints(store, 16)
+    )
     first, second = listed.commands(each, shown, (1e4,))[each[0].name]
     assert first[1e4].startswith("neusee run first_light ")
     assert second[1e4] == ""
@@ -166,7 +177,7 @@ def test_a_changed_file_or_code_is_another_point_and_a_renamed_file_is_the_same(
     def key(name="m.npy"):
         text = f"pixelwise@{tmp_path / name}+none"
         (pipeline,) = compose_pipelines(
-            "first_light", SMALL, read_pipelines(text, folder), folder.parent
+            NamedRecipe("first_light", SMALL, folder.parent), read_pipelines(text, folder)
         )
         shown, _ = scenes(load("first_light", SMALL), store, folder, 1, list(CASES))
         return EvaluationPoints(store, 16).key(pipeline, PointRequest(shown[0], 1e4))

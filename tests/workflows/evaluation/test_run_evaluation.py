@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
+import neusee
 from neusee.nodes.metrics import quality
 from neusee.nodes.resampling import resize
 from neusee.workflows import load
@@ -26,10 +27,10 @@ from neusee.workflows.evaluation.evaluation_scenes import refuse_directions, sce
 from neusee.workflows.evaluation.pipelines import (
     CASES,
     EvaluationRefused,
+    NamedRecipe,
     compose_pipelines,
     read_pipelines,
 )
-from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.recipe.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 
@@ -58,7 +59,9 @@ def photographs(tmp_path_factory):
 
 
 def pipelines(text, *more):
-    return compose_pipelines("first_light", [*SMALL, *more], read_pipelines(text, HERE), HERE)
+    return compose_pipelines(
+        NamedRecipe("first_light", [*SMALL, *more], HERE), read_pipelines(text, HERE)
+    )
 
 
 def by_hand(tmp_path, scene, pipeline, strength, more=()):
@@ -260,7 +263,7 @@ def test_every_mistake_is_said_before_anything_runs(tmp_path):
     )
     asked = read_pipelines(words, tmp_path)
     with pytest.raises(EvaluationRefused) as error:
-        compose_pipelines("first_light", SMALL, asked, tmp_path)
+        compose_pipelines(NamedRecipe("first_light", SMALL, tmp_path), asked)
     said = str(error.value)
     for part in (
         "falt+none: argument 7 doe=falt no option falt",
@@ -282,7 +285,8 @@ def test_weights_of_another_network_are_refused(tmp_path):
         EvaluationRefused, match=r"flat\+nafnet@net.safetensors: .*this network \(width 16\) has"
     ):
         compose_pipelines(
-            "first_light", SMALL, read_pipelines("flat+nafnet@net.safetensors", tmp_path), tmp_path
+            NamedRecipe("first_light", SMALL, tmp_path),
+            read_pipelines("flat+nafnet@net.safetensors", tmp_path),
         )
 
 
@@ -318,8 +322,16 @@ def test_an_argument_that_cannot_be_ends_with_one_line(tmp_path, monkeypatch, op
 def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(
     tmp_path, store, photographs, monkeypatch
 ):
-    how = {"data": photographs, "count": 6, "strengths": (0, 1e4), "small": 16, "store": store}
-    asked = read_pipelines(BARE, HERE)
+    how = {
+        "pipelines": read_pipelines(BARE, HERE),
+        "changes": SMALL,
+        "out": tmp_path,
+        "data": photographs,
+        "scenes": 6,
+        "strengths": (0, 1e4),
+        "small": 16,
+        "store": store,
+    }
     real, seen = EvaluationPoints._numbers, []
 
     def stops(self, pipeline, values):
@@ -330,9 +342,9 @@ def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(
 
     monkeypatch.setattr(EvaluationPoints, "_numbers", stops)
     with pytest.raises(KeyboardInterrupt):
-        evaluate("first_light", asked, SMALL, runs=tmp_path, **how)
+        neusee.evaluate("first_light", **how)
     lines = []
-    folder = evaluate("first_light", asked, SMALL, runs=tmp_path, progress=lines.append, **how)
+    folder = neusee.evaluate("first_light", progress=lines.append, **how)
     doc = json.loads((folder / "provenance.json").read_text())
     count = 2 * (5 * 2 + 1)  # of the scene without a laser there is one strength
     assert doc["computed"] == count - 8
@@ -372,12 +384,16 @@ def test_a_scene_keeps_its_picture_no_longer_than_it_is_used(store):
 def test_a_drawn_direction_beyond_the_reach_of_the_pupil_is_refused_before_work(store):
     """Before, the evaluation of `first_light` as shipped ended in its second scene."""
     shown, _ = scenes(load("first_light"), store, None, 3, list(CASES))
-    first, *_ = compose_pipelines("first_light", [], read_pipelines("flat+none", HERE), HERE)
+    first, *_ = compose_pipelines(
+        NamedRecipe("first_light", [], HERE), read_pipelines("flat+none", HERE)
+    )
     with pytest.raises(
         EvaluationRefused,
         match=r"scene 2 \(blue\): .*carries only 1.61 mm.*\n.*smaller sensor.shape",
     ):
         refuse_directions(first, shown)
     room = ["sensor.shape=[512,512]", "scene.shape=[576,576]"]
-    fitting, *_ = compose_pipelines("first_light", room, read_pipelines("flat+none", HERE), HERE)
+    fitting, *_ = compose_pipelines(
+        NamedRecipe("first_light", room, HERE), read_pipelines("flat+none", HERE)
+    )
     refuse_directions(fitting, scenes(load("first_light", room), store, None, 3, list(CASES))[0])

@@ -10,8 +10,7 @@ import torch
 
 from neusee.nodes.scene import Change, Photographs, symmetry
 from neusee.workflows import RecipeError, Store, load
-from neusee.workflows.training.process_mesh import ALONE
-from neusee.workflows.training.training_pictures import Shared, TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, Shared, TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY, trained
 
@@ -30,8 +29,8 @@ def photograph(tmp_path_factory):
 
 def stream(words, photograph, folder):
     recipe = load("train_small", [*TINY, *words])
-    parts = Photographs((photograph,)), Store(folder), "cpu", recipe, ALONE, (photograph,)
-    return TrainingStream(recipe, recipe.training, *parts)
+    source = PictureSource(Photographs((photograph,)), Store(folder), held_out=(photograph,))
+    return TrainingStream(recipe, recipe.training, source, recipe)
 
 
 def test_the_camera_sees_the_changed_scene_and_held_out_ones_as_they_are(tmp_path, photograph):

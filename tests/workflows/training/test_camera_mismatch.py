@@ -13,8 +13,9 @@ from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import TOLD
 from neusee.workflows.training.held_out import HELD_OUT
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import train
-from neusee.workflows.training.training_pictures import Shared, TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, Shared, TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY
 
@@ -47,7 +48,10 @@ def store(tmp_path_factory):
 def stream(words, photograph, store, held_out=()):
     recipe = load("train_small", words)
     return TrainingStream(
-        recipe, recipe.training, Photographs((photograph,)), store, "cpu", recipe, held_out=held_out
+        recipe,
+        recipe.training,
+        PictureSource(Photographs((photograph,)), store, held_out=held_out),
+        recipe,
     )
 
 
@@ -239,10 +243,14 @@ def test_a_mask_is_trained_for_what_is_told_of_it(tmp_path, photograph):
     ]
     made = ["+height_error=smooth", *differing("height_error.rms=uniform(0 nm, 20 nm)")]
     recipe = load("train_small", [*words, *differing(*DRAWN), *made])
-    found = train(recipe, Store(tmp_path), tmp_path / "runs", [], lambda line: None, (1, 2))
+    found = train(
+        recipe, TrainingSession(Store(tmp_path), tmp_path / "runs", lambda line: None), (1, 2)
+    )
     assert (found / "mask.safetensors").is_file()
     other = train(
-        load("train_small", words), Store(tmp_path), tmp_path / "runs", [], lambda line: None, (1,)
+        load("train_small", words),
+        TrainingSession(Store(tmp_path), tmp_path / "runs", lambda line: None),
+        (1,),
     )
     assert other != found
 
@@ -297,7 +305,7 @@ def test_a_law_that_no_value_can_have_is_one_located_mistake_of_the_recipe(law, 
 def test_what_no_camera_can_have_is_a_mistake_before_any_work(tmp_path, laws, said):
     recipe = load("train_small", [*CAMERA, *DUSTY, "ghosts.count=0", *differing(*laws)])
     with pytest.raises(RecipeError, match=said):
-        train(recipe, Store(tmp_path), tmp_path / "runs", [], lambda line: None, (2,))
+        train(recipe, TrainingSession(Store(tmp_path), tmp_path / "runs", lambda line: None), (2,))
     assert not (tmp_path / "runs").exists()
 
 

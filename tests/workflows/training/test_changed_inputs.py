@@ -24,6 +24,7 @@ from neusee.nodes.losses import _restoration_losses
 from neusee.nodes.restore import NAFNet, start_network
 from neusee.workflows import Store, load
 from neusee.workflows.training.recorded_inputs import prepare_folder
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import BegunTraining, UnchangedFiles, train
 
 TINY = [
@@ -424,7 +425,9 @@ def test_an_interrupted_training_with_renamed_photographs_goes_on_to_the_same_we
             "train_small", [*TINY, *WHOLE, f"train.photographs={lab.path('photographs')}"]
         )
         lines = []
-        folder = train(recipe, lab.store, lab.folder / runs, [], lines.append, (2,), watch=watch)
+        folder = train(
+            recipe, TrainingSession(lab.store, lab.folder / runs, lines.append, watch=watch), (2,)
+        )
         return folder, "\n".join(lines)
 
     def stopped(stage, done, losses):
@@ -474,7 +477,7 @@ def test_another_mask_in_the_folder_of_a_training_is_not_that_of_its_second_stag
     recipe = load("train_small", words)
 
     def trained(*numbers):
-        return train(recipe, lab.store, lab.runs, [], lambda line: None, numbers)
+        return train(recipe, TrainingSession(lab.store, lab.runs, lambda line: None), numbers)
 
     file = trained(1) / "mask.safetensors"
     before = file.read_bytes()

@@ -18,8 +18,9 @@ from neusee.nodes.scene import _photograph as _photograph_folder
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.training.held_out import COLUMNS, Validation, interval, split
 from neusee.workflows.training.process_mesh import ALONE
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import train
-from neusee.workflows.training.training_pictures import Shared, TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, Shared, TrainingStream
 
 TINY = [
     "optics.samples=48", "optics.pitch=168.27 um", "optics.bands=3", "optics.window=[32, 32]", "scene.shape=[32, 32]",
@@ -56,7 +57,9 @@ def content(paths):
 
 def trained(recipe, folder, watch=None, lines=None):
     said = (lines if lines is not None else []).append
-    return train(recipe, Store(folder / "store"), folder / "runs", [], said, (2,), watch=watch)
+    return train(
+        recipe, TrainingSession(Store(folder / "store"), folder / "runs", said, watch=watch), (2,)
+    )
 
 
 def rows_of(folder):
@@ -135,7 +138,10 @@ def test_no_crop_of_a_held_out_photograph_is_trained_on(tmp_path, folder):
         for path in sorted(tmp_path.glob("*.png"))
     }
     stream = TrainingStream(
-        recipe, recipe.training, parts.trained, Store(tmp_path), "cpu", recipe, ALONE, parts.judged
+        recipe,
+        recipe.training,
+        PictureSource(parts.trained, Store(tmp_path), mesh=ALONE, held_out=parts.judged),
+        recipe,
     )
     for stage, allowed in ((1, parts.trained.paths), (2, parts.trained.paths), (3, parts.judged)):
         count = 24 if stage != 3 else len(parts.judged)
@@ -156,7 +162,10 @@ def test_a_validation_agrees_with_numpy_and_repeats(tmp_path, folder):
     recipe = tiny(folder)
     parts = split(recipe, recipe.training, Photographs.under(folder))
     stream = TrainingStream(
-        recipe, recipe.training, parts.trained, Store(tmp_path), "cpu", recipe, ALONE, parts.judged
+        recipe,
+        recipe.training,
+        PictureSource(parts.trained, Store(tmp_path), mesh=ALONE, held_out=parts.judged),
+        recipe,
     )
     net = torch.nn.Identity()
     net.train()

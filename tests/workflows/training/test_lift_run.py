@@ -19,6 +19,7 @@ from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.training import lift_training
 from neusee.workflows.training.lift_training import LiftLearner, Pairs, train_lift
+from neusee.workflows.training.resumable_loop import TrainingSession
 
 ROOT = Path(__file__).parents[3]
 TINY = [
@@ -37,7 +38,14 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def trained(recipe, folder, watch=None):
     return train_lift(
-        recipe, Store(folder / "store"), folder / "runs", ["neusee"], lambda line: None, watch=watch
+        recipe,
+        TrainingSession(
+            Store(folder / "store"),
+            folder / "runs",
+            lambda line: None,
+            command=["neusee"],
+            watch=watch,
+        ),
     )
 
 
@@ -96,11 +104,12 @@ import os, signal
 from pathlib import Path
 from neusee.workflows import Store, load
 from neusee.workflows.training.lift_training import train_lift
+from neusee.workflows.training.resumable_loop import TrainingSession
 def watch(stage, done, found):
     if done == 3:
         os.kill(os.getpid(), signal.SIGKILL)
 here = Path({str(tmp_path)!r})
-train_lift(load("train_lift", {TINY!r}), Store(here / "store"), here / "runs", [], print, watch=watch)
+train_lift(load("train_lift", {TINY!r}), TrainingSession(Store(here / "store"), here / "runs", print, watch=watch))
 """
     env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(

@@ -17,11 +17,13 @@ from neusee.workflows.evaluation.evaluation_scenes import scenes
 from neusee.workflows.evaluation.pipelines import (
     CASES,
     EvaluationRefused,
+    NamedRecipe,
     compose_pipelines,
     read_pipelines,
 )
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.training.process_mesh import ALONE, Mesh
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import code_of_class, network_settings, train
 
 TINY = [
@@ -114,7 +116,9 @@ def mine(tmp_path, monkeypatch):
 def trained(tmp_path, out="runs", *words, watch=None):
     recipe = load("mine.yaml", [*TINY, *SHORT, *words], tmp_path)
     return train(
-        recipe, Store(tmp_path / "cache"), tmp_path / out, [], lambda line: None, (2,), watch=watch
+        recipe,
+        TrainingSession(Store(tmp_path / "cache"), tmp_path / out, lambda line: None, watch=watch),
+        (2,),
     )
 
 
@@ -159,7 +163,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights_and_a_run_uses_them(mine
 
 def evaluated(tmp_path, weights):
     words = read_pipelines(f"flat+none, five_half_rings+mine@{weights}", tmp_path)
-    _, pipeline = compose_pipelines("mine.yaml", TINY, words, tmp_path)
+    _, pipeline = compose_pipelines(NamedRecipe("mine.yaml", TINY, tmp_path), words)
     assert pipeline.name == f"five_half_rings+mine@{weights.name}"
     store = Store(tmp_path / "cache")
     (scene,), _ = scenes(load("mine.yaml", TINY, tmp_path), store, None, 1, list(CASES))
@@ -249,7 +253,8 @@ def test_an_option_of_the_user_that_takes_no_file_is_refused(mine, tmp_path):
     weights.write_bytes(b"")
     with pytest.raises(EvaluationRefused, match="bare takes no file: remove @ and the file name"):
         compose_pipelines(
-            "mine.yaml", TINY, read_pipelines(f"flat+bare@{weights}", tmp_path), tmp_path
+            NamedRecipe("mine.yaml", TINY, tmp_path),
+            read_pipelines(f"flat+bare@{weights}", tmp_path),
         )
 
 
@@ -262,7 +267,7 @@ def test_an_option_in_a_shared_folder_is_found(mine, tmp_path, monkeypatch):
     with pytest.raises(
         EvaluationRefused, match=r"wrong.safetensors: a is \(1,\), own_.*Small has None"
     ):
-        compose_pipelines("first_light", TINY, asked, tmp_path / "away")
+        compose_pipelines(NamedRecipe("first_light", TINY, tmp_path / "away"), asked)
 
 
 def test_all_processes_have_the_running_means_of_the_first(monkeypatch):

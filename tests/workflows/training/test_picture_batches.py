@@ -8,7 +8,13 @@ import torch
 from neusee.nodes import losses
 from neusee.nodes.restore import Informed, NAFNet, start_network
 from neusee.nodes.values import FilterFacts
-from neusee.workflows.training.training_iteration import Learner, Scales, _apart, joined, together
+from neusee.workflows.training.training_iteration import (
+    Learner,
+    Scales,
+    joined,
+    pictures_by_number,
+    together,
+)
 from neusee.workflows.training.training_pictures import Sample
 
 MAPS = 32
@@ -67,7 +73,7 @@ def test_a_picture_that_goes_alone_is_the_picture_itself():
 
 def test_results_are_taken_apart_by_number_with_all_patches():
     truth = Scales(torch.arange(6.0).view(6, 1, 1, 1), torch.arange(6.0).view(6, 1, 1, 1) + 10)
-    found = _apart([4, 9, 1], truth, truth)
+    found = pictures_by_number([4, 9, 1], truth, truth)
     assert list(found) == [4, 9, 1]
     assert found[9][0].coarse.flatten().tolist() == [2, 3]
     assert found[1][1].fine.flatten().tolist() == [14, 15]
@@ -76,4 +82,4 @@ def test_results_are_taken_apart_by_number_with_all_patches():
 def test_on_a_processor_each_picture_goes_alone():
     learner = Learner.__new__(Learner)
     learner.device = "cpu"
-    assert not learner._whole
+    assert not learner._batch_goes_whole

@@ -9,7 +9,7 @@ from neusee.nodes import restore
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY, trained
 
@@ -33,7 +33,9 @@ def store(tmp_path_factory):
 
 def stream(words, photograph, store):
     recipe = load("train_small", words)
-    return TrainingStream(recipe, recipe.training, Photographs((photograph,)), store, "cpu", recipe)
+    return TrainingStream(
+        recipe, recipe.training, PictureSource(Photographs((photograph,)), store), recipe
+    )
 
 
 def test_the_picture_is_that_of_any_network_behind_the_filter_and_the_problem_has_it_as_its_answer(

@@ -9,9 +9,7 @@ import torch
 from safetensors.torch import save_file
 from torch.testing import assert_close
 
-from neusee.nodes.restore._networks._convolutional_networks import NAFNet, UNet
-from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._restorer import start_network
+from neusee.nodes.restore import FFTMamba, NAFNet, UNet, start_network
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.errors import RecipeError

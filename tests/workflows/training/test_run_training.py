@@ -21,14 +21,15 @@ from safetensors.torch import load_file
 
 import neusee
 from neusee.nodes import optics
-from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
+from neusee.nodes.doe import PARAMETRISATIONS
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, as_function, load
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.blocks.train_block import MaskSettings, Rates
 from neusee.workflows.training import design_run
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import frozen, train
-from neusee.workflows.training.training_pictures import Shared, TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, Shared, TrainingStream
 from tests.workflows.crate_rules import faults
 
 ROOT = Path(__file__).parents[3]
@@ -63,12 +64,14 @@ def tiny(photographs):
 def trained(recipe, folder, stages=(1, 2), watch=None):
     return train(
         recipe,
-        Store(folder / "store"),
-        folder / "runs",
-        ["neusee", "train"],
-        lambda line: None,
+        TrainingSession(
+            Store(folder / "store"),
+            folder / "runs",
+            lambda line: None,
+            command=["neusee", "train"],
+            watch=watch,
+        ),
         stages,
-        watch=watch,
     )
 
 
@@ -130,13 +133,14 @@ def test_a_killed_training_goes_on_to_the_same_weights(tmp_path, tiny, photograp
 import os, signal
 from pathlib import Path
 from neusee.workflows import Store, load
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import train
 def watch(stage, done, found):
     if (stage, done) == (2, 1):
         os.kill(os.getpid(), signal.SIGKILL)
 here = Path({str(tmp_path / "killed")!r})
 recipe = load("train_small", {[*TINY, f"train.photographs={photographs}"]!r})
-train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
+train(recipe, TrainingSession(Store(here / "store"), here / "runs", print, watch=watch))
 """
     env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
@@ -155,7 +159,7 @@ train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
 
 def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
     sources = Photographs.under(tiny.training.photographs)
-    samples = TrainingStream(tiny, tiny.training, sources, Store(tmp_path), "cpu")
+    samples = TrainingStream(tiny, tiny.training, PictureSource(sources, Store(tmp_path)))
     height = relief_of(tiny)(pupil(tiny))
     shared = Shared.of(samples.shared({"height": height})).values
     first = [samples(shared, 1, number) for number in (0, 1, 2)]
@@ -172,7 +176,9 @@ def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
     recipe = load("train_small", [*TINY, "laser=green", "sensor.read_noise=10 e-", "tolerance=0"])
     how = recipe.training
     samples = TrainingStream(
-        recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu"
+        recipe,
+        how,
+        PictureSource(Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path)),
     )
     relief = relief_of(recipe)
     shared = Shared.of(samples.shared({"height": relief(pupil(recipe))}))
@@ -218,7 +224,7 @@ def _scene(samples, number):
 def samples_of(recipe, folder, still=False):
     sources = Photographs.under(recipe.training.photographs)
     return TrainingStream(
-        recipe, recipe.training, sources, Store(folder), "cpu", recipe if still else None
+        recipe, recipe.training, PictureSource(sources, Store(folder)), recipe if still else None
     )
 
 
@@ -435,8 +441,7 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
         ("+train.fish=1", "unknown; "),
         ("train.photographs=nowhere", "is not a folder"),
         ("train.network.kind=foo", "fft_mamba"),
-        ("train.network.directions=3", "train.network.directions"),
-        ("train.network.frequency=phase", "amp_phase"),
+        ("train.network.shuffle=9", "train.network.shuffle"),
     ],
 )
 def test_a_mistake_is_located(change, said):
@@ -448,17 +453,13 @@ def test_a_mistake_is_located(change, said):
 def test_options_of_one_network_are_refused_of_another():
     with pytest.raises(
         RecipeError,
-        match="directions, pyramid: only the network fft_mamba has such options, not unet",
+        match="shuffle: only the network fft_mamba has such options, not unet",
     ):
-        load(
-            "train_small",
-            ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"],
-        )
+        load("train_small", ["train.network.kind=unet", "train.network.shuffle=4"])
 
 
 def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, photographs):
-    options = ["directions=4", "pyramid=true", "frequency=amp_phase"]
-    own = [*TINY, "train.network.kind=fft_mamba", *(f"train.network.{x}" for x in options)]
+    own = [*TINY, "train.network.kind=fft_mamba", "train.network.shuffle=4"]
     recipe = load(
         "train_small",
         [
@@ -474,9 +475,9 @@ def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, 
         "restore.width=4",
         f"restore.weights={folder / 'network.safetensors'}",
     ]
-    with pytest.raises(RecipeError, match="trained with directions: 4"):
+    with pytest.raises(RecipeError, match=r"this network \(width 4\) has"):
         load("first_light", run)
-    load("first_light", [*run, *(f"restore.{x}" for x in options)])
+    load("first_light", [*run, "restore.shuffle=4"])
 
 
 @pytest.mark.parametrize(
@@ -520,7 +521,7 @@ def command(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
     monkeypatch.chdir(tmp_path)
     # they take longer than what is tested
-    monkeypatch.setattr(design_run, "pictures", lambda *_: {})
+    monkeypatch.setattr(design_run, "design_pictures", lambda *_: {})
 
     def call(*words):
         with pytest.raises(SystemExit) as end:

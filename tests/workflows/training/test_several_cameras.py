@@ -12,11 +12,12 @@ from neusee import recipes
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.training.held_out import Split, _by_photograph
+from neusee.workflows.training.held_out import Split, means_by_photograph
 from neusee.workflows.training.process_mesh import Mesh, MeshError
 from neusee.workflows.training.run_training import inputs_of
 from neusee.workflows.training.training_pictures import (
     HELD_OUT,
+    PictureSource,
     SeveralCameras,
     Shared,
     TrainingStream,
@@ -49,13 +50,15 @@ def test_picture_n_is_of_camera_n_and_a_held_out_photograph_is_seen_by_every_cam
     masked = ["doe=pixelwise", f"doe.file={files / 'mask.npy'}"]
     others = [["doe=flat", "sensor.background=loguniform(0.02, 0.5)"], masked]
     recipe = load("train_small", [*WORDS, f"train.cameras={json.dumps(others)}"])
-    mixed = SeveralCameras(recipe, recipe.training, photographs, store, "cpu", photographs.paths)
+    mixed = SeveralCameras(
+        recipe, recipe.training, PictureSource(photographs, store, held_out=photographs.paths)
+    )
 
     def alone(words, stage, number):
         other = load("train_small", [*WORDS, *words])
         held_out = photographs.paths * 3
         stream = TrainingStream(
-            other, other.training, photographs, store, "cpu", other, held_out=held_out
+            other, other.training, PictureSource(photographs, store, held_out=held_out), other
         )
         return stream({}, stage, number)
 
@@ -83,8 +86,8 @@ def test_a_photograph_counts_once_whatever_the_number_of_its_pictures():
         "2 b": 4.0,
         "3 b": 4.0,
     }
-    assert _by_photograph(found, 2) == {"0 a": 2.0, "1 a": 7.0, "0 b": 2.0, "1 b": 4.0}
-    assert _by_photograph(found, 1) == found
+    assert means_by_photograph(found, 2) == {"0 a": 2.0, "1 a": 7.0, "0 b": 2.0, "1 b": 4.0}
+    assert means_by_photograph(found, 1) == found
 
 
 @pytest.mark.parametrize(

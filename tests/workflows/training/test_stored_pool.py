@@ -11,7 +11,7 @@ from PIL import Image
 
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY, trained
 
@@ -30,7 +30,7 @@ def photograph(tmp_path_factory):
 def stream(words, photograph, folder):
     recipe = load("train_small", [*TINY, *POOL, *words])
     return TrainingStream(
-        recipe, recipe.training, Photographs((photograph,)), Store(folder), "cpu", recipe
+        recipe, recipe.training, PictureSource(Photographs((photograph,)), Store(folder)), recipe
     )
 
 

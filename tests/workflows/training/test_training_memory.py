@@ -10,7 +10,7 @@ import pytest
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 
 SPEC = importlib.util.spec_from_file_location(
     "live_bytes", Path(__file__).parents[2] / "live_bytes.py"
@@ -41,7 +41,7 @@ def peak(folder, bands, batch):
     photographs = Photographs((recipe.steps["scene"].params["file"],))
     with live_bytes.LiveBytes() as live:
         learner = Learner(recipe, recipe.training, "cpu")
-        samples = TrainingStream(recipe, recipe.training, photographs, Store(folder), "cpu")
+        samples = TrainingStream(recipe, recipe.training, PictureSource(photographs, Store(folder)))
         learner.begin(recipe.training.stages[1], True)
         learner.iterate(samples, 1, 0)
         live.again()

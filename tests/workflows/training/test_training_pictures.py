@@ -10,7 +10,7 @@ from kornia.geometry.transform import resize as kornia_resize
 from neusee.nodes.resampling import resize
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 from tests.workflows.training.test_warm_start import TINY
 
 
@@ -35,6 +35,8 @@ def test_a_patch_has_the_pixels_of_a_crop_by_kornia():
 def test_the_light_behind_the_mask_is_computed_where_a_loss_reads_it(tmp_path, weight, bands):
     recipe = load("train_small", [*TINY, f"+train.stages.2.bsr={weight}"])
     photographs = Photographs((recipe.steps["scene"].params["file"],))
-    samples = TrainingStream(recipe, recipe.training, photographs, Store(tmp_path), "cpu", recipe)
+    samples = TrainingStream(
+        recipe, recipe.training, PictureSource(photographs, Store(tmp_path)), recipe
+    )
     assert len(samples({}, 2, 0).light) == bands
     assert ("bsr[mask]" in samples._simulate.live) == bool(bands)

@@ -11,7 +11,7 @@ from neusee.nodes import losses
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 
 TINY = [
     "optics.samples=64",
@@ -41,7 +41,7 @@ class Trial:
         recipe = load("train_small", [*TINY, *words, f"train.photographs={folder / 'photographs'}"])
         sources = Photographs.under(recipe.training.photographs)
         self.pictures = TrainingStream(
-            recipe, recipe.training, sources, Store(folder / "store"), "cpu"
+            recipe, recipe.training, PictureSource(sources, Store(folder / "store"))
         )
         self.learner = Learner(recipe, recipe.training, "cpu")
         self.learner.begin(recipe.training.stages[1], learns=True)

@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from neusee.nodes.restore import UNet, start_network
 from neusee.workflows import RecipeError, Store, load
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import train
 
 TINY = [
@@ -27,12 +28,8 @@ def trained(words, folder, lines=None, watch=None):
     said = (lines if lines is not None else []).append
     return train(
         load("train_small", [*TINY, *words]),
-        Store(folder / "store"),
-        folder / "runs",
-        [],
-        said,
+        TrainingSession(Store(folder / "store"), folder / "runs", said, watch=watch),
         (2,),
-        watch=watch,
     )
 
 

@@ -286,9 +286,6 @@ class Network(SettingsBlock):
     width: Annotated[int, Field(ge=2, le=4096)] = 64
     #: of fft_mamba: pixels along an axis that are scanned as one
     shuffle: Annotated[int, Field(ge=1, le=8)] = 2
-    directions: Literal[2, 4] = 2  #: of fft_mamba, like the next two
-    pyramid: bool = False
-    frequency: Literal["complex", "amp_phase"] = "complex"
     steps: Annotated[int, Field(ge=1, le=16)] = 2  #: of unrolled: steps of filter and network
     #: a class of the user, in place of a kind and its options
     architecture: NetworkClass | None = None

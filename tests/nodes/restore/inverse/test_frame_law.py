@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener_spread
-from neusee.nodes.restore._inverse._masked_blur import Blurred
-from neusee.nodes.restore._inverse._wiener_prior import fitted_law
+from neusee.nodes.restore._inverse import _masked_blur, _wiener_prior
 from neusee.nodes.values import Bands, Psf
 
 SIDE, TORUS, WIDE = 64, 100, 256
@@ -62,7 +61,7 @@ def problem_of(slope, rng, noise=1e-3, told=1e-3, glare=False):
     picture[10:14, 30:50] = 40.0
     given = [torch.from_numpy(x[None].copy()) for x in (picture, weight)]
     transfer = torch.fft.rfft2(torch.from_numpy(centred(kernel, TORUS)))[None]
-    return Blurred(
+    return _masked_blur.Blurred(
         *given, transfer, torch.ones(TORUS, TORUS // 2 + 1), (TORUS, TORUS), 0.0
     ), strength
 
@@ -78,7 +77,10 @@ def test_the_law_of_a_frame_is_that_of_its_scene_behind_a_mask(slope, glare, wit
         problem, strength = problem_of(
             slope, np.random.default_rng([seed, int(10 * slope)]), glare=glare
         )
-        ratio = fitted_law(problem).power.numpy() / law(TORUS, slope, strength)[:, : TORUS // 2 + 1]
+        ratio = (
+            _wiener_prior.fitted_law(problem).power.numpy()
+            / law(TORUS, slope, strength)[:, : TORUS // 2 + 1]
+        )
         at = frequency(TORUS)[:, : TORUS // 2 + 1]
         found.append([np.log(ratio[(at > low) & (at < 2 * low)]).mean() for low in (0.05, 0.1)])
     assert np.abs(np.median(found, 0)).max() < np.log(within), np.exp(found)
@@ -87,7 +89,9 @@ def test_the_law_of_a_frame_is_that_of_its_scene_behind_a_mask(slope, glare, wit
 def test_noise_beyond_what_the_filter_assumes_is_found_and_the_right_one_is_kept():
     factors = [
         [
-            fitted_law(problem_of(3.0, np.random.default_rng(s), noise=0.1, told=0.1 / f)[0]).noise
+            _wiener_prior.fitted_law(
+                problem_of(3.0, np.random.default_rng(s), noise=0.1, told=0.1 / f)[0]
+            ).noise
             for s in range(4)
         ]
         for f in (1.0, 8.0)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore._inverse import _wiener_prior as module
-from neusee.nodes.restore._inverse._wiener_prior import Told, drawn_blotches, level_and_variance
+from neusee.nodes.restore._inverse import _wiener_prior
 
 WHITE = np.array([0.9, 1.0, 0.5])
 FULL = 25_000.0
@@ -18,7 +17,7 @@ def column(values):
 
 
 def told(value, errors):
-    return Told(column(value), column(errors))
+    return _wiener_prior.Told(column(value), column(errors))
 
 
 def worlds(count, seed):
@@ -42,7 +41,9 @@ def worlds(count, seed):
 def test_the_deviation_of_the_mean_is_that_of_its_errors():
     squares = []
     for (mean, seen, errors), (_, varied, wrong) in worlds(300, 1):
-        level, _ = level_and_variance(told(seen, errors), told(varied, wrong), column(WHITE), FULL)
+        level, _ = _wiener_prior.level_and_variance(
+            told(seen, errors), told(varied, wrong), column(WHITE), FULL
+        )
         squares.append(
             ((level.value[:, 0, 0].numpy() - mean) / level.deviation[:, 0, 0].numpy()) ** 2
         )
@@ -52,7 +53,9 @@ def test_the_deviation_of_the_mean_is_that_of_its_errors():
 def test_the_mean_is_better_than_what_the_picture_tells_and_than_the_prior():
     found, direct, prior = [], [], []
     for (mean, seen, errors), (_, varied, wrong) in worlds(300, 2):
-        level, _ = level_and_variance(told(seen, errors), told(varied, wrong), column(WHITE), FULL)
+        level, _ = _wiener_prior.level_and_variance(
+            told(seen, errors), told(varied, wrong), column(WHITE), FULL
+        )
         for values, x in (
             (found, level.value[:, 0, 0].numpy()),
             (direct, seen),
@@ -66,7 +69,7 @@ def test_the_mean_is_better_than_what_the_picture_tells_and_than_the_prior():
 def test_the_variance_is_right_on_average_by_a_factor():
     ratios = []
     for (_, seen, errors), (variance, varied, wrong) in worlds(300, 3):
-        _, squares = level_and_variance(
+        _, squares = _wiener_prior.level_and_variance(
             told(seen, errors), told(varied, wrong), column(WHITE), FULL
         )
         ratios.append(np.log(squares.value[:, 0, 0].numpy() / variance).mean())
@@ -77,7 +80,7 @@ def test_the_variance_is_right_on_average_by_a_factor():
 def test_what_is_told_exactly_is_kept():
     mean, variance = np.array([3000.0, 100.0, 9000.0]), np.array([4e6, 5e6, 1.5e6])
     nothing = np.zeros((1, 3))
-    level, squares = level_and_variance(
+    level, squares = _wiener_prior.level_and_variance(
         told(mean, nothing), told(variance, nothing), column(WHITE), FULL
     )
     np.testing.assert_allclose(level.value[:, 0, 0], mean, rtol=0.01)
@@ -89,10 +92,13 @@ def test_what_is_told_exactly_is_kept():
 def test_blotches_have_the_deviation_that_is_given_and_are_wide(size):
     deviation = torch.linspace(1.0, 3.0, size[0] * size[1], dtype=torch.float64).reshape(1, *size)
     draws = torch.stack(
-        [drawn_blotches(deviation, torch.Generator().manual_seed(seed))[0] for seed in range(600)]
+        [
+            _wiener_prior.drawn_blotches(deviation, torch.Generator().manual_seed(seed))[0]
+            for seed in range(600)
+        ]
     )
     torch.testing.assert_close(draws.square().mean(0).sqrt(), deviation[0], rtol=0.15, atol=0.0)
-    far = 3 * module._BLOTCH
+    far = 3 * _wiener_prior._BLOTCH_PIXELS
     row = draws[:, 0] / deviation[0, 0]
     assert float((row[:, 0] * row[:, 2]).mean()) > 0.8
     if size[1] > far:

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener, wiener_spread
-from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._inverse._wiener_prior import about_mean, expected_variance, fall
+from neusee.nodes.restore._inverse import _wiener, _wiener_prior
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)
@@ -151,9 +150,13 @@ def test_a_scene_whose_ends_differ_is_restored_better(seed):
 def test_the_variance_about_the_mean_is_that_of_the_covariance(picture, torus):
     rng = np.random.default_rng(1)
     kernel = rng.uniform(0, 1, torus)
-    power = fall(torus)
+    power = _wiener_prior.fall(torus)
     transfer = torch.fft.rfft2(torch.tensor(kernel))[None]
-    found = float(expected_variance(transfer, about_mean(power, picture, torus), torus))
+    found = float(
+        _wiener_prior.expected_variance(
+            transfer, _wiener_prior.about_mean(power, picture, torus), torus
+        )
+    )
     whole = (
         np.abs(np.fft.fft2(kernel)) ** 2
         * np.fft.fft2(torch.fft.irfft2(power, s=torus).numpy()).real

@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
-from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._inverse._glare import strengths
-from neusee.nodes.restore._inverse._masked_blur import DENSE, effective_psf
+from neusee.nodes.restore._inverse import _glare, _masked_blur, _wiener
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, leaves, reflectances, responses
 from neusee.nodes.values import Bands, Psf
@@ -127,11 +125,11 @@ def test_each_channel_has_its_own_psf():
     )
     psf = Psf(torch.stack([disc(1).intensity[0], disc(3).intensity[0]]), torch.ones(2))
     seen_by = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
-    found = effective_psf(psf, torch.tensor([3.0, 1.0]), seen_by, line)
+    found = _masked_blur.effective_psf(psf, torch.tensor([3.0, 1.0]), seen_by, line)
     torch.testing.assert_close(found[:2], psf.intensity)
     torch.testing.assert_close(found[2], (1200 * psf.intensity[0] + 700 * psf.intensity[1]) / 1900)
     with pytest.raises(ValueError, match="one `bands` step"):
-        effective_psf(psf, torch.ones(3), seen_by, line)
+        _masked_blur.effective_psf(psf, torch.ones(3), seen_by, line)
 
 
 def photographs(count, size=16):
@@ -280,7 +278,7 @@ def test_the_first_guess_of_the_glare_is_least_squares_beside_a_constant():
     rng = torch.Generator().manual_seed(0)
     electrons, one, two = torch.rand(3, 2, 150, 20, generator=rng)
     known = (torch.rand(2, 150, 20, generator=rng) > 0.2).float()
-    fit_one, fit_two = strengths(electrons, known, [one, two])
+    fit_one, fit_two = _glare.strengths(electrons, known, [one, two])
     found = fit_one * one + fit_two * two
     seen = known.double()
     centred = [
@@ -301,8 +299,10 @@ def test_a_narrow_psf_needs_no_coarser_grids():
     psf = Psf((kernel / kernel.sum()).float()[None], ONE)
     electrons = seen(scene() / 400, psf)
     nested, alone = (run(electrons, psf, coarser_grids=coarser) for coarser in (True, False))
-    exact = run(electrons[..., :DENSE, :DENSE], psf)
+    exact = run(electrons[..., : _masked_blur.DENSE, : _masked_blur.DENSE], psf)
     assert error(alone, nested) < 0.01 * float(nested.std())
     assert error(alone, nested) > 0  # another start of the iteration
     # solved without an iteration
-    assert run(electrons[..., :DENSE, :DENSE], psf, coarser_grids=False).equal(exact)
+    assert run(
+        electrons[..., : _masked_blur.DENSE, : _masked_blur.DENSE], psf, coarser_grids=False
+    ).equal(exact)

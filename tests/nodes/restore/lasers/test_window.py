@@ -5,7 +5,7 @@ for odd sides too.
 import pytest
 import torch
 
-from neusee.nodes.restore._lasers._candidates import _AROUND, _window
+from neusee.nodes.restore._lasers._candidates import _COMPARED_SIDE, _window
 
 
 @pytest.mark.parametrize("sides", [(640, 500), (641, 257), (90, 300)])
@@ -17,6 +17,6 @@ def test_a_place_has_the_same_pixel_in_the_window_and_in_the_frame(sides, share)
     frame[:, place[0] + sides[0] // 2, place[1] + sides[1] // 2] = 1.0
     window, middle = _window(frame, place)
     inside = frame[..., *window]
-    assert inside.shape[-2:] == tuple(min(n, _AROUND) for n in sides)
+    assert inside.shape[-2:] == tuple(min(n, _COMPARED_SIDE) for n in sides)
     y, x = (at - m + n // 2 for at, m, n in zip(place, middle, inside.shape[-2:], strict=True))
     assert float(inside[0, y, x]) == 1.0

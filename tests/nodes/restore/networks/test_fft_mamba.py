@@ -1,6 +1,7 @@
 """The FFT-Mamba network: its size, the order of its scans, and what each part owes by itself."""
 
 import itertools
+import json
 from fractions import Fraction
 
 import pytest
@@ -10,22 +11,9 @@ from torch.nn.functional import softplus
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError
-from neusee.nodes.network_weights import file_metadata
-from neusee.nodes.restore import fft_mamba
-from neusee.nodes.restore._networks._fft_mamba import (
-    SMALL,
-    Block,
-    BothWays,
-    FFTMamba,
-    Frequency,
-    Scan,
-    Spatial,
-    _decay,
-    _Phase,
-    _step,
-    radial_order,
-)
-from neusee.nodes.restore._networks._restorer import start_network
+from neusee.nodes.network_weights import OPTIONS, file_metadata
+from neusee.nodes.restore import FFTMamba, fft_mamba, start_network
+from neusee.nodes.restore._networks import _fft_mamba
 
 CPU = torch.device("cpu")
 
@@ -42,7 +30,7 @@ def begun(make):
     return start_network(make, seeded()).requires_grad_(False)
 
 
-def parameters(width, blocks, states, shuffle, directions=2, pyramid=False, frequency="complex"):
+def parameters(width, blocks, states, shuffle):
     """Written out part by part, biases last in each."""
     rank = -(-width // 16)
 
@@ -50,12 +38,7 @@ def parameters(width, blocks, states, shuffle, directions=2, pyramid=False, freq
         return 2 * (d * (rank + 2 * states) + rank * d + d + d * states + d)
 
     inner = 2 * width
-    spatial = (
-        (width * 2 * inner + 2 * inner)
-        + (9 * inner + inner)
-        + directions // 2 * both_ways(inner)
-        + 2 * inner
-    )
+    spatial = (width * 2 * inner + 2 * inner) + (9 * inner + inner) + both_ways(inner) + 2 * inner
     spatial += inner * width + width
     spectral = (
         2 * inner
@@ -84,9 +67,6 @@ def parameters(width, blocks, states, shuffle, directions=2, pyramid=False, freq
         (64, 8, 16, 4),
         (48, 8, 16, 4),
         (20, 3, 5, 1),
-        (64, 8, 16, 2, 4),
-        (64, 8, 16, 2, 2, True),
-        (20, 3, 5, 1, 4, True, "amp_phase"),
     ],
 )
 def test_has_as_many_parameters_as_its_parts(sizes):
@@ -101,21 +81,12 @@ def test_the_usual_network_has_938_thousand_parameters_in_eight_blocks():
     assert [block.spatial.by_columns for block in net.blocks] == [False, True] * 4
 
 
-def test_four_directions_are_a_ninth_more_parameters():
-    assert parameters(64, 8, 16, 2, 4) - parameters(64, 8, 16, 2) == 8 * 2 * (
-        128 * 36 + 4 * 128 + 128 + 128 * 17
-    )
-    with torch.device("meta"):
-        names = FFTMamba(20, 2, 5, 1).state_dict().keys()
-    assert not any("across" in name for name in names), "files of before have none"
-
-
 # --- the line of frequencies ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 6), (8, 8), (7, 5), (6, 9), (18, 26)])
 def test_the_order_is_a_permutation_and_the_places_undo_it(size):
-    order, place = radial_order(size, CPU)
+    order, place = _fft_mamba.radial_order(size, CPU)
     every = torch.arange(size[0] * (size[1] // 2 + 1))
     assert torch.equal(order.sort().values, every)
     assert torch.equal(order[place], every)
@@ -125,7 +96,7 @@ def test_the_order_is_a_permutation_and_the_places_undo_it(size):
 @pytest.mark.parametrize("size", [(8, 8), (7, 5), (6, 9), (4, 12)])
 def test_frequencies_rise_and_those_of_one_radius_turn(size):
     y, x = size
-    order, _ = radial_order(size, CPU)
+    order, _ = _fft_mamba.radial_order(size, CPU)
     known = []
     for row, column in itertools.product(range(y), range(x // 2 + 1)):
         up, right = Fraction(row - y if 2 * row >= y else row, y), Fraction(column, x)
@@ -136,10 +107,10 @@ def test_frequencies_rise_and_those_of_one_radius_turn(size):
 
 
 def test_the_order_made_where_nobody_learns_serves_those_who_learn():
-    radial_order.cache_clear()
+    _fft_mamba.radial_order.cache_clear()
     with torch.inference_mode():
-        radial_order((6, 10), CPU)
-    net = start_network(lambda: Frequency(4, 2), seeded())
+        _fft_mamba.radial_order((6, 10), CPU)
+    net = start_network(lambda: _fft_mamba.Frequency(4, 2), seeded())
     net(drawn(1, 4, 6, 10)).square().sum().backward()
     assert bool(net.strength.grad)
 
@@ -148,7 +119,7 @@ def test_the_order_made_where_nobody_learns_serves_those_who_learn():
 
 
 def test_steps_at_the_start_remember_ten_to_a_thousand_places():
-    scan = begun(lambda: Scan(400, 16, 4))
+    scan = begun(lambda: _fft_mamba.Scan(400, 16, 4))
     steps = softplus(scan.dt_bias.double())
     assert 1e-3 * (1 - 1e-4) <= float(steps.min()) < 1.5e-3
     assert 0.098 < float(steps.max()) <= 0.1 * (1 + 1e-4)
@@ -158,7 +129,7 @@ def test_steps_at_the_start_remember_ten_to_a_thousand_places():
 
 
 def test_a_scan_remembers_and_does_not_foresee():
-    scan, before = begun(lambda: Scan(6, 4, 2)), drawn(1, 40, 6)
+    scan, before = begun(lambda: _fft_mamba.Scan(6, 4, 2)), drawn(1, 40, 6)
     after = before.clone()
     after[:, 12] += 1
     change = (scan(after) - scan(before)).abs().amax((0, 2))
@@ -167,7 +138,7 @@ def test_a_scan_remembers_and_does_not_foresee():
 
 
 def test_a_scan_is_its_recurrence():
-    scan, u = begun(lambda: Scan(3, 2, 2)), drawn(2, 9, 3)
+    scan, u = begun(lambda: _fft_mamba.Scan(3, 2, 2)), drawn(2, 9, 3)
     read = u.double() @ scan.read.weight.double().T
     rate, into, out = read.split([2, 2, 2], -1)
     step = softplus(rate @ scan.rate.weight.double().T + scan.dt_bias.double())
@@ -183,13 +154,13 @@ def test_a_scan_is_its_recurrence():
 
 
 def test_decays_and_steps_stay_within_bounds_whatever_is_learnt():
-    scan, u = start_network(lambda: Scan(6, 4, 2), seeded()), 100 * drawn(1, 40, 6)
+    scan, u = start_network(lambda: _fft_mamba.Scan(6, 4, 2), seeded()), 100 * drawn(1, 40, 6)
     with torch.no_grad():
         scan.A_log.copy_(torch.linspace(-200, 200, scan.A_log.numel()).view_as(scan.A_log))
         scan.dt_bias.copy_(torch.linspace(-300, 300, scan.dt_bias.numel()))
-    steps = _step(100 * drawn(9, scan.dt_bias.numel()), scan.dt_bias).detach()
+    steps = _fft_mamba._step(100 * drawn(9, scan.dt_bias.numel()), scan.dt_bias).detach()
     assert (float(steps.min()), float(steps.max())) == (pytest.approx(1e-5), 8)
-    decays = _decay(scan.A_log).detach()
+    decays = _fft_mamba._decay(scan.A_log).detach()
     assert -404 < float(decays.min()) < float(decays.max()) < 0
     result = scan(u)
     result.square().mean().backward()
@@ -198,7 +169,7 @@ def test_decays_and_steps_stay_within_bounds_whatever_is_learnt():
 
 
 def test_both_ways_turned_round_are_the_other_ways():
-    both, u = begun(lambda: BothWays(4, 3, 1)), drawn(2, 17, 4)
+    both, u = begun(lambda: _fft_mamba.BothWays(4, 3, 1)), drawn(2, 17, 4)
     turned = both(u.flip(1))
     both.there, both.back = both.back, both.there
     assert_close(both(u).flip(1), turned, rtol=0, atol=1e-6)
@@ -207,7 +178,7 @@ def test_both_ways_turned_round_are_the_other_ways():
 
 
 def test_columns_of_a_picture_are_rows_of_the_picture_laid_on_its_side():
-    rows, columns = (begun(lambda by=by: Spatial(4, 3, by)) for by in (False, True))
+    rows, columns = (begun(lambda by=by: _fft_mamba.Spatial(4, 3, by)) for by in (False, True))
     state = rows.state_dict()
     columns.load_state_dict(state | {"mix.weight": state["mix.weight"].mT})
     x = drawn(1, 4, 6, 9)
@@ -217,7 +188,7 @@ def test_columns_of_a_picture_are_rows_of_the_picture_laid_on_its_side():
 
 def test_a_scan_by_rows_goes_along_rows():
     """Without the way back and the filter, a pixel changes what comes after it, row by row."""
-    part = begun(lambda: Spatial(4, 3, False))
+    part = begun(lambda: _fft_mamba.Spatial(4, 3, False))
     part.scan.back = torch.nn.Identity()
     part.mix = torch.nn.Identity()
     before = drawn(1, 4, 5, 6)
@@ -233,14 +204,14 @@ def test_a_scan_by_rows_goes_along_rows():
 
 @pytest.mark.parametrize("size", [(8, 8), (7, 5), (1, 6), (9, 1)])
 def test_a_gate_that_is_constant_multiplies_the_picture(size):
-    part, x = begun(lambda: Frequency(4, 3)), drawn(2, 4, *size)
+    part, x = begun(lambda: _fft_mamba.Frequency(4, 3)), drawn(2, 4, *size)
     part.leave.weight.zero_()
     part.leave.bias[:4] = 3.0
     assert_close(part(x), 1.3 * x, rtol=1e-5, atol=1e-6)
 
 
 def test_the_gate_of_a_frequency_is_drawn_from_the_lower_ones():
-    part = begun(lambda: Frequency(4, 3))
+    part = begun(lambda: _fft_mamba.Frequency(4, 3))
     part.scan.back = torch.nn.Identity()
     drawn_gates = []
     part.leave.register_forward_hook(lambda *call: drawn_gates.append(call[-1]))
@@ -251,7 +222,7 @@ def test_the_gate_of_a_frequency_is_drawn_from_the_lower_ones():
     part(before)
     part(before + wave)
     change = (drawn_gates[1] - drawn_gates[0]).abs().amax((0, 2))
-    place = int(radial_order((12, 16), CPU)[1][3 * 9 + 4])
+    place = int(_fft_mamba.radial_order((12, 16), CPU)[1][3 * 9 + 4])
     assert float(change[:place].max()) < 3e-6  # rounding
     assert float(change[place]) > 0.1
     assert float(change[place:].median()) > 1e-5
@@ -259,8 +230,8 @@ def test_the_gate_of_a_frequency_is_drawn_from_the_lower_ones():
 
 @pytest.mark.parametrize("size", [(8, 6), (7, 9)])
 def test_a_gate_acts_on_the_frequency_that_it_was_drawn_for(size):
-    part, x = begun(lambda: Frequency(4, 3)), drawn(1, 4, *size)
-    order, _ = radial_order(size, CPU)
+    part, x = begun(lambda: _fft_mamba.Frequency(4, 3)), drawn(1, 4, *size)
+    order, _ = _fft_mamba.radial_order(size, CPU)
     columns = order % (size[1] // 2 + 1)
     # whose mirror image is not here
     for rank in torch.nonzero((columns > 0) & (2 * columns < size[1]))[:, 0].tolist():
@@ -273,7 +244,7 @@ def test_a_gate_acts_on_the_frequency_that_it_was_drawn_for(size):
 
 
 def test_the_spectrum_is_in_single_precision_under_autocast():
-    part, x = begun(lambda: Frequency(4, 3)), drawn(1, 4, 6, 10)
+    part, x = begun(lambda: _fft_mamba.Frequency(4, 3)), drawn(1, 4, 6, 10)
     with torch.autocast("cpu", torch.bfloat16):
         result = part(x)
     assert result.dtype == torch.float32
@@ -283,7 +254,7 @@ def test_the_spectrum_is_in_single_precision_under_autocast():
 
 def test_a_small_spectrum_has_a_bounded_slope():
     """Amplitude and phase would have slopes of 1 / amplitude."""
-    part = begun(lambda: Frequency(4, 3))
+    part = begun(lambda: _fft_mamba.Frequency(4, 3))
     for size in (1.0, 1e-6, 0.0):
         x = (size * drawn(1, 4, 8, 8)).requires_grad_()
         part(x).sum().backward()
@@ -294,7 +265,7 @@ def test_a_small_spectrum_has_a_bounded_slope():
 
 
 def test_a_block_weighs_both_and_adds_little_at_the_start():
-    block, x = begun(lambda: Block(4, 3, False)), drawn(1, 4, 6, 6)
+    block, x = begun(lambda: _fft_mamba.Block(4, 3, False)), drawn(1, 4, 6, 6)
     assert float((block(x) - x).abs().max()) < 1
     block.second_scale.factor.zero_()
     for bias, part in ((60.0, block.spatial), (-60.0, block.frequency)):
@@ -324,73 +295,14 @@ def test_the_fine_pass_sees_the_coarse_one_and_both_have_the_same_weights():
     assert not torch.allclose(fine, net.improved(picture, picture), rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("frequency", ["complex", "amp_phase"])
-@pytest.mark.parametrize("pyramid", [False, True])
-@pytest.mark.parametrize("directions", [2, 4])
-def test_every_option_gives_two_scales_of_any_size_and_slopes(directions, pyramid, frequency):
-    options = {"directions": directions, "pyramid": pyramid, "frequency": frequency}
-    net = start_network(lambda: FFTMamba(4, 2, 2, 2, **options), seeded())
+def test_the_network_gives_two_scales_of_any_size_and_slopes():
+    net = start_network(lambda: FFTMamba(4, 2, 2, 2), seeded())
     picture = torch.rand(1, 3, 9, 14, generator=seeded())
     coarse, fine = net.pyramid(picture)
     assert (coarse.shape, fine.shape) == ((1, 3, 5, 7), (1, 3, 9, 14))
     assert float((fine - picture).detach().abs().mean()) < 0.5
     (coarse.square().sum() + fine.square().sum()).backward()
     assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in net.parameters())
-
-
-def test_a_pyramid_has_one_pass_and_its_coarse_estimate_is_the_fine_one_made_smaller():
-    net, picture = (
-        begun(lambda: FFTMamba(4, 1, 2, pyramid=True)),
-        torch.rand(1, 3, 16, 16, generator=seeded()),
-    )
-    passes = []
-    net.blocks.register_forward_hook(lambda *call: passes.append(1))
-    coarse, fine = net.pyramid(picture)
-    assert len(passes) == 1
-    smaller = torch.nn.functional.interpolate(fine, size=(8, 8), mode="bicubic", antialias=True)
-    assert_close(coarse, smaller, rtol=0, atol=1e-5)
-    assert_close(fine, net.improved(picture, picture), rtol=0, atol=1e-6)
-
-
-def test_four_directions_add_a_scan_across():
-    """With the scans of one way alone, a pixel changes what is right of it in its row, and below
-    it in its column.
-    """
-    part = begun(lambda: Spatial(4, 3, False, directions=4))
-    part.scan.back, part.across.back, part.mix = (torch.nn.Identity() for _ in range(3))
-    before = drawn(1, 4, 5, 6)
-    after = before.clone()
-    after[..., 2, 3] += 1
-    change = (part(after) - part(before)).abs().amax((0, 1))
-    assert not change[:2, :3].any()
-    assert not change[2, :3].any()
-    assert float(change[2:, 3:].min()) > 0
-    assert float(change[:, 4:].min()) > 0, "columns come after columns"
-
-
-def test_amplitude_and_phase_have_their_slopes_where_there_is_an_amplitude_and_finite_ones_where_not():
-    real, imaginary = (drawn(50, seed=seed).double().requires_grad_() for seed in (1, 2))
-    ours = torch.autograd.grad(_Phase.apply(real, imaginary).sum(), (real, imaginary))
-    true = torch.autograd.grad(torch.atan2(imaginary, real).sum(), (real, imaginary))
-    share = (real.square() + imaginary.square()).detach()
-    for one, other in zip(ours, true, strict=True):
-        assert_close(one, other * share / (share + SMALL))
-    part = begun(lambda: Frequency(4, 3, form="amp_phase"))
-    for size in (1.0, 1e-6, 0.0):
-        x = (size * drawn(1, 4, 8, 8)).requires_grad_()
-        part(x).sum().backward()
-        assert float(x.grad.abs().max()) < 100
-
-
-@pytest.mark.parametrize("size", [(8, 8), (7, 5)])
-def test_a_constant_gate_of_amplitude_scales_the_picture_and_one_of_phase_turns_it(size):
-    part, x = begun(lambda: Frequency(4, 3, form="amp_phase")), drawn(2, 4, *size)
-    part.leave.weight.zero_()
-    part.leave.bias[:4] = 3.0
-    assert_close(part(x), 1.3 * x, rtol=1e-5, atol=1e-5)
-    part.leave.bias[:4] = 0.0
-    part.leave.bias[4:] = 10 * torch.pi
-    assert_close(part(x), -x, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -400,8 +312,8 @@ def test_a_constant_gate_of_amplitude_scales_the_picture_and_one_of_phase_turns_
             "pyramid",
             True,
             (
-                "was trained with pyramid: true, and this network has pyramid: false; write"
-                " pyramid: true"
+                "was trained with pyramid: true, and this network has pyramid: false; train the"
+                " network again"
             ),
         ),
         ("frequency", "amp_phase", "frequency: amp_phase, and this network has frequency: complex"),
@@ -409,15 +321,17 @@ def test_a_constant_gate_of_amplitude_scales_the_picture_and_one_of_phase_turns_
     ],
 )
 def test_a_file_of_weights_tells_what_its_tensors_do_not(tmp_path, option, learnt, said):
+    """Options of earlier versions, whose tensors have the same shapes."""
     sizes = {"width": 4, "blocks": 1, "states": 2, "shuffle": 2}
     usual = {"directions": 2, "pyramid": False, "frequency": "complex"}
-    net = begun(lambda: FFTMamba(**sizes, **{option: learnt}))
-    save_file(net.state_dict(), file := tmp_path / "net.safetensors", file_metadata(net))
+    net = begun(lambda: FFTMamba(**sizes))
+    assert json.loads(file_metadata(net)[OPTIONS]) == usual
+    file = tmp_path / "net.safetensors"
+    save_file(net.state_dict(), file, {OPTIONS: json.dumps(usual | {option: learnt})})
     with pytest.raises(ParameterError, match=f"net.safetensors.*{said}") as caught:
-        fft_mamba.hooks.preflight(**sizes, **usual, weights=file)
+        fft_mamba.hooks.preflight(**sizes, weights=file)
     assert caught.value.parameter == "weights"
-    assert fft_mamba.hooks.preflight(**sizes, **usual | {option: learnt}, weights=file) == []
+    save_file(net.state_dict(), file, file_metadata(net))
+    assert fft_mamba.hooks.preflight(**sizes, weights=file) == []
     picture = torch.rand(3, 12, 16, generator=seeded())
-    assert torch.equal(
-        fft_mamba(picture, **sizes, **{option: learnt}, weights=file), net(picture[None])[0]
-    )
+    assert torch.equal(fft_mamba(picture, **sizes, weights=file), net(picture[None])[0])

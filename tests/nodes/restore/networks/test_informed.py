@@ -18,7 +18,7 @@ from neusee.nodes.restore import (
     wiener,
     wiener_problem,
 )
-from neusee.nodes.restore._inverse._wiener import EACH
+from neusee.nodes.restore._inverse._wiener import MAPS_OF_CHANNEL
 from tests.nodes.restore.networks.test_unrolled import frame, random
 
 READ = {"read_noise": 10.0}
@@ -63,7 +63,7 @@ def test_the_maps_say_what_the_filter_knows():
     """
     given = frame()
     known, posed = filter_facts(*given, **READ), wiener_problem(*given, **READ)
-    each = known.maps[: 3 * EACH].reshape(EACH, 3, 24, 24)
+    each = known.maps[: 3 * MAPS_OF_CHANNEL].reshape(MAPS_OF_CHANNEL, 3, 24, 24)
     assert torch.allclose(
         known.answer * known.scale + known.mean, wiener(*given, **READ).double(), rtol=1e-6
     )
@@ -81,7 +81,7 @@ def test_the_maps_say_what_the_filter_knows():
     ]
     told = np.array(told)
     assert np.corrcoef(told.ravel(), known.deviation[0].numpy().ravel() ** -2)[0, 1] > 0.999
-    shares = known.maps[3 * EACH :, 0, 0]
+    shares = known.maps[3 * MAPS_OF_CHANNEL :, 0, 0]
     assert float(shares[0]) < float(shares[-1]) < 1.0  # the frame tells the coarsest octave best
 
 

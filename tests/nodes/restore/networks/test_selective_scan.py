@@ -16,7 +16,6 @@ import torch
 
 from neusee.nodes import _cpp_library
 from neusee.nodes.restore._networks import _selective_scan
-from neusee.nodes.restore._networks._selective_scan import reference, selective_scan
 
 ROOT = Path(__file__).parents[4]
 RATES = [1e-6, 1e-3, 0.1, 1.0, 50.0, 200.0, "mix"]
@@ -35,6 +34,13 @@ def backend(request):
     if request.param == "cpp":
         request.getfixturevalue("cpp")
     return request.param
+
+
+def scan_by(*values, backend):
+    """The scan by one of the two backends, as the environment selects it."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("NEUSEE_SCAN", backend)
+        return _selective_scan.selective_scan(*values)
 
 
 def draw(length, d=4, n=4, *, batch=1, rate=None, kind=torch.float64, seed=0, even=False):
@@ -95,9 +101,7 @@ def gradients(scan, values, seen):
 @pytest.mark.parametrize("rate", RATES)
 def test_a_long_line_is_that_of_the_loop(rate, even, backend):
     values, truth = long_line(rate, torch.float32, even)
-    assert worst(selective_scan(*values, backend=backend), truth) < (
-        8e-7 if backend == "torch" else 3e-7
-    )
+    assert worst(scan_by(*values, backend=backend), truth) < (8e-7 if backend == "torch" else 3e-7)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -108,13 +112,13 @@ def test_a_state_that_hardly_decays_is_not_rounded_away_in_wide_lines(monkeypatc
     """
     values, truth = long_line(1e-6, torch.float32, True, 2, 2, seed)
     monkeypatch.setattr(_selective_scan, "plan_scan", lambda *_: _selective_scan.ScanPlan(*steps))
-    assert worst(selective_scan(*values, backend="torch"), truth) < 4e-7
+    assert worst(scan_by(*values, backend="torch"), truth) < 4e-7
 
 
 @pytest.mark.parametrize("rate", [1e-6, "mix", 200.0])
 def test_a_long_line_in_double_precision(rate, backend):
     values, truth = long_line(rate, torch.float64, False)
-    assert worst(selective_scan(*values, backend=backend), truth) < 1e-12
+    assert worst(scan_by(*values, backend=backend), truth) < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -126,9 +130,9 @@ def test_any_size_and_its_gradients(length, d, n, batch, backend):
     seen = torch.randn(
         batch, length, d, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
     )
-    assert worst(selective_scan(*values, backend=backend), reference(*values)) < 1e-13
-    found = gradients(lambda *x: selective_scan(*x, backend=backend), values, seen)
-    for one, truth in zip(found, gradients(reference, values, seen), strict=True):
+    assert worst(scan_by(*values, backend=backend), _selective_scan.reference(*values)) < 1e-13
+    found = gradients(lambda *x: scan_by(*x, backend=backend), values, seen)
+    for one, truth in zip(found, gradients(_selective_scan.reference, values, seen), strict=True):
         assert worst(one, truth) < 1e-12 or (length == 1 and not truth.any())
 
 
@@ -137,9 +141,9 @@ def test_any_size_and_its_gradients(length, d, n, batch, backend):
 def test_gradients_in_single_precision(rate):
     values = draw(1500, 3, 2, rate=rate, kind=torch.float32)
     seen = torch.randn(1, 1500, 3, generator=torch.Generator().manual_seed(1))
-    truth = gradients(reference, [x.double() for x in values], seen.double())
+    truth = gradients(_selective_scan.reference, [x.double() for x in values], seen.double())
     for backend in ("torch", "cpp"):
-        found = gradients(lambda *x, b=backend: selective_scan(*x, backend=b), values, seen)
+        found = gradients(lambda *x, b=backend: scan_by(*x, backend=b), values, seen)
         assert max(map(worst, found, truth)) < 5e-6, backend
 
 
@@ -147,8 +151,8 @@ def test_gradients_in_single_precision(rate):
 def test_any_cut_of_the_length_gives_the_same(monkeypatch, steps):
     values, seen = draw(40, 3, 2), torch.randn(1, 40, 3, dtype=torch.float64)
     monkeypatch.setattr(_selective_scan, "plan_scan", lambda *_: _selective_scan.ScanPlan(*steps))
-    found = gradients(lambda *x: selective_scan(*x, backend="torch"), values, seen)
-    for one, truth in zip(found, gradients(reference, values, seen), strict=True):
+    found = gradients(lambda *x: scan_by(*x, backend="torch"), values, seen)
+    for one, truth in zip(found, gradients(_selective_scan.reference, values, seen), strict=True):
         assert worst(one, truth) < 1e-12
 
 
@@ -157,8 +161,8 @@ def test_both_backends_give_the_same_numbers():
     values = draw(3001, 19, 5, batch=2, kind=torch.float32)
     assert (
         worst(
-            selective_scan(*values, backend="torch"),
-            selective_scan(*values, backend="cpp").double(),
+            scan_by(*values, backend="torch"),
+            scan_by(*values, backend="cpp").double(),
         )
         < 1e-6
     )
@@ -170,18 +174,18 @@ def test_the_number_of_threads_changes_nothing_but_roundings(monkeypatch):
     found = []
     for threads in (1, 3):
         monkeypatch.setattr(torch, "get_num_threads", lambda n=threads: n)
-        found.append(gradients(lambda *x: selective_scan(*x, backend="cpp"), values, seen))
+        found.append(gradients(lambda *x: scan_by(*x, backend="cpp"), values, seen))
     assert all(worst(one, other) < 1e-13 for one, other in zip(*found, strict=True))
 
 
 def test_gradcheck(backend):
     values = [x.requires_grad_() for x in (*draw(17, 3, 2), torch.randn(3, dtype=torch.float64))]
-    assert torch.autograd.gradcheck(lambda *x: selective_scan(*x, backend=backend), values)
+    assert torch.autograd.gradcheck(lambda *x: scan_by(*x, backend=backend), values)
 
 
 def test_a_second_derivative_is_refused(backend):
     leaves = [x.requires_grad_() for x in draw(9, 3, 2)]
-    y = selective_scan(*leaves, backend=backend)
+    y = scan_by(*leaves, backend=backend)
     with pytest.raises(RuntimeError, match="no second derivative"):
         torch.autograd.grad(y.sum(), leaves, create_graph=True)
 
@@ -190,12 +194,12 @@ def test_half_precision_and_autocast_are_computed_in_single(backend):
     halves = [x.bfloat16() for x in draw(400, 8, 4)]
     singles = [x.float() for x in halves]
     seen = torch.randn(1, 400, 8, generator=torch.Generator().manual_seed(1))
-    expected = gradients(lambda *x: selective_scan(*x, backend=backend), singles, seen)
+    expected = gradients(lambda *x: scan_by(*x, backend=backend), singles, seen)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        y = selective_scan(*halves, backend=backend)
-        found = gradients(lambda *x: selective_scan(*x, backend=backend), singles, seen)
+        y = scan_by(*halves, backend=backend)
+        found = gradients(lambda *x: scan_by(*x, backend=backend), singles, seen)
     assert y.dtype == torch.float32
-    assert torch.equal(y, selective_scan(*singles, backend=backend))
+    assert torch.equal(y, scan_by(*singles, backend=backend))
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
@@ -203,20 +207,18 @@ def test_decays_that_leave_nothing_and_lines_of_nothing(backend):
     u, dt, A, B, C = draw(300, 3, 2, kind=torch.float32)
     for dt_, u_ in ((dt * 1e30, u), (dt * 0, u), (dt, u * 0), (dt * 1e-38, u)):
         values = (u_, dt_, A, B, C)
-        y = selective_scan(*values, backend=backend)
+        y = scan_by(*values, backend=backend)
         assert bool(y.isfinite().all())
-        found = gradients(
-            lambda *x: selective_scan(*x, backend=backend), values, torch.ones_like(u)
-        )
+        found = gradients(lambda *x: scan_by(*x, backend=backend), values, torch.ones_like(u))
         assert all(bool(x.isfinite().all()) for x in found)
-    assert not selective_scan(u * 0, dt, A, B, C, backend=backend).any()
+    assert not scan_by(u * 0, dt, A, B, C, backend=backend).any()
 
 
 @pytest.mark.usefixtures("cpp")
 def test_a_state_that_dies_away_never_gets_to_the_slow_subnormal_numbers():
     u, dt, A, B, C = draw(3000, 4, 1, rate=0.7, kind=torch.float32, even=True)
     u[:, 1:] = 0
-    y = selective_scan(u, dt, A, B, torch.ones_like(C), backend="cpp").abs()
+    y = scan_by(u, dt, A, B, torch.ones_like(C), backend="cpp").abs()
     tiny = torch.finfo(torch.float32).tiny
     assert bool((y[:, :100] > 0).all() & (y[:, 1000:] < 10 * tiny).all())
     assert not bool(((y > 0) & (y < tiny)).any())
@@ -226,7 +228,7 @@ def test_a_state_that_dies_away_never_gets_to_the_slow_subnormal_numbers():
 def test_a_value_that_is_no_number_is_not_hidden(backend):
     u, dt, A, B, C = draw(50, 3, 2, kind=torch.float32)
     dt[0, 20, 1] = float("nan")
-    y = selective_scan(u, dt, A, B, C, backend=backend)
+    y = scan_by(u, dt, A, B, C, backend=backend)
     assert bool(y[:, :20].isfinite().all())
     assert bool(y[:, 20:, 1].isnan().all())
     assert bool(y[:, :, [0, 2]].isfinite().all())
@@ -236,15 +238,16 @@ def test_strided_inputs_and_the_direct_path(backend):
     u, dt, A, B, C = draw(60, 5, 3)
     D = torch.linspace(-1, 1, 5, dtype=torch.float64)
     turned = [x.transpose(1, 2).contiguous().transpose(1, 2) for x in (u, dt, B, C)]
-    y = selective_scan(
-        turned[0], turned[1], A.T.contiguous().T, turned[2], turned[3], D, backend=backend
-    )
+    y = scan_by(turned[0], turned[1], A.T.contiguous().T, turned[2], turned[3], D, backend=backend)
     assert worst(y, loop(u, dt, A, B, C) + D * u) < 1e-13
-    assert worst(y, reference(u, dt, A, B, C, D)) < 1e-13
+    assert worst(y, _selective_scan.reference(u, dt, A, B, C, D)) < 1e-13
 
 
 def test_the_backward_of_the_reference_is_linear_in_length():
-    nodes, todo = set(), [reference(*(x.requires_grad_() for x in draw(64, 2, 2))).grad_fn]
+    nodes, todo = (
+        set(),
+        [_selective_scan.reference(*(x.requires_grad_() for x in draw(64, 2, 2))).grad_fn],
+    )
     while todo:
         one = todo.pop()
         if one is not None and one not in nodes:
@@ -263,33 +266,33 @@ def test_shapes_that_do_not_fit_are_named(name):
     )
     values[name] = values[name][..., :1]
     with pytest.raises(ValueError, match=rf"^(B|{name}) is \("):
-        selective_scan(**values)
+        _selective_scan.selective_scan(**values)
 
 
 def test_what_cannot_be_scanned_is_refused():
     values = draw(6, 3, 2)
     with pytest.raises(ValueError, match="nothing to scan"):
-        selective_scan(*(x[:, :0] if x.ndim == 3 else x for x in values))
+        _selective_scan.selective_scan(*(x[:, :0] if x.ndim == 3 else x for x in values))
     with pytest.raises(ValueError, match="real numbers in floating point"):
-        selective_scan(*(x.to(torch.complex64) for x in values))
+        _selective_scan.selective_scan(*(x.to(torch.complex64) for x in values))
     with pytest.raises(ValueError, match=r"u must be \(batch, length, d\)"):
-        selective_scan(values[0][0], *values[1:])
-    with pytest.raises(ValueError, match="backend is 'fast'"):
-        selective_scan(*values, backend="fast")
+        _selective_scan.selective_scan(values[0][0], *values[1:])
+    with pytest.raises(ValueError, match="NEUSEE_SCAN is 'fast': write torch or cpp"):
+        scan_by(*values, backend="fast")
 
 
 def test_the_environment_chooses(monkeypatch):
     values, called = draw(6, 3, 2), []
     monkeypatch.setattr(_selective_scan, "compiled", lambda: called.append(1))
     monkeypatch.setenv("NEUSEE_SCAN", "torch")
-    selective_scan(*values)
+    _selective_scan.selective_scan(*values)
     assert not called
     monkeypatch.setenv("NEUSEE_SCAN", "cpp")
-    selective_scan(*values)
+    _selective_scan.selective_scan(*values)
     assert called
     monkeypatch.setenv("NEUSEE_SCAN", "fortran")
     with pytest.raises(ValueError, match="NEUSEE_SCAN is 'fortran'"):
-        selective_scan(*values)
+        _selective_scan.selective_scan(*values)
 
 
 def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_path):
@@ -300,10 +303,10 @@ def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_
     with pytest.warns(
         UserWarning, match="C\\+\\+ of the scan is not compiled and torch computes the scan"
     ) as said:
-        found = [selective_scan(*values), selective_scan(*values, backend="cpp")]
+        found = [_selective_scan.selective_scan(*values), scan_by(*values, backend="cpp")]
     assert len(said) == 1
     assert "\n" not in str(said[0].message)
-    truth = selective_scan(*values, backend="torch")
+    truth = scan_by(*values, backend="torch")
     assert all(torch.equal(y, truth) for y in found)
     assert not list(tmp_path.rglob("*.so"))
 
@@ -339,5 +342,5 @@ def test_what_is_kept_for_the_way_back_is_little():
     with torch.autograd.graph.saved_tensors_hooks(
         lambda x: (kept.append(x.numel()), x)[1], lambda x: x
     ):
-        selective_scan(u.requires_grad_(), *others, backend="torch")
+        scan_by(u.requires_grad_(), *others, backend="torch")
     assert sum(kept) < 0.2 * 4096 * 96 * 16

@@ -7,16 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes import ParameterError
-from neusee.nodes.restore import measured_psf
-from neusee.nodes.restore._measured_psf import gauged
-from neusee.nodes.restore._point_frames import (
-    State,
-    hats,
-    linear,
-    node_weights,
-    read_points,
-    shifting,
-)
+from neusee.nodes.restore import _measured_psf, _point_frames, measured_psf
 from tests.nodes.restore.points.independent_camera import CAMERA, centred, numbers, place_in, points
 
 TRIPLE = torch.ones(3, 5)
@@ -202,35 +193,38 @@ def test_the_psf_by_field_agrees_within_its_error_at_every_node(tmp_path):
 def test_shifting_is_exact_for_smooth_pictures_and_has_the_right_slope():
     at = np.arange(41) - 20.0
     offset = torch.tensor([0.37, -0.42, 2.3], dtype=torch.float64)
-    value, slope = shifting(offset, 41)
+    value, slope = _point_frames.shifting(offset, 41)
     wave = np.exp(-(at**2) / 4.5)
     for row, d in enumerate(offset.tolist()):
         expected = np.exp(-((at - d) ** 2) / 4.5)
         np.testing.assert_allclose(value[row].numpy() @ wave, expected, atol=2e-4)
         np.testing.assert_allclose(slope[row].numpy() @ wave, expected * (at - d) / 2.25, atol=1e-3)
     small = 1e-6
-    ahead, behind = (shifting(offset + step, 41)[0] for step in (small, -small))
+    ahead, behind = (_point_frames.shifting(offset + step, 41)[0] for step in (small, -small))
     torch.testing.assert_close((ahead - behind) / (2 * small), slope, rtol=0, atol=1e-6)
 
 
 def test_the_slope_is_the_transpose_of_the_change_and_the_change_that_of_the_model(one_zone):
     folder, shape, _ = one_zone
-    seen = read_points(tuple(sorted(folder.iterdir())), (15, 15), tuple(CAMERA[n] for n in _ORDER))
-    share = node_weights(seen.middle, shape, (2, 2))
+    seen = _point_frames.read_points(
+        tuple(sorted(folder.iterdir())), (15, 15), tuple(CAMERA[n] for n in _ORDER)
+    )
+    share = _point_frames.node_weights(seen.middle, shape, (2, 2))
     draw = torch.Generator().manual_seed(0)
-    like = State(
+    like = _point_frames.State(
         torch.rand(4, 3, 15, 15), torch.rand(6, 3), torch.rand(6, 2) - 0.5, torch.rand(6, 3)
     )
     state, by = (
-        State(*(torch.rand(x.shape, generator=draw).double() for x in like)) for _ in range(2)
+        _point_frames.State(*(torch.rand(x.shape, generator=draw).double() for x in like))
+        for _ in range(2)
     )
-    near = linear(seen, state, share)
+    near = _point_frames.linear(seen, state, share)
     pixels = torch.randn(seen.light.shape, generator=draw).double()
     there, back = float((near.change(by) * pixels).sum()), float(near.slope(pixels).dot(by))
     assert abs(there - back) < 1e-10 * abs(there)
     small = 1e-6
     ahead, behind = (
-        linear(seen, moved, share).model(moved.background)
+        _point_frames.linear(seen, moved, share).model(moved.background)
         for moved in (state.plus(by, small), state.plus(by, -small))
     )
     torch.testing.assert_close(
@@ -242,7 +236,7 @@ _ORDER = ("gain", "offset", "full_well", "bits", "read_noise")
 
 
 def test_weights_of_nodes_are_linear_between_nodes_and_add_up_to_one():
-    weights = hats(torch.arange(12), 12, 3)  # nodes at 1.5, 5.5, 9.5
+    weights = _point_frames.hats(torch.arange(12), 12, 3)  # nodes at 1.5, 5.5, 9.5
     torch.testing.assert_close(weights.sum(1), torch.ones(12).double())
     middles = torch.tensor([1.5, 5.5, 9.5], dtype=torch.float64)
     torch.testing.assert_close(weights @ middles, torch.arange(12).double().clamp(1.5, 9.5))
@@ -250,8 +244,10 @@ def test_weights_of_nodes_are_linear_between_nodes_and_add_up_to_one():
 
 def test_the_centre_does_not_depend_on_where_the_points_were():
     kernel = torch.tensor(centred((0.2, -0.1), (25, 25)))[None]
-    down, _ = shifting(torch.tensor([0.4]).double(), 25)
-    torch.testing.assert_close(gauged(down[:, None] @ kernel), kernel, rtol=0, atol=2e-4)
+    down, _ = _point_frames.shifting(torch.tensor([0.4]).double(), 25)
+    torch.testing.assert_close(
+        _measured_psf.gauged(down[:, None] @ kernel), kernel, rtol=0, atol=2e-4
+    )
 
 
 # --- what is refused ------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ def how(**values):
 def test_the_loss_falls_with_mask_and_stop_and_the_recipe_repeats_it(
     kind, recipe, store, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(design_run, "pictures", lambda *_: {})
+    monkeypatch.setattr(design_run, "design_pictures", lambda *_: {})
     given, said = how(kind=kind, iterations=12, learning_rate=0.1), []
     terms = Terms(recipe, given, store)
     start = gradient_descent.shape_of(terms, 0)

@@ -62,7 +62,7 @@ def recipe():
 def without_pictures(request, monkeypatch):
     """Pictures take longer than what is tested; one test looks at them."""
     if "file_is_the_mask" not in request.node.name:
-        monkeypatch.setattr(design_run, "pictures", lambda *_: {})
+        monkeypatch.setattr(design_run, "design_pictures", lambda *_: {})
 
 
 def loss_of(terms, height):
@@ -124,9 +124,9 @@ def test_the_losses_of_several_starts_have_a_legend():
     rows = [
         {"start": i, "iteration": n, "loss": 1.0 + i, "lsr": -n} for i in range(3) for n in range(4)
     ]
-    figure = design_run.history.__wrapped__(rows)
+    figure = design_run.history_figure.__wrapped__(rows)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["0", "1", "2"]
-    assert design_run.history.__wrapped__(rows[:4]).legends == []
+    assert design_run.history_figure.__wrapped__(rows[:4]).legends == []
 
 
 @pytest.mark.parametrize(("kind", "values"), [("pixelwise", {}), ("unet", {"starts": 2}),

@@ -51,7 +51,7 @@ def how(**values):
     "weights", [{"filtered_error": 1}, {"information": 1}], ids=lambda w: next(iter(w))
 )
 def test_the_loss_falls_and_the_page_has_the_rival(weights, recipe, store, tmp_path, monkeypatch):
-    monkeypatch.setattr(design_run, "pictures", lambda *_: {})
+    monkeypatch.setattr(design_run, "design_pictures", lambda *_: {})
     given = how(weights={"lsr": 0, "bsr": 0, **weights}, iterations=8)
     terms, said = Terms(recipe, given, store), []
     start = gradient_descent.shape_of(terms, 0)(terms.stop)

@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 
 from neusee.workflows import Store, load
 from neusee.workflows.training.process_mesh import Mesh, MeshError
+from neusee.workflows.training.resumable_loop import TrainingSession
 from neusee.workflows.training.run_training import train
 from tests.workflows.training.noise_photographs import noise_photograph
 
@@ -267,7 +268,7 @@ def test_a_batch_that_cannot_be_shared_is_refused_where_it_stands(tmp_path):
     with pytest.raises(
         MeshError, match=r"argument \d+   train\.stages\.1\.batch   3 pictures .* multiple of 2"
     ):
-        train(recipe, Store(tmp_path), tmp_path, [], print, mesh=Mesh(2))
+        train(recipe, TrainingSession(Store(tmp_path), tmp_path, print, mesh=Mesh(2)))
 
 
 @pytest.mark.slow
