@@ -22,8 +22,7 @@ from neusee.workflows.cli.commands_and_exit_codes import (
     TYPED,
     help_page,
 )
-from neusee.workflows.cli.interrupt_signal import Interrupts, said, say_stopped
-from neusee.workflows.engine.machine_resources import free_processors
+from neusee.workflows.cli.interrupt_signal import Interrupts, printed_sentences, say_stopped
 
 if TYPE_CHECKING:
     import typer
@@ -58,7 +57,7 @@ def settle_threads(command: str, environ: MutableMapping[str, str] = os.environ)
         return
     if not any(name in environ for name in _WAITING):
         environ["OMP_WAIT_POLICY"] = "PASSIVE"
-    threads = free_processors()
+    threads = lazy.machine_resources.free_processors()
     if (
         command not in _TIMED
         and not any(name in environ for name in _NUMBER)
@@ -98,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
         gc.disable()
         arguments = sys.argv[1:]
     TYPED[:] = arguments
-    said.clear()
+    printed_sentences.clear()
     _print_any_character()
     try:
         exit_code = _run(arguments)

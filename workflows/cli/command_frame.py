@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 DEFAULT = "first_light"
-_MOST = 100  #: lines of an error that are printed
+_MOST_ERROR_LINES = 100  #: lines of an error that are printed
 #: containers that are new, after which Python searches for garbage; 700 at first
 _NEW_OBJECTS = 10_000
 
@@ -141,10 +141,12 @@ def refusing() -> Iterator[None]:
 
 
 def _first_lines(text: str) -> list[str]:
-    """Return the lines of an error, at most `_MOST` of them, and how many more there are."""
+    """Return the lines of an error, at most `_MOST_ERROR_LINES` of them, and how many more
+    there are.
+    """
     lines = text.splitlines()
-    hidden = len(lines) - _MOST
-    return [*lines[:_MOST], f"and {hidden} more like these"] if hidden > 0 else lines
+    hidden = len(lines) - _MOST_ERROR_LINES
+    return [*lines[:_MOST_ERROR_LINES], f"and {hidden} more like these"] if hidden > 0 else lines
 
 
 @contextmanager
@@ -351,22 +353,22 @@ class ProgressLines:
     """
 
     def __init__(self, quiet: bool, clock: Callable[[], float] = time.monotonic) -> None:
-        self._quiet, self._clock, self._before = quiet, clock, clock()
+        self._quiet, self._clock, self._time_of_last_line = quiet, clock, clock()
         #: by kind of line: time and count from which the rate is taken
         self._began: dict[str, tuple[float, int]] = {}
         self._last: dict[str, int] = {}
 
     def __call__(self, line: str) -> None:
         if not self._quiet:
-            print(f"{line}{self._left(line)}", flush=True)
+            print(f"{line}{self._time_left(line)}", flush=True)
 
-    def _left(self, line: str) -> str:
+    def _time_left(self, line: str) -> str:
         """Return the time that is left, as the end of a line with a count.
 
         Other lines, and a first count, have an empty text.
         """
-        present_time, previous_time = self._clock(), self._before
-        self._before = present_time
+        present_time, previous_time = self._clock(), self._time_of_last_line
+        self._time_of_last_line = present_time
         if not (count := _COUNT_AT_END.search(line) or _COUNT.match(line)):
             return ""
         task, done_count, total = count["what"], int(count["done"]), int(count["all"])
@@ -398,7 +400,7 @@ class FewLines(ProgressLines):
 
     def __call__(self, line: str) -> None:
         has_count = _STEPS.match(line) is not None
-        time_left = self._left(line)
+        time_left = self._time_left(line)
         seconds_so_far = self._clock() - self._began_at
         if self._quiet or (has_count and not sys.stdout.isatty() and seconds_so_far < self._next):
             return
@@ -490,8 +492,8 @@ def executor_of(
 
 
 def check_executor(place: str, job: Sequence[str]) -> None:
-    """End the command before any work for a place that is none, or for options of jobs that
-    cannot be.
+    """End the command before any work if ``place`` names no executor, or if the options of
+    jobs do not belong to it.
     """
     kind = place.partition(":")[0]
     if not _is_place(place) and "://" not in place:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from types import FrameType
 
 STOPPED = "stopped; finished results are kept, and the same command goes on from there"
-said: list[str] = []  #: the sentences that this command has printed because it was stopped
+#: the sentences that this command has printed because it was stopped
+printed_sentences: list[str] = []
 #: seconds in which several signals are one press of the keys: a shell and its terminal may both
 #: send
 _ONE_PRESS = 1.0
@@ -26,8 +27,8 @@ _ONE_PRESS = 1.0
 
 def say_stopped(sentence: str = STOPPED) -> None:
     """Print why a command ends before its end, unless this was printed before."""
-    if not said:
-        said.append(sentence)
+    if not printed_sentences:
+        printed_sentences.append(sentence)
         print(sentence, file=sys.stderr, flush=True)
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from neusee.workflows.contract import node_contract as node_contract
     from neusee.workflows.engine import dask_cluster as dask_cluster
     from neusee.workflows.engine import local_executor as local_executor
+    from neusee.workflows.engine import machine_resources as machine_resources
     from neusee.workflows.engine import wanted_steps as wanted_steps
     from neusee.workflows.evaluation import pipelines as pipelines
     from neusee.workflows.explain import run_forecast as run_forecast
@@ -96,8 +97,8 @@ _MODULES = (
     "workflows.simulation.simulate_recipe",
     "workflows.studies.run_study",
     "workflows.tolerance.cheaper_steps",
-    "workflows.training.resumable_loop",
     "workflows.training.process_mesh",
+    "workflows.training.resumable_loop",
 )
 _BY_NAME = {module.rpartition(".")[2]: module for module in _MODULES}
 

@@ -229,7 +229,7 @@ def check(
     exit code is 3 if a rule fails. Runs the code.
     """
     with failing(LookupError), elsewhere(early=not _is_of_neusee(place)) as process:
-        nodes, networks = _found(place)
+        nodes, networks = _nodes_and_networks(place)
 
         by_name = lazy.node_contract.check_all(nodes, networks, process)
     failure_count = sum(finding.ok is False for finding in chain.from_iterable(by_name.values()))
@@ -298,7 +298,7 @@ def _count(nodes: int, networks: int) -> str:
     return " and ".join(f"{count} {noun}{'s' * (count != 1)}" for count, noun in counts)
 
 
-def _found(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
+def _nodes_and_networks(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
     """Return the nodes and the network classes at a place by name; raise `LookupError` if there
     are none.
     """

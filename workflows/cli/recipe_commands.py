@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -49,7 +49,7 @@ from neusee.workflows.report.terminal_text import commands_to_try, json_line
 if TYPE_CHECKING:
     from neusee.workflows.explain.run_forecast import Plan
     from neusee.workflows.graph.recipe_graph import Recipe
-    from neusee.workflows.simulation.simulate_recipe import Simulation
+    from neusee.workflows.simulation.simulate_recipe import RunOptions, Simulation
     from neusee.workflows.store.result_store import Store
     from neusee.workflows.sweeps.sweep_points import OnError
 
@@ -122,7 +122,8 @@ def run(
         lazy.console.mode_for(is_silent),
         predicted_seconds,
     )
-    simulate = lazy.simulate_recipe.simulate
+    # imported before the table appears
+    simulation_module = lazy.simulate_recipe
     with (
         resumable(
             lambda: kept_in(
@@ -132,9 +133,10 @@ def run(
         executor_of(executor, store, job_options, _speaker(is_silent)) as cluster,
         table,
     ):
-        simulation = simulate(
-            cheaper_recipe, store, out, command, device, table.watch, cluster, limit, steps_to_rerun
+        options = simulation_module.RunOptions(
+            device, cluster, limit, steps_to_rerun, watch=table.watch
         )
+        simulation = simulation_module.simulate(cheaper_recipe, store, out, command, options)
     if is_silent:
         hints = []
         _say_briefly(simulation, as_json)
@@ -453,20 +455,17 @@ def sweep(
     with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
         # many points make garbage, which the program otherwise never searches
         search_for_garbage()
-        code = lazy.sweep_screen.run_sweep(
-            name,
-            words,
-            first=first_number,
+        options = lazy.sweep_screen.SweepOptions(
             zip=paired,
             on_error=error_policy,
             netcdf=netcdf,
             device=device,
+            workers=workers,
             out=out,
-            store=store,
             quiet=quiet,
             as_json=as_json,
-            workers=workers,
         )
+        code = lazy.sweep_screen.run_sweep(name, words, store, options, first_number)
     if code:
         raise typer.Exit(code)
 
@@ -522,15 +521,16 @@ def restore(
         frame_camera = lazy.frame_recipes.FrameCamera(camera, mask, psf)
         recipes = lazy.frame_recipes.recipes_of(files, frame_camera, changes, folder, first_number)
     store, silent = the_store(), quiet or as_json
-    options = option_words({"camera": camera, "mask": mask, "psf": psf})
+    option_texts = option_words({"camera": camera, "mask": mask, "psf": psf})
+    options = lazy.simulate_recipe.RunOptions(device, memory=limit)
 
     with (
         resumable(lambda: kept_in(store, "finished steps are")),
         failing(lazy.errors.RunError, code=FAILED),
     ):
         for file, recipe in zip(files, recipes, strict=True):
-            command = ["neusee", "restore", str(file), *changes, *options]
-            simulation = _restored(recipe, store, out, command, (device, limit), silent)
+            command = ["neusee", "restore", str(file), *changes, *option_texts]
+            simulation = _restored(recipe, store, out, command, options, silent)
             _say(simulation, as_json, quiet)
 
 
@@ -539,17 +539,15 @@ def _restored(
     store: Store,
     out: Path,
     command: list[str],
-    place: tuple[str, int | None],
+    options: RunOptions,
     silent: bool,
 ) -> Simulation:
     """Run the recipe of a frame, with the lines of its steps unless the command is silent."""
-    # the limit of memory in bytes, or None
-    device, limit = place
     _refuse_beyond_memory(
         lazy.run_forecast.planned(
-            recipe, store, lazy.run_forecast.lanes_for(recipe, device, limit)
+            recipe, store, lazy.run_forecast.lanes_for(recipe, options.device, options.memory)
         ),
-        limit,
+        options.memory,
     )
     if not silent:
         say(lazy.console.opening(recipe, shlex.join(command[1:])))
@@ -561,7 +559,7 @@ def _restored(
         {},
     ) as table:
         return lazy.simulate_recipe.simulate(
-            cheaper_recipe, store, out, command, device, table.watch, None, limit
+            cheaper_recipe, store, out, command, replace(options, watch=table.watch)
         )
 
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,6 @@ from neusee.workflows.cli.command_frame import option_words, say_json, say_line
 from neusee.workflows.cli.commands_and_exit_codes import DONE, FAILED, INTERRUPTED
 from neusee.workflows.report.console import Mode, ProgressTable, mode_for
 from neusee.workflows.report.terminal_text import lasts
-from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import read_words
 from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, outcomes
@@ -43,53 +43,76 @@ _LAST = 25  #: points in a live table
 _USUAL = {"on-error": "stop", "device": "cpu", "out": Path("runs")}
 
 
+@dataclass(frozen=True)
+class SweepOptions:
+    """The options of ``neusee sweep``."""
+
+    zip: bool = False  #: pair the values of the axes in place of combining them
+    on_error: OnError = "stop"  #: what follows a failed point
+    netcdf: bool = False  #: write ``sweep.nc`` too
+    device: str = "cpu"
+    workers: int = 0  #: points that run at the same time; 0: by free processors
+    out: Path = Path("runs")  #: folder of the folders of results
+    quiet: bool = False  #: print the path of the table alone
+    as_json: bool = False  #: print the result as one JSON object, and nothing else
+
+    def words(self) -> list[str]:
+        """Return the words of the options that are not as usual, for a command that repeats the
+        sweep.
+        """
+        values = {
+            "zip": self.zip,
+            "netcdf": self.netcdf,
+            "on-error": self.on_error,
+            "device": self.device,
+            "out": self.out,
+        }
+        return option_words(
+            {name: value for name, value in values.items() if value != _USUAL.get(name)}
+        )
+
+
 def run_sweep(
     recipe: str,
     words: Sequence[str],
-    *,
+    store: Store,
+    options: SweepOptions = SweepOptions(),
     first: int = 2,
-    zip: bool = False,
-    on_error: OnError = "stop",
-    netcdf: bool = False,
-    device: str = "cpu",
-    out: Path = Path("runs"),
-    store: Store | None = None,
-    quiet: bool = False,
-    as_json: bool = False,
-    workers: int = 0,
 ) -> int:
     """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of
     the command.
 
-    With ``as_json`` the result is printed as one JSON object, and nothing else. ``words`` are the
-    changes and axes; the first of them is argument ``first`` of the command line.
+    ``words`` are the changes and axes; the first of them is argument ``first`` of the command line.
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
-    if netcdf:
+    if options.netcdf:
         require_xarray("--netcdf")
     start_time, folder = time.perf_counter(), Path().absolute()
-    sweeping = Sweeping(
-        recipe, read_words(words, folder, first), folder, store or open_store(), zip, device
-    )
-    options = {"zip": zip, "netcdf": netcdf, "on-error": on_error, "device": device, "out": out}
-    command_line = ["neusee", "sweep", recipe, *words, *_words_of(options)]
-    silent = quiet or as_json
+    axes_and_changes = read_words(words, folder, first)
+    sweeping = Sweeping(recipe, axes_and_changes, folder, store, options.zip, options.device)
+    command_line = ["neusee", "sweep", recipe, *words, *options.words()]
+    silent = options.quiet or options.as_json
     if not silent:
         print(*_opening(sweeping), sep="\n", flush=True)
     outcomes_so_far, state, error = _run_points(
-        sweeping, on_error, silent, sweeping.workers(workers)
+        sweeping, options.on_error, silent, sweeping.workers(options.workers)
     )
     # a failed last point has said why the sweep stopped
     if error is not None and not (
-        on_error == "stop" and outcomes_so_far and outcomes_so_far[-1].state == "failed"
+        options.on_error == "stop" and outcomes_so_far and outcomes_so_far[-1].state == "failed"
     ):
         raise error
     result = sweeping.sweep(outcomes_so_far, state)
     path = write_sweep(
-        sweeping, result, command_line, out, netcdf, time.perf_counter() - start_time
+        sweeping,
+        result,
+        command_line,
+        options.out,
+        options.netcdf,
+        time.perf_counter() - start_time,
     )
     if silent:
-        _say_briefly(result, path, command_line, as_json)
+        _say_briefly(result, path, command_line, options.as_json)
     else:
         print(
             *_closing(
@@ -107,25 +130,25 @@ def _exit_code(result: Sweep) -> int:
     return FAILED if result.failed else DONE
 
 
-def _say_briefly(result: Sweep, path: Path, again: Sequence[str], as_json: bool) -> None:
+def _say_briefly(result: Sweep, path: Path, command_line: Sequence[str], as_json: bool) -> None:
     """Print the path of the table of a sweep, or its document as JSON, and the failures on
     stderr.
     """
     for line in _failures(result):
         print(line, file=sys.stderr)
     if as_json:
-        say_json(_document(result, path, again))
+        say_json(_document(result, path, command_line))
     else:
         say_line(str(path / "sweep.csv"))
 
 
-def _document(result: Sweep, path: Path, again: Sequence[str]) -> dict[str, Any]:
+def _document(result: Sweep, path: Path, command_line: Sequence[str]) -> dict[str, Any]:
     """Return the result of a sweep for ``--json``: its table, its state, and every number of
     every point.
     """
     return {
         "table": str(path / "sweep.csv"),
-        "command": shlex.join(again),
+        "command": shlex.join(command_line),
         "recipe": result.recipe,
         "state": result.state,
         "points": result.points,
@@ -173,15 +196,8 @@ def _run_points(
     return table.outcomes, "complete", None
 
 
-def _words_of(options: Mapping[str, Any]) -> list[str]:
-    """Return the words of the options that are not as usual."""
-    return option_words(
-        {name: value for name, value in options.items() if value != _USUAL.get(name)}
-    )
-
-
 def _closing(
-    result: Sweep, path: Path, again: Sequence[str], seconds: float, failure: str
+    result: Sweep, path: Path, command_line: Sequence[str], seconds: float, failure: str
 ) -> Iterator[str]:
     """Yield the lines that appear on the screen after the end of a sweep."""
     yield ""
@@ -192,7 +208,7 @@ def _closing(
         yield f"warning  {failure}"
     if result.state != "complete":
         state = "nothing is kept in the cache" if failure else "what is done is kept"
-        yield f"partial: {state}; to go on: {shlex.join(again)}"
+        yield f"partial: {state}; to go on: {shlex.join(command_line)}"
 
 
 def _failures(result: Sweep) -> Iterator[str]:

@@ -36,14 +36,14 @@ from neusee.workflows.contract.node_rules import (
     outcome_of,
 )
 from neusee.workflows.contract.surroundings import (
-    FRESH,
     HASH,
+    OF_NEW_PROCESSES,
     THREADS,
     VARIABLES,
     WORK,
     Elsewhere,
     NotStartedError,
-    Others,
+    OtherSurroundings,
     Settings,
     Surrounding,
 )
@@ -56,7 +56,7 @@ from neusee.workflows.keys.code_digest import Code
 
 
 #: s of a call after which its process ends: the one that asked, which waits less, has died
-_LONGEST = 600
+_LONGEST_TRIAL = 600
 _SIDE = 64  #: of the matrices of unrelated work
 _errors: list[object] = [None]  #: what NumPy does at an error, as this process has set it last
 
@@ -97,7 +97,7 @@ def _answer(connection: Connection, asked: Asked) -> None:
     """Send the outcome of each call, in the order that was asked for."""
     _settle(asked.settings)
     for module, pickled in asked.calls:
-        faulthandler.dump_traceback_later(_LONGEST, exit=True)
+        faulthandler.dump_traceback_later(_LONGEST_TRIAL, exit=True)
         connection.send_bytes(pickle.dumps(_called(asked, module, pickled)))
         faulthandler.cancel_dump_traceback_later()
 
@@ -186,7 +186,7 @@ _UNSTEADY = (
 )
 
 Changes = frozenset[Surrounding]
-Found = dict[str, Outcome]  #: by the name of the call
+Outcomes = dict[str, Outcome]  #: by the name of the call
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +204,7 @@ class Tried:
 class Trial:
     """The calls, their outcomes here, and the processes in which they are made again."""
 
-    def __init__(self, tried: Sequence[Tried], others: Others) -> None:
+    def __init__(self, tried: Sequence[Tried], others: OtherSurroundings) -> None:
         self.others = others
         self.findings = dict[str, Finding]()  #: by the name of the call
         self._pickled = dict[str, bytes]()
@@ -218,7 +218,7 @@ class Trial:
                 )
                 self.findings[call.name] = Finding(RULE, None, text)
         self._tried = {call.name: call for call in tried if call.name in self._pickled}
-        self._here: Found = {}
+        self._outcomes_here: Outcomes = {}
         self._processes = dict[Changes, Elsewhere]()  # by what only a new process can have
 
     def compare(self, first: Elsewhere) -> None:
@@ -233,11 +233,11 @@ class Trial:
         outcomes_away = self._outcomes(first, frozenset(self.others.changed()))
         # first, since a call that ends its process would end this one
         self._leave_out_ends([name for name, outcome in outcomes_away.items() if outcome.is_end])
-        self._here = {
+        self._outcomes_here = {
             name: outcome_of(call.function, call.module) for name, call in self._tried.items()
         }
         differing_names = list[str]()
-        for name, outcome_here in self._here.items():
+        for name, outcome_here in self._outcomes_here.items():
             if outcome_here.failure:
                 self.findings[name] = Finding(RULE, None, "not tried: the example fails here")
             elif self._difference(name, outcomes_away[name], outcome_here):
@@ -251,13 +251,13 @@ class Trial:
         """Return True if a call ends its process also in the same surroundings, so that it is
         not made here.
         """
-        return name not in self._here and name in self._pickled
+        return name not in self._outcomes_here and name in self._pickled
 
     # --- processes --------------------------------------------------------------------------------
 
     def _outcomes(
-        self, process: Elsewhere, changes: Changes, others: Others | None = None
-    ) -> Found:
+        self, process: Elsewhere, changes: Changes, others: OtherSurroundings | None = None
+    ) -> Outcomes:
         """Return the outcome of each call in a process, in the other order where other work is
         changed.
         """
@@ -272,19 +272,19 @@ class Trial:
         # by name, whatever the order of the calls
         return dict(zip(names, process.outcomes(Asked(settings, own_files(), calls)), strict=True))
 
-    def _each(self, sets: Sequence[Iterable[Surrounding]]) -> list[Found]:
+    def _outcomes_of_each(self, sets: Sequence[Iterable[Surrounding]]) -> list[Outcomes]:
         """Return the outcomes for each set of changes; the processes that they need start at the
         same time.
         """
         change_sets = [frozenset(change_set) for change_set in sets]
         for change_set in change_sets:
             # processes that differ in nothing that only a new one can have are shared
-            if change_set & FRESH not in self._processes:
-                self._processes[change_set & FRESH] = self._stack.enter_context(
+            if change_set & OF_NEW_PROCESSES not in self._processes:
+                self._processes[change_set & OF_NEW_PROCESSES] = self._stack.enter_context(
                     closing(Elsewhere(self.others, change_set))
                 )
         return [
-            self._outcomes(self._processes[change_set & FRESH], change_set)
+            self._outcomes(self._processes[change_set & OF_NEW_PROCESSES], change_set)
             for change_set in change_sets
         ]
 
@@ -297,7 +297,7 @@ class Trial:
         if not names:
             return
         # without a change
-        [outcomes_in_same] = self._each([()])
+        [outcomes_in_same] = self._outcomes_of_each([()])
         for name in names:
             if outcomes_in_same[name].is_end:
                 self._fail(
@@ -307,19 +307,19 @@ class Trial:
                 )
                 del self._tried[name]
 
-    def _settle_rounding(self, names: list[str], away: Found) -> None:
+    def _settle_rounding(self, names: list[str], away: Outcomes) -> None:
         """Say which results differ by rounding alone, and with the number of threads alone."""
         rounding_errors = dict[str, float]()
         for name in names:
-            deviation = self._difference(name, away[name], self._here[name])
+            deviation = self._difference(name, away[name], self._outcomes_here[name])
             if deviation and deviation.is_rounding:
                 rounding_errors[name] = deviation.size
         if not rounding_errors:
             return
         # all changes but the number of threads, which may change rounding
-        [outcomes_of_others] = self._each([set(self.others.changed()) - {THREADS}])
+        [outcomes_of_others] = self._outcomes_of_each([set(self.others.changed()) - {THREADS}])
         for name, size in rounding_errors.items():
-            if not self._difference(name, outcomes_of_others[name], self._here[name]):
+            if not self._difference(name, outcomes_of_others[name], self._outcomes_here[name]):
                 self._say_same(name, size)
 
     def _settle_others(self, names: list[str]) -> None:
@@ -327,12 +327,14 @@ class Trial:
         if not names:
             return
         changed = self.others.changed()
-        outcomes_in_same, *outcomes_by_surrounding = self._each(
+        outcomes_in_same, *outcomes_by_surrounding = self._outcomes_of_each(
             [(), *([surrounding] for surrounding in changed)]
         )
-        differing_from_here = self._differences(names, outcomes_in_same, self._here)
+        differing_from_here = self._differences(names, outcomes_in_same, self._outcomes_here)
         # the same surroundings a second time: what differs now depends on chance or a clock
-        second_outcomes = self._each([()])[0] if differing_from_here else outcomes_in_same
+        second_outcomes = (
+            self._outcomes_of_each([()])[0] if differing_from_here else outcomes_in_same
+        )
         for name in names:
             if deviation := self._difference(name, second_outcomes[name], outcomes_in_same[name]):
                 self._fail(
@@ -350,7 +352,7 @@ class Trial:
         )
 
     def _settle_one(
-        self, name: str, surrounding: Surrounding, outcomes: Found, same: Found
+        self, name: str, surrounding: Surrounding, outcomes: Outcomes, same: Outcomes
     ) -> None:
         """Say if a result depends on one surrounding, by more than rounding if on the threads."""
         deviation = self._difference(name, outcomes[name], same[name])
@@ -359,13 +361,13 @@ class Trial:
             self._fail_in(name, surrounding, deviation, variables)
 
     def _differences(
-        self, names: Iterable[str], actual: Found, expected: Found
+        self, names: Iterable[str], actual: Outcomes, expected: Outcomes
     ) -> dict[str, Difference]:
         """Return how the outcomes differ, by name, of those that do."""
         pairs = ((name, self._difference(name, actual[name], expected[name])) for name in names)
         return {name: deviation for name, deviation in pairs if deviation}
 
-    def _deciding(self, name: str, same: Found) -> list[str]:
+    def _deciding(self, name: str, same: Outcomes) -> list[str]:
         """Return the variables of the environment without any of which a result differs, by
         halving.
         """
@@ -387,7 +389,7 @@ class Trial:
         return sorted(deciding)
 
     def _settle_hidden(
-        self, names: list[str], same: Found, unsteady: Mapping[str, Difference]
+        self, names: list[str], same: Outcomes, unsteady: Mapping[str, Difference]
     ) -> None:
         """Say what decides where no surrounding that was changed alone does."""
         if not names:
@@ -411,7 +413,8 @@ class Trial:
             else:
                 self._fail(
                     name,
-                    f"with all of these changed together, but none alone: {self.others.said()}",
+                    "with all of these changed together, but none alone:"
+                    f" {self.others.described()}",
                 )
 
     # --- words ------------------------------------------------------------------------------------
@@ -427,7 +430,7 @@ class Trial:
         count = len(self.others.changed()) - (rounding > 0)
         text = (
             f"the same bits in {count} changed surroundings:"
-            f" {self.others.said(without_threads=rounding > 0)}"
+            f" {self.others.described(without_threads=rounding > 0)}"
         )
         if rounding:
             text += (

@@ -54,7 +54,7 @@ class Finding:
 
 
 _LINES = ("Shapes:", "Units:", "Error:", "Source:")
-_LONGEST = 240  #: characters of the first paragraph
+_MOST_CHARACTERS = 240  #: characters of the first paragraph
 _HOOKS = ("reference", "skip_bound", "skip_scale", "zero_bound", "preflight", "shape", "check")
 
 
@@ -66,7 +66,7 @@ def check_docstring(node: Node) -> Iterator[Finding]:
     if (
         not first_paragraph.endswith(".")
         or not first_paragraph[:1].isupper()
-        or len(first_paragraph) > _LONGEST
+        or len(first_paragraph) > _MOST_CHARACTERS
     ):
         faults.append("the first paragraph must be one sentence")
     faults += [f"one line must begin with {word}" for word in _LINES if not _has_line(lines, word)]
@@ -141,7 +141,7 @@ def _raises(node: Node) -> bool:
 
 
 _SEED = 2026
-_FEW = 8  #: numbers of a tensor whose values a rule for shapes may read
+_MOST_NUMBERS = 8  #: numbers of a tensor whose values a rule for shapes may read
 _SLOPES = re.compile(
     r"numerical:\s*(?:tensor\()?([^\s,)]+).*?analytical:\s*(?:tensor\()?([^\s,)]+)", re.DOTALL
 )
@@ -367,7 +367,7 @@ def check_shape(call: Call) -> Iterator[Finding]:
     if hook is None:
         return
     inputs = [
-        each_tensor(lambda x: x.to("meta") if x.numel() > _FEW else x, value)
+        each_tensor(lambda x: x.to("meta") if x.numel() > _MOST_NUMBERS else x, value)
         for value in call.inputs
     ]
     stated_tensors = _every_tensor(hook(*inputs, **call.params))

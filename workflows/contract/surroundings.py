@@ -97,7 +97,7 @@ MEMORY = Surrounding(
 )
 #: those of a new process of Python; the others change in a fork of one, before it imports code of
 #: the user
-FRESH = frozenset({LOCALE, HASH, THREADS, MEMORY})
+OF_NEW_PROCESSES = frozenset({LOCALE, HASH, THREADS, MEMORY})
 ALL = (FOLDER, LOCALE, HASH, THREADS, ZONE, RANDOM, WORK, ERRORS, HOME, VARIABLES, MEMORY)
 
 ZONE_ELSEWHERE = "NSC-13:45"  #: a zone that needs no table: UTC and 13 h 45 min
@@ -135,7 +135,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class Others:
+class OtherSurroundings:
     """What a process gets in place of the surroundings of this one."""
 
     hash_seed: int
@@ -166,7 +166,7 @@ class Others:
         """Return the number of threads in words."""
         return f"{self.threads} thread{'s' * (self.threads > 1)}"
 
-    def said(self, without_threads: bool = False) -> str:
+    def described(self, without_threads: bool = False) -> str:
         """Return all that is changed, and what is not, as one text."""
         words = {
             LOCALE: f"locale ({self.locale})",
@@ -243,7 +243,7 @@ class Others:
         return surrounding is not VARIABLES or bool(self.variables)
 
 
-def others(environ: Mapping[str, str]) -> Others:
+def other_surroundings(environ: Mapping[str, str]) -> OtherSurroundings:
     """Return other surroundings than those of a process with the environment ``environ``."""
     seed_text = environ.get("PYTHONHASHSEED", "")
     threads = environ.get("OMP_NUM_THREADS", "")
@@ -254,7 +254,7 @@ def others(environ: Mapping[str, str]) -> Others:
     locale_here = next(
         (environ[name] for name in ("LC_ALL", "LC_CTYPE", "LANG") if environ.get(name)), "C"
     )
-    return Others(
+    return OtherSurroundings(
         hash_seed=hash_seed,
         threads=other_threads,
         threads_here=threads_here,
@@ -330,7 +330,7 @@ def _is_utf8(name: str) -> bool:
 # A process with other surroundings, seen from the process that asks it for outcomes.
 
 
-LONGEST = 300.0  #: s of one call
+LONGEST_CALL = 300.0  #: s of one call
 _SCRIPT = """
 import sys
 sys.path[:] = sys.argv[2:]
@@ -349,9 +349,9 @@ class Elsewhere:
     other things.
     """
 
-    def __init__(self, others: Others, changes: frozenset[Surrounding]) -> None:
+    def __init__(self, others: OtherSurroundings, changes: frozenset[Surrounding]) -> None:
         # what only a new process can have; forks change the others
-        self.others, self._fresh = others, changes & FRESH
+        self.others, self._process_changes = others, changes & OF_NEW_PROCESSES
         self.folder = tempfile.TemporaryDirectory(prefix="neusee-check-")
         try:
             self._start()
@@ -396,7 +396,7 @@ class Elsewhere:
                 stdin=no_stream,
                 stdout=no_stream,
                 stderr=no_stream,
-                env=self.others.environment(self._fresh, os.environ),
+                env=self.others.environment(self._process_changes, os.environ),
                 pass_fds=[other_end.fileno()],
                 process_group=0,
             )
@@ -427,10 +427,10 @@ class Elsewhere:
         """
         outcomes: list[Outcome] = []
         while True:
-            if not self._pipe.poll(LONGEST):
+            if not self._pipe.poll(LONGEST_CALL):
                 self._end()
                 self._start()
-                return [*outcomes, _ended(f"does not end within {LONGEST:.0f} s")]
+                return [*outcomes, _ended(f"does not end within {LONGEST_CALL:.0f} s")]
             answer = pickle.loads(self._pipe.recv_bytes())
             # the exit code: no more outcomes come from this fork
             if isinstance(answer, int):
@@ -455,8 +455,8 @@ def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
 
     def process() -> Elsewhere:
         if not processes:
-            other_surroundings = others(os.environ)
-            processes.append(Elsewhere(other_surroundings, frozenset(other_surroundings.changed())))
+            others = other_surroundings(os.environ)
+            processes.append(Elsewhere(others, frozenset(others.changed())))
         return processes[0]
 
     try:

@@ -24,7 +24,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.placement.machine_file import read_machines
 from neusee.workflows.report.contents import FIGURES, files_of
-from neusee.workflows.report.files_beside import LARGE, ROOM
+from neusee.workflows.report.files_beside import LARGE_RESULT, ROOM
 from neusee.workflows.report.terminal_text import columns
 from neusee.workflows.store.cache_settings import UNITS, format_size
 from neusee.workflows.store.metadata import Metadata
@@ -203,7 +203,7 @@ def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
     """
     # bytes: of a result that waits with others, of all that wait, of a result that waits alone
     largest_small, room_for_small, largest_shown = (
-        min(LARGE, limit / 32),
+        min(LARGE_RESULT, limit / 32),
         min(ROOM, limit / 16),
         limit / 16,
     )

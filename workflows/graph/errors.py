@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 UNREAD = "unread"  #: code of a value to which no step refers
-_KNOWN = "there are: "  #: text before a list of known names
+_BEFORE_NAMES = "there are: "  #: text before a list of known names
 
 
 #: characters that no reader sees and a terminal obeys: they move the cursor, clear the screen, or
@@ -26,6 +26,11 @@ CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 def visible(text: str) -> str:
     """Return a text with escapes such as ``\\x1b`` in place of characters that a terminal obeys."""
     return CONTROL.sub(lambda match: ascii(match[0])[1:-1], text)
+
+
+def shortened(text: str, characters: int) -> str:
+    """Return a text of at most a number of characters; an ellipsis stands for what is left out."""
+    return text if len(text) <= characters else f"{text[: characters - 1]}…"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -99,7 +104,7 @@ def _lists_once(messages: Iterable[str]) -> Iterator[str]:
     """
     told_names = set[str]()
     for message in messages:
-        text_before, separator, names = message.partition(_KNOWN)
+        text_before, separator, names = message.partition(_BEFORE_NAMES)
         yield (
             f"{text_before}see the names above"
             if separator and "," in names and names in told_names
@@ -118,7 +123,7 @@ def nearest(name: str, among: Iterable[str]) -> str:
     if similar_names:
         return f"did you mean {similar_names[0]}?"
     return (
-        f"{_KNOWN}{', '.join(names[:12])}{', …' if len(names) > 12 else ''}"
+        f"{_BEFORE_NAMES}{', '.join(names[:12])}{', …' if len(names) > 12 else ''}"
         if names
         else "there are none"
     )

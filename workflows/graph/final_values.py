@@ -61,11 +61,11 @@ class Config:
         return "".join(f"{line}\n" for line in _lines(tree, 0))
 
 
-def changes(base: Config, other: Config, apart: str) -> list[str]:
+def changes(base: Config, other: Config, ignored_block: str) -> list[str]:
     """Return the overrides that turn the values of one recipe into those of another, but for the
-    block ``apart``.
+    block ``ignored_block``.
     """
-    new_values, old_values = _given_values(other, apart), _given_values(base, apart)
+    new_values, old_values = _given_values(other, ignored_block), _given_values(base, ignored_block)
     overrides = [f"~{path}" for path in old_values if path not in new_values]
     for path, value in new_values.items():
         if path not in old_values:
@@ -75,11 +75,15 @@ def changes(base: Config, other: Config, apart: str) -> list[str]:
     return overrides
 
 
-def _given_values(config: Config, apart: str) -> dict[str, Any]:
-    """Return the values of a recipe that are no defaults, but for those of the block ``apart``."""
+def _given_values(config: Config, ignored_block: str) -> dict[str, Any]:
+    """Return the values of a recipe that are no defaults, but for those of the
+    block ``ignored_block``.
+    """
     settings_given = {path: s for path, s in config.settings.items() if not s.default}
     return {
-        path: setting.value for path, setting in settings_given.items() if setting.path[0] != apart
+        path: setting.value
+        for path, setting in settings_given.items()
+        if setting.path[0] != ignored_block
     }
 
 

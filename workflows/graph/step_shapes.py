@@ -99,13 +99,14 @@ def without_values(value: Any) -> Form:
     from torch import Tensor
 
     if isinstance(value, Tensor):
-        return value if value.numel() <= _FEW else value.detach().to("meta")
+        return value if value.numel() <= _MOST_NUMBERS else value.detach().to("meta")
     if hasattr(value, "_make"):
         return value._make(map(without_values, value))
     return [without_values(item) for item in value] if isinstance(value, list) else value
 
 
-_FEW = 4096  #: numbers of a tensor up to which the values may tell the work of a later node
+#: numbers of a tensor up to which the values may tell the work of a later node
+_MOST_NUMBERS = 4096
 
 
 def bytes_of(form: Form) -> float:

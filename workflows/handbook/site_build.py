@@ -213,8 +213,8 @@ def _take(picture: Picture, results: Path, target: Path) -> str:
 # --- the site -------------------------------------------------------------------------------------
 
 #: the file by which a folder is known as a handbook, which a new build may replace
-_MARK = ".neusee_handbook"
-_REST = "More"  #: the section of the pages that the list `nav` of the settings does not name
+_MARK_FILE = ".neusee_handbook"
+_OTHER_PAGES = "More"  #: the section of the pages that the list `nav` of the settings does not name
 _NEEDED = ("mkdocs", "material")
 
 Tree = list[dict[str, Any]]
@@ -238,7 +238,7 @@ def check_folder(out: Path) -> None:
         writable_folder(out)
     except ValueError as error:
         raise HandbookError(f"--out: {error}") from None
-    if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
+    if out.is_dir() and any(out.iterdir()) and not (out / _MARK_FILE).is_file():
         raise HandbookError(
             f"{out} holds files that are no handbook, and a build replaces a folder: name a new"
             " folder"
@@ -270,7 +270,7 @@ def build_handbook(
         settings = Path(folder, "mkdocs.yml")
         settings.write_text(settings_text(pages, docs, site), encoding="utf-8")
         _run_mkdocs(settings, strict)
-        (site / _MARK).touch()
+        (site / _MARK_FILE).touch()
         _replace(out, site)
     return out / "index.html"
 
@@ -301,7 +301,7 @@ def complete_nav(nav: Tree, pages: Mapping[str, str]) -> Tree:
     unnamed_pages = [
         {title_of(text): path} for path, text in pages.items() if path not in named_pages
     ]
-    return _sections(nav, pages) + ([{_REST: unnamed_pages}] if unnamed_pages else [])
+    return _sections(nav, pages) + ([{_OTHER_PAGES: unnamed_pages}] if unnamed_pages else [])
 
 
 def _sections(nav: Tree, pages: Mapping[str, str]) -> Tree:

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, visible
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import Config, Setting, changes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.keys.sealed_files import head_of
@@ -55,7 +55,7 @@ from neusee.workflows.recipe.text.overrides import (
 )
 from neusee.workflows.recipe.text.recipe_files import groups_of, shared_folders
 from neusee.workflows.recipe.text.references import References
-from neusee.workflows.recipe.text.yaml_values import Value, Where
+from neusee.workflows.recipe.text.yaml_values import Value, Where, title_of
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -332,9 +332,9 @@ def check(composed: Composed) -> Recipe:
     estimates = estimates_of(root, references, checker.diagnostics)
     outputs = outputs_of(root, wiring)
     # shapes are known only along a graph without a cycle
-    check_steps(
-        checked, checker, None if cycles_found else outputs, memory.forms if memory else None
-    )
+    outputs_of_shapes = None if cycles_found else outputs
+    earlier_forms = memory.forms if memory else None
+    check_steps(checked, checker, outputs_of_shapes, earlier_forms)
     expect, exports = expectations(root, wiring), exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
     # after all that could use a value
@@ -462,7 +462,7 @@ def _bind(
         # no copy is made, but what the step refers to counts as used
         if not step.items:
             for key in ("from", "with", "device", "cache"):
-                wiring.references.touch(step.part(key), step.dims)
+                wiring.references.touch(step.entry(key), step.dims)
         for items in step.items:
             name = step.instance(items)
             # the same values were checked before
@@ -497,7 +497,7 @@ def _bound_copy(
 ) -> _BoundCopy | None:
     """Return one copy of a step with its parameters and inputs, or None without its node."""
     name, scope = step.instance(items), step.scope(wiring.root, items)
-    parameters = wiring.references.resolve(step.part("with"), scope)
+    parameters = wiring.references.resolve(step.entry("with"), scope)
     wires = known_wires[name] if name in known_wires else wiring.wires(step, items)
     device = device_of(step, wiring.references, scope, checker.diagnostics)
     cached = cached_of(step, wiring.references, scope, checker.diagnostics)
@@ -557,8 +557,7 @@ _TITLE = 4096  #: bytes of the first line of a recipe, at most
 
 def _titled(path: Path) -> Titled:
     """Return a recipe with its title: the first line of its file, if that is a comment."""
-    first_line = head_of(path, _TITLE).decode("utf-8", "replace").partition("\n")[0].strip()
-    return Titled(path.stem, visible(first_line.lstrip("# ")) if first_line.startswith("#") else "")
+    return Titled(path.stem, title_of(head_of(path, _TITLE).decode("utf-8", "replace")))
 
 
 # --- changed recipe -------------------------------------------------------------------------------

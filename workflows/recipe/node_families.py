@@ -244,11 +244,8 @@ def _with_parameters(node: Node) -> Node:
 def unannotated(node: Node) -> list[str]:
     """Return the names of the parameters of a node that have no annotation."""
     parameters = inspect.signature(node.fn).parameters.values()
-    return [
-        p.name
-        for p in parameters
-        if p.kind is p.KEYWORD_ONLY and p.name != "rng" and p.name not in node.hints
-    ]
+    names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    return [name for name in names if name != "rng" and name not in node.hints]
 
 
 def _failure(where: str, error: BaseException) -> str:

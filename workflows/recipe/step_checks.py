@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from neusee.nodes import Node, ParameterError
 from neusee.nodes.parameters import is_file, texts_of
-from neusee.workflows.graph.errors import Diagnostic, Location, nearest
+from neusee.workflows.graph.errors import Diagnostic, Location, nearest, shortened
 from neusee.workflows.graph.final_values import Setting
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order, ordered
 from neusee.workflows.graph.step_shapes import (
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 # Check of the parameters of steps against the signatures of their nodes.
 
 
-_LONGEST = 40  #: largest number of characters of a value in a message
+_MOST_CHARACTERS = 40  #: largest number of characters of a value in a message
 
 
 @dataclass(slots=True)
@@ -124,7 +124,7 @@ class Checker:
                     Diagnostic(step.key, f"{step.name}.with.{error.parameter}", str(error))
                 )
             else:
-                self.diagnostics.append(Diagnostic(value.mark, _said(value), str(error)))
+                self.diagnostics.append(Diagnostic(value.mark, _value_text(value), str(error)))
         except ValueError as error:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
         except OSError as error:  # a read that fails does not say of which file
@@ -158,7 +158,7 @@ class Checker:
 def _strange_files(params: Mapping[str, Any], values: Mapping[str, Value]) -> list[Diagnostic]:
     """Return a diagnostic for each value that leads to a file which its recipe may not name."""
     reasons = [(value, _strange(params[name], value)) for name, value in values.items()]
-    return [Diagnostic(value.mark, _said(value), why) for value, why in reasons if why]
+    return [Diagnostic(value.mark, _value_text(value), why) for value, why in reasons if why]
 
 
 def _strange(parameter: Any, value: Value) -> str:
@@ -215,7 +215,7 @@ def _problems(
                 )
         else:
             value = _deepest(values[name], detail["loc"][1:])
-            messages_by_place.setdefault((value.mark, _said(value)), []).append(
+            messages_by_place.setdefault((value.mark, _value_text(value)), []).append(
                 message_of(detail, value)
             )
     # parameters that moved to the same node share one message
@@ -255,10 +255,9 @@ def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
     return value
 
 
-def _said(value: Value) -> str:
+def _value_text(value: Value) -> str:
     """Return the name and the text of a recipe value, such as ``sensor.gain = -1``."""
-    text = str(value.plain)
-    return f"{value.name} = {text if len(text) <= _LONGEST else text[: _LONGEST - 1] + '…'}"
+    return f"{value.name} = {shortened(str(value.plain), _MOST_CHARACTERS)}"
 
 
 # --- known before run -----------------------------------------------------------------------------
@@ -304,14 +303,14 @@ def check_steps(
     checked: Iterable[CheckedStep],
     checker: Checker,
     outputs: Iterable[str] | None,
-    before: dict[str, KnownForm] | None = None,
+    earlier_forms: dict[str, KnownForm] | None = None,
 ) -> None:
     """Check each step with its node's own check and with the shapes of its inputs; collect notes
     and diagnostics.
 
     ``outputs`` are the steps whose results the recipe returns; None means a cycle of steps, so that
-    no shape is known. ``before`` has what earlier checks of the same graph found, and is brought up
-    to date.
+    no shape is known. ``earlier_forms`` has what earlier checks of the same graph found, and is
+    brought up to date.
     """
     by_name = {candidate.step.name: candidate for candidate in checked}
     sources = {name: _sources_among(by_name, candidate.step) for name, candidate in by_name.items()}
@@ -321,7 +320,7 @@ def check_steps(
         checker=checker,
         computed=needed_names,
         is_cycle=outputs is None,
-        before={} if before is None else before,
+        earlier_forms={} if earlier_forms is None else earlier_forms,
         memory=machine_memory(),
     )
     order = by_name if outputs is None else ordered(sources, by_name)
@@ -344,7 +343,7 @@ class _FormChecks:
     checker: Checker
     computed: Collection[str]  #: steps that an output needs
     is_cycle: bool  #: whether the steps depend on each other in a cycle
-    before: dict[str, KnownForm]  #: what earlier checks found, brought up to date
+    earlier_forms: dict[str, KnownForm]  #: what earlier checks found, brought up to date
     memory: float  #: of the machine, bytes
     results: dict[str, Any] = field(default_factory=dict)
 
@@ -352,7 +351,7 @@ class _FormChecks:
         """Check a step whose inputs were checked, and return its notes."""
         current_step = self.by_name[name]
         input_forms, is_computed = inputs_of(current_step.step, self.results), name in self.computed
-        known_form = self.before.get(name)
+        known_form = self.earlier_forms.get(name)
         # nothing has changed since an earlier check
         if known_form is not None and known_form.holds(current_step, input_forms, is_computed):
             self.results[name] = known_form.form
@@ -377,14 +376,14 @@ class _FormChecks:
             del self.results[name]
             self.checker.diagnostics.append(_at_shape(current_step, problem))
         elif name in self.results:
-            self.before[name] = KnownForm(
+            self.earlier_forms[name] = KnownForm(
                 current_step, input_forms, is_computed, notes, self.results[name]
             )
         return notes
 
     def _add_result(self, name: str) -> None:
         """Add what is known of the result of a step, or a diagnostic if it cannot be."""
-        current_step, known_form = self.by_name[name], self.before.get(name)
+        current_step, known_form = self.by_name[name], self.earlier_forms.get(name)
         try:
             self.results[name] = form = _form(current_step.step, self.results)
             if known_form is not None and alike(form, known_form.form):
@@ -640,7 +639,7 @@ class Attempt:
 #: name and items of each block; None for a block without items
 Names = tuple[tuple[str, tuple[str, ...] | None], ...]
 
-_MOST = 16  #: largest number of graphs in the cache
+_MOST_GRAPHS = 16  #: largest number of graphs in the cache
 _graphs: dict[tuple[Value | None, Value | None, Names], CachedGraph] = {}  #: by `_key`
 
 
@@ -688,7 +687,7 @@ def cache_graph(
     graph = CachedGraph(steps, absent, {name: wires[name] for name in steps_with_fixed_wires})
     key = _key(root)
     # the oldest graph goes first
-    while len(_graphs) >= _MOST:
+    while len(_graphs) >= _MOST_GRAPHS:
         _graphs.pop(next(iter(_graphs), key), None)
     _graphs[key] = graph
 

@@ -25,7 +25,7 @@ from neusee.workflows.recipe.text.yaml_values import Value, kind
 # its copies.
 
 
-_MOST = 20_000  #: steps of a recipe, at most, with all copies
+_MOST_STEPS = 20_000  #: steps of a recipe, at most, with all copies
 _KEYS = ("node", "each", "from", "with", "device", "cache")
 _DEVICE = re.compile(r"any|cpu|gpu|mps|cuda(:\d+)?")
 _NAME = re.compile(r"[^\W\d][\w-]*")
@@ -51,7 +51,7 @@ class Declared:
     def instances(self) -> tuple[str, ...]:
         return tuple(map(self.instance, self.items))
 
-    def part(self, key: str) -> Value:
+    def entry(self, key: str) -> Value:
         """Return the value of a key of a step, such as ``from`` or ``cache``, or an empty
         mapping for a missing key.
         """
@@ -96,7 +96,7 @@ def declare(
         dims = _dims(value, root, diagnostics)
         copies = _number_of_copies(dims, root)
         step_count += copies
-        if step_count > _MOST:
+        if step_count > _MOST_STEPS:
             raise RecipeError([_too_many(value, dims or (), root, copies, step_count)])
         steps[name] = Declared(name, value, node, dims or (), _items_of(dims, root))
     return steps, absent
@@ -133,17 +133,17 @@ def _too_many(
     step: Value, dims: tuple[str, ...], root: Value, copies: int, total: int
 ) -> Diagnostic:
     """Return the diagnostic for the step with which a recipe has more steps than the limit."""
-    if copies <= _MOST:
+    if copies <= _MOST_STEPS:
         message = (
-            f"with this step the recipe has {total} steps, more than the limit of {_MOST}: split"
-            " the recipe"
+            f"with this step the recipe has {total} steps, more than the limit of {_MOST_STEPS}:"
+            " split the recipe"
         )
         return Diagnostic(step.key, step.name, message)
     sizes = " x ".join(f"{len(root.items[dim].items)} {dim}" for dim in dims)
     dims_value = step.items["each"]
     message = (
-        f"makes {sizes} = {copies} steps, more than the limit of {_MOST}: use fewer items, or a"
-        " sweep"
+        f"makes {sizes} = {copies} steps, more than the limit of {_MOST_STEPS}: use fewer items,"
+        " or a sweep"
     )
     return Diagnostic(dims_value.mark, dims_value.name, message)
 
@@ -256,7 +256,7 @@ def device_of(
     """Return the device, such as ``gpu``, that a copy of a step requests, or an empty string for
     any device.
     """
-    setting = references.resolve(step.part("device"), scope)
+    setting = references.resolve(step.entry("device"), scope)
     if broken(setting) or setting.data in ({}, None, "any"):
         return ""
     if not isinstance(setting.data, str) or not _DEVICE.fullmatch(setting.data):
@@ -278,7 +278,7 @@ def cached_of(
     """Return False for a step with ``cache: false``, whose result is computed in each run and
     never stored.
     """
-    setting = references.resolve(step.part("cache"), scope)
+    setting = references.resolve(step.entry("cache"), scope)
     if broken(setting) or setting.data in ({}, None):
         return True
     if not isinstance(setting.data, bool):
@@ -325,7 +325,7 @@ class Wiring:
         """Return the steps that feed each input of one copy of a step, in the order of the
         node's inputs.
         """
-        sources = self.references.resolve(step.part("from"), step.scope(self.root, items))
+        sources = self.references.resolve(step.entry("from"), step.scope(self.root, items))
         values = self._by_input(step.node, sources) if step.node else None
         if step.node is None or values is None:
             return {}
@@ -382,7 +382,7 @@ class Wiring:
         is optional.
         """
         if name in node.optional or (
-            name == "stop" and became_input(node.path, map(str, step.part("with").items))
+            name == "stop" and became_input(node.path, map(str, step.entry("with").items))
         ):
             return  # the parameters of an old recipe are reported with the step that replaces them
         if not (isinstance(sources.data, dict) and _misspelt(name, node, sources)):
@@ -419,24 +419,25 @@ class Wiring:
         assert parsed is not None
         return self.steps[parsed[0]]
 
-    def _is_single(self, value: Value, here: Mapping[str, str]) -> bool:
-        """Return True if a value names one copy of a step; ``here`` contains the items of the step
-        that reads it.
+    def _is_single(self, value: Value, reader_items: Mapping[str, str]) -> bool:
+        """Return True if a value names one copy of a step; ``reader_items`` contains the items of
+        the step that reads it.
         """
         parsed, producer = _parse(value), self._named(value)
         chosen_items = parsed[1] if parsed else None
         # each list of items is fixed by the reader, or by the brackets
-        return set(producer.dims) <= set(here) or len(chosen_items or ()) == len(producer.dims)
+        is_fixed_by_reader = set(producer.dims) <= set(reader_items)
+        return is_fixed_by_reader or len(chosen_items or ()) == len(producer.dims)
 
     def _refuse_copies(
-        self, node: Node, name: str, value: Value, path: str, here: Mapping[str, str]
+        self, node: Node, name: str, value: Value, path: str, reader_items: Mapping[str, str]
     ) -> None:
         """Report an input of one step that names several copies.
 
-        `here` has the items of the step that reads it.
+        `reader_items` has the items of the step that reads it.
         """
         producer = self._named(value)
-        open_lists = ", ".join(dim for dim in producer.dims if dim not in here)
+        open_lists = ", ".join(dim for dim in producer.dims if dim not in reader_items)
         message = (
             f"{node.path} takes one step as {name}; {producer.name} is a step for each of"
             f" {open_lists}:"
@@ -459,21 +460,21 @@ class Wiring:
         self.refuse(value, path, f"{node.path} needs {name}, but the input is {instead}")
 
     def _producers(
-        self, value: Value, path: str, here: Mapping[str, str], makers: str = ""
+        self, value: Value, path: str, reader_items: Mapping[str, str], makers: str = ""
     ) -> tuple[str, ...] | None:
-        """Return the copies of a step that a value names; ``here`` contains the items of the
-        step that reads them.
+        """Return the copies of a step that a value names; ``reader_items`` contains the items of
+        the step that reads them.
         """
         parsed = _parse(value)
         if parsed is None or parsed[0] not in self.steps:
             self.refuse(value, path, self._unknown(value, makers))
             return None
         producer, items = self.steps[parsed[0]], parsed[1]
-        selected = {} if items is None else self._chosen(producer, items, value, path)
+        selected = {} if items is None else self._selected_items(producer, items, value, path)
         if selected is None:
             return None
         # brackets count before the items of the reader; a list with neither gives all its items
-        item_by_list = {**here, **selected}
+        item_by_list = {**reader_items, **selected}
         items_by_list = [
             [item_by_list[dim]] if dim in item_by_list else self._items(dim)
             for dim in producer.dims
@@ -497,7 +498,7 @@ class Wiring:
             f" {hint if hint.startswith('did you mean') else f'check the name{makers}'}"
         )
 
-    def _chosen(
+    def _selected_items(
         self, producer: Declared, items: Sequence[str], value: Value, path: str
     ) -> dict[str, str] | None:
         """Return the items in the brackets of a name such as ``spot[mask,green]``, by the list that

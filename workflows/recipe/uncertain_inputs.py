@@ -398,10 +398,10 @@ class Inputs:
     @property
     def has_table(self) -> bool:
         """Return True if some inputs are drawn as whole rows of a table of samples."""
-        return self.most is not None
+        return self.most_draws is not None
 
     @property
-    def most(self) -> int | None:
+    def most_draws(self) -> int | None:
         """Return the largest possible number of independent draws of the inputs, or None if
         there is no limit.
         """
@@ -499,9 +499,8 @@ def only_values(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
     laws = {name: law for name, law in uncertain.laws.items() if name in names}
     joint = uncertain.joint
     remaining = [name for name in joint.names if name in names] if joint else []
-    return replace(
-        uncertain, laws=laws, joint=joint.only(remaining) if joint and remaining else None
-    )
+    remaining_joint = joint.only(remaining) if joint and remaining else None
+    return replace(uncertain, laws=laws, joint=remaining_joint)
 
 
 def _all_readers(

@@ -269,7 +269,7 @@ class RunTable(ProgressTable):
         earlier runs took.
         """
         super().__init__(mode)
-        self._left = dict(predicted or {})
+        self._seconds_of_steps_left = dict(predicted or {})
         self.families = families(recipe, names)
         self.widths = (
             max((len(family.cells()[0]) for family in self.families.values()), default=0),
@@ -284,7 +284,7 @@ class RunTable(ProgressTable):
     def watch(self, event: Event) -> None:
         """Update the table of steps with the start or the end of a step."""
         if event.done is not None:
-            self._left.pop(event.step, None)
+            self._seconds_of_steps_left.pop(event.step, None)
         family = note(self.families, event)
         if event.done is not None and family.needed and len(family.done) == len(family.members):
             self.show_row(family.cells())
@@ -311,7 +311,7 @@ class RunTable(ProgressTable):
         """Return the time that is left, or how many steps were neither computed nor loaded in
         the end.
         """
-        if (seconds_left := sum(self._left.values())) >= 1:
+        if (seconds_left := sum(self._seconds_of_steps_left.values())) >= 1:
             return f"about {lasts(seconds_left)} left, as earlier runs took"
         count = sum(copy.state == "not needed" for copy in self._done())
         steps = "1 step was" if count == 1 else f"{count} steps were"
@@ -388,7 +388,9 @@ def forecast_line(seconds: float, steps: int, unknown: int) -> str:
     return f"time     about {lasts(seconds)}, as earlier runs took{new_steps}"
 
 
-def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str = "") -> list[str]:
+def closing(
+    doc: Mapping[str, Any], path: str, next_commands: Sequence[str], took: str = ""
+) -> list[str]:
     """Return the lines to print after a run: steps left out, result table, gain by the mask,
     verdict, next commands.
 
@@ -407,7 +409,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str =
     lines += [f"warning  {line}" for line in doc["warnings"]]
     has_overview = any(figure["name"] == "overview" for figure in doc["figures"])
     lines += [f"pictures {Path(path).parent / 'figures' / 'overview.png'}"] if has_overview else []
-    return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
+    return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in next_commands]]
 
 
 def _error_lines(doc: Mapping[str, Any]) -> list[str]:

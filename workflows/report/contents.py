@@ -163,7 +163,7 @@ class Bound:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class Source:
     """The source of an argument of a drawing function: steps to read, function of their results,
     and part of a key.
     """
@@ -173,7 +173,7 @@ class Found:
     identity: Any  #: plain JSON
 
 
-def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code, store: Store) -> Found:
+def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code, store: Store) -> Source:
     """Find the source of an argument of a drawing function in a recipe, from a text such as
     ``psf[mask]``.
 
@@ -185,20 +185,20 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code, store: 
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         params = [[name, plain(value)] for name, value in step.params.items()]
-        return Found((), lambda values: Bound(step), [step.node.path, code_of(step, code), params])
+        return Source((), lambda values: Bound(step), [step.node.path, code_of(step, code), params])
     if match := _PARAMETER.fullmatch(need):
         value = _parameter(match["step"], match["name"], recipe)
-        return Found((), lambda values: value, plain(value))
+        return Source((), lambda values: value, plain(value))
     # all copies of a step
     if need.endswith("*]"):
         return _items(need[:-2], recipe, keys)
     _step(need, recipe)
     if need not in keys:
         raise Missing(f"no output of this run needs the step {need}")
-    return Found((need,), lambda values: values[need], keys[need])
+    return Source((need,), lambda values: values[need], keys[need])
 
 
-def _variants(family: str, recipe: Recipe, code: Code, store: Store) -> Found:
+def _variants(family: str, recipe: Recipe, code: Code, store: Store) -> Source:
     """Find the errors and run times of the variants of a step, which a study of accuracy has
     measured.
     """
@@ -209,7 +209,7 @@ def _variants(family: str, recipe: Recipe, code: Code, store: Store) -> Found:
         raise Missing(
             f"`neusee study accuracy {recipe.name}` measures it, and the next run shows it"
         )
-    return Found((), lambda values: rows, rows)
+    return Source((), lambda values: rows, rows)
 
 
 def _parameter(step: str, name: str, recipe: Recipe) -> Any:
@@ -242,7 +242,7 @@ def _step(name: str, recipe: Recipe) -> Step:
     return recipe.steps[name]
 
 
-def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
+def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Source:
     """Find all copies of a step from the beginning of their names, such as ``spot[mask,``."""
     copy_of_item = {
         copy_name[len(prefix) : -1]: copy_name
@@ -252,7 +252,7 @@ def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
     if not copy_of_item:
         raise Missing(f"the recipe has no step {prefix}…]")
     identity = [[item, keys[name]] for item, name in copy_of_item.items()]
-    return Found(
+    return Source(
         tuple(copy_of_item.values()),
         lambda values: {item: values[name] for item, name in copy_of_item.items()},
         identity,

@@ -54,9 +54,8 @@ def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = Fa
     """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021, with ``half``
     in 16 bits a value.
     """
-    write_spectral(
-        path, cube.intensity if isinstance(cube, Psf) else cube, bands.centres, half=half
-    )
+    values = cube.intensity if isinstance(cube, Psf) else cube
+    write_spectral(path, values, bands.centres, half=half)
 
 
 def safetensors(path: Path, /, **values: Any) -> None:

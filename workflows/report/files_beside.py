@@ -54,7 +54,7 @@ from neusee.workflows.store.serialization import pack, tensors_in, unpack
 # another reason no process answers, the run draws its pictures itself.
 
 
-MOST = 1 << 27  #: bytes of the arguments of a picture that go through the pipe
+MOST_PIPE_BYTES = 1 << 27  #: bytes of the arguments of a picture that go through the pipe
 _PATIENCE = 120.0  #: s for one picture, after which the process counts as lost
 _WORDS = (str, int, float, Path, type(None))
 
@@ -125,7 +125,7 @@ class DrawingProcess:
 
 def _sent(path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> bytes:
     """Return a job as bytes; raise `NotDrawn` for arguments that are large or that are no data."""
-    if sum(tensor.nbytes for tensor in tensors_in(list(arguments.values()))) > MOST:
+    if sum(tensor.nbytes for tensor in tensors_in(list(arguments.values()))) > MOST_PIPE_BYTES:
         raise NotDrawn("the arguments are large")
     try:
         packed = {name: _packed(value) for name, value in arguments.items()}
@@ -205,8 +205,9 @@ def _made(job: bytes) -> str:
 # error is met there again. So nothing of the report depends on this module but its time.
 
 
-LARGE = 1 << 26  #: bytes; a larger result is held only for files that need nothing else any more
-_SMALL = 1 << 22  #: bytes of a result that is held in any case
+#: bytes; a larger result is held only for files that need nothing else any more
+LARGE_RESULT = 1 << 26
+_SMALL_RESULT = 1 << 22  #: bytes of a result that is held in any case
 ROOM = 1 << 27  #: bytes of smaller results that are held for files
 
 
@@ -223,7 +224,7 @@ class FilesBeside:
         self, files: Callable[[Recipe], Iterable[DerivedFile]], shelf: DerivedFiles, limit: float
     ) -> None:
         self._files, self._shelf = files, shelf
-        self._large, self._room = min(LARGE, limit / 32), min(ROOM, limit / 16)
+        self._large, self._room = min(LARGE_RESULT, limit / 32), min(ROOM, limit / 16)
         self._limit = limit
         self._recipe: Recipe | None = None
         self._code = Code(shelf.store.code_memo)
@@ -279,7 +280,7 @@ class FilesBeside:
         """Return True for a result of so many bytes that none of it may be held now."""
         if size > self._large and (self._busy or size > self._limit / 16):
             return True
-        return size > _SMALL and process_memory() > self._limit / 2
+        return size > _SMALL_RESULT and process_memory() > self._limit / 2
 
     def add(
         self, name: str, key: str, make: Callable[..., None], arguments: Mapping[str, Any]
@@ -356,7 +357,7 @@ class FilesBeside:
         """Begin a file whose results are all held; one for the report if it cannot be made here."""
         sources = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
         arguments = {name: source.make(self._held) for name, source in sources.items()}
-        is_large = _bytes_of(list(arguments.values())) > MOST
+        is_large = _bytes_of(list(arguments.values())) > MOST_PIPE_BYTES
         is_drawing = isinstance(file.make, Drawing)
         # a large picture would take the pipe too long: the report draws it
         if is_drawing and (is_large or self._drawer is None):
@@ -369,14 +370,16 @@ class FilesBeside:
             arguments,
             is_large or file.copied,
         )
-        future = self._start(job, self._draws if is_drawing else self._writes)
+        threads = self._draws if is_drawing else self._writes
+        future = self._start(job, threads)
         if is_large:
             self._busy.add(file.name)
             future.add_done_callback(lambda _: self._busy.discard(file.name))
 
     def _start(self, job: _Job, threads: ThreadPoolExecutor) -> Future[None]:
         """Begin a job in a thread, and keep it for `finish`."""
-        future = threads.submit(self._make, job, None if job.here else self._drawer)
+        drawer = None if job.here else self._drawer
+        future = threads.submit(self._make, job, drawer)
         self._begun.append((future, job))
         return future
 

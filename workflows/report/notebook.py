@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from neusee.nodes import TensorStats
 from neusee.workflows.engine.runner import Result, values_of
 from neusee.workflows.engine.wanted_steps import BANDS, LINES, TABLE
+from neusee.workflows.graph.errors import shortened
 from neusee.workflows.graph.final_values import Setting, flow
 from neusee.workflows.graph.recipe_graph import Recipe, by_family, in_order
 from neusee.workflows.report.contents import FIGURES
@@ -30,7 +31,7 @@ _WEIGHT = 800_000  #: bytes of base64, limit for all pictures together
 #: pixels of the longer side, by the number of pictures; 280 for other numbers
 _EDGES = {1: 640, 2: 400}
 _NAMES = {"plain": "plain lens", "mask": "with mask"}
-_LONGEST = 100  #: characters of a value in a table, at most
+_MOST_CHARACTERS = 100  #: characters of a value in a table, at most
 
 
 def result_html(result: Result) -> str:
@@ -315,10 +316,7 @@ def _settings(title: str, settings: Mapping[str, Setting], shown: bool) -> dict[
     """Return the table of settings: path, value and where it was written."""
     rows = []
     for name, setting in settings.items():
-        text = flow(setting.value)
-        rows.append(
-            [name, text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…", setting.source]
-        )
+        rows.append([name, shortened(flow(setting.value), _MOST_CHARACTERS), setting.source])
     return _table(title, ["parameter", "value", "from"], rows, shown=shown)
 
 

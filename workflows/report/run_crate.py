@@ -46,9 +46,9 @@ _PERSON = re.compile(r"(?P<name>[^<>]*[^<>\s])\s*<(?P<address>https?://[^<>\s]+)
 _LINK = re.compile(r"\[(?P<name>[^]]+)]\((?P<address>[^)]+)\)")
 
 
-def tools(said: Mapping[str, Any]) -> list[Entity]:
+def tools(document: Mapping[str, Any]) -> list[Entity]:
     """Return neusee and the libraries that it computed with; neusee is the first."""
-    versions = dict(said.get("versions") or _of_facts(said.get("facts") or ()))
+    versions = dict(document.get("versions") or _of_facts(document.get("facts") or ()))
     libraries = [
         _library(*name_and_version)
         for name_and_version in versions.items()
@@ -254,7 +254,7 @@ _FILES = {
 
 
 def write_crate(
-    folder: Path, name: str, said: Mapping[str, Any], ended: datetime | None = None
+    folder: Path, name: str, document: Mapping[str, Any], ended: datetime | None = None
 ) -> None:
     """Write the crate of a complete folder of results; ``name`` is the final name of the folder.
 
@@ -263,7 +263,7 @@ def write_crate(
     """
     crate = {
         "@context": f"{_SPECIFICATION}/context",
-        "@graph": _graph(folder, name, said, ended or datetime.now(UTC)),
+        "@graph": _graph(folder, name, document, ended or datetime.now(UTC)),
     }
     _write(folder, crate)
 
@@ -304,23 +304,23 @@ def _write(folder: Path, crate: Mapping[str, Any]) -> None:
     unfinished.replace(folder / CRATE)
 
 
-def _graph(folder: Path, name: str, said: Mapping[str, Any], ended: datetime) -> list[Entity]:
+def _graph(folder: Path, name: str, document: Mapping[str, Any], ended: datetime) -> list[Entity]:
     """Return the entities of a crate: the folder, its command, software, files and people.
 
     ``said`` is what the folder says of its command, and ``ended`` when that ended.
     """
-    title_of_path = _titles(said)
+    title_of_path = _titles(document)
     parts = [_file(path, size, title_of_path.get(path, "")) for path, size in _sizes(folder)]
-    input_files, licences = inputs(said.get("inputs") or ())
-    software = tools(said)
+    input_files, licences = inputs(document.get("inputs") or ())
+    software = tools(document)
     creator, licence_entity = person(), licence()
-    action = _command_entity(name, said, ended)
+    action = _command_entity(name, document, ended)
     action |= _of_command(parts, input_files, software, creator)
     root = {
         "@id": "./",
         "@type": "Dataset",
         "name": name,
-        "description": _description(said),
+        "description": _description(document),
         "datePublished": _time(ended),
         "license": reference(licence_entity),
         "conformsTo": {"@id": _PROFILE},
@@ -336,9 +336,9 @@ def _graph(folder: Path, name: str, said: Mapping[str, Any], ended: datetime) ->
     return list({entity["@id"]: entity for entity in entities}.values())
 
 
-def _titles(said: Mapping[str, Any]) -> dict[str, str]:
+def _titles(document: Mapping[str, Any]) -> dict[str, str]:
     """Return the titles of files by path: those of figures, and of what each run writes."""
-    figures = [row for row in said.get("figures") or () if isinstance(row, Mapping)]
+    figures = [row for row in document.get("figures") or () if isinstance(row, Mapping)]
     return {row["file"]: row["title"] for row in figures if "file" in row} | _FILES
 
 
@@ -356,16 +356,16 @@ def _profile() -> Entity:
     return {"@id": _PROFILE, "@type": "CreativeWork", "name": "Process Run Crate", "version": "0.5"}
 
 
-def _command_entity(name: str, said: Mapping[str, Any], ended: datetime) -> Entity:
+def _command_entity(name: str, document: Mapping[str, Any], ended: datetime) -> Entity:
     """Return the entity of the command that wrote the folder, with its times and its state."""
-    command = _command(said)
-    is_stopped = said.get("state") in ("stopped", "interrupted")
-    began = _began(said, ended)
+    command = _command(document)
+    is_stopped = document.get("state") in ("stopped", "interrupted")
+    began = _began(document, ended)
     return {
         "@id": f"#{quoted(name)}",
         "@type": "CreateAction",
         "name": command or name,
-        **({"description": f"Computed on {said['device']}."} if said.get("device") else {}),
+        **({"description": f"Computed on {document['device']}."} if document.get("device") else {}),
         **({"startTime": _time(began)} if began else {}),
         "endTime": _time(ended),
         "actionStatus": _FAILED if is_stopped else _COMPLETED,
@@ -389,29 +389,31 @@ def _of_command(
     }
 
 
-def _command(said: Mapping[str, Any]) -> str:
+def _command(document: Mapping[str, Any]) -> str:
     """Return the command line that a document names, which is a text, a list of words or
     missing.
     """
-    command = said.get("command") or said.get("again") or ""
+    command = document.get("command") or document.get("again") or ""
     return command if isinstance(command, str) else " ".join(map(str, command))
 
 
-def _began(said: Mapping[str, Any], ended: datetime) -> datetime | None:
+def _began(document: Mapping[str, Any], ended: datetime) -> datetime | None:
     """Return the time at which a command began, from the document or from the seconds that it
     took, if one is known.
     """
-    if said.get("began"):
-        return datetime.fromisoformat(said["began"])
-    return ended - timedelta(seconds=said["seconds"]) if said.get("seconds") is not None else None
+    if document.get("began"):
+        return datetime.fromisoformat(document["began"])
+    if document.get("seconds") is None:
+        return None
+    return ended - timedelta(seconds=document["seconds"])
 
 
-def _description(said: Mapping[str, Any]) -> str:
+def _description(document: Mapping[str, Any]) -> str:
     """Return the description of the folder: the title of the recipe, and the kind of study."""
-    kind_of_study = said.get("study") or said.get("stage")
+    kind_of_study = document.get("study") or document.get("stage")
     text = (
-        str(said.get("title") or "").strip()
-        or f"Results of the recipe {said.get('recipe') or 'of a run'}."
+        str(document.get("title") or "").strip()
+        or f"Results of the recipe {document.get('recipe') or 'of a run'}."
     )
     return f"{text} ({kind_of_study})" if kind_of_study else text
 

@@ -65,7 +65,8 @@ class RunFolder:
     def write(self, name: str, content: str | bytes) -> Path:
         """Write a file into the folder of a run, and return the path of the file."""
         path = self.place(name)
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        data = content.encode() if isinstance(content, str) else content
+        path.write_bytes(data)
         return path
 
     def write_rows(self, name: str, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

@@ -18,7 +18,7 @@ from neusee.workflows.engine.runner import Result
 from neusee.workflows.engine.wanted_steps import compared
 from neusee.workflows.graph.recipe_graph import Recipe, StepRecord
 from neusee.workflows.keys.cache_key import file_digest
-from neusee.workflows.recipe.distributions.nominal_values import told
+from neusee.workflows.recipe.distributions.nominal_values import standing_rows
 from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.paper_readings import consequences, in_force
 from neusee.workflows.report.run_folder import present_time
@@ -218,7 +218,7 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
         "metrics": metrics(recipe, result.keys, result.value),
         "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked)],
         "warnings": [],
-        "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
+        "posterior": standing_rows(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
         "consequences": consequences(recipe.config.values),
         "left_out": [

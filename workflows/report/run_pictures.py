@@ -19,7 +19,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
-from neusee.workflows.report.contents import FIGURES, Found, Missing, find, is_table
+from neusee.workflows.report.contents import FIGURES, Missing, Source, find, is_table
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
@@ -128,7 +128,7 @@ class DerivedFile:
 
 
 #: a file, its key, and the arguments of its ``make``
-Job = tuple[DerivedFile, str, Mapping[str, Found]]
+Job = tuple[DerivedFile, str, Mapping[str, Source]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,23 +267,17 @@ def _in_turn(predicted: Iterable[StepRecord]) -> tuple[Slot, ...]:
         lane = done.lane or done.device
         slot_before = last_slot.get(lane)
         start = slot_before.end if slot_before else 0.0
+        end = start + (done.predicted or 0.0)
         # a step begins when the one before it on its device ends
-        slots.append(
-            Slot(
-                done.step,
-                lane,
-                start,
-                start + (done.predicted or 0.0),
-                after=slot_before.task if slot_before else "",
-            )
-        )
+        task_before = slot_before.task if slot_before else ""
+        slots.append(Slot(done.step, lane, start, end, after=task_before))
         last_slot[lane] = slots[-1]
     return tuple(slots)
 
 
 def arguments_of(
     needs: Mapping[str, str], recipe: Recipe, keys: Mapping[str, str], code: Code, store: Store
-) -> dict[str, Found]:
+) -> dict[str, Source]:
     """Find the source of each argument of a drawing function; omit arguments marked by ``?`` whose
     step is missing.
 
@@ -299,12 +293,12 @@ def arguments_of(
     return sources
 
 
-def steps_of(sources: Mapping[str, Found]) -> frozenset[str]:
+def steps_of(sources: Mapping[str, Source]) -> frozenset[str]:
     """Return the steps that the sources of all arguments need."""
     return frozenset(itertools.chain.from_iterable(source.steps for source in sources.values()))
 
 
-def key_of_file(file: DerivedFile, sources: Mapping[str, Found]) -> str:
+def key_of_file(file: DerivedFile, sources: Mapping[str, Source]) -> str:
     """Return the key of a file: the digest of how it is made and of what it shows."""
     return digest(*file.kind, [[name, source.identity] for name, source in sources.items()])
 

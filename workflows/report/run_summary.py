@@ -195,7 +195,7 @@ SENTENCES = ("buys", "irradiance", "costs", "rival", "frame")
 PLAIN, MASK, RESTORED = "plain lens", "with mask", "restored"
 _PEAK, _QUALITY, _LOST = "peak/I_sat", "PSNR (dB)", "saturated px"
 _EQUAL = 0.01  #: relative difference of two peaks below which the mask changes nothing
-_LEAST = 0.9  #: LSR above which there is nothing to replace
+_UNSUPPRESSED_LSR = 0.9  #: LSR above which there is nothing to replace
 _TIMES = 2.0  #: ratio of two peaks below which their difference is told in percent
 
 Arm = Mapping[str, float]
@@ -306,7 +306,7 @@ def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str
     that computes them.
     """
     largest_lsr = max(lsr.values(), default=1.0)
-    if largest_lsr >= _LEAST:
+    if largest_lsr >= _UNSUPPRESSED_LSR:
         return {}
     text = f"A grey filter that passes {largest_lsr:.3g} of the light weakens the laser as much: "
     command = f"doe=grey_filter doe.transmittance={largest_lsr:.3g}"
@@ -389,8 +389,10 @@ def _ratios(lsr: Mapping[str, float]) -> str:
     if not lsr:
         return ""
     wavelengths = sorted(lsr, key=lsr.__getitem__)
-    least, most_text = (f"{lsr[name]:.3g} at {name}" for name in (wavelengths[0], wavelengths[-1]))
-    return f"LSR {least}" if len(lsr) == 1 else f"LSR from {least} to {most_text}"
+    least_text, most_text = (
+        f"{lsr[name]:.3g} at {name}" for name in (wavelengths[0], wavelengths[-1])
+    )
+    return f"LSR {least_text}" if len(lsr) == 1 else f"LSR from {least_text} to {most_text}"
 
 
 def _costs(plain: Arm, mask: Arm, restored: Arm, laser: bool, element: str) -> str:
@@ -409,18 +411,20 @@ def _picture(plain: Arm, mask: Arm, restored: Arm, element: str) -> str:
     if _QUALITY not in plain or _QUALITY not in mask:
         return ""
     # PSNR behind the plain lens, behind the mask, and after restoration
-    before, behind, after = (arm.get(_QUALITY, -math.inf) for arm in (plain, mask, restored))
-    end = f", and {after:.1f} dB after restoration" if _QUALITY in restored else ""
+    plain_psnr, mask_psnr, restored_psnr = (
+        arm.get(_QUALITY, -math.inf) for arm in (plain, mask, restored)
+    )
+    end = f", and {restored_psnr:.1f} dB after restoration" if _QUALITY in restored else ""
     text = (
-        f"PSNR {before:.1f} dB with the plain lens{',' if end else ' and'} {behind:.1f} dB with the"
-        f" {element}{end}"
+        f"PSNR {plain_psnr:.1f} dB with the plain lens{',' if end else ' and'}"
+        f" {mask_psnr:.1f} dB with the {element}{end}"
     )
     verb = "cost" if _several(element) else "costs"
-    if behind >= before:
+    if mask_psnr >= plain_psnr:
         return f"The {element} {verb} no picture quality here: {text}"
     return (
         f"The {element} {verb} picture"
-        f" quality{', which restoration wins back' if after >= before else ''}: {text}"
+        f" quality{', which restoration wins back' if restored_psnr >= plain_psnr else ''}: {text}"
     )
 
 

@@ -89,7 +89,7 @@ def marked_column(
     ]
 
 
-def said(value: Any) -> str:
+def cell_text(value: Any) -> str:
     """Return the value of a table cell as text, with three digits of a real number and a dash
     for None.
     """
@@ -157,7 +157,7 @@ def _with_mark(value: Any) -> Marked:
 
 def _cell(cell: Marked, numeric: bool) -> dict[str, str]:
     """Return text and classes of a cell: ``n`` aligns right, ``one`` keeps a word in one line."""
-    text = said(cell.value)
+    text = cell_text(cell.value)
     alignment = ""
     if numeric or _is_number(cell.value):
         alignment = "n"
@@ -196,7 +196,7 @@ def _plain(value: Any) -> str:
     """
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_inner(item)}" for name, item in value.items())
-    return ", ".join(map(_inner, value)) if isinstance(value, list | tuple) else said(value)
+    return ", ".join(map(_inner, value)) if isinstance(value, list | tuple) else cell_text(value)
 
 
 def _inner(value: Any) -> str:

@@ -21,7 +21,6 @@ from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Event, Recipe, StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_folder, run_page
-from neusee.workflows.report import run_page as run_timing
 from neusee.workflows.report.data_exports import data_files, exports
 from neusee.workflows.report.files_beside import FilesBeside, GraphAhead
 from neusee.workflows.report.run_folder import NotWritten, RunFolder, code_text, new_run
@@ -38,6 +37,19 @@ from neusee.workflows.report.run_pictures import (
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Where a run computes, what it computes anew, and who watches it."""
+
+    #: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first
+    device: str = "cpu"
+    executor: Executor | None = None  #: computes the steps in place of this process
+    memory: int | None = None  #: bytes that the run may use on each device at most
+    #: steps that are computed, with all that follow from them, although their results are stored
+    anew: Sequence[str] = ()
+    watch: Callable[[Event], None] | None = None  #: gets each event of the run
 
 
 @dataclass(frozen=True)
@@ -61,33 +73,27 @@ def simulate(
     store: Store,
     runs: Path,
     command: Sequence[str],
-    device: str = "cpu",
-    watch: Callable[[Event], None] | None = None,
-    executor: Executor | None = None,
-    memory: int | None = None,
-    anew: Sequence[str] = (),
+    options: RunOptions = RunOptions(),
 ) -> Simulation:
     """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder
     remains.
-
-    The steps ``anew``, and all that follow from them, are computed although their results are
-    stored.
     """
+    memory = options.memory
     finished: dict[str, StepRecord] = {}
     start_time = timestamp()
 
     def note(event: Event) -> None:
         if event.done is not None:
             finished[event.step] = event.done
-        if watch is not None:
-            watch(event)
+        if options.watch is not None:
+            options.watch(event)
 
     picture_store = DerivedFiles(store)
+    # a run with a limit of its own keeps nothing for files beside it
+    memory_beside = memory_limit(None) if memory is None else 0.0
     with (
         warnings.catch_warnings(record=True) as caught_warnings,
-        FilesBeside(
-            _files, picture_store, memory_limit(None) if memory is None else 0.0
-        ) as files_beside,
+        FilesBeside(_files, picture_store, memory_beside) as files_beside,
     ):
         warnings.simplefilter("default")
         # cheaper steps, as far as the tolerance of the recipe allows
@@ -102,7 +108,15 @@ def simulate(
             graph_pictures(*result)
 
         result = run(
-            recipe, store, wanted(recipe), explained_run, device, executor, memory, show, anew=anew
+            recipe,
+            store,
+            wanted(recipe),
+            explained_run,
+            options.device,
+            options.executor,
+            memory,
+            show,
+            anew=options.anew,
         )
         # the records of steps that were computed here have their times
         result = replace(
@@ -153,7 +167,7 @@ def _write(
     folder.write("code.json", code_text(result))
     folder.write("recipe.yaml", recipe_text(result.recipe))
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), document["metrics"])
-    folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(document["steps"]))
+    folder.write_rows("timing.csv", run_page.COLUMNS, run_page.rows(document["steps"]))
     run_folder.prepare()
     finish()
     picture_files, missing_files = pictures(result, shelf)

@@ -15,7 +15,7 @@ from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.distributions.joint_distribution import Z_90
-from neusee.workflows.recipe.distributions.nominal_values import told
+from neusee.workflows.recipe.distributions.nominal_values import standing_rows
 from neusee.workflows.recipe.uncertain_inputs import (
     NEGLIGIBLE,
     SCRAMBLES,
@@ -130,7 +130,8 @@ def _points(inputs: Inputs, seed: int, limit: int, points: str) -> InputDraws:
     """
     if points == "sobol":
         return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(limit, LEAST) / SCRAMBLES)), seed)
-    return inputs.independent(limit if inputs.most is None else min(limit, inputs.most), seed)
+    draws = limit if inputs.most_draws is None else min(limit, inputs.most_draws)
+    return inputs.independent(draws, seed)
 
 
 def _ends(inputs: Inputs) -> FloatArray:
@@ -352,7 +353,7 @@ def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
         "wanted": result.wanted,
         "decided by": list(result.deciding),
         "inputs": result.input_rows,
-        "posterior": told(result.inputs.uncertain.standings),
+        "posterior": standing_rows(result.inputs.uncertain.standings),
         "cut off": dict(result.inputs.notes),
         "left out": result.left_out,
         "idle": list(result.inputs.idle),

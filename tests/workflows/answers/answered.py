@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from neusee.workflows.answers import repeated_command
 from neusee.workflows.answers import repeated_command as installed_program
 from neusee.workflows.answers import repeated_command as typed_command
-from neusee.workflows.report.study_report import Section, StudyReport, StudyRun, as_json, said
+from neusee.workflows.report.study_report import Section, StudyReport, StudyRun, as_json, cell_text
 from neusee.workflows.store.shared_folder import Disk
 
 WORDS = ("safety", "mine.yaml", "a.b=1")
@@ -24,7 +24,7 @@ class PlainReport:
 
     def write(self, folder, document) -> None:
         folder.write("provenance.json", as_json(document))
-        folder.write("report.html", f"<p>{document['date']}, {said(document['seconds'])} s")
+        folder.write("report.html", f"<p>{document['date']}, {cell_text(document['seconds'])} s")
         folder.write("figures/curve.png", b"PNG")
 
 

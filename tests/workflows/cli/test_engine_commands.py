@@ -179,14 +179,14 @@ def test_what_no_machine_holds_is_refused_on_an_empty_cache_before_any_work(neus
 
 
 def test_a_plan_of_what_never_ran_has_numbers_and_names_the_guesses(neusee, here, monkeypatch):
-    from neusee.workflows.engine import cost_model as cost_laws
+    from neusee.workflows.engine import cost_model
 
     code, out, _ = neusee("plan", "first_light")
     assert code == 0
     assert "guess" not in out
     assert "?" not in out
     assert "while the steps run, of which the program itself holds" in out
-    laws = {path: law for path, law in cost_laws.shipped().items() if path != "restore.wiener"}
+    laws = {path: law for path, law in cost_model.shipped().items() if path != "restore.wiener"}
     monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", lambda: laws)
     line = next(
         line

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neusee.workflows.cli import app
-from neusee.workflows.recipe import step_checks as known_before_run
+from neusee.workflows.recipe import step_checks
 
 OpenEXR = pytest.importorskip("OpenEXR")
 SMALL = (
@@ -106,7 +106,7 @@ def test_a_value_that_fails_after_the_optics_is_refused_at_its_place(refused, ch
 
 
 def test_a_result_that_no_memory_holds_is_refused_with_its_sizes(refused, monkeypatch):
-    monkeypatch.setattr(known_before_run, "machine_memory", lambda: 8e9)
+    monkeypatch.setattr(step_checks, "machine_memory", lambda: 8e9)
     err = refused("scene=siemens", "scene.shape=[20000,20000]", "optics.pixel=zoh")
     assert (
         "9.6 GB for a result of 3 x 20000 x 20000 values and one input, and this machine has 8 GB"
@@ -118,7 +118,7 @@ def test_a_step_that_a_cheaper_form_replaces_or_that_nobody_needs_is_not_judged_
     neusee, monkeypatch
 ):
     """All 31 bands of this scene take 0.5 GB, but only three planes of them are computed."""
-    monkeypatch.setattr(known_before_run, "machine_memory", lambda: 2e8)
+    monkeypatch.setattr(step_checks, "machine_memory", lambda: 2e8)
     code, _, err = neusee(
         "validate",
         "first_light",
@@ -164,7 +164,7 @@ def test_what_is_known_before_the_run_is_what_the_run_gives(tmp_path):
     recipe = load("first_light", SMALL)
     known = {}
     for name in in_order({name: step.sources for name, step in recipe.steps.items()}, recipe.steps):
-        known[name] = known_before_run._form(recipe.steps[name], known)
+        known[name] = step_checks._form(recipe.steps[name], known)
     found = {name: value for name, value in known.items() if value is not None}
     assert {
         "raw[mask]",
@@ -564,9 +564,9 @@ def test_a_recipe_that_grows_beyond_a_limit_is_refused_with_the_limit(
 
 
 def test_the_limit_of_steps_counts_the_steps_and_their_copies(neusee, tmp_path, monkeypatch):
-    from neusee.workflows.recipe import steps as step_declarations
+    from neusee.workflows.recipe import steps
 
-    monkeypatch.setattr(step_declarations, "_MOST", 30)
+    monkeypatch.setattr(steps, "_MOST_STEPS", 30)
     (tmp_path / "mine.yaml").write_text(many(29))
     assert neusee("validate", "mine.yaml")[0] == 0
     (tmp_path / "mine.yaml").write_text(many(30))
@@ -672,7 +672,7 @@ def test_a_file_of_ones_own_recipe_is_no_mistake_with_a_scene_that_has_no_file(n
 def test_the_guide_states_each_limit_as_the_program_has_it():
     from neusee.nodes import input_files
     from neusee.nodes.spectra import _bands
-    from neusee.workflows.recipe import steps as step_declarations
+    from neusee.workflows.recipe import steps
     from neusee.workflows.recipe.text import references, yaml_values
     from neusee.workflows.recipe.text.recipe_files import packaged
 
@@ -683,10 +683,10 @@ def test_the_guide_states_each_limit_as_the_program_has_it():
     ]
     assert references._MOST_VALUES == references._MOST_CHARACTERS
     assert stated == [
-        step_declarations._MOST,
-        yaml_values._LARGEST,
+        steps._MOST_STEPS,
+        yaml_values._MOST_BYTES,
         references._MOST_VALUES,
-        yaml_values._MOST_ALIASED,
+        yaml_values._MOST_ALIASED_VALUES,
         _bands._MOST_BANDS,
         input_files.PIXELS,
         input_files.VALUES,

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from neusee.nodes import input_files as input_size
+from neusee.nodes import input_files
 from neusee.workflows.cli import app
 from neusee.workflows.engine.machine_resources import limited
 from tests import file_bombs as bombs
@@ -78,10 +78,10 @@ def test_a_pipe_in_the_place_of_a_record_of_code_makes_no_run_wait(neusee, tmp_p
 
 
 def test_what_is_free_is_compared_where_no_limit_is_set(monkeypatch):
-    monkeypatch.setattr(input_size, "_measures", [lambda: input_size.Room(50e6)])
-    input_size.needs(50e6, "a.npy", "numbers")
-    with pytest.raises(input_size.BeyondMemory) as refused:
-        input_size.needs(3.7e9, "a.npy", "numbers")
+    monkeypatch.setattr(input_files, "_measures", [lambda: input_files.Room(50e6)])
+    input_files.needs(50e6, "a.npy", "numbers")
+    with pytest.raises(input_files.BeyondMemory) as refused:
+        input_files.needs(3.7e9, "a.npy", "numbers")
     assert (
         str(refused.value)
         == "a.npy would need 3.7 GB of memory to read (numbers), more than the 50 MB that are"
@@ -91,23 +91,23 @@ def test_what_is_free_is_compared_where_no_limit_is_set(monkeypatch):
 
 
 def test_a_small_file_is_read_whatever_is_free(monkeypatch):
-    monkeypatch.setattr(input_size, "_measures", [lambda: input_size.Room(-1e9)])
-    input_size.needs(input_size.SMALL, "a.npy", "numbers")
-    with pytest.raises(input_size.BeyondMemory, match="more than the 0 bytes that are free"):
-        input_size.needs(input_size.SMALL + 1, "a.npy", "numbers")
+    monkeypatch.setattr(input_files, "_measures", [lambda: input_files.Room(-1e9)])
+    input_files.needs(input_files.SMALL, "a.npy", "numbers")
+    with pytest.raises(input_files.BeyondMemory, match="more than the 0 bytes that are free"):
+        input_files.needs(input_files.SMALL + 1, "a.npy", "numbers")
 
 
 def test_the_least_limit_of_the_process_counts():
     with limited(1e15), limited(1e14):
-        room = input_size._measures[-1]()
+        room = input_files._measures[-1]()
         assert room.limit == 1e14
-        assert room.free <= input_size.free_memory().free + 1e9
-    assert input_size._measures[-1]().limit is None
+        assert room.free <= input_files.free_memory().free + 1e9
+    assert input_files._measures[-1]().limit is None
 
 
 def test_a_line_that_is_too_long_is_named(tmp_path):
-    (tmp_path / "a.csv").write_text("a,b\n" + "1" * (input_size.LINE + 1))
+    (tmp_path / "a.csv").write_text("a,b\n" + "1" * (input_files.LINE + 1))
     with pytest.raises(ValueError, match=r"a\.csv:2 has more than 1000000 characters"):
-        list(input_size.lines_of(tmp_path / "a.csv"))
-    (tmp_path / "a.csv").write_text("a,b\r\n" + "1" * input_size.LINE)
-    assert [len(line) for line in input_size.lines_of(tmp_path / "a.csv")] == [5, input_size.LINE]
+        list(input_files.lines_of(tmp_path / "a.csv"))
+    (tmp_path / "a.csv").write_text("a,b\r\n" + "1" * input_files.LINE)
+    assert [len(line) for line in input_files.lines_of(tmp_path / "a.csv")] == [5, input_files.LINE]

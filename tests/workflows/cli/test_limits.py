@@ -409,9 +409,11 @@ def test_a_height_network_and_a_lift_refuse_weights_that_are_not_finite(tmp_path
 
     from neusee.nodes import ParameterError, doe, spectra
     from neusee.nodes.doe._parametrisations import HeightNet
-    from neusee.nodes.spectra._lift import start_mst_plus_plus
 
-    nets = {"height": HeightNet(4), "lift": start_mst_plus_plus(torch.Generator().manual_seed(0))}
+    nets = {
+        "height": HeightNet(4),
+        "lift": spectra.start_mst_plus_plus(torch.Generator().manual_seed(0)),
+    }
     for name, net in nets.items():
         tensors = {
             key: value.detach().clone().contiguous() for key, value in net.state_dict().items()

@@ -12,9 +12,7 @@ import pytest
 import typer
 
 import neusee
-from neusee.workflows.cli import app
-from neusee.workflows.cli import commands_and_exit_codes as command_list
-from neusee.workflows.cli import program_options as typer_program
+from neusee.workflows.cli import app, commands_and_exit_codes, program_options
 
 
 def commands(group, *before):
@@ -78,9 +76,9 @@ def test_the_list_of_commands_is_whole(said):
     assert listed == list(WHOLE.commands)
 
 
-@pytest.mark.parametrize("name", command_list.COMMANDS)
+@pytest.mark.parametrize("name", commands_and_exit_codes.COMMANDS)
 def test_the_list_has_the_first_line_of_the_help_of_a_command(name):
-    module, text = command_list.COMMANDS[name]
+    module, text = commands_and_exit_codes.COMMANDS[name]
     command = getattr(importlib.import_module(f"neusee.workflows.cli.{module}"), name)
     own = command.info.help if isinstance(command, typer.Typer) else inspect.getdoc(command)
     assert own.partition("\n")[0] == text
@@ -89,16 +87,16 @@ def test_the_list_has_the_first_line_of_the_help_of_a_command(name):
 @pytest.mark.parametrize("columns", ["80", "81", "200"])
 def test_the_page_of_help_is_that_of_typer_to_the_letter(columns, said, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", columns)
-    assert typer_program.run_program(["--help"], False) == 0
+    assert program_options.run_program(["--help"], False) == 0
     page = capsys.readouterr().out
-    assert said("--help") == page == f"{command_list.help_page()}\n"
+    assert said("--help") == page == f"{commands_and_exit_codes.help_page()}\n"
 
 
 @pytest.mark.parametrize("columns", ["79", "60", "20"])
 def test_a_narrow_terminal_gets_the_page_from_typer(columns, said, monkeypatch):
     monkeypatch.setenv("COLUMNS", columns)
     text = said("--help")
-    assert text != f"{command_list.help_page()}\n"
+    assert text != f"{commands_and_exit_codes.help_page()}\n"
     assert max(map(len, text.splitlines())) <= max(50, int(columns) - 2)
 
 
@@ -110,15 +108,15 @@ def test_the_page_of_help_needs_nothing_but_the_standard_library():
         capture_output=True,
         text=True,
     )
-    assert (done.stdout, done.stderr) == (f"{command_list.help_page()}\n", "")
+    assert (done.stdout, done.stderr) == (f"{commands_and_exit_codes.help_page()}\n", "")
 
 
 @pytest.mark.parametrize("name", ["run", "nodes", "study", "cache"])
 def test_the_help_of_a_command_imports_no_other_command(name):
-    own = command_list.COMMANDS[name][0]
+    own = commands_and_exit_codes.COMMANDS[name][0]
     others = {
         f"neusee.workflows.cli.{module}"
-        for module, _ in command_list.COMMANDS.values()
+        for module, _ in commands_and_exit_codes.COMMANDS.values()
         if module != own
     }
     code = (

@@ -10,16 +10,15 @@ import sys
 
 import pytest
 
-from neusee.workflows.cli import app as thread_settings
 from neusee.workflows.cli.app import settle_threads
-from neusee.workflows.engine import machine_resources as processors
+from neusee.workflows.engine import machine_resources
 from neusee.workflows.engine.machine_resources import threads_for
 
 
 @pytest.fixture
 def before_torch(monkeypatch):
     monkeypatch.delitem(sys.modules, "torch")
-    monkeypatch.setattr(thread_settings, "free_processors", lambda: 3)
+    monkeypatch.setattr(machine_resources, "free_processors", lambda: 3)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +49,7 @@ def test_what_the_user_has_set_stays(command, given, added):
 
 @pytest.mark.usefixtures("before_torch")
 def test_a_single_free_processor_is_not_given_away(monkeypatch):
-    monkeypatch.setattr(thread_settings, "free_processors", lambda: 1)
+    monkeypatch.setattr(machine_resources, "free_processors", lambda: 1)
     environ: dict[str, str] = {}
     settle_threads("run", environ)
     assert environ["OMP_NUM_THREADS"] == "1"
@@ -66,7 +65,7 @@ def test_nothing_changes_where_torch_is_imported():
 
 def test_a_machine_that_tells_no_load_keeps_its_threads(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    assert processors.free_processors() is None
+    assert machine_resources.free_processors() is None
 
 
 def test_a_command_decides_before_torch_is_imported():

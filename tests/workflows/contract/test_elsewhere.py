@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from neusee.workflows.contract import surroundings
-from neusee.workflows.contract import surroundings as elsewhere_client
 from neusee.workflows.contract.node_contract import check_all
 from neusee.workflows.contract.surroundings import elsewhere
 from neusee.workflows.recipe.node_families import import_own, own_nodes
@@ -284,7 +283,7 @@ def test_a_call_that_ends_its_process_ends_no_check(ended):
 
 @pytest.mark.slow
 def test_a_call_without_an_end_is_given_up(checked, monkeypatch):
-    monkeypatch.setattr(elsewhere_client, "LONGEST", 3)
+    monkeypatch.setattr(surroundings, "LONGEST_CALL", 3)
     text = source_of("hangs", "time.sleep(1e6)") + source_of("plain", "x * 2")
     found = checked("hangs_elsewhere", text)
     assert said(found["hangs"]).text.endswith(
@@ -324,9 +323,9 @@ def test_the_other_locale_is_one_of_those_that_are_installed(now, names, other):
 
 def test_a_locale_that_cannot_be_changed_is_said(monkeypatch):
     monkeypatch.setattr(surroundings, "installed_locales", lambda environ: [])
-    others = surroundings.others({"PATH": "/bin", "OMP_NUM_THREADS": "4"})
+    others = surroundings.other_surroundings({"PATH": "/bin", "OMP_NUM_THREADS": "4"})
     assert (
-        others.said()
+        others.described()
         == "folder, hash seed, 1 thread, time zone, random states, order of work, np.seterr, HOME,"
         " unset memory; locale not changed: no other is installed"
     )
@@ -341,7 +340,7 @@ def test_variables_that_find_libraries_stay_and_others_go():
         "DECLARED": "3",
         "HOME": "/h",
     }
-    others = surroundings.others(environ)
+    others = surroundings.other_surroundings(environ)
     assert others.variables == ("DECLARED", "GAIN")
     settings = others.settings(frozenset(surroundings.ALL), Path("/empty"), {"DECLARED": "3"})
     assert {name: settings.variables[name] for name in ("GAIN", "HOME", "TZ")} == {

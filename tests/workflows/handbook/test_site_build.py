@@ -12,8 +12,7 @@ from typer.main import get_command
 import neusee
 from neusee.workflows.cli import app
 from neusee.workflows.cli.handbook_reference import reference_pages
-from neusee.workflows.handbook import site_build as build
-from neusee.workflows.handbook import site_build as command_pictures
+from neusee.workflows.handbook import site_build
 from neusee.workflows.handbook.recipe_and_python_reference import escaped, prose, table
 from neusee.workflows.handbook.site_build import (
     GUIDE,
@@ -107,7 +106,7 @@ def test_a_command_finds_the_results_of_the_one_before(tmp_path, monkeypatch):
         (results / "a.png").write_text(words[0])
         return results
 
-    monkeypatch.setattr(command_pictures, "_run", run)
+    monkeypatch.setattr(site_build, "_run", run)
     pictures = [Picture((name,), "a.png", "Nothing.") for name in ("first", "second", "third")]
     draw_pictures(pictures, tmp_path, tmp_path / "pictures", print)
     assert seen == [[], ["first"], ["second"]]
@@ -139,7 +138,7 @@ def test_a_page_that_the_list_does_not_name_stands_in_a_section_of_its_own():
         {"How to": [{"Gone": "gone.md"}]},
         {"Reference": [{"Parts": "ref/"}]},
     ]
-    assert build.complete_nav(nav, pages) == [
+    assert site_build.complete_nav(nav, pages) == [
         {"Start": "index.md"},
         {"Reference": [{"Parts": [{"A": "ref/a.md"}, {"B": "ref/b.md"}]}]},
         {"More": [{"Something new": "new.md"}]},
@@ -148,7 +147,7 @@ def test_a_page_that_the_list_does_not_name_stands_in_a_section_of_its_own():
 
 def test_every_page_is_in_the_settings_once(reference, tmp_path):
     pages = {**read_pages(), **reference}
-    text = build.settings_text(pages, tmp_path, tmp_path)
+    text = site_build.settings_text(pages, tmp_path, tmp_path)
     found = re.findall(r"[\w/]+\.md", text.partition("\nnav:")[2])
     assert sorted(found) == sorted(pages)
 
@@ -175,7 +174,7 @@ def test_without_mkdocs_one_sentence_says_what_to_install(monkeypatch, capsys, t
 
 
 def test_a_folder_with_other_files_is_refused_and_kept(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(build, "check_modules", lambda: None)
+    monkeypatch.setattr(site_build, "check_modules", lambda: None)
     (tmp_path / "thesis.txt").write_text("years of work")
     code, err = ended(["--out", str(tmp_path)], capsys)
     assert code == 2
@@ -274,7 +273,7 @@ def site(tmp_path_factory, reference):
     if importlib.util.find_spec("mkdocs") is None or importlib.util.find_spec("material") is None:
         pytest.skip("mkdocs-material is not installed")
     out = tmp_path_factory.mktemp("book") / "handbook"
-    build.build_handbook(out, reference, False, print, strict=True)
+    site_build.build_handbook(out, reference, False, print, strict=True)
     return out
 
 
@@ -306,7 +305,7 @@ def test_a_second_build_replaces_the_first_and_follows_no_link(site, reference, 
     (site / "old.html").write_text("old")
     (site / "link").symlink_to(tmp_path)
     (tmp_path / "thesis.txt").write_text("years of work")
-    build.build_handbook(site, reference, False, print)
+    site_build.build_handbook(site, reference, False, print)
     assert not (site / "old.html").exists()
     assert not (site / "link").is_symlink()
     assert (tmp_path / "thesis.txt").exists()
@@ -316,6 +315,6 @@ def test_a_second_build_replaces_the_first_and_follows_no_link(site, reference, 
 @pytest.mark.long
 def test_every_picture_of_the_guide_is_drawn_by_its_command(reference, tmp_path):
     pytest.importorskip("material")
-    page = build.build_handbook(tmp_path / "handbook", reference, True, print, strict=True)
+    page = site_build.build_handbook(tmp_path / "handbook", reference, True, print, strict=True)
     wanted = {(p.words, p.file) for text in read_pages().values() for p in pictures_of(text)}
     assert len(list((page.parent / "pictures").iterdir())) == len(wanted) > 30

@@ -13,8 +13,7 @@ import torch
 from neusee import recipes
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.step_shapes import alike
-from neusee.workflows.recipe import step_checks as bound_steps
-from neusee.workflows.recipe import step_checks as graph_cache
+from neusee.workflows.recipe import step_checks
 from neusee.workflows.recipe.loading import check
 from neusee.workflows.recipe.text.composition import Composer, compose
 
@@ -57,7 +56,7 @@ def drawn(seed):
 
 @pytest.fixture(autouse=True)
 def no_graph(monkeypatch):
-    monkeypatch.setattr(graph_cache, "_graphs", {})
+    monkeypatch.setattr(step_checks, "_graphs", {})
 
 
 def test_a_check_after_others_says_what_a_check_alone_says(monkeypatch):
@@ -66,7 +65,7 @@ def test_a_check_after_others_says_what_a_check_alone_says(monkeypatch):
     assert any(len(each) < 20 for each in after)
     assert sum(len(each) > 20 for each in after) > 10
     for each, found in zip(words, after, strict=True):
-        graph_cache._graphs.clear()
+        step_checks._graphs.clear()
         assert repr(told(each)) == repr(found), each
 
 
@@ -90,9 +89,9 @@ def test_a_recipe_that_is_composed_after_others_is_the_recipe_composed_alone():
 
 def test_a_step_is_checked_again_only_where_a_value_that_it_reads_has_changed(monkeypatch):
     checked = []
-    remember = bound_steps.Attempt.remember
+    remember = step_checks.Attempt.remember
     monkeypatch.setattr(
-        bound_steps.Attempt,
+        step_checks.Attempt,
         "remember",
         lambda self, name, *rest: (checked.append(name), remember(self, name, *rest)),
     )

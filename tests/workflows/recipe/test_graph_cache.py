@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from neusee.workflows.graph.errors import RecipeError
-from neusee.workflows.recipe import loading
-from neusee.workflows.recipe import step_checks as graph_cache
+from neusee.workflows.recipe import loading, step_checks
 from neusee.workflows.recipe.text import composition
 
 RECIPE = """\
@@ -33,7 +32,7 @@ def forget(monkeypatch):
     """Read as a fresh process would."""
 
     def forget():
-        monkeypatch.setattr(graph_cache, "_graphs", {})
+        monkeypatch.setattr(step_checks, "_graphs", {})
         loading._checked.cache_clear()
         composition._merged.cache_clear()
 
@@ -147,4 +146,4 @@ def test_little_is_remembered(read, forget):
     for pitch in range(1, 60):
         read(RECIPE.replace("pitch: 3 um", f"pitch: {pitch} um"), "sensor.gain=2")
     sizes = (cache.cache_info().currsize for cache in (loading._checked, composition._merged))
-    assert max(len(graph_cache._graphs), *sizes) <= 16
+    assert max(len(step_checks._graphs), *sizes) <= 16

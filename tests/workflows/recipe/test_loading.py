@@ -9,7 +9,6 @@ import neusee
 from neusee.workflows.graph.errors import Location, RunError
 from neusee.workflows.recipe import loading
 from neusee.workflows.recipe.blocks import settings_block, train_block
-from neusee.workflows.recipe.blocks import train_block as train_lift_block
 from neusee.workflows.recipe.loading import groups, load, recipes
 from neusee.workflows.recipe.text.yaml_values import parse
 from neusee.workflows.store.result_store import Store
@@ -366,7 +365,7 @@ def test_the_settings_of_trainings_are_imported_for_recipes_that_have_one():
     assert not [name for name in tops if ".blocks" in name]
     assert loading.BLOCKS == (
         train_block.KEY,
-        train_lift_block.LIFT_KEY,
+        train_block.LIFT_KEY,
         settings_block.KEY,
         loading.TRACED,
     )

@@ -24,7 +24,6 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step, StepRecord
 from neusee.workflows.report import files_beside
-from neusee.workflows.report import files_beside as drawing_process
 from neusee.workflows.report.contents import Bound
 from neusee.workflows.report.files_beside import DrawingProcess, FilesBeside, GraphAhead, NotDrawn
 from neusee.workflows.report.run_pictures import DerivedFile, Drawing, files_of, graphs, states_of
@@ -96,7 +95,7 @@ def texts(paths: dict[str, Path]) -> dict[str, str]:
 
 @pytest.fixture
 def forks(monkeypatch):
-    monkeypatch.setattr(drawing_process, "possible", lambda: sys.platform == "linux")
+    monkeypatch.setattr(files_beside, "possible", lambda: sys.platform == "linux")
     if sys.platform != "linux":
         pytest.skip("pictures are drawn in a fork only on Linux")
 
@@ -122,7 +121,7 @@ def test_no_memory_means_no_file_before_the_report(tmp_path):
 
 
 def test_a_large_result_is_held_only_for_files_that_need_nothing_else(tmp_path, monkeypatch):
-    monkeypatch.setattr(files_beside, "LARGE", 100)
+    monkeypatch.setattr(files_beside, "LARGE_RESULT", 100)
     (paths, _), early = result_of(tmp_path, files())
     assert texts(paths) == {"one": "2016", "both": "6048"}
     assert len(early) == 1  # the file of the first result alone
@@ -149,7 +148,7 @@ def test_a_process_that_was_killed_is_not_waited_for(tmp_path, forks):
 
 def test_what_is_large_or_no_data_is_not_sent(tmp_path, forks, monkeypatch):
     drawer = DrawingProcess()
-    monkeypatch.setattr(drawing_process, "MOST", 10)
+    monkeypatch.setattr(files_beside, "MOST_PIPE_BYTES", 10)
     with pytest.raises(NotDrawn, match="large"):
         drawer.make(tmp_path / "b", sums, {"x": torch.ones(3)})
     with pytest.raises(NotDrawn):

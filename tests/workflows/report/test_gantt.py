@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from neusee.workflows.placement.heft_schedule import Cluster, Device, Task, heft
-from neusee.workflows.report.figures import graph_and_timeline as gantt
+from neusee.workflows.report.figures import graph_and_timeline
 from neusee.workflows.report.figures.graph_and_timeline import timeline
 from neusee.workflows.report.figures.style import styled
 
@@ -77,7 +77,11 @@ def test_the_lanes_stand_above(drawn):
 def test_the_critical_path_is_red(drawn):
     schedule = planned(9)
     _, _, steps = drawn(schedule, [])
-    red = {t.get_text() for t in steps.get_yticklabels() if t.get_color() == gantt.VERMILION}
+    red = {
+        t.get_text()
+        for t in steps.get_yticklabels()
+        if t.get_color() == graph_and_timeline.VERMILION
+    }
     assert red == {s.task for s in schedule.critical_path()}
 
 

@@ -11,9 +11,7 @@ import torch
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.wanted_steps import wanted
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report import console
-from neusee.workflows.report import run_folder as run_html
-from neusee.workflows.report import run_summary as mask_story
+from neusee.workflows.report import console, run_folder, run_summary
 from neusee.workflows.report.run_summary import sentences
 
 PLAIN = {"peak/I_sat": 912.3, "LSR": 1.0, "PSNR (dB)": 27.07, "saturated px": 244.0}
@@ -180,20 +178,20 @@ def test_the_peak_is_said_in_watts_and_no_multiple_is_a_verdict_of_damage(judged
     """First light: 912 I_sat are 1.8 mW/cm2, ten million times below what damages; a mask
     protects from nothing.
     """
-    found = mask_story.irradiance({"plain lens": 18.4, "with mask": 0.0782}, judged)["irradiance"]
+    found = run_summary.irradiance({"plain lens": 18.4, "with mask": 0.0782}, judged)["irradiance"]
     assert found.startswith(
         "The lasers have 1.84 mW/cm2 behind the plain lens and 7.82 uW/cm2 behind the mask there: "
     )
     assert ("`damage: published`" in found) is not judged
     assert found.endswith("and a multiple of saturation is not a measure of damage.")
-    assert mask_story.irradiance({"plain lens": 0.0}, judged) == {}
+    assert run_summary.irradiance({"plain lens": 0.0}, judged) == {}
     for watts, text in (
         (1e4, "1 W/cm2"),
         (7.35e5, "73.5 W/cm2"),
         (7.8e9, "780 kW/cm2"),
         (3e13, "3 GW/cm2"),
     ):
-        assert text in mask_story.irradiance({"plain lens": watts}, judged)["irradiance"]
+        assert text in run_summary.irradiance({"plain lens": watts}, judged)["irradiance"]
 
 
 def test_several_lasers_have_the_least_and_the_largest_ratio():
@@ -234,7 +232,7 @@ def run_of(lasers, values):
     values = values | lines | {"bands": Bands(centres, centres, centres)}
     strengths = {f"lasers.{name}.strength": 0.0 if name == "dark" else 1e3 for name in lasers}
     recipe = SimpleNamespace(steps=dict.fromkeys(values), config=SimpleNamespace(values=strengths))
-    return mask_story.story(recipe, dict.fromkeys(values, ""), values.__getitem__)
+    return run_summary.story(recipe, dict.fromkeys(values, ""), values.__getitem__)
 
 
 PAIR = {
@@ -325,15 +323,15 @@ def test_the_page_leads_with_the_pictures_and_the_story(document):
     document["figures"] = [
         {"name": "overview", "title": "What the camera sees", "caption": "Pictures."}
     ]
-    page = run_html.page(document, {"overview": b"png"})
+    page = run_folder.page(document, {"overview": b"png"})
     places = [
         page.index(text)
         for text in (*document["story"].values(), 'alt="What the camera', "Right.", 'id="notes"')
     ]
     assert places == sorted(places)
-    wrong = run_html.page(document | {"failed": ["a check"]}, {"overview": b"png"})
+    wrong = run_folder.page(document | {"failed": ["a check"]}, {"overview": b"png"})
     assert wrong.index("Right.") < wrong.index(document["story"]["buys"])
-    assert "What the camera sees" not in run_html.page(document | {"story": {}}, {})
+    assert "What the camera sees" not in run_folder.page(document | {"story": {}}, {})
 
 
 @pytest.mark.parametrize(
@@ -341,23 +339,23 @@ def test_the_page_leads_with_the_pictures_and_the_story(document):
 )
 def test_the_page_shows_no_backtick(document, why):
     """Words between backticks are code, in the story and in the reasons of what is not drawn."""
-    document["story"] |= mask_story.irradiance(
+    document["story"] |= run_summary.irradiance(
         {"plain lens": 18.4, "with mask": 0.0782}, judged=False
     )
     document["missing"] = [{"title": "Error against run time", "why": why}]
-    page = run_html.page(document, {})
+    page = run_folder.page(document, {})
     assert "<code>damage: published</code> and <code>neusee safety</code> compare them" in page
     assert "`" not in page.partition("</style>")[2]
 
 
 def test_the_rival_of_a_mask_is_the_grey_filter_of_its_least_suppressed_laser():
-    (text,) = mask_story.rival({"410 nm": 0.0012, "690 nm": 0.0022}, {}).values()
+    (text,) = run_summary.rival({"410 nm": 0.0012, "690 nm": 0.0022}, {}).values()
     assert (
         text == "A grey filter that passes 0.0022 of the light weakens the laser as much: for its"
         " picture, restored alike, run this recipe with doe=grey_filter"
         " doe.transmittance=0.0022."
     )
-    assert mask_story.rival({}, {}) == mask_story.rival({"530 nm": 0.95}, {}) == {}
+    assert run_summary.rival({}, {}) == run_summary.rival({"530 nm": 0.95}, {}) == {}
 
 
 def test_the_rival_has_the_quality_of_its_own_picture_if_the_run_computed_it():
@@ -368,14 +366,14 @@ def test_the_rival_has_the_quality_of_its_own_picture_if_the_run_computed_it():
         " restored by a "
     )
     end = "(doe=grey_filter doe.transmittance=0.00149)."
-    assert mask_story.rival(GREEN, numbers) == {
+    assert run_summary.rival(GREEN, numbers) == {
         "rival": (
             f"{opening}Wiener filter, has a PSNR of 20.1 dB against 17.7 dB behind the mask; "
             f"no pixel saturates {end}"
         )
     }
     alone = {"grey filter, restored": {"PSNR (dB)": 12.0, "saturated px": 1234.0}}
-    assert mask_story.rival(GREEN, alone)["rival"].endswith(
+    assert run_summary.rival(GREEN, alone)["rival"].endswith(
         f"a PSNR of 12.0 dB; 1,234 pixels saturate {end}"
     )
 
@@ -393,7 +391,7 @@ def test_the_rival_has_the_quality_of_its_own_picture_if_the_run_computed_it():
     ],
 )
 def test_the_story_names_what_stands_in_place_of_a_mask(doe, name, plural):
-    assert mask_story.element(load("first_light", [f"doe={doe}"])) == name
+    assert run_summary.element(load("first_light", [f"doe={doe}"])) == name
     numbers = {"plain lens": PLAIN, "with mask": MASK, "restored": {}}
     found = sentences(numbers, GREEN, True, name)
     assert found["buys"].startswith(

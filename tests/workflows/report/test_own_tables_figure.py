@@ -5,9 +5,9 @@ its file.
 import numpy as np
 import pytest
 
-from neusee.workflows.report.figures import optics as own_tables
+from neusee.workflows.report.figures import optics
 
-draw = own_tables.tables.__wrapped__
+draw = optics.tables.__wrapped__
 
 
 def panels(figure):

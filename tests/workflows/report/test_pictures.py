@@ -18,14 +18,12 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import contents, run_pictures
-from neusee.workflows.report.figures import camera_pictures as camera_overview
-from neusee.workflows.report.figures import camera_pictures as frame_and_interval
-from neusee.workflows.report.figures import camera_pictures as scene_spectra
-from neusee.workflows.report.figures import graph_and_timeline as recipe_graph
-from neusee.workflows.report.figures import optics
-from neusee.workflows.report.figures import optics as own_tables
-from neusee.workflows.report.figures import verification as numerics
-from neusee.workflows.report.figures import verification as photon_transfer
+from neusee.workflows.report.figures import (
+    camera_pictures,
+    graph_and_timeline,
+    optics,
+    verification,
+)
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
@@ -127,7 +125,7 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
     lines = {"green": Bands(*(x[1:3] for x in bands()))}
     return {
         "overview": (
-            camera_overview.overview,
+            camera_pictures.overview,
             dict(
                 truth=scene(),
                 plain=scene() + 0.3,
@@ -137,7 +135,7 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
             ),
         ),
         "frame": (
-            frame_and_interval.restored_frame,
+            camera_pictures.restored_frame,
             dict(
                 frame=scene(),
                 restored=scene() - 0.2 * (spot() > 0),
@@ -156,7 +154,7 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
             dict(lsr=light.lsr, bands=bands(), psf=light.mask, bsr=torch.full((B,), 0.9)),
         ),
         "spectra": (
-            scene_spectra.spectra,
+            camera_pictures.spectra,
             dict(
                 scene=scene(),
                 radiance=light.cube,
@@ -166,12 +164,12 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
                 lines=lines,
             ),
         ),
-        "tables": (own_tables.tables, table_arguments),
-        "sensor": (photon_transfer.transfer, dict(measured=transfer_curve())),
-        "stability": (numerics.stability, dict(step=linear_image, psf=light.plain)),
-        "error_time": (numerics.error_time, dict(rows=VARIANTS)),
+        "tables": (optics.tables, table_arguments),
+        "sensor": (verification.transfer, dict(measured=transfer_curve())),
+        "stability": (verification.stability, dict(step=linear_image, psf=light.plain)),
+        "error_time": (verification.error_time, dict(rows=VARIANTS)),
         "graph": (
-            recipe_graph.graph,
+            graph_and_timeline.graph,
             dict(
                 sources={
                     "bands": [],
@@ -191,7 +189,7 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
 
 
 def test_a_run_without_restoration_has_an_overview():
-    figure = camera_overview.overview.__wrapped__(truth=scene(), plain=scene() + 0.3, mask=scene())
+    figure = camera_pictures.overview.__wrapped__(truth=scene(), plain=scene() + 0.3, mask=scene())
     assert [ax.get_title() for ax in figure.axes] == ["truth", "plain lens", "with mask"]
 
 
@@ -299,9 +297,9 @@ def test_no_axes_are_empty(figure_of, name):
 def test_a_lamp_darkens_neither_the_scene_nor_the_points_of_the_spectra():
     lamp = scene()
     lamp[:, 3, 3] = 1e3
-    ax = scene_spectra.canvas(4, 4)[1][0, 0]
-    scene_spectra._scene(ax, lamp, points := scene_spectra._points(lamp))
-    assert points == scene_spectra._points(scene())
+    ax = camera_pictures.canvas(4, 4)[1][0, 0]
+    camera_pictures._scene(ax, lamp, points := camera_pictures._points(lamp))
+    assert points == camera_pictures._points(scene())
     assert float(ax.images[0].get_array()[:, 20:].max()) > 0.9
 
 
@@ -311,8 +309,8 @@ def test_a_lamp_darkens_neither_the_scene_nor_the_points_of_the_spectra():
 def test_a_ring_marks_a_laser_only_inside_the_picture(at, rings):
     light = torch.zeros(3, N, N)
     light[:, *at] = 1.0
-    ax = camera_overview.canvas(4, 4)[1][0, 0]
-    camera_overview._ring(ax, {"green": light}, scene())
+    ax = camera_pictures.canvas(4, 4)[1][0, 0]
+    camera_pictures._ring(ax, {"green": light}, scene())
     assert len(ax.patches) == rings
 
 
@@ -326,8 +324,8 @@ def test_without_bsr_there_is_one_panel(light):
 def test_one_clipped_level_does_not_squeeze_the_photon_transfer_curve(left):
     whole = transfer_curve()[:-1]
     top = torch.tensor([[7e4, left * (800 + 2.7 * 7e4), 800 + 2.7 * 7e4]], dtype=torch.float64)
-    ax = photon_transfer.transfer.__wrapped__(measured=torch.cat([whole, top])).axes[0]
-    alone = photon_transfer.transfer.__wrapped__(measured=whole).axes[0]
+    ax = verification.transfer.__wrapped__(measured=torch.cat([whole, top])).axes[0]
+    alone = verification.transfer.__wrapped__(measured=whole).axes[0]
     assert ax.get_ylim()[0] == alone.get_ylim()[0]
     (clipped,) = (line for line in ax.lines if line.get_label().startswith("clipped"))
     assert clipped.get_xdata().tolist() == [7e4]
@@ -336,7 +334,7 @@ def test_one_clipped_level_does_not_squeeze_the_photon_transfer_curve(left):
 
 
 def test_laser_added_as_shifted_psf_is_sound_where_a_joint_convolution_is_not(light):
-    errors = numerics.laser_trial(linear_image, light.plain)
+    errors = verification.laser_trial(linear_image, light.plain)
     assert float(errors[0, -1]) < 1e-4
     assert float(errors[1, -1]) > 50 * float(errors[0, -1])
 
@@ -345,8 +343,8 @@ def test_graph_places_no_two_boxes_on_one_another_and_readers_below():
     sources = {
         f"s{i}": [f"s{j}" for j in range(max(0, i - 3), i)] + ["root"] for i in range(45)
     } | {"root": []}
-    wires, _, _ = recipe_graph.grouped(sources, {})
-    places = recipe_graph.layout(wires)
+    wires, _, _ = graph_and_timeline.grouped(sources, {})
+    places = graph_and_timeline.layout(wires)
     by_row = sorted((y, x) for x, y in places.values())
     assert all(a[0] != b[0] or b[1] - a[1] >= 1 for a, b in itertools.pairwise(by_row))
     assert all(places[b][1] < places[name][1] for name, befores in wires.items() for b in befores)
@@ -354,7 +352,7 @@ def test_graph_places_no_two_boxes_on_one_another_and_readers_below():
 
 def test_graph_groups_items_and_a_family_that_ran_at_all_ran():
     sources = {"a[x]": [], "a[y]": [], "b": ["a[x]", "a[y]"]}
-    wires, looks, counts = recipe_graph.grouped(
+    wires, looks, counts = graph_and_timeline.grouped(
         sources, {"a[x]": "cached", "a[y]": "run", "b": "not needed"}
     )
     assert wires == {"a": [], "b": ["a"]}

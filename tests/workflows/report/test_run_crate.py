@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from neusee.workflows.report import run_crate
-from neusee.workflows.report import run_crate as crate_sources
 from neusee.workflows.report.run_crate import (
     CRATE,
     CREATOR,
@@ -112,7 +111,7 @@ def test_every_sample_that_ships_has_a_licence():
         for path in SAMPLES.iterdir()
         if path.suffix in (".jpg", ".exr", ".png", ".safetensors")
     }
-    assert shipped <= crate_sources._samples().keys()
+    assert shipped <= run_crate._samples().keys()
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,6 @@ from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report import run_folder, run_page, run_pictures, run_summary
-from neusee.workflows.report import run_folder as run_html
-from neusee.workflows.report import run_page as run_timing
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
@@ -185,7 +183,7 @@ def test_every_table_scrolls_within_its_box(done):
 def test_sentences_have_room_beside_wide_columns_and_show_no_backticks(done):
     doc = {**done.document, "readings": [{"name": "a", "value": "b", "state": "c", "matter": "of `d`", "number": "C1",
                                           "reason": "`e` < f"}]}  # fmt: skip
-    text = run_html.page(doc, {})
+    text = run_folder.page(doc, {})
     assert '<th class="why">contradiction in the paper</th><th class="why">why</th>' in text
     assert re.search(r"\.why \{ min-width: \d+rem; \}", text)
     assert "<td>of <code>d</code> (C1)</td><td><code>e</code> &lt; f</td>" in text
@@ -217,7 +215,7 @@ def test_a_reason_and_a_check_share_a_column_that_wraps(done):
         "why": "changes at most 0",
         "checks": [{"text": "a < b", "ok": True}],
     }
-    text = run_html.page({**done.document, "steps": [step]}, {})
+    text = run_folder.page({**done.document, "steps": [step]}, {})
     assert (
         '<td class="check"><span class="soft">changes at most 0</span>; <span>a &lt; b</span></td>'
         in text
@@ -227,7 +225,7 @@ def test_a_reason_and_a_check_share_a_column_that_wraps(done):
 
 def test_a_short_time_is_not_shown_as_none(done):
     steps = [{**done.document["steps"][0], "made_in": seconds} for seconds in (0.0004, 0.0006, 0.0)]
-    text = run_html.page({**done.document, "steps": steps}, {})
+    text = run_folder.page({**done.document, "steps": steps}, {})
     cells = re.findall(r"</td><td class=\"n\">(&lt; 0.001|[\d.]+)(?:<br>.*?)?</td><td>2 DN", text)
     assert cells == ["&lt; 0.001", "0.001", "0.000"]
 
@@ -317,7 +315,7 @@ def test_a_missed_number_and_a_failed_check_stand_first(tmp_path):
 def test_the_page_can_be_written_again_from_what_is_stored(done):
     before = done.page.read_bytes()
     done.page.unlink()
-    assert run_html.rebuild(done.folder).read_bytes() == before
+    assert run_folder.rebuild(done.folder).read_bytes() == before
 
 
 def test_a_second_run_reads_the_same_numbers_and_says_where_they_come_from(done, tmp_path):
@@ -376,13 +374,13 @@ def test_time_is_added_up_with_each_key_once():
         row("e", "run", 2.0, began=0.75, kept=False),
         row("twin of e", "cached", 2.0, key="e"),
     ]
-    found = run_timing.timing(rows, planned=2.5)
+    found = run_page.timing(rows, planned=2.5)
     assert (found["ran"], found["served"], found["steps"], found["told"]) == (2, 4, 7, 1)
     assert (found["seconds"], found["span"], found["planned"]) == (3.0, 2.25, 2.5)
     assert (found["predicted"], found["actual"]) == (1.5, 1.0)
     assert (found["saved"], found["share"]) == (8.0, 8 / 11)
     assert (found["read"], found["written"]) == (400, 1000)
-    assert run_timing.said_of(found) == [
+    assert run_page.said_of(found) == [
         "2 of 7 steps ran: 3 s of computing time.",
         "Predicted for the 1 whose time was no guess: 1.5 s; actual: 1 s.",
         "Planned duration, with parallel branches: 2.5 s; actual: 2.25 s.",
@@ -393,7 +391,7 @@ def test_time_is_added_up_with_each_key_once():
 
 def test_a_result_that_is_read_counts_before_the_same_one_asleep():
     rows = [row("a", "not needed", 3.0, key="k"), row("b", "cached", 3.0, key="k", bytes=70)]
-    found = run_timing.timing(rows)
+    found = run_page.timing(rows)
     assert (found["read"], found["saved"], found["share"], found["planned"]) == (70, 3.0, 1.0, None)
 
 
@@ -427,7 +425,7 @@ def test_a_page_of_before_there_was_an_account_of_time_is_still_written(done):
     del doc["timing"]
     doc["steps"] = [{k: v for k, v in s.items() if k != "predicted"} for s in doc["steps"]]
     path.write_text(json.dumps(doc))
-    page = run_html.rebuild(done.folder)
+    page = run_folder.rebuild(done.folder)
     assert "Time" in page.read_text()
     (entry,) = [
         e
@@ -444,7 +442,7 @@ def test_the_page_shows_what_each_step_was_expected_to_take(done):
     )
     doc = dict(done.document)
     doc["steps"] = [{**s, "predicted": 1.25} for s in doc["steps"]]
-    assert run_html.page(doc, {}).count("1.250 expected</span>") == 2
+    assert run_folder.page(doc, {}).count("1.250 expected</span>") == 2
 
 
 def test_every_row_of_the_page_has_a_cell_for_each_column(done):

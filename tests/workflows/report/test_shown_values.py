@@ -15,11 +15,11 @@ from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.report import run_pictures as shown_values
+from neusee.workflows.report import run_pictures
 from neusee.workflows.report.run_folder import NotWritten
 from neusee.workflows.report.run_pictures import in_turn
 from neusee.workflows.simulation import simulate_recipe
-from neusee.workflows.simulation.simulate_recipe import simulate
+from neusee.workflows.simulation.simulate_recipe import RunOptions, simulate
 from neusee.workflows.store.result_store import Store
 
 MB = 10**6
@@ -79,13 +79,13 @@ def test_every_group_gets_its_values_and_no_value_outlives_its_last_group(made):
 @pytest.fixture
 def asked(monkeypatch):
     """The steps of each run that the values asked for."""
-    steps, real = [], shown_values.run
+    steps, real = [], run_pictures.run
 
     def counted(known, store, names, **options):
         steps.append(list(names))
         return real(known, store, names, **options)
 
-    monkeypatch.setattr(shown_values, "run", counted)
+    monkeypatch.setattr(run_pictures, "run", counted)
     return steps
 
 
@@ -132,7 +132,11 @@ def test_a_report_that_takes_more_than_the_limit_is_stopped_and_leaves_no_folder
         NotWritten, match=r"the report was stopped, .*: the process holds .* the limit is "
     ):
         simulate(
-            recipe(), Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run"], memory=limit
+            recipe(),
+            Store(tmp_path / "cache"),
+            tmp_path / "runs",
+            ["neusee", "run"],
+            RunOptions(memory=limit),
         )
     assert list((tmp_path / "runs").glob("*")) == []
     assert run(recipe(), Store(tmp_path / "cache")).done["out"].state == "cached"

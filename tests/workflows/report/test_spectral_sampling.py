@@ -7,8 +7,7 @@ import pytest
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.wanted_steps import wanted
-from neusee.workflows.report import run_folder as run_html
-from neusee.workflows.report import run_page
+from neusee.workflows.report import run_folder, run_page
 from neusee.workflows.report.console import closing
 from neusee.workflows.report.tolerance_spent import spectral_error
 from neusee.workflows.store.result_store import Store
@@ -48,7 +47,7 @@ def test_an_error_larger_than_the_tolerance_is_a_warning(store):
         " the PSF" in line
     )
     assert "larger than the tolerance 0.001, which is relative to the bands of the recipe" in line
-    assert "This error is larger than the tolerance of 0.001" in run_html.page(doc, {})
+    assert "This error is larger than the tolerance of 0.001" in run_folder.page(doc, {})
     rows = {(step, index): number for step, _, index, number in doc["metrics"]}
     assert max(rows["spectral", i] for i in range(3)) == errors["of the PSF of a white point"]
     assert rows["outside[mask]", 0] > rows["outside[plain]", 0] > 0
@@ -63,7 +62,7 @@ def test_a_smaller_error_is_a_number_beside_the_tolerance(store):
     line = next(line for line in closing(doc, "report.html", []) if line.startswith("bands"))
     assert "LOOK" not in line
     assert "tolerance 5, which is relative to the bands" in line
-    assert "larger than the tolerance" not in run_html.page(doc, {})
+    assert "larger than the tolerance" not in run_folder.page(doc, {})
 
 
 def test_a_recipe_without_these_steps_says_nothing():

@@ -9,9 +9,9 @@ import pytest
 from neusee.workflows.report.study_report import (
     Marked,
     Section,
+    cell_text,
     marked_column,
     page,
-    said,
     with_uncertainty,
 )
 
@@ -104,7 +104,7 @@ def test_every_ink_is_read_on_its_ground_in_light_and_in_dark():
     ("value", "text"), [(3, "3"), (True, "yes"), (2.0, "2"), (1e-9, "1e-09"), ("a", "a")]
 )
 def test_what_a_cell_says(value, text):
-    assert said(value) == text
+    assert cell_text(value) == text
 
 
 def test_words_between_backticks_are_code_and_a_sign_stays_beside_its_word():

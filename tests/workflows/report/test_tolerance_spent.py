@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
-from neusee.workflows.report import run_folder as run_html
+from neusee.workflows.report import run_folder
 from neusee.workflows.report.tolerance_spent import said_of_errors, spent
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
@@ -198,7 +198,7 @@ def test_the_page_says_it(recipe, warm, tmp_path):
     assert max(doc["spent"]["bounds"].values()) <= recipe.tolerance
     whole = simulate(replace(recipe, exact=True), warm, tmp_path / "runs", ["neusee"])
     assert "every step was computed in full" in whole.page.read_text()
-    assert "measured beside --exact" in run_html.page(
+    assert "measured beside --exact" in run_folder.page(
         {**doc, "spent": spent(run(recipe, warm))}, {}
     )
 

@@ -11,8 +11,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 import neusee
-from neusee.nodes.restore._networks._convolutional_networks import NAFNet
-from neusee.nodes.restore._networks._restorer import start_network
+from neusee.nodes.restore import NAFNet, start_network
 from neusee.nodes.scene import grey
 from neusee.nodes.scene._exr import exr_parts
 from neusee.workflows import Store, load

@@ -141,7 +141,7 @@ def test_joint_draws_are_taken_whole(tmp_path):
             "transfer", f"posterior={tmp_path / 'draws.npz'}", "sensor.offset=normal(390 e-, 1 e-)"
         )
     )
-    assert inputs.most == 200
+    assert inputs.most_draws == 200
     found = inputs.independent(200, 3).values[:, 1:]
     rows = np.stack([1 / draws["gain [e-/DN]"], draws["read_noise"]], 1)
     assert (found[np.argsort(found[:, 0])] == rows[np.argsort(rows[:, 0])]).all()
@@ -558,7 +558,7 @@ def test_rows_of_a_table_outside_the_allowed_values_are_refused_or_left_out(tmp_
     rows[7, 0] = -1.0
     np.savez(tmp_path / "one.npz", **{"read_noise": rows[:, 0], "quantum_efficiency": rows[:, 1]})
     inputs = Inputs.of(small("transfer", f"posterior={tmp_path / 'one.npz'}"), negligible=1e-3)
-    assert inputs.most == 1999
+    assert inputs.most_draws == 1999
     assert "1 of its 2000 rows lie outside" in inputs.notes["sensor.read_noise"]
     rows[:20, 0] = -1.0
     np.savez(tmp_path / "many.npz", **{"read_noise": rows[:, 0], "quantum_efficiency": rows[:, 1]})

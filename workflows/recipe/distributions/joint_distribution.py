@@ -440,12 +440,10 @@ def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Poste
             for name, column in columns.items()
         ]
     lengths = {len(column) for column in draws}
-    if len(lengths) != 1:
-        raise ValueError(
-            "the values have different numbers of draws"
-            if lengths
-            else "the file contains no draws"
-        )
+    if not lengths:
+        raise ValueError("the file contains no draws")
+    if len(lengths) > 1:
+        raise ValueError("the values have different numbers of draws")
     joint = Joint.of_draws(tuple(columns), np.stack(draws, 1))
     return Posterior(
         joint, units={name: GAIN_UNIT if unit == "e-/DN" else unit for name, unit in units.items()}

@@ -306,17 +306,19 @@ def _empirical(text: str, arguments: Sequence[str], folder: Path, mark: Location
             raise ValueError(f"{path.name} gives the unit {unit} of {name}: remove the unit here")
         scale, unit = _unit(options["unit"])
         samples = samples * scale
-    # raises for a unit that no recipe has; e-/DN is none of a recipe
-    if unit and unit != "e-/DN":
-        _unit(unit)
-    require_samples(samples, f"{path.name}, column {name}" if name else path.name)
-    shape = Discrete.of(samples, np.full(len(samples), 1.0 / len(samples)))
+    # a recipe has no e-/DN; any other unit that a recipe does not have raises
     reciprocal = unit == "e-/DN"
+    if unit and not reciprocal:
+        _unit(unit)
+    place = f"{path.name}, column {name}" if name else path.name
+    require_samples(samples, place)
+    shape = Discrete.of(samples, np.full(len(samples), 1.0 / len(samples)))
+    unit_of_law = "DN/e-" if reciprocal else unit
     return Law(
         kind="empirical",
         text=text,
         shape=shape,
-        unit="DN/e-" if reciprocal else unit,
+        unit=unit_of_law,
         reciprocal=reciprocal,
         file=path,
         written_path=arguments[0],

@@ -449,6 +449,6 @@ def _rounded(value: float, unit: str) -> str:
     return f"{value:.6g} {unit}".rstrip()
 
 
-def told(standings: Sequence[Standing]) -> list[dict[str, Any]]:
+def standing_rows(standings: Sequence[Standing]) -> list[dict[str, Any]]:
     """Return comparisons of recipe values with their posteriors as data for JSON."""
     return [{**asdict(standing), "far": standing.far} for standing in standings]

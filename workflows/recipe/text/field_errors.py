@@ -17,7 +17,7 @@ from neusee.workflows.recipe.text.yaml_values import Value
 _LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
 
-_LONG = 1e9  #: limit from which a number is told by its power of ten
+_LONG_NUMBER = 1e9  #: limit from which a number is told by its power of ten
 
 
 def message_of(error: ErrorDetails, value: Value) -> str:
@@ -70,7 +70,7 @@ def _limit_in_unit(error: ErrorDetails, value: Value) -> str:
         return ""
     limit = error["ctx"][name]
     if not isinstance(value.data, str):
-        return f"must be {_LIMITS[name]} {limit:g}" if abs(limit) > _LONG else ""
+        return f"must be {_LIMITS[name]} {limit:g}" if abs(limit) > _LONG_NUMBER else ""
     try:
         _, unit, _ = read_written(value.data)
     except ValueError:

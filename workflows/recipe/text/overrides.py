@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, shortened
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text.other_spellings import advice_on_argument, instead
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, parse
@@ -22,7 +22,7 @@ from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, parse
 
 
 #: recipe keys that are not blocks of parameters
-_WHOLE = {
+_OTHER_KEYS = {
     "steps",
     "seed",
     "tolerance",
@@ -33,7 +33,7 @@ _WHOLE = {
     "posterior",
     "nodes",
 }
-RESERVED = frozenset(_WHOLE | {"safety", "traceability"})
+RESERVED = frozenset(_OTHER_KEYS | {"safety", "traceability"})
 #: keys below which an override may set a missing path
 _OPEN = ("expect", "posterior", "safety", "traceability")
 
@@ -269,7 +269,7 @@ def arguments_in(value: Value) -> Iterator[Location]:
 
 
 _ALLOWED = "give a number, a string, True or False, None, a list or a mapping"
-_LONGEST = 40  #: largest number of characters of a value in a message
+_MOST_CHARACTERS = 40  #: largest number of characters of a value in a message
 
 
 def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
@@ -319,8 +319,9 @@ def _named(key: str, argument: Any, mark: Location) -> Override:
                 )
             ]
         )
+    argument = key if key.startswith("~") else f"{key}=null"
     try:
-        return read_override(key if key.startswith("~") else f"{key}=null", mark)
+        return read_override(argument, mark)
     except RecipeError as error:
         raise RecipeError([Diagnostic(mark, key, p.message) for p in error.diagnostics]) from None
 
@@ -335,8 +336,7 @@ def _override(named: Override, path: tuple[str, ...], argument: Any) -> Override
     name = ".".join(path)
     mark = named.mark if path == named.path else replace(named.mark, file=f"argument {name}")
     value = _value(argument, mark, path)
-    value_text = flow(value.plain)
-    value_text = value_text if len(value_text) <= _LONGEST else value_text[: _LONGEST - 1] + "…"
+    value_text = shortened(flow(value.plain), _MOST_CHARACTERS)
     return Override(f"{named.sign}{name}={value_text}", named.sign, path, value, mark)
 
 

@@ -109,9 +109,11 @@ def option_file(group: str, option: str, folders: tuple[Path, ...]) -> Path | No
     """Return the first file of an option in ``folders``, or None."""
     if not NAME.fullmatch(group) or not NAME.fullmatch(option):
         return None
-    return next(
-        (path for folder in folders if (path := folder / group / f"{option}.yaml").is_file()), None
-    )
+    for folder in folders:
+        path = folder / group / f"{option}.yaml"
+        if path.is_file():
+            return path
+    return None
 
 
 # --- recipes by name ------------------------------------------------------------------------------

@@ -274,10 +274,10 @@ _LACKS_SPACE = re.compile(r"[\w.-]+:\S.*")
 _PROPERTIES = re.compile(r"(?:[&!]\S*\s+)*(?:[&!]\S*)?")  #: anchor and tag before a value
 _NULLS = ("", "~", "null", "Null", "NULL")
 _BOOLEANS = ("true", "True", "TRUE", "false", "False", "FALSE")
-_MOST = 1_000_000  #: largest number of values in one file
-_LARGEST = 4_000_000  #: bytes of one file; 20 000 steps take about half of them
+_MOST_VALUES = 1_000_000  #: largest number of values in one file
+_MOST_BYTES = 4_000_000  #: bytes of one file; 20 000 steps take about half of them
 _DIGITS = 400  #: of a whole number, at most
-_MOST_ALIASED = 100_000  #: largest number of values from aliases in one file
+_MOST_ALIASED_VALUES = 100_000  #: largest number of values from aliases in one file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -386,13 +386,13 @@ def read(path: Path, shown: str) -> Document:
     try:
         with opened(path) as file:
             size = os.fstat(file.fileno()).st_size
-            if size > _LARGEST:
+            if size > _MOST_BYTES:
                 message = (
-                    f"the file has {size} bytes, more than the limit of {_LARGEST}: split the"
+                    f"the file has {size} bytes, more than the limit of {_MOST_BYTES}: split the"
                     " recipe into groups"
                 )
                 raise RecipeError([Diagnostic(Location(shown), "", message)])
-            text = file.read(_LARGEST).decode("utf-8-sig")
+            text = file.read(_MOST_BYTES).decode("utf-8-sig")
     except NotRegular as error:
         raise RecipeError([Diagnostic(Location(shown), "", str(error))]) from None
     except UnicodeDecodeError as error:
@@ -420,8 +420,13 @@ def _document(text: str, shown: str, folder: str) -> Document:
     line = package_line(text)
     if line is not None:
         raise RecipeError([Diagnostic(Location(shown, line + 1, 1), "", ADVICE_ON_HEADER)])
-    first_line = text.lstrip().partition("\n")[0].strip()
-    return Document(root, visible(first_line.lstrip("# ")) if first_line.startswith("#") else "")
+    return Document(root, title_of(text.lstrip()))
+
+
+def title_of(text: str) -> str:
+    """Return the title of a recipe: its first line without ``#``; empty if that is no comment."""
+    first_line = text.partition("\n")[0].strip()
+    return visible(first_line.lstrip("# ")) if first_line.startswith("#") else ""
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
@@ -488,12 +493,12 @@ class _Builder:
 
     def value(self, node: Node, path: Where, key: Location) -> Value:
         mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
-        if tag not in _KNOWN:
+        if tag not in _KNOWN_TAGS:
             return self._refuse(mark, path, f"unknown YAML tag {tag}: remove the tag")
         # an alias is the same node again
         if id(node) in self.built:
             self.aliased += self.size[id(node)]
-            self._refuse_many(self.aliased, _MOST_ALIASED, mark, path)
+            self._refuse_many(self.aliased, _MOST_ALIASED_VALUES, mark, path)
             return replace(_moved(self.built[id(node)], path), key=key)
         if id(node) in self.open:
             message = "a YAML alias refers to the value that contains the alias"
@@ -615,7 +620,7 @@ class _Builder:
         is_mapping = isinstance(node, MappingNode)
         children = list(chain.from_iterable(node.value)) if is_mapping else node.value
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
-        self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
+        self._refuse_many(self.size[id(node)], _MOST_VALUES, value.mark, value.path)
 
     def _refuse_many(self, count: int, limit: int, mark: Location, path: Where) -> None:
         """Raise `RecipeError` if a value has more values than a limit."""
@@ -655,7 +660,7 @@ def _moved(value: Value, path: Where) -> Value:
     return replace(value, data=data, path=path)
 
 
-_KNOWN = {
+_KNOWN_TAGS = {
     f"!!{name}"
     for name in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp", "merge", "value")
 }

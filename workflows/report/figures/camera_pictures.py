@@ -233,7 +233,7 @@ BRIGHT = 1.5  #: times white, which nothing that is lit by the light of the scen
 _LEVEL = 0.95  #: of the quantile of Student's t that ends an interval of 90 %
 #: degrees of freedom of a draw, whose errors are averaged over 7 x 7 pixels and alike in a few of
 #: them
-_EACH = 4
+_FREEDOM_OF_A_DRAW = 4
 
 
 def half_width(spread: Tensor, draws: int) -> Tensor:
@@ -242,7 +242,7 @@ def half_width(spread: Tensor, draws: int) -> Tensor:
     """
     from scipy.stats import t
 
-    return spread * float(t.ppf(_LEVEL, _EACH * draws))
+    return spread * float(t.ppf(_LEVEL, _FREEDOM_OF_A_DRAW * draws))
 
 
 def unexplained(restored: Tensor, half: Tensor, invented: Tensor) -> Tensor:

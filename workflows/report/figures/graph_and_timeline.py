@@ -226,11 +226,11 @@ Row = tuple[str, str, float, float]  #: step, device, start in s since the run b
 Spans = Mapping[str, tuple[str, float, float]]  #: device, start in s and duration in s of each step
 
 _COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#8C6D1F", "#6A51A3", "#5F6B6D")
-_MOST = 80  #: largest number of rows of steps; only the longest steps have a row
+_MOST_ROWS = 80  #: largest number of rows of steps; only the longest steps have a row
 _MEASURED = 5  #: texts of the names and of the times that are measured to find the widest
 #: inches beside the names and times, above and below the axes
 _ASIDE, _ABOVE, _BELOW = 0.15, 0.56, 0.46
-_MOST_BESIDE = 0.5  #: share of the width for names; longer ones make the picture wider
+_LARGEST_NAME_SHARE = 0.5  #: share of the width for names; longer ones make the picture wider
 _BETWEEN = 0.06  #: space between the axes, as a share of their mean height
 #: heights in inches of the row of a step and of the row of a device
 _STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3
@@ -297,7 +297,7 @@ def _shown(plan: Spans, ran: Spans) -> list[str]:
         {**plan, **ran},
         key=lambda s: -max(plan.get(s, ("", 0, 0))[2], ran.get(s, ("", 0, 0))[2]),
     )
-    return sorted(longest[:_MOST], key=lambda s: (ran.get(s) or plan[s])[1])
+    return sorted(longest[:_MOST_ROWS], key=lambda s: (ran.get(s) or plan[s])[1])
 
 
 def _lanes(ax: Any, chart: _Chart) -> None:
@@ -374,7 +374,7 @@ def _place(figure: Any, names: Sequence[str]) -> None:
         for texts in (labels, times)
     )
     sides = {
-        "left": min((name_width + _ASIDE) / width, _MOST_BESIDE),
+        "left": min((name_width + _ASIDE) / width, _LARGEST_NAME_SHARE),
         "right": 1 - (time_width + _ASIDE) / width,
     }
     figure.subplots_adjust(

@@ -161,7 +161,8 @@ def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = Non
     """Draw the laser suppression ratio (LSR) over wavelength with its lower bound, and beside it
     the BSR if given.
     """
-    figure, axes = canvas(11.0 if bsr is not None else 6.4, 4.2, 1, 2 if bsr is not None else 1)
+    width, columns = (6.4, 1) if bsr is None else (11.0, 2)
+    figure, axes = canvas(width, 4.2, 1, columns)
     wavelengths_nm, lsr_axis = nanometres(bands.centres), axes[0, 0]
     _unsuppressed(lsr_axis)
     lsr_axis.semilogy(

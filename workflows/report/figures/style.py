@@ -185,18 +185,18 @@ _OFFSETS = (
     (-16, -21),
 )
 _MARKER = 12  #: pixels, the side of the square that the marker of a point takes
-_APART = 3  #: pixels between two labels side by side
+_LABEL_GAP = 3  #: pixels between two labels side by side
 _FRAME = {
     "boxstyle": "round,pad=0.15",
     "facecolor": "white",
     "edgecolor": "black",
     "linewidth": 0.8,
 }
-_FEW = 2.5  #: decades of an axis with numbers between the powers of ten
+_MOST_DECADES = 2.5  #: decades of an axis with numbers between the powers of ten
 #: numbers of a decade, and their least distance in decades
 _SUBS = (((1.0, 2.0, 5.0), 0.3), ((1.0, 3.0), 0.47))
 _POINTS = 9.0  #: size of the numbers of an axis
-_SHORT = 0.85  #: share of the length of an axis that is left after the layout
+_AXIS_SHARE = 0.85  #: share of the length of an axis that is left after the layout
 
 
 class PointLabel(NamedTuple):
@@ -264,7 +264,7 @@ def _place(ax: Any, point: PointLabel, taken: list[Any], renderer: Any, framed: 
         text = ax.annotate(point.text, (point.x, point.y), **placement, fontsize=9, **style)
         text.set_in_layout(False)
         box = text.get_window_extent(renderer)
-        padded = box.padded(_APART, _APART * framed)
+        padded = box.padded(_LABEL_GAP, _LABEL_GAP * framed)
         if _contains(inside, box) and not any(padded.overlaps(other) for other in taken):
             taken.append(box)
             return
@@ -293,14 +293,11 @@ def plain_ticks(axis: Any) -> None:
     ticks_that_fit = [
         subs
         for subs, gap in _SUBS
-        if decades <= _FEW and gap * axis_length / decades > label_length
+        if decades <= _MOST_DECADES and gap * axis_length / decades > label_length
     ]
-    axis.set_major_locator(
-        LogLocator(
-            subs=ticks_that_fit[0] if ticks_that_fit else (1.0,),
-            numticks=max(2, int(axis_length / label_length)),
-        )
-    )
+    ticks = ticks_that_fit[0] if ticks_that_fit else (1.0,)
+    tick_count = max(2, int(axis_length / label_length))
+    axis.set_major_locator(LogLocator(subs=ticks, numticks=tick_count))
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -309,7 +306,7 @@ def _length(axis: Any) -> float:
     """Return the length of an axis in points before the layout is known, on the short side."""
     box = axis.axes.get_window_extent()
     pixels = box.width if axis.axis_name == "x" else box.height
-    return float(_SHORT * pixels * 72 / axis.figure.dpi)
+    return float(_AXIS_SHARE * pixels * 72 / axis.figure.dpi)
 
 
 def _label_size(axis: Any, low: float, high: float) -> float:

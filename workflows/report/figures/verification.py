@@ -29,7 +29,7 @@ from neusee.workflows.report.figures.style import (
 # float32.
 
 
-_LEAST = 1e-17  #: an error of zero has no place on a logarithmic axis
+_LEAST_ERROR = 1e-17  #: an error of zero has no place on a logarithmic axis
 STRENGTHS = (0.0, 1.0, 1e3, 1e6)  #: peak of the laser divided by the white of the scene
 METHODS = ("shifted PSF, added", "scene and laser\nin one convolution")
 
@@ -51,7 +51,7 @@ def error_time(*, rows: Sequence[tuple[str, str, float, float]]) -> Any:
         ax.loglog(
             # a row: property, new value, error, seconds
             [r[3] * 1e3 for r in rows_of_line],
-            [max(r[2], _LEAST) for r in rows_of_line],
+            [max(r[2], _LEAST_ERROR) for r in rows_of_line],
             "o",
             color=colour,
             label=line,
@@ -64,7 +64,7 @@ def error_time(*, rows: Sequence[tuple[str, str, float, float]]) -> Any:
         figure,
         {
             ax: [
-                PointLabel(1e3 * seconds, max(error, _LEAST), text, BLACK)
+                PointLabel(1e3 * seconds, max(error, _LEAST_ERROR), text, BLACK)
                 for _, text, error, seconds in rows
                 if text
             ]
