@@ -455,7 +455,7 @@ def sweep(
     with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
         # many points make garbage, which the program otherwise never searches
         search_for_garbage()
-        options = lazy.sweep_screen.SweepOptions(
+        options = lazy.sweep_screen.SweepCommandOptions(
             zip=paired,
             on_error=error_policy,
             netcdf=netcdf,

@@ -44,7 +44,7 @@ _USUAL = {"on-error": "stop", "device": "cpu", "out": Path("runs")}
 
 
 @dataclass(frozen=True)
-class SweepOptions:
+class SweepCommandOptions:
     """The options of ``neusee sweep``."""
 
     zip: bool = False  #: pair the values of the axes in place of combining them
@@ -76,7 +76,7 @@ def run_sweep(
     recipe: str,
     words: Sequence[str],
     store: Store,
-    options: SweepOptions = SweepOptions(),
+    options: SweepCommandOptions = SweepCommandOptions(),
     first: int = 2,
 ) -> int:
     """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of

@@ -156,7 +156,8 @@ def test_statistics_of_two_pixels_are_those_of_their_closed_form(size, cut):
     """The cut-off itself counts; the median of an even number is the lower one; 1 of 100 is
     below `low`.
     """
-    found = mtf(two_pixels(0.6, size, clear=math.pi * (cut + 1e-9) ** 2 / 4))
+    psf = two_pixels(0.6, size)._replace(cut_off=torch.tensor([cut], dtype=torch.float64))
+    found = mtf(psf)
     exact = contrasts(0.6, size, cut)
     assert float(found.rms) == pytest.approx(
         math.sqrt(sum(x**2 for x in exact) / len(exact)), rel=1e-9

@@ -4,6 +4,7 @@ with neusee.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -178,18 +179,23 @@ FURTHER = {
 STEADY = 1e4 * 10**4.5  #: W/m2, the geometric middle of 10 to 100 kW/cm2
 
 
-@pytest.fixture(scope="module", params=SITUATIONS)
+@pytest.fixture(params=SITUATIONS)
 def worked(request):
     """The situation, and what neusee says behind the plain lens, without the mask, which takes
     time.
     """
+    return worked_situation(request.param)
+
+
+@functools.cache
+def worked_situation(name):
     recipe = load(
-        request.param,
+        name,
         ["safety.protection.mask=null", "safety.draws=100", "optics.samples=512", *FOCUSED],
     )
     said = document(estimate(recipe))
     plain = [each for each in said["limits"] if each["protection"] == "plain lens"]
-    return request.param, SITUATIONS[request.param], said, plain
+    return name, SITUATIONS[name], said, plain
 
 
 def rows_of(plain):

@@ -2,6 +2,7 @@
 inputs by other means.
 """
 
+import functools
 import html
 import math
 import re
@@ -43,14 +44,24 @@ KNOWN = {
 }
 
 
-@pytest.fixture(scope="module", params=SHEETS)
-def sheet(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def sheet_of(tmp_path_factory):
+    """A function that makes the sheet of a name once for all tests."""
+    return functools.cache(lambda name: made_sheet(name, Store(tmp_path_factory.mktemp("store"))))
+
+
+@pytest.fixture(params=SHEETS)
+def sheet(request, sheet_of):
     """The estimate, the text of its worksheet, and its lines: value and numbers by symbol."""
-    recipe, changes = SHEETS[request.param]
+    return sheet_of(request.param)
+
+
+def made_sheet(name, store):
+    recipe, changes = SHEETS[name]
     with pytest.MonkeyPatch.context() as patch:
-        if request.param not in HELPED:
+        if name not in HELPED:
             patch.setattr(safety_estimate, "remedies", lambda *_: ())
-        found = estimate(load(recipe, [*FEW, *changes]), Store(tmp_path_factory.mktemp("store")))
+        found = estimate(load(recipe, [*FEW, *changes]), store)
     text = worksheet_page(found)
     lines = {}
     for symbol, row in ROW.findall(text):

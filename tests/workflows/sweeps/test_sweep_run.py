@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from neusee.workflows import load
-from neusee.workflows.cli.sweep_screen import SweepOptions, run_sweep
+from neusee.workflows.cli.sweep_screen import SweepCommandOptions, run_sweep
 from neusee.workflows.engine import local_executor
 from neusee.workflows.graph.errors import RecipeError, RunError
 from neusee.workflows.store.result_store import Store
@@ -71,7 +71,7 @@ def command(recipe, store, tmp_path, capsys):
     """Run the command and give its exit code, its folder and what it printed."""
 
     def command(*words, **values):
-        options = SweepOptions(out=tmp_path / "runs", **values)
+        options = SweepCommandOptions(out=tmp_path / "runs", **values)
         code = run_sweep(recipe, words or WORDS, store, options)
         return code, tmp_path / "runs/sweeps/latest", capsys.readouterr().out
 
@@ -208,7 +208,7 @@ def test_netcdf_without_its_packages_is_refused_before_anything_runs(
     recipe, store, nodes, monkeypatch
 ):
     monkeypatch.setattr(sweep_files, "_PACKAGES", ("xarray", "no_such_package"))
-    told = refused(lambda: run_sweep(recipe, WORDS, store, SweepOptions(netcdf=True)))
+    told = refused(lambda: run_sweep(recipe, WORDS, store, SweepCommandOptions(netcdf=True)))
     assert told == ['--netcdf |  | needs no_such_package: pip install "neusee[xarray]"']
     assert nodes.CALLS == []
 
@@ -368,7 +368,7 @@ def test_a_command_with_workers_that_is_interrupted_keeps_what_is_done(command, 
 def test_a_cache_that_cannot_be_written_is_said_once_by_all_workers(recipe, tmp_path, capsys):
     (tmp_path / "cache").write_text("no folder")
     store = Store(tmp_path / "cache")
-    options = SweepOptions(out=tmp_path / "runs", workers=2)
+    options = SweepCommandOptions(out=tmp_path / "runs", workers=2)
     with pytest.warns(UserWarning, match="cannot be written") as told:
         code = run_sweep(recipe, WORDS, store, options)
     assert code == 0
@@ -436,7 +436,7 @@ def test_quiet_says_where_the_table_is_and_nothing_else(command):
 
 def test_quiet_says_on_stderr_what_failed(recipe, store, tmp_path, capsys):
     words = ["sensor.read_noise=1 e-,2 e-", "sensor.most=1.5"]
-    options = SweepOptions(out=tmp_path / "runs", quiet=True)
+    options = SweepCommandOptions(out=tmp_path / "runs", quiet=True)
     assert run_sweep(recipe, words, store, options) == 1
     found = capsys.readouterr()
     assert found.out.splitlines() == [
@@ -453,7 +453,7 @@ def test_plain_lines_and_a_live_table_show_the_same_points(
         monkeypatch.setattr(sys.stdout, "isatty", lambda: tty, raising=False)
         monkeypatch.setenv("COLUMNS", "200")
         words = ["sensor.read_noise=1 e-,2 e-"]
-        run_sweep(recipe, words, store, SweepOptions(out=tmp_path / "runs"))
+        run_sweep(recipe, words, store, SweepCommandOptions(out=tmp_path / "runs"))
         return capsys.readouterr().out
 
     for out in (shown(False), shown(True)):
