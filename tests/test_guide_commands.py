@@ -135,6 +135,7 @@ def carry_out(words: str, place: Path, monkeypatch) -> None:
         with pytest.raises(SystemExit) as end:
             app.main([*arguments, *(["--out", str(shown_by(own, place))] if asked else [])])
         assert end.value.code == (found.code if found else 0)
+    return None
 
 
 def no_picture(place: Path, file: Path, **_) -> None:

@@ -113,6 +113,7 @@ def main() -> None:
     for name in args.names or CLAIMS:
         print(name, flush=True)
         write({name: section(name, CLAIMS[name](args.turns))})
+    return None
 
 
 def write(new: Mapping[str, str]) -> None:

@@ -91,8 +91,7 @@ def by_hand(case: Case) -> dict[str, tuple[float, float]]:
     peak = PASSING * through * (math.pi * DIAMETER**2 / 4) / (wavelength * FOCAL) ** 2
     peak *= 2 / x * math.tanh(x / 2) * 1e-4  # of 1 W or 1 J, in 1/cm2
     if case.power:
-        light = {"mean": (case.power * peak, fluence_by_hand(case.dwell) / case.dwell)}
-        return light
+        return {"mean": (case.power * peak, fluence_by_hand(case.dwell) / case.dwell)}
     seconds = min(case.duration, case.dwell)
     share = seconds / case.duration
     fluence, rate = case.energy * peak, max(case.rate, 1 / case.dwell)

@@ -277,6 +277,7 @@ def say_folder(folder: Path, as_json: bool, *further: str) -> None:
     for name in files:
         document |= json.loads(text_of(folder / name))
     say_json(document)
+    return None
 
 
 def print_warning(message: Warning | str, *where: object, **details: object) -> None:

@@ -115,6 +115,7 @@ def train(
     if rank == 0:
         lines = [] if silent else _next(folder, stage)
         _say_results(folder, as_json, lines)
+    return None
 
 
 def _refuse_stage(recipe: Recipe, stage: Stages) -> None:
@@ -137,6 +138,7 @@ def _say_results(folder: Path, as_json: bool, lines: list[str]) -> None:
     document_files = (folder / name for name in ("mask.json", "training.json"))
     documents = {path.stem: json.loads(text_of(path)) for path in document_files if path.is_file()}
     say_json({"folder": str(folder), **documents})
+    return None
 
 
 def _lift(

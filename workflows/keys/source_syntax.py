@@ -103,6 +103,7 @@ class Syntax:
                     self._visit(child, scope)
                 else:
                     self._words.append(_word(child))
+        return None
 
     def _scope_inside(self, item: ast.AST, scope: Scope) -> Scope:
         """Note a call or a join with the functions around it, and return those around its parts."""

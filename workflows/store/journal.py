@@ -208,13 +208,14 @@ class Journal:
         except FileNotFoundError:
             return self._rebuild()
         except OSError:
-            return
+            return None
         if not _HEAD.fullmatch(head):
             return self._rebuild()
         self._head, self._offset = head, start + len(new_bytes)
         self._rows += _parsed(new_bytes)
         if self._whole and len(self._rows) > _SPARE:
             self._drop_old_rows()
+        return None
 
     def _drop_old_rows(self) -> None:
         """Write the journal anew with the newest row of each key, if most rows are older ones."""

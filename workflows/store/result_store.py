@@ -464,6 +464,7 @@ class Store(Warned, Maintained):
         warnings.warn(
             f"the stored result {key} is damaged ({error}) and counts as missing", stacklevel=5
         )
+        return None
 
     def put_aside(self, key: str, error: Exception) -> None:
         """Move the files of a damaged result to ``bad/`` for inspection; a file of another user

@@ -55,14 +55,13 @@ def veiled(source=None, surfaces=ONE, shape=(96, 96), direction=None, **params):
 def scattered(surface, low, high):
     """Integrate a BSDF from one direction cosine to another, over the logarithm, by SciPy."""
     b0, l, s = (surface[name] for name in ("b0", "l", "s"))  # noqa: E741
-    total = quad(
+    return quad(
         lambda v: b0 * (1 + (math.exp(v) / l) ** 2) ** (s / 2) * math.exp(2 * v),
         math.log(low),
         math.log(high),
         epsrel=1e-10,
         limit=300,
     )[0]
-    return total
 
 
 def account(surfaces, side):

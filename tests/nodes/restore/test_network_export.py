@@ -46,8 +46,7 @@ def started(make):
 
 
 def own(network):
-    made = own_network(Architecture(network.__name__, network), None, 1).eval()
-    return made
+    return own_network(Architecture(network.__name__, network), None, 1).eval()
 
 
 def picture(y, x):

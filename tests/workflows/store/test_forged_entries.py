@@ -481,8 +481,7 @@ def attack(root, seed):
 
 
 def attacks(tmp_path, seeds):
-    wrong = [seed for seed in seeds if attack(tmp_path / f"cache{seed}", seed)]
-    return wrong
+    return [seed for seed in seeds if attack(tmp_path / f"cache{seed}", seed)]
 
 
 def rewrites_values(seed):

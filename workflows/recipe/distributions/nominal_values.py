@@ -189,7 +189,7 @@ class _Reader:
         each mistake.
         """
         if block.data is None:
-            return
+            return None
         items = block.items if isinstance(block.data, dict) else {"file": block}
         if unknown_values := [v for key, v in items.items() if key not in (*_KEYS, *_SUMMARY)]:
             return self._fail(
@@ -208,6 +208,7 @@ class _Reader:
         except ValueError as error:
             return self._fail(block.mark, KEY, str(error))
         self._apply(posterior, pairs, use, block.mark)
+        return None
 
     def _posterior(self, block: Value, items: Mapping[Any, Value]) -> Posterior:
         """Return the posterior that the block names.
