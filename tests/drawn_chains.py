@@ -9,11 +9,11 @@ from neusee.workflows.calibration.posterior_mixture import normalised
 ENSEMBLES, STEPS, WALKERS = 4, 250, 8
 
 
-def drawn_chains(problem, mode, file, *, seed, **how):
+def drawn_chains(problem, mode, file, sampling, *_):
     """Return weighted draws of the posterior as chains: independent, so that every check of
     chains holds.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(sampling.seed)
     samples, log = draw_samples(problem, mode, rng)
     at = rng.choice(len(samples), ENSEMBLES * STEPS * WALKERS, p=normalised(log))
     draws = samples[at].reshape(ENSEMBLES, STEPS, WALKERS, -1)

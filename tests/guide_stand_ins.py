@@ -193,7 +193,7 @@ FEW_POINTS = {
     "studies.work_precision:_CALLS": 1,
 }
 FEW_STOPS = {
-    "protection.protection_result:_RATIO": 0.5,
+    "protection.protection_result:_DIAMETER_RATIO": 0.5,
     "protection.protection_result:_MASK_STOPS": (1.0, 0.7),
 }
 

@@ -225,9 +225,13 @@ def fit_law(some):
     told = [
         x
         for x in some
-        if x["spread"] > law._PLAIN * x["ideal"] and x["lost"] > 0.004 and x["spread"] < 0.3
+        if x["spread"] > law._CLEAN_LENS_GROWTH * x["ideal"]
+        and x["lost"] > 0.004
+        and x["spread"] < 0.3
     ]
-    sizes = [math.sqrt(x["spread"] ** 2 - x["ideal"] ** 2) * x["side"] / law._SIDE for x in told]
+    sizes = [
+        math.sqrt(x["spread"] ** 2 - x["ideal"] ** 2) * x["side"] / law._SCATTER_SIDE for x in told
+    ]
     matrix = np.array(
         [[1.0, math.log(size), x["clip"]] for x, size in zip(told, sizes, strict=True)]
     )

@@ -93,8 +93,8 @@ def test_a_well_below_the_converter_moves_no_gain(tmp_path):
 def test_a_posterior_that_is_moved_away_from_its_levels_is_refused(tmp_path, monkeypatch):
     """As by a correction: every draw of the gain 10 % too large."""
 
-    def moved(problem, mode, file, **how):
-        chains = drawn_chains(problem, mode, file, **how)
+    def moved(problem, mode, file, *more):
+        chains = drawn_chains(problem, mode, file, *more)
         chains.draws[..., problem.names.index("gain")] += math.log(1.1)
         return chains
 

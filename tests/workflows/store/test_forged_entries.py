@@ -102,7 +102,7 @@ def heals(root, value):
 
 FORGED_TYPES = [
     "neusee.nodes._node:_imported",
-    "neusee.nodes._node:_found",
+    "neusee.nodes._node:_arguments",
     "neusee.nodes._node:importlib.import_module",
     "neusee.nodes.values:torch.hub.load",
     "neusee.nodes.values:Tensor",
@@ -608,7 +608,7 @@ def test_a_forged_entry_at_a_url_does_no_harm(tmp_path, monkeypatch, secret):
     fsspec = pytest.importorskip("fsspec")
     monkeypatch.setenv("NEUSEE_CACHE_SECRET", secret)
     for i, layout in enumerate(
-        (called("os:system"), {"new": 1}, {"tensor": 9}, called("neusee.nodes._node:_found"))
+        (called("os:system"), {"new": 1}, {"tensor": 9}, called("neusee.nodes._node:_arguments"))
     ):
         url = f"file://{tmp_path / str(i)}"
         RemoteStore(url, tmp_path / f"one{i}").put(KEY, STOP, ABOUT)
