@@ -240,7 +240,9 @@ def filtered(folder: Path) -> None:
     for name, height in masks.items():
         with torch.no_grad():
             psf = terms.psf(height)
-            kept = math.exp(-float(losses.contrast(psf, up_to=how.up_to)) / terms.count)
+            kept = math.exp(
+                -float(losses.contrast(psf, up_to=how.up_to)) / len(terms.bands.centres)
+            )
             wrong = [
                 math.exp(float(Terms.parts(_as(terms, colour), height)["wiener"]))
                 for colour in (0.0, 1.0)

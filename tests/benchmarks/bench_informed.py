@@ -31,7 +31,7 @@ from neusee.nodes.scene import Photographs
 from neusee.nodes.values import FilterFacts
 from neusee.workflows import Store, load
 from neusee.workflows.evaluation.confidence_intervals import less
-from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
+from neusee.workflows.training.training_pictures import HELD_OUT, PictureSource, TrainingStream
 
 ROOT = Path(__file__).parents[2]
 DESIGNED = ROOT / "recipes" / "samples" / "demonstration_mask.png"
@@ -194,9 +194,8 @@ def run(folder, pictures, count, masks):
             if mask not in streams:
                 recipe = load(recipe_file, words(mask))
                 kind = OfRival if mask in RIVALS else Judged
-                streams[mask] = kind(
-                    recipe, recipe.training, photographs, store, "cpu", recipe, held_out=held_out
-                )
+                source = PictureSource(photographs, store, held_out=held_out)
+                streams[mask] = kind(recipe, recipe.training, source, frozen=recipe)
             streams[mask].strength, streams[mask].factor = strength, PEAK if mask in RIVALS else 1.0
             found, kept = streams[mask]({}, HELD_OUT, number)
             name = f"{number:03d}_{mask.replace(' ', '_')}_{strength:g}"

@@ -371,7 +371,10 @@ def test_the_page_of_a_camera_states_what_its_models_leave_open(tmp_path, monkey
     monkeypatch.setattr(emcee_sampler, "_MOST_STEPS", 60)
     recipe = load("calibrate_camera")
     folder = run_calibration.calibrate(
-        recipe, Store(tmp_path / "cache"), tmp_path / "runs", walkers=32
+        recipe,
+        Store(tmp_path / "cache"),
+        tmp_path / "runs",
+        options=run_calibration.CalibrationOptions(walkers=32),
     )
     page, doc = (
         (folder / "report.html").read_text(),

@@ -11,7 +11,7 @@ from PIL import Image
 import neusee
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
-from neusee.workflows.training.training_pictures import HELD_OUT
+from neusee.workflows.training.training_pictures import HELD_OUT, PictureSource
 from tests.benchmarks.bench_informed import STEPS, Judged, judged_frame, words
 from tests.nodes.restore.lasers import own_camera
 
@@ -60,8 +60,8 @@ def test_the_network_is_better_than_the_told_filter_and_no_worse_than_the_best_o
     over_told, over_best = [], []
     for mask in ("plain", "half_ring", "designed"):
         recipe = load(file, words(mask))
-        where = Store(tmp_path / "cache"), "cpu", recipe
-        stream = Judged(recipe, recipe.training, photographs, *where, held_out=photographs.paths)
+        source = PictureSource(photographs, Store(tmp_path / "cache"), held_out=photographs.paths)
+        stream = Judged(recipe, recipe.training, source, frozen=recipe)
         for number, strength in enumerate((1e3, 1e5)):
             stream.strength = strength
             found, kept = stream({}, HELD_OUT, number)
