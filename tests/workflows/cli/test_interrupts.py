@@ -168,7 +168,7 @@ SLOW = {
     "study": (
         ["study", "stability", "laser_free"],
         "import",
-        "neusee.workflows.studies.stability_study",
+        "neusee.workflows.studies.extreme_cases",
     ),
     "safety": (["safety", "safety_pointer"], "open", "run_safety."),
     "safety, while it writes": (["safety", "pulse.yaml"], "open", "provenance.json"),

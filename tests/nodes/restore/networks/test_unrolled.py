@@ -11,6 +11,7 @@ from safetensors.torch import save_file
 
 from neusee.nodes import ParameterError
 from neusee.nodes.restore import Unrolled, start_network, unrolled, wiener, wiener_problem
+from neusee.nodes.restore._networks import _wiener_networks
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)
@@ -149,7 +150,7 @@ def test_gradients_of_the_node_agree_with_differences(tmp_path, monkeypatch):
     """With conjugate gradients that end: after ten steps, sums that nearly cancel are a third
     off.
     """
-    monkeypatch.setattr(Unrolled.__init__, "__defaults__", (16, 2, 100))
+    monkeypatch.setattr(_wiener_networks, "PULLED_STEPS", 100)
     electrons, *others = frame(16, 16)
     how = written(network(0.2), tmp_path)
     picture, way = electrons.double().requires_grad_(), random(3, 16, 16, seed=12) - 0.5
