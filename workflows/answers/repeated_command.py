@@ -1,4 +1,4 @@
-"""A command that may have a stored answer, which is looked for before the command runs."""
+"""A command that may have a stored answer, which is looked up before the command runs."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ if TYPE_CHECKING:
 # Name of a stored answer: the digest of the command as typed and of the process in which it runs.
 
 
-#: variables of a login or a terminal window that no program of this house reads; the working folder
-#: counts by itself, and the secret of the cache by the signature of each answer
+#: environment variables of a login or a terminal window that neusee does not read; the working
+#: folder counts separately, and the secret of the cache counts through the signature of each answer
 IGNORED = frozenset(
     {
         "NEUSEE_CACHE_SECRET",
@@ -78,10 +78,10 @@ IGNORED = frozenset(
 
 
 def command_name(words: Sequence[str], terminal: Sequence[object]) -> str:
-    """Return the name of the answer to a command; ``terminal`` says how wide the terminal is and
-    what it shows.
+    """Return the name of the answer to a command; ``terminal`` describes the width of the terminal
+    and what it can show.
 
-    The name depends on the words, the working folder, all variables of the environment but
+    The name depends on the words, the working folder, all environment variables except
     `IGNORED`, the terminal, Python with its options and search path, and the machine. Answers of
     another form have other names.
     """
@@ -103,18 +103,18 @@ def command_name(words: Sequence[str], terminal: Sequence[object]) -> str:
 
 
 def _decisive(variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables of the environment that may decide an answer."""
+    """Return the environment variables that may affect an answer."""
     return {name: value for name, value in variables.items() if name not in IGNORED}
 
 
 # --- installed program ----------------------------------------------------------------------------
 
-# Digest of the program as it is installed: its source files, the packages beside it, and the
-# graphics devices.
+# Digest of the installed program: its source files, the packages beside it, and the graphics
+# devices.
 
 
-ROOT = Path(__file__).parents[2]  #: of the package neusee
-SOURCES = ("nodes", "workflows")  #: folders of the package of which every file counts
+ROOT = Path(__file__).parents[2]  #: folder of the package neusee
+SOURCES = ("nodes", "workflows")  #: folders of the package in which every file counts
 SITES = ("site-packages", "dist-packages")  #: names of folders of installed packages
 _ABOUT = (".dist-info", ".egg-info", ".egg-link", ".pth")
 _CODE = (".py", ".so", ".pyd", ".zip")
@@ -122,7 +122,7 @@ _DRIVER = "/proc/driver/nvidia/version"
 
 
 class ProgramState(NamedTuple):
-    """Digest of the installed program, and when the newest of its source files changed."""
+    """Digest of the installed program, and the time of the newest change of a source file."""
 
     digest: str
     changed: int  #: ns since 1970
@@ -134,7 +134,7 @@ def standard_library() -> str:
 
 
 def program_state(root: Path = ROOT) -> ProgramState:
-    """Return the state of the program, with the content of each of its source files; import
+    """Return the state of the program, which covers the content of each source file; import
     nothing.
 
     Raises `OSError` if the package is not a folder of files.
@@ -178,8 +178,8 @@ def _below(folder: str, above: str = "") -> Iterator[str]:
 
 
 def _importable(folder: str) -> list[tuple[str, int]]:
-    """Return what a folder of the search path can import: installed packages with their time, or
-    files of code.
+    """Return the entries of a folder in the search path that can be imported: installed packages
+    with their time stamps, or files of code.
 
     The folders of Python itself count by the version of Python.
     """
@@ -194,7 +194,8 @@ def _importable(folder: str) -> list[tuple[str, int]]:
                 for entry in entries
                 if (entry.name.endswith(_ABOUT) if is_site else _is_code(entry))
             ]
-            # code of the user counts by name: with imported code no answer is kept
+            # code of the user counts only by name, since no answer is kept once such code was
+            # imported
             return sorted(
                 (entry.name, entry.stat().st_mtime_ns if is_site else 0) for entry in code_entries
             )
@@ -218,7 +219,7 @@ def _devices() -> list[str]:
 
 # --- repeated command -----------------------------------------------------------------------------
 
-# A command that may have a stored answer: the answer is looked for before the command, and kept
+# A command that may have a stored answer: the answer is looked up before the command, and stored
 # after it.
 #
 # command = begin(["safety", "safety_pointer"], terminal)   # None where no answer can be right
@@ -228,30 +229,28 @@ def _devices() -> list[str]:
 
 running: list[Command] = []  #: the command of this process, if its answer may be kept
 _SYSTEM = ("/proc", "/sys", "/dev")
-_OUT = "runs"  #: folder of results where the command names none
+_OUT = "runs"  #: default folder of results
 _RECIPES = (".yaml", ".yml")
-#: files that are made of others: bytecode, compiled modules, and the list of fonts that matplotlib
-#: keeps
+#: files that are derived from others: byte code, compiled modules, and matplotlib's list of fonts
 _DERIVED = re.compile(r"\.pyc$|\.so$|/fontlist-v[^/]*$")
-#: files of a cache that decide what a forecast or an explanation says, beside the results
-#: themselves
+#: files of a cache that affect a forecast or an explanation, beside the results themselves
 _OF_CACHE = re.compile(r"journal\.jsonl|speeds\.json|code/.*")
-_SHARE = 0.9  #: of the free memory, which a run may use
-#: in the path of a folder of results that is not complete
+_SHARE = 0.9  #: share of the free memory that a run may use
+#: matches the path of an unfinished folder of results
 _PART = re.compile(r"/\.[^/]*\.part(/|$)")
-_TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
-#: ns before the command began in which its modules may have been imported
+_TICK = 20_000_000  #: ns, longer than the resolution of the clock of a file system
+#: time (ns) before the start of the command in which its modules may have been imported
 _IMPORTED = 2_000_000_000
 _NAME = re.compile(r"\d{4}-\d\d-\d\d_(?P<label>.+)_(?P<key>[0-9a-f]{8})(_[1-9]\d{0,6})?")
-_MAIN = ("__main__", "__mp_main__")  #: the program that the user starts
-#: packages whose files are opened without Python, and named by no parameter
+_MAIN = ("__main__", "__mp_main__")  #: names of the module that the user starts
+#: packages that open files outside of Python, without a parameter that states them
 _NATIVE = ("h5py", "netCDF4")
 
 
 def begin(words: Sequence[str], terminal: Sequence[object]) -> Command | None:
-    """Return the command that may have a stored answer, or None where none is looked for or kept.
+    """Return the command that may have a stored answer, or None if no answer can be read or stored.
 
-    That is where the cache is at a URL or not usable, and in a process that has already imported
+    That is so if the cache is at a URL or not usable, and in a process that has already imported
     torch.
     """
     if "torch" in sys.modules or "://" in os.environ.get("NEUSEE_CACHE", ""):
@@ -263,14 +262,16 @@ def begin(words: Sequence[str], terminal: Sequence[object]) -> Command | None:
 
 
 class Said(NamedTuple):
-    """What a command that writes nothing has taken from a store."""
+    """The dependencies of a command that writes nothing: the results that it has read from a
+    store.
+    """
 
     store: Store
     memory: float = 0.0  #: bytes that must be free
-    out: None = None  #: no folder of results
+    out: None = None  #: there is no folder of results
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields of the answer that say on what it rests."""
+        """Return the fields of the answer that list its dependencies."""
         return {"files": {}, "stored": taken_from(self.store, {}), "memory": int(self.memory)}
 
 
@@ -278,16 +279,16 @@ class Results(NamedTuple):
     """The folder of results of a command."""
 
     folder: Path  #: complete
-    out: Path  #: the folder that has it
-    report: StudyReport  #: that was written there
+    out: Path  #: the folder that contains it
+    report: StudyReport  #: the report that was written there
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields of the answer that say what the folder holds."""
+        """Return the fields of the answer with the content of the folder."""
         return {"files": kept_files(self.folder, self.report)}
 
 
 class Command:
-    """A command whose answer may be stored, from its begin."""
+    """A command whose answer may be stored, from its start on."""
 
     def __init__(self, words: Sequence[str], terminal: Sequence[object], disk: Disk) -> None:
         self._began, self._clocks = time.perf_counter(), (time.time_ns(), time.monotonic_ns())
@@ -296,23 +297,23 @@ class Command:
         self._opened, self._doubtful = Opened(), False
 
     def _started(self) -> int:
-        """Return the time (ns) of the begin by the clock as it is set now; the program is
-        imported by then.
+        """Return the start time (ns) of the command by the present clock; call this only after the
+        program is imported.
         """
         from neusee.nodes.import_times import Moment
 
         return Moment(*self._clocks).time()
 
     def answer(self) -> str | None:
-        """Write the folder of the stored answer again and return the text to print, or None without
-        a right answer.
+        """Write the folder of the stored answer again and return the text to print, or None if no
+        valid answer is stored.
 
-        Without one, the files that this process opens from now on are recorded.
+        If there is none, the files that this process opens from now on are recorded.
         Raises `OSError` if the folder of results cannot be written.
         """
         answer = read_answer(self._disk, self.name)
         if answer and self._holds(answer):
-            # a damaged document
+            # these errors come from a damaged document
             with suppress(ValueError, KeyError, TypeError, AttributeError):
                 text = self._given_again(answer)
                 used(self._disk, self.name)
@@ -322,7 +323,7 @@ class Command:
         return None
 
     def _holds(self, answer: Answer) -> bool:
-        """Return True if everything that decided an answer is as it was."""
+        """Return True if everything that the answer depends on is unchanged."""
         return (
             answer.state == self._state.digest
             and self._fits(answer)
@@ -344,8 +345,8 @@ class Command:
         return said_again(answer, folder, document)
 
     def doubt(self) -> None:
-        """Keep no answer: the command has said something that its text does not hold, such as a
-        warning.
+        """Store no answer, because the command has printed something that is not part of its text,
+        such as a warning.
         """
         self._doubtful = True
 
@@ -356,8 +357,8 @@ class Command:
         recipe: Recipe,
         results: Results | RunResults | Said | None = None,
     ) -> None:
-        """Keep the answer of a command that has ended well; do so only if nothing that it rests on
-        is in doubt.
+        """Store the answer of a command that ended well, unless one of its dependencies is in
+        doubt.
 
         Args: text: of the terminal, with `stored_answer.PAGE` for the path of the page. recipe:
                 that of the command.
@@ -384,7 +385,9 @@ class Command:
         as_json: bool,
         results: Results | RunResults | Said | None,
     ) -> Answer:
-        """Return the answer to keep: the text, what decided it, and the folder if there is one."""
+        """Return the answer to store: the text, its dependencies, and the folder if there is
+        one.
+        """
         folder_results = results if results and results.out else None
         results_folder = str(folder_results.out) if folder_results else ""
         label, key = _parts(folder_results.folder.name) if folder_results else ("", "")
@@ -401,10 +404,10 @@ class Command:
         )
 
     def _fits(self, answer: Answer) -> bool:
-        """Return True if the folder of an answer is the one that the command names, and if it can
-        be written.
+        """Return True if the command states the same folder of results as the answer, and if that
+        folder can be written.
 
-        If it cannot be written, the command itself says why.
+        If it cannot be written, the command itself will report why.
         """
         if not answer.key:
             return not answer.files
@@ -421,7 +424,7 @@ class Command:
 
     def _is_doubtful(self) -> bool:
         """Return True if the program may have changed since the command began, or if the command
-        said more.
+        printed more than its text.
         """
         state_now = program_state()
         return (
@@ -438,7 +441,7 @@ class Command:
         written_folder = os.path.abspath(out) if out else None
         ignored = self._ignored()
         files = self._files_opened(ignored)
-        # a recipe that another one extends may lie anywhere, with options beside it
+        # a recipe that is extended by another may lie in any folder, with options beside it
         recipe_neighbours = {os.path.dirname(path) for path in files if path.endswith(_RECIPES)}
         recipes = _recipe_folders(self._words) | recipe_neighbours
         if any(path in cache for path in (os.getcwd(), *files)) or written_folder in recipes:
@@ -452,17 +455,21 @@ class Command:
         )
 
     def _ignored(self) -> Folders:
-        """Return the folders of what is installed and of the cache, which have other witnesses."""
+        """Return the folders of installed packages and of the cache, which are checked in other
+        ways.
+        """
         sources = [ROOT / name for name in SOURCES]
         return Folders([*_installed(), *_SYSTEM, self._disk.folder, *sources])
 
     def _files_opened(self, ignored: Folders) -> list[str]:
-        """Return the files that were opened and are neither ignored nor made from other ones."""
+        """Return the opened files that are neither ignored nor derived from other files."""
         opened_files = [path for path in self._opened.files if not _DERIVED.search(path)]
         return [path for path in opened_files if path.endswith(_RECIPES) or path not in ignored]
 
     def _folders_listed(self, ignored: Folders) -> dict[str, Listing]:
-        """Return what was in the folders that were listed, but for ignored and unfinished ones."""
+        """Return the content of the folders that were listed, except for ignored and unfinished
+        folders.
+        """
         return {
             path: listing
             for path, listing in self._opened.folders.items()
@@ -470,8 +477,8 @@ class Command:
         }
 
     def _of_cache(self) -> list[str]:
-        """Return the files of the cache that were read and decide what a forecast or an
-        explanation says.
+        """Return the files of the cache that were read and that affect a forecast or an
+        explanation.
         """
         return [
             path
@@ -481,14 +488,14 @@ class Command:
 
 
 def _are_free(memory: int) -> bool:
-    """Return True if a run may use so many bytes of memory now."""
+    """Return True if a run may use ``memory`` bytes now."""
     if not memory:
         return True
     return _SHARE * free_memory() >= memory
 
 
 def _inside(path: str, folder: str) -> str:
-    """Return a path relative to a folder, links followed."""
+    """Return a path relative to a folder, with symbolic links resolved."""
     return os.path.relpath(os.path.realpath(path), os.path.realpath(folder))
 
 
@@ -505,7 +512,7 @@ def _parts(folder: str) -> tuple[str, str]:
 
 
 def _recipe_folders(words: Sequence[str]) -> set[str]:
-    """Return the folders in which the recipe and its options are looked for."""
+    """Return the folders in which the recipe and its options are searched."""
     from neusee.workflows.recipe.text.recipe_files import shared_folders
 
     folders_of_recipes = (
@@ -518,7 +525,7 @@ def _recipe_folders(words: Sequence[str]) -> set[str]:
 
 
 def _input_files(recipe: Recipe) -> set[str]:
-    """Return the paths of all files that the values of a recipe name; one that is a folder is
+    """Return the paths of all files that occur as values of a recipe; a path that is a folder is
     refused later.
     """
     values_left: list[Any] = list(recipe.config.values.values())
@@ -535,8 +542,8 @@ def _input_files(recipe: Recipe) -> set[str]:
 
 
 def _installed() -> list[str]:
-    """Return the folders of Python's own modules and of installed packages, whose versions
-    count.
+    """Return the folders of Python's own modules and of installed packages, which count by their
+    versions.
     """
     return [
         standard_library(),
@@ -545,12 +552,10 @@ def _installed() -> list[str]:
 
 
 def _own_code() -> Iterable[str]:
-    """Yield the modules of this process that are neither neusee nor installed: a recipe names
-    code of its own.
-    """
+    """Yield the loaded modules that are neither neusee's nor installed, so the user's own code."""
     covered_folders = Folders([*_installed(), ROOT])
     for name, module in list(sys.modules.items()):
-        file = getattr(module, "__file__", None)  # of torch.ops it is a name without a folder
+        file = getattr(module, "__file__", None)  # for torch.ops, this is a name without a folder
         if (
             file
             and name not in _MAIN

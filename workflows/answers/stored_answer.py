@@ -39,38 +39,41 @@ if TYPE_CHECKING:
 
 # --- stored answer --------------------------------------------------------------------------------
 
-# File of a stored answer in the folder ``answers/`` of the cache: sealed as every file there, and
-# never half written.
+# File of a stored answer in the folder ``answers/`` of the cache: sealed like every file there, and
+# never incomplete.
 #
-# The first line is the seal, which names the answer; the second line is a JSON object; then follow
-# the files of the folder of results. An answer that is damaged, of another format or without the
-# signature that is asked for is missing.
+# The first line is the seal, which contains the name of the answer; the second line is a JSON
+# object; then follow the files of the folder of results. An answer counts as missing if it is
+# damaged, has another format or lacks the required signature.
 
 
 FOLDER, SUFFIX = "answers", ".answer"
-#: kinds of answers: with the files of a folder, and with what a run shows
+#: kinds of answers: with all files of a folder, and with the document of a run
 AS_KEPT, RUN = "as kept", "run"
-MOST_BYTES = 32 << 20  #: bytes of the largest answer that is kept
+MOST_BYTES = 32 << 20  #: size (bytes) of the largest answer that is stored
 _LABEL = re.compile(r"\w[\w.-]*")
 _FILE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command printed and wrote, and what must be as it was for the answer to be right."""
+    """The text and the files of a command, and everything that must be unchanged for the answer to
+    be valid.
+    """
 
     state: str  #: digest of the installed program
     witnesses: Witnesses
-    text: str  #: of the terminal, with a mark in place of the path of the page
-    as_json: bool  #: whether the text is JSON
+    text: str  #: printed text, with a mark in place of the path of the page
+    as_json: bool  #: True if the text is JSON
     out: str  #: folder in which the command makes its folder of results
     label: str  #: recipe and kind in the name of this folder
-    #: of the result, in the name of this folder; empty for a command that writes no folder
+    #: key of the result in the name of this folder; empty for a command that writes no folder
     key: str
-    files: Mapping[str, bytes]  #: of this folder by name, with marks in place of date and seconds
-    stored: StoredResults = NOTHING  #: what of the cache the answer rests on
+    #: files of this folder by name, with marks in place of date and seconds
+    files: Mapping[str, bytes]
+    stored: StoredResults = NOTHING  #: results and files of the cache that the answer depends on
     kind: str = AS_KEPT  #: how the folder is written again
-    memory: int = 0  #: bytes that must be free
+    memory: int = 0  #: memory (bytes) that must be free
 
 
 def answer_path(disk: Disk, name: str) -> str:
@@ -79,8 +82,8 @@ def answer_path(disk: Disk, name: str) -> str:
 
 
 def read_answer(disk: Disk, name: str) -> Answer | None:
-    """Return the answer ``name``, or None if it is missing, damaged, of another format or not
-    signed.
+    """Return the answer ``name``, or None if it is missing, damaged, of another format or without
+    the required signature.
     """
     path = answer_path(disk, name)
     try:
@@ -95,8 +98,8 @@ def read_answer(disk: Disk, name: str) -> Answer | None:
 
 
 def write_answer(disk: Disk, name: str, answer: Answer) -> bool:
-    """Write the answer ``name`` under a temporary name and rename it; return False for one that is
-    too large.
+    """Write the answer ``name`` under a temporary name and rename the file; return False for an
+    answer that is too large.
 
     Raises `OSError` if the folder cannot be written.
     """
@@ -113,7 +116,7 @@ def write_answer(disk: Disk, name: str, answer: Answer) -> bool:
 
 
 def used(disk: Disk, name: str) -> None:
-    """Note that an answer was used, so that it stays longer than others."""
+    """Record that an answer was used, so that it is kept longer than others."""
     with suppress(OSError):
         os.utime(answer_path(disk, name), follow_symlinks=False)
 
@@ -145,7 +148,7 @@ def unpacked(name: str, raw: bytes) -> Answer:
     fields: dict[str, Any] = json.loads(head_line)
     files, offset = {}, 0
     for file, size in fields.pop("files"):
-        # abs: a wrong answer must not read backwards
+        # abs, so that a damaged size cannot move the offset backwards
         files[_checked(_FILE, file)] = file_bytes[offset : offset + abs(size)]
         offset += abs(size)
     if offset != len(file_bytes):
@@ -163,7 +166,7 @@ def unpacked(name: str, raw: bytes) -> Answer:
 
 
 def _refuse_other_types(answer: Answer) -> None:
-    """Raise ValueError if a field of an answer is not of its type."""
+    """Raise ValueError if a field of an answer has the wrong type."""
     files, absent_paths, recipes, listed_folders = answer.witnesses
     texts = [answer.state, answer.text, answer.out, answer.label, answer.key, answer.kind]
     for mapping in (files, recipes, listed_folders):
@@ -177,7 +180,7 @@ def _refuse_other_types(answer: Answer) -> None:
 
 
 def _checked(form: re.Pattern[str], text: str) -> str:
-    """Return a text that has a form; raise `ValueError` for any other text."""
+    """Return ``text`` if it matches the pattern ``form``; raise `ValueError` otherwise."""
     if not form.fullmatch(text):
         raise ValueError(f"{text!r} is no name of a file in a folder of results")
     return text
@@ -188,12 +191,12 @@ def _checked(form: re.Pattern[str], text: str) -> str:
 # Number and size of the stored answers, the check of all of them, and the removal of old ones.
 
 
-COUNT, BYTES = 200, 64 << 20  #: of answers that stay when a new one is written
-_WEEK = 7 * 86400.0  #: s without use after which `neusee cache gc` removes an answer
+COUNT, BYTES = 200, 64 << 20  #: greatest number and total size (bytes) of the answers that are kept
+_WEEK = 7 * 86400.0  #: time (s) without use after which `neusee cache gc` removes an answer
 
 
 class Kept(NamedTuple):
-    """A stored answer: its name, its bytes and when it was last used (s)."""
+    """A stored answer: its name, its size (bytes) and the time of its last use (s)."""
 
     name: str
     path: str
@@ -202,7 +205,7 @@ class Kept(NamedTuple):
 
 
 def answers(disk: Disk) -> list[Kept]:
-    """Return all stored answers, the one that was used last first."""
+    """Return all stored answers, the most recently used first."""
     return sorted(_found(disk), key=lambda answer: (-answer.used, answer.name))
 
 
@@ -220,10 +223,10 @@ def _found(disk: Disk) -> Iterator[Kept]:
 
 
 def make_room(disk: Disk, budget: int | None = None) -> None:
-    """Remove the answers that were not used for longest, until at most `COUNT` of them and `BYTES`
-    are left.
+    """Remove the least recently used answers until at most `COUNT` answers with at most `BYTES`
+    bytes are left.
 
-    With a ``budget`` of the store in bytes, at most a twentieth of it is left.
+    If the store has a ``budget`` (bytes), the answers may use at most a twentieth of it.
     """
     total_bytes, limit = 0, BYTES if budget is None else min(BYTES, budget // 20)
     for number, answer in enumerate(answers(disk)):
@@ -243,13 +246,13 @@ def sweep(disk: Disk, dry: bool = False, everything: bool = False) -> list[Kept]
 
 
 def check(disk: Disk) -> tuple[list[Kept], list[Kept]]:
-    """Return the answers that are as written, and those that are not, which are moved to the
-    folder ``bad/``.
+    """Return the undamaged answers, and the damaged ones, which are moved to the folder
+    ``bad/``.
     """
     undamaged, damaged = [], []
     for answer in answers(disk):
         is_readable = read_answer(disk, answer.name) is not None
-        # one of another format or without a signature stays where it is
+        # an answer of another format or without a signature is not moved
         if is_readable or os.path.lexists(answer.path):
             undamaged.append(answer)
         else:
@@ -268,24 +271,26 @@ def _remove(disk: Disk, answer: Kept) -> bool:
 
 # --- results folder -------------------------------------------------------------------------------
 
-# The folder of results of a command as an answer keeps it, with marks for date and seconds, and
+# The folder of results of a command: stored in an answer, with marks for date and seconds, and
 # written again.
 
 
 PAGE, DATE, SECONDS = "@neusee-page@", "@neusee-date@", "@neusee-seconds@"  #: marks
 DOCUMENT = "provenance.json"
-_MARKED = (DOCUMENT, "report.html")  #: the files with a date and seconds
+_MARKED = (DOCUMENT, "report.html")  #: files that contain the date and the seconds
 
 
 class NotRepeatable(ValueError):
-    """Error for a folder of results that the marks do not give again byte by byte."""
+    """Error for a folder of results that cannot be reproduced byte by byte from the stored files
+    and marks.
+    """
 
 
 def kept_files(folder: Path, report: StudyReport) -> dict[str, bytes]:
-    """Return the files of a complete folder of results by name, with marks; the crate is written
-    anew each time.
+    """Return the files of a complete folder of results by name, with marks; the crate is left out,
+    since it is written anew each time.
 
-    Raises `NotRepeatable` if the marks do not give the same bytes again.
+    Raises `NotRepeatable` if filling the marks does not reproduce the same bytes.
     """
     files = {
         path.relative_to(folder).as_posix(): bytes_of(path, sys.maxsize)
@@ -295,7 +300,7 @@ def kept_files(folder: Path, report: StudyReport) -> dict[str, bytes]:
     document = json.loads(files[DOCUMENT])
     if document.get("warnings"):
         raise NotRepeatable("a command with a warning")
-    # written once more, with marks in place of date and seconds
+    # write the report once more, with marks in place of date and seconds
     with TemporaryDirectory(prefix="neusee-") as temporary_folder:
         report.write(
             RunFolder(Path(temporary_folder)), {**document, "date": DATE, "seconds": SECONDS}
@@ -308,10 +313,10 @@ def kept_files(folder: Path, report: StudyReport) -> dict[str, bytes]:
 
 
 def filled(name: str, content: bytes, date: str, seconds: float) -> bytes:
-    """Return the content of a file with a date and seconds in place of the marks."""
+    """Return the content of a file with the date and the seconds in place of the marks."""
     if name not in _MARKED:
         return content
-    # in JSON a number, in quotes as long as it is a mark
+    # the seconds are a number in JSON, but the mark is a text in quotes
     content = content.replace(f'"{SECONDS}"'.encode(), repr(seconds).encode())
     return content.replace(SECONDS.encode(), f"{seconds:.3g}".encode()).replace(
         DATE.encode(), date.encode()
@@ -336,34 +341,34 @@ def write_again(answer: Answer, seconds: float) -> Path:
 
 def printed(answer: Answer, page: Path) -> str:
     """Return the text of an answer with the path of its page."""
-    # with the escapes of JSON, without its quotes
+    # escaped as in JSON, but without the quotes
     page_text = json.dumps(str(page))[1:-1] if answer.as_json else str(page)
     return answer.text.replace(PAGE, page_text)
 
 
 # --- repeated run ---------------------------------------------------------------------------------
 
-# The folder of a run whose results all come from the cache, as an answer keeps it, and written
-# again without torch.
+# The folder of a run whose results all come from the cache: stored in an answer, and written again
+# without torch.
 #
-# The answer keeps the document of the run and its small files; pictures and data files are those of
-# the cache. The page is made of the document and the pictures, as `neusee report` makes it.
+# The answer contains the document of the run and its small files; pictures and data files are taken
+# from the cache. The page is made from the document and the pictures, as `neusee report` makes it.
 
 
-FOLDER_MARK, SECONDS_MARK = "@neusee-folder@", "@neusee-took@"  #: marks in the text of the terminal
+FOLDER_MARK, SECONDS_MARK = "@neusee-folder@", "@neusee-took@"  #: marks in the printed text
 REPORT_PAGE = "report.html"
 _FIGURES = "figures/"
-_ANY = sys.maxsize  #: bytes of a file of a run, which this program wrote
-_SERVED = {"cached", "not needed", "left out"}  #: states of a step that was not computed
+_ANY = sys.maxsize  #: size limit (bytes) for files of a run, which this program wrote
+_SERVED = {"cached", "not needed", "left out"}  #: states of steps that were not computed
 
 
 class RunResults(NamedTuple):
-    """The folder of a run, and what it rests on."""
+    """The folder of a run, and the dependencies of the run."""
 
     folder: Path  #: complete
     out: Path  #: the folder that has it
     document: Mapping[str, Any]
-    taken: Mapping[str, Path]  #: by name in the folder: the file of the store
+    taken: Mapping[str, Path]  #: files of the store that were taken, by name in the folder
     store: Store
 
     def fields(self) -> dict[str, Any]:
@@ -386,7 +391,7 @@ class RunResults(NamedTuple):
             if name not in not_kept:
                 files[name] = bytes_of(path, _ANY)
         document_again = json.loads(files[DOCUMENT])
-        # the answer is only kept if the same page can be made of it
+        # the answer is stored only if it reproduces the same page
         page_again = page(document_again, _pictures(folder, self.taken))
         if (
             page_again.encode() != bytes_of(folder / REPORT_PAGE, _ANY)
@@ -416,7 +421,7 @@ def write_run_again(answer: Answer, disk: Disk, seconds: float) -> tuple[Path, d
 
 
 def said_again(answer: Answer, folder: Path, document: Mapping[str, Any]) -> str:
-    """Return the text of the terminal for a run that was written again."""
+    """Return the printed text for a run whose folder was written again."""
     if answer.as_json:
         return json_line({"report": str(folder / REPORT_PAGE), **document})
     return answer.text.replace(SECONDS_MARK, f"{document['seconds']:.2f}").replace(
@@ -425,8 +430,8 @@ def said_again(answer: Answer, folder: Path, document: Mapping[str, Any]) -> str
 
 
 def _of_now(document: dict[str, Any], seconds: float) -> dict[str, Any]:
-    """Return the document of a run with the time and the memory of this process, and with the
-    run that it repeats.
+    """Return the document of a run with the time and the memory of this process, and with a
+    reference to the repeated run.
     """
     memory = process_peak()
     present_facts = {"engine": f"{seconds:.3f} s", "peak memory": format_size(memory)}

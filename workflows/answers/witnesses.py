@@ -1,4 +1,6 @@
-"""Files, folders and results on which an answer rests, and whether they are as they were."""
+"""Witnesses of an answer: the files, folders and results that it depends on, and a check that they
+are unchanged.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ from neusee.workflows.store.shared_folder import Disk
 
 # --- witnesses ------------------------------------------------------------------------------------
 
-# Files and folders on which an answer rests, and the comparison with what they are now.
+# Files and folders that an answer depends on, and their comparison with the present state.
 
 
 class Unsettled(ValueError):
@@ -33,26 +35,24 @@ class Unsettled(ValueError):
 
 
 class Witnesses(NamedTuple):
-    """Files and folders on which an answer rests, each with a digest."""
+    """Files and folders that an answer depends on, each with a digest."""
 
-    files: dict[str, str]  #: by path: digest of the content
-    absent: list[str]  #: paths at which a file was wanted, and where there was none
-    #: by folder in which recipes and options are looked for: digest of their names
+    files: dict[str, str]  #: digest of the content, by path
+    absent: list[str]  #: paths at which a file was looked for, but did not exist
+    #: digest of the names of recipes and options, by the folder in which they are searched
     recipes: dict[str, str]
-    listed: dict[str, str]  #: by another folder that was listed: digest of all names in it
+    listed: dict[str, str]  #: digest of all names in each other folder that was listed, by folder
 
 
 class Listing(NamedTuple):
-    """The names in a folder, and when the folder last changed (ns); 0 for a folder that is
-    missing.
-    """
+    """The names in a folder, and the time of its last change (ns); 0 for a missing folder."""
 
     names: list[str]
     changed: int
 
 
 def listing(folder: str) -> Listing:
-    """Return the names in a folder as they are now."""
+    """Return the present names in a folder."""
     try:
         folder_status = os.stat(folder)
     except OSError:
@@ -67,8 +67,8 @@ def witnesses_of(
     before: int,
     made: str | None = None,
 ) -> Witnesses:
-    """Return witnesses for these paths as they are now; a path without a file is a witness of its
-    absence.
+    """Return witnesses for the present state of these paths; a path without a file is a witness
+    that the file is absent.
 
     ``made`` is a folder that the command itself may have made: as a new name in a listed folder it
     is no change. Raises `Unsettled` for what changed after the time ``before`` (ns), and for a
@@ -80,7 +80,7 @@ def witnesses_of(
             raise Unsettled(f"{folder} changed while the command ran")
     digests: dict[str, str] = {}
     absent_paths = []
-    # digests of the files as they are now
+    # digests of the present files
     for path in sorted(set(files)):
         try:
             digests[path] = file_digest(path, before)
@@ -98,14 +98,14 @@ def witnesses_of(
 
 
 def _names_but(folder: str, then: Listing, made: str | None) -> list[str]:
-    """Return the names in a folder as it is now, without the folder ``made`` if it is new."""
-    # the folder below the listed one that leads to it
+    """Return the present names in a folder, without the folder ``made`` if it is new."""
+    # the entry of the listed folder that contains ``made``
     made_name = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
     return [name for name in all_names(folder) if name != made_name or name in then.names]
 
 
 def hold(witnesses: Witnesses) -> bool:
-    """Return True if every file and folder is as it was; read the content of each file."""
+    """Return True if every file and folder is unchanged; the content of each file is read."""
     try:
         return (
             not any(map(os.path.lexists, witnesses.absent))
@@ -123,13 +123,13 @@ def hold(witnesses: Witnesses) -> bool:
 
 
 def file_digest(path: str, before: int | None = None) -> str:
-    """Return the digest of the content of a file; never wait for a pipe in its place.
+    """Return the digest of the content of a file; a pipe in its place does not block.
 
     Raises `Unsettled` for what is no file, and for a file that changed after the time ``before``
     (ns).
     """
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
-        # again after the reading
+        # checked again after reading
         file_status = os.fstat(file.fileno())
         if not stat.S_ISREG(file_status.st_mode):
             raise Unsettled(f"{path} is not a file")
@@ -141,15 +141,15 @@ def file_digest(path: str, before: int | None = None) -> str:
 
 
 def recipe_names(folder: str) -> list[str]:
-    """Return the names of the recipes in a folder, and of the options in its groups, as far as
-    they are files.
+    """Return the names of the recipes in a folder and of the options in its groups, each with
+    whether it is a file.
     """
     return sorted(_yaml_in(folder, groups=True))
 
 
 def _yaml_in(folder: str, groups: bool) -> Iterator[str]:
-    """Yield the YAML files in a folder, each with whether it is a file, and with ``groups``
-    those of its subfolders.
+    """Yield the YAML files in a folder, each with whether it is a file; with ``groups``, those of
+    its subfolders too.
     """
     try:
         with os.scandir(folder) as scan:
@@ -164,7 +164,9 @@ def _yaml_in(folder: str, groups: bool) -> Iterator[str]:
 
 
 def all_names(folder: str) -> list[str]:
-    """Return all names in a folder; a folder that is missing has the name of no file."""
+    """Return all names in a folder; for a missing folder, the type of the error as a name that no
+    file can have.
+    """
     try:
         return sorted(os.listdir(folder))
     except OSError as error:
@@ -185,26 +187,28 @@ def _digest(names: list[str]) -> str:
 
 # --- opened files ---------------------------------------------------------------------------------
 
-# Record of the files that this process opens to read and of the folders that it lists, by an audit
-# hook of Python.
+# Record of the files that this process opens for reading and of the folders that it lists, made by
+# an audit hook of Python.
 
 
 _LISTS = ("os.listdir", "os.scandir")
 _WRITES = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
-_listeners: list[Opened] = []  #: at most one; the hook of a process cannot be removed
+_listeners: list[Opened] = []  #: empty or one record; the hook of a process cannot be removed
 _hooked: list[bool] = []
 
 
 class Opened:
-    """The files that were opened to read and the folders that were listed, as absolute paths."""
+    """The files that were opened for reading and the folders that were listed, as absolute
+    paths.
+    """
 
     def __init__(self) -> None:
         self.files: dict[str, None] = {}
-        self.folders: dict[str, Listing] = {}  #: as each was when it was listed first
+        self.folders: dict[str, Listing] = {}  #: content of each folder when it was first listed
         self._lists = False
 
     def listen(self) -> None:
-        """Begin the record; another record of this process ends."""
+        """Begin the record; it replaces an earlier record of this process."""
         _listeners[:] = [self]
         if not _hooked:
             _hooked.append(True)
@@ -216,8 +220,8 @@ class Opened:
             _listeners.remove(self)
 
     def hear(self, event: str, arguments: tuple[Any, ...]) -> None:
-        """Note one event of Python's audit; a file descriptor in place of a path says nothing
-        new.
+        """Record one audit event of Python; an event with a file descriptor in place of a path adds
+        nothing.
         """
         path = os.curdir if event in _LISTS and arguments[0] is None else arguments[0]
         if not isinstance(path, str | bytes | os.PathLike):
@@ -228,10 +232,10 @@ class Opened:
             self.files[os.path.abspath(os.fsdecode(path))] = None
 
     def _list(self, folder: str) -> None:
-        """Note what is in a folder when it is listed first."""
+        """Record the content of a folder when it is first listed."""
         if self._lists or folder in self.folders:
             return
-        self._lists = True  # listing is an event too
+        self._lists = True  # the listing made here is an event too
         try:
             self.folders[folder] = listing(folder)
         finally:
@@ -239,7 +243,7 @@ class Opened:
 
 
 class Folders:
-    """Some folders with all that is below them."""
+    """Some folders with everything below them."""
 
     def __init__(self, roots: Iterable[str | os.PathLike[str]]) -> None:
         paths: list[str] = []
@@ -248,8 +252,8 @@ class Folders:
         self._starts = tuple(f"{path.rstrip('/')}/" for path in paths)
 
     def __contains__(self, path: object) -> bool:
-        """Return True if a path is one of the folders or below one of them, whatever links lead
-        there.
+        """Return True if a path is one of the folders or below one of them, with or without
+        symbolic links resolved.
         """
         return any(
             f"{form}/".startswith(self._starts) for form in (str(path), os.path.realpath(str(path)))
@@ -257,26 +261,26 @@ class Folders:
 
 
 def _is_written(mode: Any, flags: Any) -> bool:
-    """Return True for a file that is opened to be written anew or made."""
+    """Return True for a file that is opened for writing, or that is created."""
     if isinstance(mode, str):
         return mode[:1] in ("w", "x", "a")
     return isinstance(flags, int) and bool(flags & _WRITES)
 
 
 def _hear(event: str, arguments: tuple[Any, ...]) -> None:
-    """Hand an audit event to the record under way, if there is one."""
+    """Pass an audit event to the present record, if there is one."""
     if _listeners and (event == "open" or event in _LISTS):
         _listeners[0].hear(event, arguments)
 
 
 # --- stored results -------------------------------------------------------------------------------
 
-# Results and files of the cache on which an answer rests, and the comparison with what they are
-# now, without torch.
+# Results and files of the cache that an answer depends on, and their comparison with the present
+# state, without torch.
 #
-# A result that was loaded is compared byte by byte, as a run that loads it does; of the others the
-# metadata are compared, which hold the size and the checksum of the value, and the size of its
-# file.
+# A result that was loaded is compared byte by byte, as in a run that loads it. For other results
+# only the metadata are compared, which contain the size and the checksum of the value, and the size
+# of its file.
 
 
 _KEY = re.compile(r"[0-9a-z-]{2,64}")
@@ -284,21 +288,21 @@ _FILE = re.compile(r"(files|bands)/[0-9a-z]{2}/\w[\w.-]*")
 
 
 class StoredResults(NamedTuple):
-    """What of a cache an answer rests on; by default nothing."""
+    """The results and files of a cache that an answer depends on; by default none."""
 
-    #: by key: digest of the metadata, or an empty text for a result that was missing
+    #: digest of the metadata by key; an empty text for a result that was missing
     results: Mapping[str, str] = {}
     loaded: tuple[str, ...] = ()  #: keys of the results whose values were loaded
-    files: Mapping[str, str] = {}  #: by path in the cache: digest of a band, a picture or an export
-    taken: Mapping[str, str] = {}  #: by name in the folder of results: the path in the cache
+    files: Mapping[str, str] = {}  #: digest of a band, a picture or an export, by path in the cache
+    taken: Mapping[str, str] = {}  #: path in the cache, by name in the folder of results
 
 
 NOTHING = StoredResults()
 
 
 def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
-    """Return what a process has asked of a store so far, and the stored files that it took into a
-    folder of results.
+    """Return the results that a process has looked up in a store so far, and the stored files that
+    it took into a folder of results.
 
     Raises `Unsettled` for a file that is not in the store, and `OSError` for one that cannot be
     read.
@@ -316,8 +320,8 @@ def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
 
 
 def still_there(disk: Disk, then: StoredResults) -> bool:
-    """Return True if every result is as it was and every file has the same content; change
-    nothing in the cache.
+    """Return True if every result and the content of every file are unchanged; the cache itself is
+    not modified.
     """
     small_results = SmallResults(disk)
     try:
@@ -335,15 +339,15 @@ def still_there(disk: Disk, then: StoredResults) -> bool:
 
 
 def note_use(disk: Disk, then: StoredResults) -> None:
-    """Record that the values were used, as a run that loads them does."""
+    """Record that the values were used, as for a run that loads them."""
     for key in then.loaded:
         metadata.record_use(disk, key)
 
 
 def checked(fields: Mapping[str, Any]) -> StoredResults:
-    """Return the results that the JSON of an answer names.
+    """Return the results that the JSON of an answer lists.
 
-    Raises `ValueError` or `TypeError` for what `taken_from` never gives.
+    Raises `ValueError` or `TypeError` for fields that `taken_from` never writes.
     """
     results = StoredResults(**{**fields, "loaded": tuple(fields.get("loaded", ()))})
     if not all(
@@ -365,8 +369,8 @@ def checked(fields: Mapping[str, Any]) -> StoredResults:
 
 
 def _about(disk: Disk, small: SmallResults, key: str) -> Metadata | None:
-    """Return the metadata of a result as a store finds them, without moving a damaged result
-    away.
+    """Return the metadata of a result as a store would find them, but do not move a damaged
+    result.
     """
     small_metadata = small.find(key)
     return small_metadata if is_kept(small_metadata) else metadata.find(disk, key) or small_metadata
@@ -380,8 +384,8 @@ def _said(about: Metadata | None) -> str:
 
 
 def _is_whole(disk: Disk, about: Metadata | None) -> bool:
-    """Return True if the file of a value has the checksum in the metadata, or with a secret the
-    signed digest.
+    """Return True if the file of a value has the checksum in the metadata, or the signed digest if
+    a secret is set.
     """
     if not is_kept(about):
         return False
@@ -394,7 +398,7 @@ def _is_whole(disk: Disk, about: Metadata | None) -> bool:
 
 
 def _digest_of_results(path: str) -> str:
-    """Return a digest of a file, of the kind that the store uses for its files."""
+    """Return a digest of a file by the algorithm that the store uses for its files."""
     algorithm: Any = hashlib.sha256 if secrets() else xxhash.xxh3_128
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):

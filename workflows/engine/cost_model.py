@@ -35,14 +35,14 @@ from neusee.workflows.recipe.step_checks import machine_memory
 
 # --- cost laws ------------------------------------------------------------------------------------
 
-# Laws of the cost of a node: seconds and peak memory from shapes and parameters, with coefficients
-# that were measured.
+# Laws of the cost of a node: seconds and peak memory as functions of shapes and parameters, with
+# measured coefficients.
 #
-# The peak memory of a step is ``a + b inputs + c result + d work`` bytes beyond the memory in use
-# before, and its time is ``e + f operations`` seconds. ``node_costs.json`` has the coefficients of
-# each shipped node, which tests/benchmarks/fit_costs.py fits to runs of the shipped recipes on a
-# CPU, and the spread of the runs about the law. Seconds are the processor time of one thread, so
-# that a busy machine does not make a law slow.
+# The peak memory of a step, beyond the memory in use before, is ``a + b inputs + c result + d
+# work`` bytes, and its time is ``e + f operations`` seconds. ``node_costs.json`` has the
+# coefficients of each shipped node, which tests/benchmarks/fit_costs.py fits to runs of the shipped
+# recipes on a CPU, and the spread of the runs about the law. Seconds are the processor time of one
+# thread, so that a busy machine does not make a law slow.
 
 
 #: bytes of a result whose shape is not known, in a recipe without any known shape
@@ -54,7 +54,8 @@ class Size(NamedTuple):
 
     inputs: float  #: bytes
     result: float  #: bytes
-    work: float  #: bytes beside inputs and result, up to a factor: `Hooks.work` of the node
+    #: bytes beside inputs and result, up to a constant factor: `Hooks.work` of the node
+    work: float
     operations: float  #: up to a factor
     bands: int = 0  #: number of bands that can be computed one after another; 0 if not known
     known: bool = True  #: False where the shape of the result is a guess
@@ -67,7 +68,7 @@ class Range(NamedTuple):
     most: float = 1.0
 
 
-Spread = tuple[Range, Range]  #: of the peak memory, and of the seconds
+Spread = tuple[Range, Range]  #: the spread of the peak memory, and the spread of the seconds
 EXACT: Spread = (Range(), Range())
 
 
@@ -87,7 +88,7 @@ class Law:
 
     memory: tuple[float, float, float, float]  #: bytes, and factors of inputs, result and work
     seconds: tuple[float, float]  #: s, and s for each operation
-    spread: Spread = EXACT  #: of runs about the law
+    spread: Spread = EXACT  #: spread of measured runs about the law
     #: the libraries that the node loads, whose cost is not in the numbers above
     loads: Loading | None = None
     #: bytes of the largest result that was measured, for a node without a rule of the shape
@@ -120,8 +121,8 @@ def shipped() -> Mapping[str, Law]:
 
 @cache
 def guess() -> Law:
-    """Return the law of a node that was never measured: the largest costs for its size that any
-    shipped node has.
+    """Return the law for a node that was never measured: the largest cost of any shipped node at
+    the same size.
     """
     return _law(_file()["guess"])
 
@@ -130,14 +131,14 @@ def _law(law: Mapping[str, Any]) -> Law:
     """Return the law that one entry of ``node_costs.json`` describes."""
     # least and largest multiple of the law: of the memory first, then of the seconds
     spread = (Range(*law["spread"][0]), Range(*law["spread"][1])) if "spread" in law else EXACT
-    # the names of the libraries, then the bytes and the seconds that they cost
+    # the names of the libraries, then the bytes and the seconds of loading them
     loads = Loading(tuple(law["loads"][0]), *law["loads"][1:]) if "loads" in law else None
     return Law(tuple(law["memory"]), tuple(law["seconds"]), spread, loads, law.get("most", 0.0))
 
 
 def libraries_of(paths: Iterable[str]) -> float:
-    """Return the bytes of the libraries that the nodes with these paths load, and this process
-    has not loaded yet.
+    """Return the memory (bytes) of the libraries that these nodes load and that this process has
+    not loaded yet.
     """
     total, loaded = 0.0, set[str]()
     for path in paths:
@@ -153,7 +154,9 @@ def libraries_of(paths: Iterable[str]) -> float:
 
 
 class Sized(NamedTuple):
-    """The size of a step, and what it follows from: the points of a sweep share most steps."""
+    """The size of a step, with the data from which it was computed: the points of a sweep share
+    most steps.
+    """
 
     step: Step
     inputs: Sequence[Any]
@@ -161,7 +164,7 @@ class Sized(NamedTuple):
     least: float
     form: Form
     size: Size
-    reads_file: bool  #: which may change
+    reads_file: bool  #: True if the step reads a file, which may change
 
     def holds(
         self, step: Step, inputs: Sequence[Any], below: Sequence[Size], smallest: float
@@ -183,7 +186,7 @@ class Sized(NamedTuple):
 
 
 def _equal(params: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
-    with suppress(Exception):  # values such as tensors, which have no single answer
+    with suppress(Exception):  # values such as tensors cannot be compared to one truth value
         return bool(params == others)
     return False
 
@@ -216,8 +219,8 @@ def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
 def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, Size]:
     """Return the size of each step in ``order``.
 
-    A result of unknown shape counts at least ``smallest`` bytes. The sizes of the recipe before
-    are taken again where a step is unchanged.
+    A result of unknown shape counts at least ``smallest`` bytes. The sizes of the previous recipe
+    are used again where a step is unchanged.
     """
     forms: dict[str, Form] = {}
     sizes: dict[str, Size] = {}
@@ -232,14 +235,15 @@ def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, S
         try:
             forms[name] = form_of(step.node, inputs, step.params)
         except OverflowError:
-            # more bytes than an address has: no machine can hold it, and the plan refuses it
+            # more bytes than an address can express: no machine can hold it, and the plan refuses
+            # it
             sizes[name] = Size(0.0, math.inf, math.inf, math.inf)
             continue
         sizes[name] = _size(step, inputs, forms[name], source_sizes, smallest)
         if forms[name] is None and not sizes[name].known:
             forms[name] = _guessed_form(inputs)
         if remembered is not None and alike(forms[name], remembered.form):
-            # the same object, so that later steps have the size that they had
+            # the same object, so that later steps keep their size
             forms[name] = remembered.form
         _remember(
             Sized(
@@ -265,10 +269,10 @@ def _guessed_form(inputs: Sequence[Form]) -> Form:
 def _size(
     step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size], smallest: float
 ) -> Size:
-    """Return the size of a step, from the ``form`` of its result or, where that is not known,
-    from the sizes ``below`` of its inputs.
+    """Return the size of a step, from the ``form`` of its result or, if that is not known, from the
+    sizes ``below`` of its inputs.
 
-    ``smallest`` is the number of bytes that a result of unknown shape has at least.
+    ``smallest`` is a lower bound on the bytes of a result of unknown shape.
     """
     is_known = all(size.known for size in below)
     if form is not None and complete(step.node, inputs):
@@ -281,7 +285,7 @@ def _size(
         result_bytes = law.most
     else:
         result_bytes, is_known = max(input_bytes, smallest), False
-    # without a rule for the work: one operation for each number of 4 bytes
+    # without a rule for the work, assume one operation for each number of 4 bytes
     return Size(input_bytes, result_bytes, 0.0, (input_bytes + result_bytes) / 4, 0, is_known)
 
 
@@ -290,7 +294,7 @@ def size_of(node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result
     without values.
     """
     input_bytes, result_bytes = bytes_of(list(inputs)), bytes_of(result)
-    # without a rule of the node: one operation for each number of 4 bytes
+    # without a rule of the node, assume one operation for each number of 4 bytes
     work_bytes, operations = 0.0, (input_bytes + result_bytes) / 4
     if node.hooks.work is not None:
         work_bytes, operations = node.hooks.work(result, *inputs, **params)
@@ -302,8 +306,8 @@ def size_of(node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result
 def measured_size(
     node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result: Any
 ) -> list[float] | None:
-    """Return the size of a step that ran, as the journal keeps it, or None if the rule of the
-    node fails.
+    """Return the size of a finished step in the form that the journal stores, or None if the rule
+    of the node fails.
     """
     try:
         forms = [without_values(x) for x in inputs]
@@ -317,21 +321,22 @@ def measured_size(
 # Cost model: run time, size of the result and memory of a step, predicted from shapes and from
 # earlier runs.
 #
-# The result has the bytes of its shape and type. For time and memory, runs of the same node at the
-# same size on this machine come first; then the law of the node (`cost_model`), scaled by the runs
-# of this machine; then, for a node that was never measured, the upper end of what shipped nodes
-# need.
+# The size of the result follows from its shape and type. Time and memory come from the first of
+# these that exists: runs of the same node at the same size on this machine; the law of the node
+# (`cost_model`), scaled by the runs of this machine; for a node that was never measured, the
+# largest cost of the shipped nodes.
 
 
 _FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
 _MOST_RESULTS = (
-    100  #: earlier results of a step or a node among which those of its size are searched
+    100  #: number of earlier results of a step or a node that are searched for results of its size
 )
-_NOISE_BYTES = 1 << 25  #: bytes of a peak below which the memory of the process is mostly noise
-#: how much larger a step of a node without a law may be than the largest one that was measured
+#: peak (bytes) below which the measured memory of the process is mostly noise
+_NOISE_BYTES = 1 << 25
+#: greatest ratio of the size of a step, whose node has no law, to the largest measured size
 _LARGEST_EXTRAPOLATION = 8
-_OVERHEAD_SECONDS = 1e-3  #: s of a step below which its time is mostly overhead
+_OVERHEAD_SECONDS = 1e-3  #: time (s) of a step below which it is mostly overhead
 
 Row = Mapping[str, Any]  #: a line of the journal
 
@@ -342,12 +347,12 @@ class Estimate:
 
     seconds: Mapping[str, float]  #: by kind of device: ``cpu``, ``cuda``
     bytes: float  #: size of the result
-    work: float  #: memory during the run, beside the inputs and the result
+    work: float  #: memory (bytes) during the run, beside the inputs and the result
     known: bool  #: False for a guess: neither the shape nor a measurement of the node is known
     spread: Spread = EXACT  #: of the peak memory and of the seconds
     bands: int = 0  #: number of bands that can be computed one after another; 0 if not known
     sized: bool = True  #: False where the size of the result is a guess as well
-    #: bytes of the libraries that the step loads, which count in the memory of the program
+    #: memory (bytes) of the libraries that the step loads, which count as memory of the program
     libraries: float = 0.0
 
     @property
@@ -406,10 +411,10 @@ class Costs:
         # the same result was computed before
         if exact and _is_measured(exact):
             return self._repeated([exact], kinds, size)
-        # its size is known: runs of the node at this size, or its law
+        # the size is known: use runs of the node at this size, or its law
         if size is not None and size.known:
             return self._predicted(step.node.path, kinds, size)
-        # of unknown size: earlier runs of this very step, or a guess
+        # the size is unknown: use earlier runs of this very step, or a guess
         rows = self._steps.get(f"{step.name} {step.node.path}", [])[-_NEWEST:]
         return (
             self._repeated(rows, kinds, None) if rows else self._guess(step.node.path, kinds, size)
@@ -418,8 +423,8 @@ class Costs:
     def in_turn(
         self, steps: Iterable[tuple[str, Step, Row | None]], kinds: Sequence[str]
     ) -> dict[str, Estimate]:
-        """Predict the costs of steps that run one after another: a library costs the first step
-        that loads it.
+        """Predict the costs of steps that run one after another; the cost of loading a library is
+        added to the first step that loads it.
 
         Args: steps: a key, the step, and the measured costs of the same result or None. Returns:
                 the costs by key.
@@ -442,8 +447,8 @@ class Costs:
         return estimates
 
     def _measured(self, step: Step, exact: Row | None) -> bool:
-        """Return True if the costs of a step are those of earlier runs, which loaded the
-        libraries as well.
+        """Return True if the predicted cost of a step comes from earlier runs, which include the
+        loading of libraries.
         """
         size = self._sizes.get(step.name)
         rows = self._nodes.get(step.node.path, [])
@@ -476,16 +481,16 @@ class Costs:
             # back in the order of time
             return self._repeated(runs_of_size[::-1], kinds, size, law)
         runs_with_size = [row for row in past_runs if _size_of_work(row)]
-        # a run at a far smaller size says little about this one
+        # runs at far smaller sizes do not predict this one
         if law is None and _LARGEST_EXTRAPOLATION * _largest_extent(runs_with_size) < _extent(size):
             return self._guess(path, kinds, size, runs_with_size[-_NEWEST:])
         law_or_guess = law or guess()
-        # how much more than the law the newest runs took here
+        # ratio of the newest runs on this machine to the law
         memory_and_time_factors = _scales(law_or_guess, runs_with_size[-_NEWEST:], self._faster)
         peak = max(size.result, memory_and_time_factors[0] * law_or_guess.peak(size))
         cpu_seconds = memory_and_time_factors[1] * law_or_guess.time(size)
         seconds = {kind: cpu_seconds / self._faster(kind) for kind in kinds}
-        # `Estimate.work` is what the peak holds beside the result
+        # `Estimate.work` is the peak without the result
         return Estimate(
             seconds, size.result, peak - size.result, True, law_or_guess.spread, size.bands
         )
@@ -494,14 +499,14 @@ class Costs:
         self, rows: Sequence[Row], kinds: Sequence[str], size: Size | None, law: Law | None = None
     ) -> Estimate:
         """Predict a step by the median of earlier runs of the same size."""
-        # measured rows have one size, so that the median is the size of each of them
+        # all rows have the same size, so that the median is this size
         result_bytes = size.result if size else float(median(row["bytes"] for row in rows))
         peaks = _measured_peaks(rows)
         lower_bound = law.peak(size) * law.spread[0].least if law and size else 0.0
         peak = max(median(peaks) if peaks else 0.0, result_bytes, lower_bound)
         seconds = {kind: self._seconds(rows, kind) for kind in kinds}
         usual_spread = law.spread if law else EXACT
-        # of the memory about its prediction, of the time about its median
+        # spread of the memory about its prediction, and of the time about its median
         spread = (
             _range(peaks, peak, usual_spread[0]),
             _range([row["seconds"] for row in rows], None, usual_spread[1]),
@@ -513,14 +518,14 @@ class Costs:
     def _guess(
         self, path: str, kinds: Sequence[str], size: Size | None, rows: Sequence[Row] = ()
     ) -> Estimate:
-        """Predict the upper end of the costs of a step whose shape is unknown or whose node never
-        ran at such a size.
+        """Predict the largest likely cost of a step whose shape is unknown, or whose node never ran
+        at such a size.
 
-        ``rows`` has runs at sizes that are much smaller: a node that took more there than the law
-        says takes more here.
+        ``rows`` has runs at much smaller sizes: if the node exceeded its law there, the guess
+        is increased by the same factor.
         """
         size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path) or guess()
-        # never below the law, because a guess is an upper end
+        # never below the law, because a guess is an upper limit
         memory_and_time_factors = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
         cpu_seconds, peak = (
             memory_and_time_factors[1] * law.spread[1].most * law.time(size),
@@ -534,8 +539,8 @@ class Costs:
         )
 
     def _seconds(self, rows: Sequence[Row], kind: str) -> float:
-        """Return the median time (s) of runs on a kind of device; without runs there, that of
-        other kinds, scaled by the ratio of their speeds.
+        """Return the median time (s) of runs on a kind of device. Without such runs, times of other
+        kinds are scaled by the ratio of the speeds.
         """
         runs_on_kind = [row for row in rows if _kind(row) == kind]
         if runs_on_kind:
@@ -564,7 +569,7 @@ class Costs:
 
 
 def _append(rows: list[Row], row: Row) -> None:
-    """Append a row to the newest ones, of which at most twice `_MOST_RESULTS` are there."""
+    """Append a row, and keep at most twice `_MOST_RESULTS` of the newest rows."""
     rows.append(row)
     if len(rows) > 2 * _MOST_RESULTS:
         del rows[:_MOST_RESULTS]
@@ -590,16 +595,16 @@ def _is_measured(row: Row) -> bool:
     """Return True for a journal line with a time, a size and a peak of memory that this machine
     can have.
     """
-    # a peak above the memory of this machine is damage, or of another machine
+    # a peak above the memory of this machine is damaged, or comes from another machine
     fits = _kind(row) != "cpu" or (row.get("peak") or 0) <= machine_memory()
     return fits and row.get("seconds") is not None and row.get("bytes") is not None
 
 
 def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:
-    """Return the factors from a law to the runs of this machine, for memory and for time; 1 where
+    """Return the median ratios of the runs on this machine to a law, for memory and for time; 1 if
     nothing was measured.
 
-    Small steps are left out, because allocators and overheads hide what they need.
+    Small steps are left out, because allocators and overheads dominate their cost.
     """
     peak_ratios, time_ratios = [], []
     for row in rows:
@@ -630,7 +635,7 @@ def _extent(size: Size) -> float:
 
 
 def _alike(size: Size, other: Size) -> bool:
-    """Return True if two sizes agree in bytes, work and operations, but for rounding."""
+    """Return True if two sizes agree in bytes, work and operations up to rounding."""
     return size[:4] == other[:4] or all(
         abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(size[:4], other[:4], strict=True)
     )

@@ -1,4 +1,6 @@
-"""Clusters of the command line: on this machine, of a scheduler, or of jobs of SLURM."""
+"""Clusters that the command line uses: worker processes on this machine, an existing scheduler, or
+SLURM jobs.
+"""
 
 from __future__ import annotations
 
@@ -25,37 +27,36 @@ from neusee.workflows.store.result_store import Store
 
 # --- slurm options --------------------------------------------------------------------------------
 
-# The options of the jobs that SLURM starts for a run, as the command line states them:
-# ``queue=gpu``, ``cores=4``.
+# Options of the SLURM jobs of a run, in the form of the command line: ``queue=gpu``, ``cores=4``.
 
 
 _COMMANDS = ("sbatch", "scancel")
 N = TypeVar("N", int, float)
-#: of SLURM: minutes, hours:minutes:seconds, or days-hours:minutes:seconds
+#: format of a SLURM time: minutes, hours:minutes:seconds, or days-hours:minutes:seconds
 _TIME = re.compile(r"(\d+-)?\d+(:\d+){0,2}")
 
 
 @dataclass(frozen=True)
 class SlurmOptions:
-    """What one job of SLURM asks for; a text that is empty leaves the default of the site."""
+    """Requirements of one SLURM job; an empty text leaves the default of the site."""
 
     queue: str = ""  #: partition
     account: str = ""
-    #: processors of a job, and threads of its worker; 0: as many as this program computes with
+    #: processors of a job, and threads of its worker; 0: as many as the threads of this program
     cores: int = 0
-    memory: str = "8 GB"  #: of a job; the worker is ended at 95 % of it
-    walltime: str = ""  #: such as 02:00:00; without it half an hour
-    wait: float = 5.0  #: minutes until the first job has to start
+    memory: str = "8 GB"  #: memory of a job; the worker is ended at 95 % of it
+    walltime: str = ""  #: time limit such as 02:00:00; half an hour if empty
+    wait: float = 5.0  #: time (min) within which the first job must start
     interface: str = ""  #: network between scheduler and workers, such as ib0
-    python: str = ""  #: program of the workers; without it the one that runs this program
+    python: str = ""  #: Python executable of the workers; if empty, that of this program
     logs: str = "slurm_logs"  #: folder
     directive: tuple[str, ...] = ()  #: further lines of #SBATCH, such as --gres=gpu:1
     prologue: tuple[str, ...] = ()  #: commands before the worker, such as module load cuda
 
     @classmethod
     def read(cls, words: Sequence[str]) -> SlurmOptions:
-        """Return the options in words such as ``queue=gpu``; raise ValueError for a word that is
-        none.
+        """Return the options in words such as ``queue=gpu``; raise ValueError for a word that is no
+        option.
         """
         options = cls()
         for word in words:
@@ -85,7 +86,7 @@ def _value(name: str, text: str, before: Any) -> Any:
         if isinstance(before, int):
             return _at_least_one(int(text))
         if isinstance(before, float):
-            # the check is in seconds, the option in minutes
+            # at least 1 s; the option is in minutes
             return _at_least_one(float(text.removesuffix("min").strip()) * 60) / 60
     except ValueError:
         raise ValueError(f"{name}={text}: must be {_KINDS[name]}") from None
@@ -111,11 +112,11 @@ def _at_least_one(number: N) -> N:
 
 # --- slurm jobs -----------------------------------------------------------------------------------
 
-# Jobs of SLURM whose workers compute a run: submitted through dask-jobqueue, waited for, and
+# SLURM jobs whose workers compute a run: they are submitted through dask-jobqueue, waited for, and
 # cancelled at the end.
 
 
-_LOOK = 5.0  #: s between two looks at the queue
+_LOOK = 5.0  #: interval (s) between two queries of the queue
 _CLOSING = 10.0  #: s for dask to close
 
 
@@ -125,12 +126,10 @@ class SlurmJobs:
 
     cluster: Any = None  #: `dask_jobqueue.SLURMCluster`
     ids: list[str] = field(default_factory=list)
-    refused: list[str] = field(default_factory=list)  #: what sbatch said
+    refused: list[str] = field(default_factory=list)  #: error messages of sbatch
 
     async def submit(self, command: str, script: str) -> str:
-        """Run the command that submits a script, and return what it prints; note what it
-        refuses.
-        """
+        """Run the command that submits a script, and return its output; note a refusal."""
         process = await asyncio.create_subprocess_exec(
             *shlex.split(command), script, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
@@ -152,8 +151,8 @@ class SlurmJobs:
         return printed
 
     def queue(self) -> str:
-        """Return what squeue says of the jobs, such as ``2 PENDING (Resources)``; an empty text
-        if none is left.
+        """Return the states of the jobs that squeue reports, such as ``2 PENDING (Resources)``; an
+        empty text if no job is left.
         """
         try:
             command = ["squeue", "--noheader", "--jobs", ",".join(self.ids), "--format", "%T (%r)"]
@@ -166,7 +165,7 @@ class SlurmJobs:
         return ", ".join(f"{lines.count(line)} {line}" for line in dict.fromkeys(lines))
 
     def cancel(self) -> None:
-        """Cancel all jobs; a job that has ended already is none to cancel."""
+        """Cancel all jobs; jobs that have ended are not affected."""
         if self.ids:
             with suppress(OSError, subprocess.TimeoutExpired):
                 subprocess.run(["scancel", *self.ids], capture_output=True, timeout=60)
@@ -202,7 +201,7 @@ def wait_for_job(
         present_time = time.monotonic()
         if jobs.refused:
             raise ClusterLost(f"sbatch refused a job: {jobs.refused[0]}")
-        # said once, as soon as a job has a number
+        # reported once, as soon as a job has a number
         if jobs.ids and not is_announced:
             is_announced = True
             say(
@@ -225,8 +224,8 @@ def wait_for_job(
 
 
 def _dask_jobqueue() -> tuple[type[Any], type[Any]]:
-    """Return the classes of a cluster and of a job; leave Ctrl-C as it is, for which the package
-    exits with 0.
+    """Return the classes of a cluster and of a job, and restore the handler of Ctrl-C, which the
+    package replaces by an exit with 0.
     """
     interrupt_handler = signal.getsignal(signal.SIGINT)
     from dask_jobqueue.slurm import SLURMCluster, SLURMJob
@@ -238,7 +237,7 @@ def _dask_jobqueue() -> tuple[type[Any], type[Any]]:
 
 
 def _with_job_reports(job_class: type[Any], jobs: SlurmJobs) -> type[Any]:
-    """Return a class of jobs that tell ``jobs`` their numbers and what sbatch refuses."""
+    """Return a class of jobs that report their numbers and the refusals of sbatch to ``jobs``."""
 
     async def submit(self: Any, script: str) -> str:
         return await jobs.submit(self.submit_command, script)
@@ -247,7 +246,7 @@ def _with_job_reports(job_class: type[Any], jobs: SlurmJobs) -> type[Any]:
 
 
 def _settings(options: SlurmOptions) -> dict[str, Any]:
-    """Return the arguments of a cluster; what is not stated is left to the configuration of the
+    """Return the arguments of a cluster; options that are not stated keep the configuration of the
     site.
     """
     site_options = {
@@ -255,7 +254,7 @@ def _settings(options: SlurmOptions) -> dict[str, Any]:
         for name in ("queue", "account", "walltime", "interface", "python")
     }
     return {
-        # of dask, which would compute as many steps at once: the threads are those of torch
+        # number of steps that dask computes at once; torch uses the threads inside a step
         "cores": 1,
         "processes": 1,
         "job_cpu": options.cores or torch.get_num_threads(),
@@ -272,11 +271,11 @@ def _settings(options: SlurmOptions) -> dict[str, Any]:
 
 # --- dask cluster ---------------------------------------------------------------------------------
 
-# The clusters on which the command line computes: workers on this machine, those of a scheduler, or
-# jobs of SLURM.
+# The clusters on which the command line computes: workers on this machine, workers of a scheduler,
+# or SLURM jobs.
 
 
-#: in the environment of workers whose terminal is that of the user
+#: environment of workers that share the user's terminal
 _QUIET = {"DASK_LOGGING__DISTRIBUTED": "critical"}
 
 
@@ -288,17 +287,17 @@ def cluster(
     say: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = warnings.warn,
 ) -> Iterator[Dask]:
-    """Yield an executor for workers that the text ``where`` names.
+    """Yield an executor for the workers that the text ``where`` describes.
 
-    ``dask:4`` are four local workers, ``dask:here`` is this process, ``slurm:4`` are four jobs of
+    ``dask:4`` means four local workers, ``dask:here`` this process, ``slurm:4`` four jobs of
     SLURM with the options ``job``, such as ``queue=gpu``; anything else is the address of a
-    scheduler. ``say`` is called with what is waited for, and ``warn`` for a scheduler that is
+    scheduler. ``say`` is called with a line while it waits, and ``warn`` if the scheduler is
     silent. Raises `ClusterLost` if no scheduler or no worker comes.
     """
     silence_logs()
     kind, _, worker_count = where.partition(":")
     with ExitStack() as clusters:
-        # 0: a worker computes with as many threads as this process
+        # 0: as many threads on a worker as in this process
         threads, address = 0, where
         if kind == "dask":
             address = clusters.enter_context(_local(worker_count))

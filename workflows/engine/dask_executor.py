@@ -44,17 +44,17 @@ from neusee.workflows.store.serialization import tensors_in
 
 # --- scheduler link -------------------------------------------------------------------------------
 
-# The link to a scheduler of dask: whether it answers, which workers it has, and when to give up.
+# The link to a dask scheduler: whether it answers, which workers it has, and when the run gives up.
 #
-# A link that is cut for less than `PATIENCE` comes back by itself: the client connects again, and
-# what was not told is asked for again. Beyond it the run ends with one sentence, and what is
-# finished stays in the cache.
+# A link that is cut for less than `PATIENCE` recovers by itself: the client connects again, and
+# asks again for missing outcomes. After that time the run ends with one sentence, and finished
+# results stay in the cache.
 
 
-PATIENCE = 60.0  #: s without a scheduler, or without any worker, after which a run gives up
-_ANSWER = 10.0  #: s in which a scheduler answers a question
-_ATTEMPT = 5.0  #: s of one attempt to connect again
-_BETWEEN = 5.0  #: s between two questions while steps are computed
+PATIENCE = 60.0  #: time (s) without a scheduler, or without any worker, after which a run gives up
+_ANSWER = 10.0  #: time limit (s) for an answer of the scheduler
+_ATTEMPT = 5.0  #: time limit (s) of one attempt to connect again
+_BETWEEN = 5.0  #: interval (s) between two queries while steps are computed
 _LOGGERS = ("distributed", "tornado", "tornado.application", "asyncio")
 
 
@@ -63,17 +63,21 @@ class ClusterLost(OSError):
 
 
 class SchedulerLink:
-    """The connection to a scheduler through a `distributed.Client`, made anew where it was lost."""
+    """The connection to a scheduler through a `distributed.Client`; a lost connection is replaced
+    by a new one.
+    """
 
     def __init__(self, client: Any, warn: Callable[[str], None]) -> None:
         self.client, self._warn = client, warn
         self.address = str(client.scheduler.address)
         self._asked = self._workers_seen = time.monotonic()
-        self.newest: Mapping[str, int] = {}  #: the workers that the scheduler told last
-        self._lost: list[Any] = []  # clients before, which futures of lost tasks still name
+        #: threads of each worker, from the last answer of the scheduler
+        self.newest: Mapping[str, int] = {}
+        self._lost: list[Any] = []  # earlier clients, to which futures of lost tasks still refer
 
     def renewed(self) -> bool:
-        """Return True if the connection was lost and is made anew, so that all tasks are lost.
+        """Return True if the connection was lost and replaced by a new one, so that all tasks are
+        lost.
 
         Raises `ClusterLost` if the scheduler does not return, or had no worker for too long.
         """
@@ -93,7 +97,7 @@ class SchedulerLink:
         """Return the number of threads by address of the connected workers, or None if the
         scheduler does not answer.
 
-        Raises `ClusterLost` if there was none for too long.
+        Raises `ClusterLost` if there was no worker for too long.
         """
         threads: Mapping[str, int] | None = None
         with suppress(OSError, AttributeError):  # the latter while the client closes
@@ -118,20 +122,20 @@ class SchedulerLink:
         return workers
 
     def close(self) -> None:
-        """Close the connection, and those before it."""
+        """Close the connection, and all earlier ones."""
         for client in (self.client, *self._lost):
             with suppress(Exception):
                 client.close(timeout=_ANSWER)
 
     def _connect_again(self) -> None:
-        """Connect to the scheduler with a new client, because one that waits for a lost packet
-        misses the return.
+        """Connect to the scheduler with a new client, because a client that waits for a lost packet
+        does not notice the return of the link.
         """
         self._warn(
             f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it"
             " to return"
         )
-        # kept, because futures of lost tasks still name it
+        # kept, because futures of lost tasks still refer to it
         self._lost.append(self.client)
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
@@ -156,8 +160,8 @@ def connected(address: Any, seconds: float = PATIENCE) -> Any:
 
 
 def silence_logs() -> None:
-    """Let dask and its network print nothing in this process: what a user needs to know is said
-    in a sentence.
+    """Suppress the log messages of dask and its network libraries in this process; neusee reports
+    to the user in its own sentences.
     """
     import distributed  # noqa: F401  makes its loggers, each with a handler of its own
 
@@ -172,8 +176,8 @@ def silence_logs() -> None:
 
 # --- dask worker ----------------------------------------------------------------------------------
 
-# The side of a worker of `dask.distributed`: it computes chains of steps, and returns outcomes
-# without values.
+# Code that runs on a worker of `dask.distributed`: it computes chains of steps, and returns
+# outcomes without values.
 #
 # The worker reads values by key from the store, or takes values of earlier tasks from memory, and
 # writes the last result of the chain to the store.
@@ -183,35 +187,35 @@ _PLANNED = 0.6  #: fraction of the memory of a worker that a schedule may use
 
 
 class _Here:
-    """State of one worker between tasks: the store, digests of code, and the most recently used
+    """State of one worker between tasks: the store, the digests of code, and the most recently used
     values.
     """
 
     def __init__(self, where: str, room: float) -> None:
         self.store = open_store(where)
-        # by the modules that the caller had imported; None: those here
+        # digests by the modules that the caller had imported; None: the modules imported here
         self._codes: dict[frozenset[str] | None, Code] = {None: Code(self.store.code_memo)}
         self._own = own_modules()
         self.values: OrderedDict[Key, Any] = OrderedDict()
-        # bytes that values may have, and that they have
+        # greatest and present size (bytes) of the values
         self.room, self.held = room, 0
 
     def look_again(self) -> None:
-        """Compute digests of code anew if a job has brought modules of a user, which may change
-        what others compute.
+        """Compute the digests of code again if a job has loaded modules of the user, which may
+        change the results of others.
         """
         if self._own != own_modules():
             self._codes, self._own = {None: Code(self.store.code_memo)}, own_modules()
 
     def code_for(self, work: StepJob) -> Code | None:
-        """Return the digests of code by which a step has the digest of the caller, or None where
-        its code differs.
+        """Return the digests of code with which a step has the same digest as for the caller, or
+        None if its code differs here.
 
         What a package of the user holds depends on which of its modules were imported. The caller's
         count: this worker imports those that it lacks, and leaves out those that steps of other
         recipes imported here.
         """
-        # first by the modules that are imported here, then by those of the caller
+        # try the modules that are imported here, and then those of the caller
         for imported_modules in (None, work.own.followed if work.own else frozenset[str]()):
             for module in sorted(imported_modules or ()):
                 imported(module)
@@ -223,8 +227,8 @@ class _Here:
         return None
 
     def fetch(self, key: Key, kinds: Mapping[Key, Any]) -> Any:
-        """Return the value of a key; ``kinds`` are the annotated types of the inputs of a step,
-        by their keys.
+        """Return the value of a key; ``kinds`` maps the key of each input of a step to its
+        annotated type.
         """
         if key not in self.values:
             try:
@@ -238,7 +242,7 @@ class _Here:
         self.held += _size(value) - _size(self.values.get(key))
         self.values[key] = value
         self.values.move_to_end(key)
-        # those used longest ago are forgotten; the newest stays whatever its size
+        # the least recently used values are deleted; the newest stays whatever its size
         while self.held > self.room and len(self.values) > 1:
             self.held -= _size(self.values.popitem(last=False)[1])
 
@@ -247,8 +251,8 @@ _here: dict[str, _Here] = {}
 
 
 def _chance_of_its_own() -> None:
-    """Give dask a module `random` of its own: its threads draw beside a step, which would be taken
-    for draws of the step.
+    """Give dask its own copy of the module `random`: its threads draw while a step runs, which
+    would count as draws of the step.
     """
     own_random = _second_random()
     for name, module in list(sys.modules.items()):
@@ -258,9 +262,7 @@ def _chance_of_its_own() -> None:
 
 @cache
 def _second_random() -> ModuleType:
-    """Return the module `random` loaded once more, with the classes and functions of the first one
-    and a generator of its own.
-    """
+    """Return a second copy of the module `random` with its own generator."""
     specification = find_spec("random")
     assert specification is not None
     assert specification.loader is not None
@@ -282,10 +284,10 @@ def lane_here(dask_worker: Any) -> tuple[str, float]:
 def work_here(
     chain: tuple[StepJob, ...], where: str, threads: int, room: float, signed: str = ""
 ) -> list[Outcome]:
-    """Compute a chain of jobs on a worker; return outcomes without values, and cache up to ``room``
-    bytes of values.
+    """Compute a chain of jobs on a worker, and return outcomes without values. The worker keeps up
+    to ``room`` bytes of values.
 
-    ``signed`` is a signature by the secret of the caller, which this worker needs too.
+    ``signed`` is a signature by the caller's secret; the worker must have the same secret.
     """
     if not _same_secret(signed):
         text = (
@@ -305,14 +307,14 @@ def work_here(
         # the later jobs of a chain need this result
         if outcome.held or outcome.error or outcome.lost:
             break
-        # what is not stored must be computed again, with what it needed
+        # a value that is not stored must be computed again, with its inputs
         refetch = 0.0 if outcome.kept else outcome.seconds + refetch
     return [_light(outcome) for outcome in outcomes]
 
 
 def _same_secret(signed: str) -> bool:
-    """Return True if a signature of the caller is right by the secret of this process, or
-    neither has one.
+    """Return True if the secret of this process confirms the caller's signature, or if neither side
+    has a secret.
     """
     try:
         check_signature(signed, "worker", "", b"")
@@ -339,7 +341,7 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
         )
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
     work = replace(work, own=own_code(work.step, code))
-    # of an earlier job, whose memo may still hold it
+    # taints of an earlier job, whose data the module may still keep
     if work.own and (earlier_taints := taints_of(work.own.modules)):
         return Outcome(work, taints=earlier_taints)
     outcome = carry_out(work, partial(here.fetch, kinds=kinds_of(work)), here.store)
@@ -373,7 +375,7 @@ def kinds_of(work: StepJob) -> dict[Key, Any]:
 
 
 def _light(outcome: Outcome) -> Outcome:
-    """Return an outcome that pickle can send: without the value, and with any error as a
+    """Return an outcome that pickle can send: without its value, and with any error wrapped in a
     `RunError`.
     """
     outcome.value = None
@@ -383,7 +385,7 @@ def _light(outcome: Outcome) -> Outcome:
 
 
 def _size(value: Any) -> int:
-    """Return the bytes of the tensors in a value."""
+    """Return the total size of the tensors in a value, in bytes."""
     return 0 if value is None else sum(t.nbytes for t in tensors_in(value))
 
 
@@ -398,8 +400,8 @@ def _size(value: Any) -> int:
 
 
 _SHARE = 0.4  #: fraction of the planned memory for values that the next tasks of a worker may read
-_LOOK = 1.0  #: s between two queries for the connected workers
-_TRIES = 3  #: number of workers that may die during one chain before the run fails
+_LOOK = 1.0  #: interval (s) between two queries for the connected workers
+_TRIES = 3  #: number of workers that may die while they compute one chain before the run fails
 
 
 class Dask:
@@ -416,18 +418,19 @@ class Dask:
         threads: int = 0,
         warn: Callable[[str], None] = warnings.warn,
     ) -> None:
-        """Use ``threads`` threads on a worker, by default as many as here; ``warn`` is told at
-        once of a lost link.
+        """Use ``threads`` threads on a worker, by default as many as here; ``warn`` is called at
+        once if the link is lost.
         """
         self.where = getattr(store, "url", None) or str(store.root.absolute())
         self.link = SchedulerLink(client, warn)
-        # as many as here give the same round-off as here
+        # the same number of threads as here gives the same rounding as here
         self.threads = threads or torch.get_num_threads()
         self._lanes: dict[str, Lane] = {}
         self._looked = -_LOOK  # time (s) of the last query for workers; none yet
         self._running: dict[Any, tuple[StepJob, ...]] = {}  # chain of jobs of each future
-        self._tries: dict[Key, int] = {}  # how often a chain was sent, by its first key
-        self._bound = set[Any]()  # futures of chains that are meant for one worker
+        # number of times that each chain was sent, by its first key
+        self._tries: dict[Key, int] = {}
+        self._bound = set[Any]()  # futures of chains that are assigned to one worker
 
     @property
     def client(self) -> Any:
@@ -462,7 +465,7 @@ class Dask:
             _SHARE
             * min((worker_address.memory for worker_address in self._lanes.values()), default=0.0),
             signature("worker", "", b""),
-            # another name at each attempt: dask gives the result of an equal name again
+            # a new name for each attempt: dask returns the old result for an equal name
             key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",
             pure=False,
             retries=_TRIES,
@@ -496,7 +499,8 @@ class Dask:
         stored.
         """
         for future in self._running:
-            future.release()  # waits for no answer, which a lost scheduler does not give
+            # this does not wait for an answer, which a lost scheduler would not send
+            future.release()
         self._running = {}
         self._bound.clear()
 
@@ -509,14 +513,14 @@ class Dask:
             future.release()
 
     def _free_of_lost_workers(self) -> None:
-        """Send again what was meant for a worker that is gone: dask would keep it for that
-        worker if none was left.
+        """Send again the chains that were assigned to a lost worker: dask would otherwise keep them
+        for that worker if none was left.
         """
         if present := self.link.newest:
             self._submit_again([f for f in self._bound if self._running[f][0].lane not in present])
 
     def _rest(self, seconds: float) -> None:
-        """Wait until a task ends, or for a time."""
+        """Wait until a task ends, at most ``seconds``."""
         from distributed import wait
 
         with suppress(TimeoutError, CancelledError), self.client.as_current():
@@ -547,7 +551,7 @@ class Dask:
         connected.
         """
         present_workers = self.link.workers()
-        if present_workers is None and self._lanes:  # a cut, which may end
+        if present_workers is None and self._lanes:  # the link is cut, but may recover
             return
         present_workers = present_workers or self.link.wait_for_workers()
         new_addresses = [address for address in present_workers if address not in self._lanes]
@@ -572,7 +576,7 @@ class Dask:
 
 
 def _why_not(cause: BaseException | None) -> str:
-    """Return why no worker computed a step, without the advice of dask."""
+    """Return the reason why no worker computed a step, without dask's own advice."""
     if cause is None:
         return "the link to the cluster was lost again and again while a worker computed the step"
     if type(cause).__name__ == "KilledWorker":

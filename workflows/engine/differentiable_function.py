@@ -25,7 +25,7 @@ from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 Theta = Mapping[str, Any]
 
-#: words by which torch says that a function does not pass one of its transforms
+#: words in torch's errors for a function that does not support a transform
 _MARKS = {
     "vmap": ("vmap", "Batching rule", "batching rule"),
     "jvp": ("jvp", "forward mode", "forward AD", "second derivative"),
@@ -70,16 +70,16 @@ def as_function(
     names = recipe.outputs if outputs is None else tuple(outputs)
     replaced_steps, tuned_params = _read(recipe, free)
     recipe = with_substitutions(recipe, names, replaced_steps | tuned_params.keys())
-    # a step whose result the caller gives needs nothing
+    # a step whose result the caller provides needs no inputs
     sources = {
         name: () if name in replaced_steps else step.sources for name, step in recipe.steps.items()
     }
     order = in_order(sources, names)
     if unused_names := sorted((replaced_steps | tuned_params.keys()) - set(order)):
         raise ValueError(f"no output depends on {', '.join(unused_names)}")
-    # computed at every call; all others once, here
+    # steps computed at every call; all others are computed once, here
     live_steps = _from_roots(order, sources, {*replaced_steps, *tuned_params, *redraw})
-    # what the live steps read, and the outputs
+    # steps that the live steps read, and the outputs
     steps_read_live = set(names).union(*(sources[step] for step in live_steps))
     fixed_results = run(recipe, store, sorted(steps_read_live - live_steps.keys()), device=device)
     bounds_of_skipped = {
@@ -181,7 +181,7 @@ class _Function:
         return {name: values[name] for name in self.wanted}
 
     def _free(self, name: str, values: dict[str, Any]) -> None:
-        """Delete the values that no later step reads than the step ``name``."""
+        """Delete the values that no step after ``name`` reads."""
         for source in set(self.recipe.steps[name].sources):
             if self._last[source] == name and source not in self.wanted:
                 del values[source]
@@ -190,7 +190,7 @@ class _Function:
         self, step: Step, values: dict[str, Any], theta: Theta, ledger: ErrorBudget, seed: int
     ) -> Any:
         """Return the result of one live step, from the values so far and the parameters in
-        ``theta``; name the step in an error of torch.
+        ``theta``. An error of torch names the step.
         """
         params = {
             **step.params,
@@ -214,14 +214,14 @@ class _Function:
         ledger: ErrorBudget,
         seed: int,
     ) -> Any:
-        """Return the result of a step, or that of a cheaper step where the tolerance of the
-        recipe allows it.
+        """Return the result of a step, or of a cheaper step if the tolerance of the recipe allows
+        it.
         """
         if step.node.hooks.skip_bound is not None:
             with torch.no_grad():
                 verdict = ledger.verdict(step, params, lambda name: self._facts_of(name, values))
             if verdict.left_out:
-                # the input takes the place of the result
+                # the step is left out: its input replaces its result
                 return values[verdict.instead]
         else:
             ledger.pass_on(step)
@@ -244,10 +244,10 @@ class _Function:
 def _named_transform_error(
     error: Exception, step: Step, inputs: list[Any], exact: bool
 ) -> Exception:
-    """Return an error that names the step and the transform of `torch.func` that it does not
-    pass, or ``error``.
+    """Return an error that names the step and the `torch.func` transform that it does not support,
+    or ``error`` itself.
     """
-    # the transform of `torch.func` under way, if there is one
+    # the active `torch.func` transform, if any
     interpreter = peek_interpreter_stack()
     if interpreter is None:
         return error
@@ -261,7 +261,7 @@ def _named_transform_error(
         if transform == "vmap"
         else "use torch.autograd"
     )
-    # an exact recipe is no way out where the recipe is exact
+    # do not advise an exact recipe if the recipe is already exact
     alternative = "" if exact and transform == "vmap" else _OTHERWISE[transform]
     text = (
         f"torch.func.{transform} does not pass {step.node.path} ({error_text[:120]} ...):"
@@ -271,8 +271,8 @@ def _named_transform_error(
 
 
 class _Ends:
-    """Statistics of an image; minimum and maximum are computed at once, any other statistic at
-    its first use.
+    """Statistics of an image; minimum and maximum are computed at once, all other statistics at
+    their first use.
     """
 
     def __init__(self, value: Tensor) -> None:

@@ -16,7 +16,7 @@ from neusee.workflows.keys.cache_key import Key, device_kind
 _FIRST_PAUSE, _LONGEST_PAUSE = (
     0.01,
     0.5,
-)  #: s between attempts at a job that another process computes
+)  #: pauses (s) between attempts at a job that another process computes
 
 Chain = tuple[StepJob, ...]  #: jobs of which each feeds only the next job
 #: a function that returns True if the memory suffices for one more step beside the running steps
@@ -24,8 +24,8 @@ MemoryProfile = Callable[[StepJob, Sequence[StepJob]], bool]
 
 
 class Loop:
-    """Progress of a run: chains of jobs that wait for inputs, chains that are ready, and the
-    chain on each device.
+    """Progress of a run: chains of jobs that wait for inputs, ready chains, and the chain that each
+    device computes.
     """
 
     def __init__(
@@ -41,22 +41,22 @@ class Loop:
         for i, chain in enumerate(chains):
             self._chain_of.update({job.key: i for job in chain})
         self._chains = list(chains)
-        # by chain: the values of other chains that it waits for
+        # for each chain, the keys of the values of other chains that it waits for
         self._missing = [self._outside(chain) for chain in chains]
-        # by value: the chains that wait for it
+        # for each value, the chains that wait for it
         self._after: dict[Key, list[int]] = {}
         for i, missing in enumerate(self._missing):
             for key in missing:
                 self._after.setdefault(key, []).append(i)
         self._ready = [i for i, missing in enumerate(self._missing) if not missing]
         self._ready.reverse()  # the next chain is the last item, which a list can remove fastest
-        # chain -> time of the next attempt, and the wait after it
+        # chains that another process computes: time of the next attempt, and the last pause
         self._held: dict[int, tuple[float, float]] = {}
         self._open = len(chains)  # chains that are not done
 
     def outcomes(self) -> Iterator[Outcome]:
-        """Yield the outcome of each job, with the error of a failed job, when it arrives, until
-        all jobs are done.
+        """Yield the outcome of each job when it arrives, until all jobs are done; the outcome of a
+        failed job contains the error.
         """
         while self._open:
             self._hand_out()
@@ -69,7 +69,7 @@ class Loop:
                 raise RuntimeError(f"no device or worker is left to compute {name}")
             for outcome in self.executor.wait(self._patience()):
                 self._settle(outcome)
-                # computed by another process: it is tried again later, and yields then
+                # a result that another process computes is tried again later, and yielded then
                 if not outcome.held:
                     yield outcome
 
@@ -82,9 +82,7 @@ class Loop:
         return {key for key in read_keys if key in self._chain_of and key not in own_keys}
 
     def _hand_out(self) -> None:
-        """Submit to every idle device or worker the first ready chain of jobs that may run
-        there.
-        """
+        """Submit to every idle device or worker the next ready chain of jobs that may run there."""
         self._make_due_chains_ready()
         for lane, lane_state in self.executor.lanes.items():
             if lane in self.busy or not self._ready:
@@ -92,7 +90,7 @@ class Loop:
             ready_index = self._first_for(lane, lane_state.device)
             if ready_index is not None:
                 chain = self._chains[self._ready.pop(ready_index)]
-                # it was planned for another device or worker
+                # the chain was planned for another device or worker
                 if chain[0].lane != lane:
                     chain = tuple(_moved(job, lane, lane_state.device) for job in chain)
                 chain = self.busy[lane] = (self.begin(chain[0]), *chain[1:])
@@ -106,7 +104,7 @@ class Loop:
         """
         running = list(itertools.chain.from_iterable(self.busy.values()))
         lanes = self.executor.lanes
-        # the first chain is the last of the list
+        # the list is in reverse order: the next chain is last
         for ready_index in range(len(self._ready) - 1, -1, -1):
             chain = self._chains[self._ready[ready_index]]
             planned_lane = chain[0].lane
@@ -119,7 +117,7 @@ class Loop:
         return None
 
     def _make_due_chains_ready(self) -> None:
-        """Make the chains ready whose wait for another process is over."""
+        """Make those chains ready whose pause is over."""
         present_time = time.monotonic()
         for chain_index in [
             chain_index
@@ -127,12 +125,12 @@ class Loop:
             if attempt_time <= present_time
         ]:
             self._ready.append(chain_index)
-            # no second attempt until this one has its outcome; the wait is kept to double it
+            # no further attempt until this one has its outcome; the pause is kept to double it
             self._held[chain_index] = (float("inf"), self._held[chain_index][1])
 
     def _patience(self) -> float | None:
-        """Return the time (s) to wait for running jobs; if only other processes compute, first
-        sleep for this time.
+        """Return the time (s) to wait for running jobs; None means no limit. If only other
+        processes compute, sleep for this time first.
         """
         attempt_times = [
             attempt_time for attempt_time, _ in self._held.values() if attempt_time < float("inf")
@@ -151,7 +149,7 @@ class Loop:
         key = outcome.work.key
         chain_index = self._chain_of[key]
         is_last = key == self._chains[chain_index][-1].key
-        # after any of these the rest of the chain does not run on the device
+        # in each of these cases no later job of the chain runs on the device
         if outcome.held or is_last or outcome.error or outcome.lost:
             self.busy.pop(outcome.work.lane, None)
         if outcome.held:
@@ -170,12 +168,12 @@ class Loop:
         freed_chains = [i for i in waiting_chains if not self._missing[i]]
         self._ready += freed_chains
         if len(self.executor.lanes) > 1 or freed_chains:
-            # the first chain is the last of the list
+            # the list is in reverse order: the next chain is last
             self._ready.sort(reverse=True)
 
     def _hold(self, i: int, key: Key) -> None:
-        """Let a chain wait, twice as long as before, from the job whose result another process
-        computes.
+        """Postpone a chain, from the job that another process computes, with twice the previous
+        pause.
         """
         chain = self._chains[i]
         # the first pause is `_FIRST_PAUSE`: twice the half of it
@@ -186,7 +184,7 @@ class Loop:
 
 
 def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
-    """Group jobs into chains: single jobs, or if ``fused``, jobs on one device that each feed
+    """Group jobs into chains: single jobs, or if ``fused``, jobs on one device of which each feeds
     only the next job.
     """
     if not fused:
@@ -195,7 +193,7 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
     planned = {job.key for job in works}
     chains: dict[Key, list[StepJob]] = {}  # by the key of the last job
     for job in works:
-        # a job joins a chain if it reads one planned result, which nobody else reads
+        # a job joins a chain if it reads exactly one planned result, which no other job reads
         planned_sources = list(planned.intersection(job.sources))
         is_only_reader = len(planned_sources) == 1 and readers[planned_sources[0]] == 1
         chain = chains.get(planned_sources[0]) if is_only_reader else None
@@ -210,13 +208,15 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
 def _in_order_of_first_jobs(
     chains: Iterable[list[StepJob]], works: Sequence[StepJob]
 ) -> list[Chain]:
-    """Return the chains in the order in which the list of jobs has their first jobs."""
+    """Return the chains, sorted by the position of their first jobs in ``works``."""
     position = {job.key: i for i, job in enumerate(works)}
     return sorted(map(tuple, chains), key=lambda chain: position[chain[0].key])
 
 
 def _continues(chain: Sequence[StepJob], work: StepJob) -> bool:
-    """Return True if a job on the device of a chain reads a result that nobody else asked for."""
+    """Return True if a job runs on the device of a chain and the last result of the chain is not
+    requested itself.
+    """
     return not chain[-1].wanted and chain[-1].lane == work.lane
 
 

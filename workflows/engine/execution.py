@@ -55,36 +55,37 @@ from neusee.workflows.tolerance.skip_decision import ErrorBudget, SkipDecision
 
 # --- run series -----------------------------------------------------------------------------------
 
-# A series of runs, such as those of the points of a sweep: what a run found that holds for the next
-# run as well.
+# A series of runs, such as the points of a sweep: data that one run found and that the next run can
+# use.
 
 
 @dataclass(eq=False)
 class RunSeries:
-    """What the runs of a series share: the code of nodes, keys of steps, and statistics of results.
+    """Data that the runs of a series share: the code of nodes, keys of steps, and statistics of
+    results.
 
-    The key of a result decides its statistics, so that they hold whatever has become of the result
+    The key of a result determines its statistics, so they stay valid even if it is no longer
     in the store.
     """
 
     known_keys: KnownKeys
-    #: of the results of the newest run alone
+    #: statistics of the results of the newest run only
     facts: dict[Key, TensorStats] = field(default_factory=dict)
 
     @classmethod
     def begun(cls, store: Store) -> RunSeries:
-        """Return a series without a run, whose code is read now."""
+        """Return a series without a run; the code of nodes is read now."""
         return cls(KnownKeys(Code(store.code_memo)))
 
     def read_code_again(self, store: Store) -> None:
-        """Forget the digests of code and the keys that rest on them."""
+        """Forget the digests of code, and the keys that depend on them."""
         self.known_keys = KnownKeys(Code(store.code_memo))
 
     def keep(self, facts: Mapping[Key, TensorStats | None], keys: Iterable[Key]) -> None:
-        """Keep the statistics of the results ``keys`` for the next run, in place of those of
-        earlier runs.
+        """Keep the statistics of the results ``keys`` for the next run; those of earlier runs are
+        deleted.
 
-        The next run computes private results again, which may differ then.
+        Private results are left out: the next run computes them again, and they may differ.
         """
         public = [key for key in keys if not is_private(key)]
         keys_and_stats = ((key, facts.get(key)) for key in public)
@@ -93,13 +94,13 @@ class RunSeries:
 
 # --- values in memory -----------------------------------------------------------------------------
 
-# The values of a run that are in memory, each until no later step of the run needs it.
+# The values of a run in memory, each kept until no later step of the run needs it.
 
 
 class ValuesInMemory(dict[Key, Any]):
-    """Values by cache key, with what this run knows of their copies in the store.
+    """Values by cache key, and whether the store has copies of them.
 
-    ``later`` has the values that are being written in the background.
+    ``later`` contains the values that are being written in the background.
     """
 
     def __init__(self, store: Store, later: WriteBehind) -> None:
@@ -109,7 +110,7 @@ class ValuesInMemory(dict[Key, Any]):
         self._unsure = dict[Key, bool]()
 
     def add(self, outcome: Outcome) -> None:
-        """Add the value of a step that was computed."""
+        """Add the value of a computed step."""
         key = outcome.work.key
         self[key] = outcome.value
         self._unsure.pop(key, None)
@@ -117,8 +118,8 @@ class ValuesInMemory(dict[Key, Any]):
             self._unsure[key] = outcome.is_written_later
 
     def free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
-        """Delete the values that no later step needs; with ``keep``, only those of which the
-        store has a copy.
+        """Delete the values that no later step needs; with ``keep``, only those that the store has
+        a copy of.
         """
         for key in keys:
             unused = uses[key] <= 0 and key in self and key not in self._later
@@ -134,14 +135,15 @@ class ValuesInMemory(dict[Key, Any]):
 
 # --- private steps --------------------------------------------------------------------------------
 
-# Steps whose results hold for this process alone, since own code was seen to read what its key does
-# not cover.
+# Steps whose results are valid in this process only, because code of the user was observed to read
+# something its key does not cover.
 
 
 class TaintedRun(Exception):
-    """Signal of a run whose keys no longer hold: an own step reached what its key does not cover.
+    """Raised when the cache keys of a run are no longer valid, because a step of the user used
+    something that its key does not include.
 
-    The run begins again with private keys for this code and for all that follows from it.
+    The run begins again, with private keys for this code and for all steps that depend on it.
     """
 
     def __init__(self, outcome: Outcome) -> None:
@@ -150,10 +152,10 @@ class TaintedRun(Exception):
 
 
 def refuse_taints(outcome: Outcome) -> None:
-    """Taint the code of a step that was seen to reach what its key does not cover; say so, and
-    raise `TaintedRun`.
+    """Taint the code of a step that used something its key does not cover; warn of it, and raise
+    `TaintedRun`.
 
-    A step whose code was tainted before has a private key, and its run goes on.
+    A step whose code was tainted before has a private key, and the run continues.
     """
     if not outcome.taints or outcome.work.own is None:
         return
@@ -177,25 +179,26 @@ def refuse_taints(outcome: Outcome) -> None:
 # Execution of one run: the keys of the steps, the values that are loaded or computed, and the
 # records.
 #
-# No function is recursive over the graph. Values are kept by key: two steps with one key are
+# No function is recursive over the graph. Values are kept by key: two steps with the same key are
 # computed once. A step that is left out has the key of its input.
 
 
-_UNLOCKED_SECONDS = 1e-3  #: s below which two processes may both compute a step without a lease
+#: time (s) of a step below which two processes may both compute it, without a lease
+_UNLOCKED_SECONDS = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """What a run must give, and what computes and stores it."""
+    """The results that a run must return, and the executor and the store that it uses."""
 
     recipe: Recipe
-    outputs: tuple[str, ...]  #: steps whose values the run must give
+    outputs: tuple[str, ...]  #: steps whose values the run must return
     store: Store
-    devices: list[str]  #: the preferred device first
-    memory: int | None  #: bytes that this process, and each GPU, may use; None for what is free
+    devices: list[str]  #: the preferred device comes first
+    memory: int | None  #: bytes that this process, and each GPU, may use; None: the free memory
     executor: Executor | None  #: None for this process
-    watch: Callable[[Event], None]  #: is called with what becomes of each step
-    show: Show  #: is called with each computed result
+    watch: Callable[[Event], None]  #: called when a step begins and when it ends
+    show: Show  #: called with each computed result
 
 
 class Execution:
@@ -220,18 +223,20 @@ class Execution:
         self.executor = request.executor or self.own
         self.series = series
         self.code, self.began = series.known_keys.code, time.time()
-        self._carried = carried  # outcomes of an attempt before this one, by step
-        self._anew = set[Key]()  # of steps that are computed although the store has their results
+        self._carried = carried  # outcomes of an earlier attempt, by step
+        # keys of steps that are computed although the store has their results
+        self._anew = set[Key]()
         self._asked_anew = dependents(recipe, anew) if anew else frozenset[str]()
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
         self.values = ValuesInMemory(store, self.own.later)
         self.facts: dict[Key, TensorStats | None] = {**self.series.facts}
-        self.again: dict[Key, float] = {}  # s to obtain again a value that was computed in this run
-        self.took: dict[str, float] = {}  # the longest time of a step of each node, s
+        # time (s) to obtain again a value that was computed in this run
+        self.again: dict[Key, float] = {}
+        self.took: dict[str, float] = {}  # longest time (s) of a step of each node
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
-        # and of steps that did not run
+        # records of finished steps, and of steps that did not run
         self.done, self._unneeded_records = dict[str, StepRecord](), dict[str, StepRecord]()
         self.receipts: dict[Key, dict[str, Any]] = {}  # metadata of values that were not kept
         self.costs: Costs | None = None
@@ -246,7 +251,7 @@ class Execution:
         for name in order:
             step = self.recipe.steps[name]
             if step.node.hooks.skip_bound is not None:
-                # a step that may be left out: its result is that of the step in its place
+                # a step that may be left out: if it is, its result is that of another step
                 verdict = self.verdicts[name] = self.ledger.verdict(
                     step, step.params, self._facts_of
                 )
@@ -257,7 +262,7 @@ class Execution:
                     )
                     continue
             else:
-                # the error bounds of its inputs become that of its result
+                # the error bounds of its inputs determine that of its result
                 self.ledger.pass_on(step)
             try:
                 # a key depends on the kind of device where the step draws random numbers
@@ -269,21 +274,21 @@ class Execution:
             # computed although the store may have its result
             if name in self._asked_anew:
                 self._anew.add(key)
-            # of steps with one key the first computes the value
+            # the first of several steps with the same key computes the value
             if key not in self.makers:
                 self.makers[key], self.origins[key] = step, origin
-                # its value may be there from an attempt before this one
+                # an earlier attempt may have computed its value
                 self._take_over(name, key, origin)
 
     def _take_over(self, name: str, key: Key, origin: dict[str, Any]) -> None:
-        """Use the value that an attempt before this one computed and could not store, if its
+        """Use the value that an earlier attempt computed but could not store, if parameters and
         inputs are the same.
         """
         earlier_outcome = self._carried.get(name)
         if earlier_outcome is None or earlier_outcome.value is None:  # a worker sends no value
             return
         if any(
-            # the code may differ: only its taint has changed it
+            # the digest of the code is not compared: it changed only because the code was tainted
             earlier_outcome.work.origin[origin_part] != origin[origin_part]
             for origin_part in ("params", "inputs")
         ):
@@ -294,7 +299,7 @@ class Execution:
         self.values.add(outcome)
         self.facts[key] = outcome.facts
         self.again[key] = outcome.seconds + outcome.work.refetch_seconds
-        # as a step that ran in this run
+        # it counts as a step that ran in this run
         self._finish(ran(outcome, "not stored", self._bound(name), self.began, None))
 
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
@@ -308,16 +313,16 @@ class Execution:
             order = in_order(upstream, targets)
             try:
                 plan = [key for key in order if key in upstream.missing]
-                # how often each value is still to be read
+                # number of reads of each value that are still to come
                 uses = uses_of(plan, [*targets, *later], upstream.knows, self.sources)
                 return self._execute(plan, targets, keep, uses, asked=not (keep or later))
-            # a stored value was damaged or removed: it counts as missing in the next plan
+            # a stored value is damaged or was removed: the next plan counts it as missing
             except InputMissing:
                 continue
 
     def close(self) -> None:
-        """Save the digests of code, finish all writes, and delete the values and the executor,
-        which refers to this.
+        """Save the digests of code and finish all writes. Delete the values and the executor, which
+        refers back to this object.
         """
         self.series.keep(self.facts, self.makers)
         self.code.save()
@@ -335,7 +340,7 @@ class Execution:
                 continue
             key = self.keys[name]
             record_of_key = self.done.get(self.makers[key].name)
-            # neither this step nor one with its key had to run
+            # neither this step nor another with the same key had to run
             if record_of_key is None or record_of_key.state == "not needed":
                 self._finish(self.record_of_unneeded(name))
             else:
@@ -367,7 +372,7 @@ class Execution:
         steps ``names``.
         """
         upstream = Upstream(self.known, self.sources)
-        # the walk asks `upstream` for every value, which notes the missing ones
+        # the walk looks up every value in `upstream`, which notes the missing ones
         in_order(upstream, [self.keys[name] for name in names])
         return set(upstream.missing)
 
@@ -375,7 +380,7 @@ class Execution:
         return [self.keys[name] for name in self.makers[key].sources]
 
     def known(self, key: Key) -> bool:
-        """Return True if a value is in memory or in the store; remember the metadata of a value
+        """Return True if a value is in memory or in the store. Remember the metadata of a value
         that was not stored.
         """
         if key in self.values:
@@ -392,7 +397,7 @@ class Execution:
         not stored.
         """
         metadata = self.store.about(key)
-        # metadata without a number of bytes are those of an evicted value
+        # metadata without a size belong to an evicted value
         return self.store.read_seconds(metadata.get("bytes") or 0) if metadata else float("inf")
 
     def _execute(
@@ -405,13 +410,13 @@ class Execution:
     ) -> None:
         """Compute the values with the keys ``plan``, and then load the ``targets``.
 
-        ``uses`` counts the reads that are still to come of each value; a value without one is
-        deleted. ``asked``: the targets are what the user asked for.
+        ``uses`` counts the reads of each value that are still to come; a value without any is
+        deleted. ``asked``: the user requested the targets.
         """
         self.values.free(list(self.values), uses, keep)
         for keys, executor in self._by_executor(plan):
             keys_of_others = [key for key in plan if key not in keys]
-            # what steps in another process or after these read must be kept for them
+            # values that later steps, or steps in another process, read must be kept for them
             read_by_others = set[Key]().union(*map(self.sources, keys_of_others))
             for outcome in self._outcomes(keys, {*targets, *read_by_others}, asked, executor):
                 key, sources = outcome.work.key, outcome.work.sources
@@ -424,12 +429,12 @@ class Execution:
             self._fetch(key)
 
     def _by_executor(self, plan: list[Key]) -> list[tuple[list[Key], Executor]]:
-        """Return the steps that other processes may compute, and then those whose results hold
-        for this one alone.
+        """Return the keys of the steps that other processes may compute, and then of those whose
+        results are valid in this process only; each with its executor.
         """
         private = [key for key in plan if self.executor is not self.own and is_private(key)]
         public = [key for key in plan if key not in private]
-        # an executor without steps is left out
+        # a group without steps is left out
         return [group for group in ((public, self.executor), (private, self.own)) if group[0]]
 
     def _outcomes(
@@ -454,7 +459,7 @@ class Execution:
             for outcome in Loop(chains, executor, self._begin, has_room).outcomes():
                 self._note(outcome)
                 yield outcome
-        # also Ctrl-C: no job is left running
+        # Ctrl-C too: no job may be left running
         except BaseException:
             executor.cancel()
             raise
@@ -462,14 +467,14 @@ class Execution:
     def _prepared(
         self, plan: list[Key], targets: Collection[Key], asked: bool, executor: Executor
     ) -> Prepared:
-        """Return the jobs that compute the values with the keys ``plan``, on their devices; raise
+        """Return the scheduled jobs that compute the values with the keys ``plan``; raise
         `RunError` if the memory is too small.
         """
         self.costs = self.costs or past_costs(
             self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted))
         )
-        # a small one stays in memory until it is read
-        # what the user asked for is kept whatever its size
+        # a small target stays in memory until it is read; a result that the user requested is kept
+        # whatever its size
         threshold = 0.0 if asked else small_result(executor)
         large_targets = {
             key for key in targets if self.costs.size_of(self.makers[key].name) >= threshold
@@ -481,13 +486,13 @@ class Execution:
             raise RunError(self.recipe.steps[error.task], [], error) from error
 
     def _work(self, key: Key, target: bool, executor: Executor) -> StepJob:
-        """Return the job of the step that makes the value ``key``; ``target`` says that its
-        result is kept whatever its cost.
+        """Return the job of the step that computes the value ``key``; if ``target``, its result is
+        kept whatever its cost.
         """
         step = self.makers[key]
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], executor.lanes
-        # several lanes: the plan decides
+        # with several lanes, the plan decides
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
         is_requested, name, seed = (
             target or step.name in self.wanted,
@@ -509,7 +514,9 @@ class Execution:
         return replace(job, own=own_code(step, self.code))
 
     def _read(self, wire: Wire) -> Read:
-        """Return the key of the value behind a wire, the keys of a list of values, or None."""
+        """Return the key of the value that an input is connected to, a tuple of keys for a list of
+        steps, or None.
+        """
         return (
             self.keys[wire]
             if isinstance(wire, str)
@@ -521,20 +528,20 @@ class Execution:
         inputs again.
         """
         self.watch(Event(work.step.name, None))
-        # s; a value of this run may have to be computed again, others are read
+        # time (s): a value of this run may have to be computed again, other values are read
         refetch = sum(
             self.again[key] if key in self.again else self._reading(key)
             for key in set(work.sources)
         )
         return replace(
-            # a quick step needs no lease: to compute it twice costs less
+            # a quick step needs no lease: computing it twice costs less
             work,
             refetch_seconds=refetch,
             unlocked=self._probable_seconds(work) < _UNLOCKED_SECONDS,
         )
 
     def _probable_seconds(self, work: StepJob) -> float:
-        """Return the time of a job as this run measured its node, or as it is predicted."""
+        """Return the time (s) of a job, as measured for its node in this run, or as predicted."""
         path, estimate = work.step.node.path, self.expected[work.key]
         if path in self.took:
             return self.took[path]
@@ -544,7 +551,7 @@ class Execution:
         """Record the outcome of a step, or raise the error in this outcome."""
         job, step, key = outcome.work, outcome.work.step, outcome.work.key
         if outcome.lost:
-            # `make` plans anew, without the lost values
+            # `make` plans again, without the lost values
             raise InputMissing(*outcome.lost)
         if outcome.error is not None:
             raise (
@@ -561,7 +568,7 @@ class Execution:
         path = step.node.path
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
         compute_seconds = outcome.seconds + job.refetch_seconds
-        # to obtain the value again: read it, or compute it with its inputs
+        # time to obtain the value again: read it, or compute it with its inputs
         self.again[key] = (
             self.store.read_seconds(outcome.bytes) if outcome.kept else compute_seconds
         )
@@ -587,7 +594,7 @@ class Execution:
                 )
             except KeyError:
                 raise InputMissing(key) from None
-            # loaded, and not computed in this run
+            # the value was loaded, and not computed in this run
             if self.makers[key].name not in self.done:
                 self._finish(self._cached(key, seconds=time.perf_counter() - began))
         return self.values[key]
@@ -621,14 +628,14 @@ class Execution:
         return self.facts.get(key)
 
     def _why(self, name: str, key: Key) -> str:
-        """Return why a step ran: its result was not stored, and the reason why it was not left
+        """Return the reason why a step ran: its result was not stored, and why it was not left
         out.
         """
         reason = "faster to compute than to store" if key in self.receipts else "not in the store"
         return f"{reason}; {self.verdicts[name].why}" if name in self.verdicts else reason
 
     def _bound(self, name: str) -> float | None:
-        """Return the error bound of leaving a step out, or None for a step that is never left
+        """Return the error bound for leaving a step out, or None for a step that cannot be left
         out.
         """
         return self.verdicts[name].bound if name in self.verdicts else None

@@ -18,12 +18,12 @@ from neusee.workflows.store.result_store import Store
 
 # --- device names ---------------------------------------------------------------------------------
 
-# Names of the devices of this machine that a run may use, such as ``cpu`` or ``cuda:0,cuda:1``.
+# Names of the devices of this machine for a run, such as ``cpu`` or ``cuda:0,cuda:1``.
 
 
 def check_devices(text: str) -> None:
-    """Raise ValueError for a list of devices with the same device twice, or with one that cannot
-    compute a recipe here.
+    """Raise ValueError for a list with the same device twice, or with a device that cannot compute
+    here.
 
     ``cpu:0,cpu:1`` are two lanes of one CPU, and so two devices.
     """
@@ -35,7 +35,7 @@ def check_devices(text: str) -> None:
             raise ValueError(f"{name}: {_reason(str(error))}") from error
         if torch_device.type == "meta":
             raise ValueError(f"{name}: a tensor there has a shape and no values: write cpu or cuda")
-        # "cuda" is the device that torch makes its tensors on
+        # "cuda" means the device on which torch allocates by default
         kind_and_index = torch_device.type, torch.device(name).index or torch_device.index or 0
         if kind_and_index in names:
             devices = (
@@ -51,8 +51,8 @@ def check_devices(text: str) -> None:
 
 
 def _reason(text: str) -> str:
-    """Return why a device cannot compute here, from the error of torch, without the names of its
-    operators.
+    """Return why a device cannot compute here: the error message of torch, or a sentence if the
+    message names internal operators.
     """
     if "aten::" in text:
         return (
@@ -87,7 +87,7 @@ def lanes_of(
     pools = [pool_of(device) for device in devices]
     lanes = {}
     for device in devices:
-        # libraries and data of the program are not in the memory of a GPU
+        # libraries and data of the program use no memory of a GPU
         program_bytes = program_memory(nodes) if pool_of(device) == "cpu" else 0
         limit = (
             memory_limit(memory)
@@ -101,17 +101,17 @@ def lanes_of(
 
 
 def memory_limit(memory: int | None, workers: int = 1) -> float:
-    """Return the largest memory of this process in bytes: ``memory``, or most of what is free
-    beside the process.
+    """Return the memory limit of this process in bytes: ``memory``, or by default its present
+    memory plus most of the free memory.
 
-    Several processes, ``workers``, divide what is free.
+    If there are several ``workers``, they divide the free memory.
     """
     return memory or process_memory() + _SHARE * free_memory() / workers
 
 
 def program_memory(nodes: Iterable[str] = ()) -> float:
-    """Return the memory of this process in bytes before the first step, with the libraries that
-    ``nodes`` load.
+    """Return the memory of this process in bytes before the first step, including the libraries
+    that ``nodes`` load.
     """
     return process_memory() + libraries_of(nodes)
 

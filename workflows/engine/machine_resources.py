@@ -1,5 +1,5 @@
-"""Memory and processors of this machine: what is in use, what is free, and the memory limit, above
-which a step or a report is stopped.
+"""Memory and processors of this machine: use, free amounts, and the memory limit above which a step
+or a report is stopped.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ if TYPE_CHECKING:
 
 # --- processors -----------------------------------------------------------------------------------
 
-# The processors that other work leaves free, by which a command chooses its threads and its worker
-# processes.
+# The processors that other work leaves free; a command chooses its numbers of threads and of worker
+# processes from them.
 
 
 def free_processors() -> int | None:
-    """Return the number of processors that no other work needs, at least one; None where the system
-    tells no load.
+    """Return the number of processors that no other work uses, at least 1; None if the system
+    reports no load.
 
-    Work that has only begun, or that has just ended, does not count: both the last minute and this
-    moment must be busy.
+    Work that has only begun, or has just ended, does not count: both the mean load of the last
+    minute and the present load must be high.
     """
     try:
         own_processors, all_of_them = len(os.sched_getaffinity(0)), os.cpu_count() or 1
         with open("/proc/loadavg", encoding="ascii") as file:
-            # such as "0.52 0.58 0.59 2/743 12345": load of a minute first, running/all processes
-            # fourth
+            # such as "0.52 0.58 0.59 2/743 12345": the first field is the mean load of a minute,
+            # the fourth the running and all processes
             load_fields = file.read().split()
-        # running processes of all, less this one
+        # running processes, without this one
         load_of_minute, running_now = (
             float(load_fields[0]),
             int(load_fields[3].partition("/")[0]) - 1,
         )
     except (OSError, AttributeError, ValueError, IndexError):  # not Linux
         return None
-    # the load of the machine, in the share of its processors that this process may use
+    # the load, scaled to the share of the processors that this process may use
     return threads_for(
         own_processors, min(load_of_minute, running_now) * own_processors / all_of_them
     )
 
 
 def threads_for(processors: int, load: float) -> int:
-    """Return the number of threads that fit beside ``load`` busy processes on a number of
-    processors, at least one.
+    """Return the number of threads that fit beside ``load`` busy processes on ``processors``
+    processors, at least 1.
     """
     return max(1, min(processors, round(processors - load)))
 
@@ -67,10 +67,10 @@ def threads_for(processors: int, load: float) -> int:
 _LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _USAGE_FILES = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
 _PAGE = os.sysconf("SC_PAGE_SIZE")  #: bytes
-FRESH_SECONDS = 0.02  #: s, the time between two looks of the watch over the memory
-# time of the newest look at the free memory in s, and what it found in bytes
+FRESH_SECONDS = 0.02  #: interval (s) between two reads of the memory in use
+# time (s) of the newest reading of the free memory, and its result (bytes)
 _newest_free = [-FRESH_SECONDS, 0.0]
-_highest = 0  # peak memory of this process before the last reset of the counter of the system
+_highest = 0  # peak memory (bytes) of this process before the last reset of the system's counter
 
 
 class PeakMemory:
@@ -89,7 +89,7 @@ class PeakMemory:
         if not self.watched:
             return self
         if self.device.startswith("cuda"):
-            # here, because a command that computes nothing asks for the free memory alone
+            # imported here, because a command that computes nothing needs only the free memory
             import torch
 
             torch.cuda.reset_peak_memory_stats(self.device)
@@ -127,7 +127,7 @@ def _peak_reset() -> bool:
     _highest = max(_highest, resident("VmHWM:") or 0)
     try:
         with open("/proc/self/clear_refs", "w") as file:
-            # 5: reset the peak resident memory, by proc(5)
+            # 5 means: reset the peak resident memory, see proc(5)
             file.write("5")
     except OSError:
         return False
@@ -135,7 +135,7 @@ def _peak_reset() -> bool:
 
 
 def resident(field: str) -> int | None:
-    """Return a number of bytes that the system tells of this process, such as ``VmRSS:``, or
+    """Return a number of bytes that the system reports for this process, such as ``VmRSS:``, or
     None.
     """
     with suppress(OSError), open("/proc/self/status") as file:
@@ -150,7 +150,7 @@ def process_memory() -> int:
     """Return the memory of this process in bytes: code, libraries and data that are resident
     now.
     """
-    # a fifth of the time of /proc/self/status
+    # takes a fifth of the time of /proc/self/status
     with suppress(OSError), open("/proc/self/statm") as file:
         # the second number of statm is the resident memory in pages
         return int(file.read().split()[1]) * _PAGE
@@ -158,8 +158,8 @@ def process_memory() -> int:
 
 
 def process_peak() -> int:
-    """Return the peak memory of this process in bytes since it started, whatever `PeakMemory`
-    measured since then.
+    """Return the peak memory of this process in bytes since it started, regardless of resets by
+    `PeakMemory`.
     """
     return max(
         _highest, resident("VmHWM:") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
@@ -167,10 +167,10 @@ def process_peak() -> int:
 
 
 def give_back() -> None:
-    """Give the memory that was freed back to the system; glibc keeps blocks below 32 MB of a
-    busy process otherwise.
+    """Return freed memory to the system; otherwise glibc keeps blocks below 32 MB in a busy
+    process.
     """
-    with suppress(OSError, AttributeError):  # another C library
+    with suppress(OSError, AttributeError):  # another C library has no such function
         _libc().malloc_trim(0)
 
 
@@ -183,7 +183,7 @@ def free_memory() -> int:
     """Return the bytes that this process can still use: free memory of the machine, or of its
     control group.
 
-    A number that is younger than `FRESH_SECONDS` is given again, because short runs ask more often
+    A value younger than `FRESH_SECONDS` is used again, because short runs call this more often
     than it changes.
     """
     present_time = time.monotonic()
@@ -193,8 +193,8 @@ def free_memory() -> int:
 
 
 def _free_memory() -> int:
-    """Return the bytes that this process can still use: the least of what the machine, its
-    control group and the limits leave; at least 0.
+    """Return the bytes that this process can still use: the minimum over the machine, its control
+    group and the limits; at least 0.
     """
     free = there_is("cpu") - process_memory()
     with suppress(OSError, ValueError, StopIteration), open("/proc/meminfo") as file:
@@ -210,8 +210,8 @@ def _free_memory() -> int:
 
 
 def _reclaimable(group: Path) -> int:
-    """Return the bytes of files that a control group keeps in memory and gives back when memory
-    is short.
+    """Return the bytes of files that a control group caches in memory and releases when memory is
+    short.
     """
     for line in (group / "memory.stat").read_text().splitlines():
         if line.startswith(("inactive_file ", "total_inactive_file ")):
@@ -234,19 +234,17 @@ def there_is(device: str) -> int:
 
 # --- memory watch ---------------------------------------------------------------------------------
 
-# Watch over the memory of this process: a step or a report that takes the process above its limit
+# Watch over the memory of this process: a step or a report that raises the memory above the limit
 # is stopped.
 #
-# A thread reads the resident memory some fifty times a second and raises `MemoryLimit` in its
-# thread, which stops when its current call of a library returns. A single call that allocates too
-# much is covered by the prediction before the run, and where it reads a file by the size that the
-# header of the file states.
+# A thread reads the resident memory about fifty times a second and raises `MemoryLimit` in the
+# watched thread, which stops when its current library call returns. A single call that allocates
+# too much is covered by the prediction before the run, and, if it reads a file, by the size that
+# the header of the file states.
 
 
-_SECONDS_BETWEEN_LOOKS = 0.02  #: s between two looks
-_SHARE_TO_GIVE_BACK = (
-    0.9  #: share of the limit from which memory that was freed is given back to the system
-)
+_SECONDS_BETWEEN_LOOKS = 0.02  #: interval (s) between two readings
+_SHARE_TO_GIVE_BACK = 0.9  #: share of the limit above which freed memory is returned to the system
 _ADVICE = (
     "give more memory, or choose a smaller picture, pupil or number of bands; the steps that are"
     " finished stay in the cache"
@@ -272,9 +270,11 @@ class MemoryLimit(Exception):
         return f"the process holds {format_size(int(_at_last_stop[0]))}{limits}"
 
 
-_at_last_stop = [0.0, 0.0]  # bytes of the process and the limit when a step was last stopped
+# memory of the process and its limit (bytes) when a step was last stopped
+_at_last_stop = [0.0, 0.0]
 _limits: list[float] = []
-_watched_threads: dict[int, bool] = {}  # threads that are watched; True if told to stop
+# watched threads; True after `MemoryLimit` was raised in the thread
+_watched_threads: dict[int, bool] = {}
 _guard = threading.RLock()
 _wake = threading.Event()
 _thread: list[threading.Thread] = []
@@ -283,7 +283,7 @@ _thread: list[threading.Thread] = []
 @contextmanager
 def limited(limit: float) -> Iterator[None]:
     """Limit the memory of this process to ``limit`` bytes while the ``with`` block runs."""
-    # here, because `neusee --help` asks for the free processors alone, and nodes import slowly
+    # imported here, because nodes import slowly, and `neusee --help` needs only the free processors
     from neusee.nodes import input_files
 
     input_files.measured_by(_room)
@@ -297,13 +297,13 @@ def limited(limit: float) -> Iterator[None]:
 
 
 def limit_now() -> float | None:
-    """Return the limit of the memory of this process in bytes, or None where none is set."""
+    """Return the memory limit of this process in bytes, or None if none is set."""
     return min(_limits, default=None)
 
 
 def _room() -> Room:
-    """Return the memory that the readers of input files may still use: what the limits leave, or
-    what is free.
+    """Return the memory that readers of input files may still use: the rest up to the limit, or the
+    free memory.
     """
     from neusee.nodes import input_files
 
@@ -320,7 +320,8 @@ def guarded() -> Iterator[None]:
     without a limit.
     """
     thread_id = threading.get_ident()
-    if not _limits or thread_id in _watched_threads:  # the block outside is stopped
+    # an outer block of this thread is watched already
+    if not _limits or thread_id in _watched_threads:
         yield
         return
     with _guard:
@@ -336,15 +337,15 @@ def guarded() -> Iterator[None]:
     finally:
         try:
             stopped = _stop_watching(thread_id)
-        except MemoryLimit:  # told at the last moment, and delivered only now
+        except MemoryLimit:  # the exception was raised at the last moment, and arrives only now
             stopped = _stop_watching(thread_id)
     if stopped:
         raise MemoryLimit
 
 
 def _stop_watching(here: int) -> bool:
-    """Watch a thread no longer; return True if it was told to stop, with no exception left to be
-    delivered.
+    """Stop watching a thread; return True if `MemoryLimit` was raised in it. No exception is left
+    pending.
     """
     with _guard:
         stopped = _watched_threads.pop(here, True)
@@ -354,15 +355,15 @@ def _stop_watching(here: int) -> bool:
 
 
 def _await_exception(here: int) -> None:
-    """Let the exception that this thread was told arrive here.
+    """Wait until the exception that was raised in this thread arrives here.
 
-    To withdraw it is not enough: CPython 3.11 and 3.12 would go on to look for it at every call,
+    It is not enough to withdraw it: CPython 3.11 and 3.12 would still check for it at every call,
     and hang if traced.
     """
     try:
-        # in the place of one that is on its way
+        # replaces an exception that is pending
         _raise_in(ctypes.c_ulong(here), ctypes.py_object(MemoryLimit))
-        # until the exception arrives
+        # loop until the exception arrives
         while True:
             pass
     except MemoryLimit:
@@ -370,8 +371,8 @@ def _await_exception(here: int) -> None:
 
 
 def _watch_memory() -> None:
-    """Watch the memory in an endless loop, in a thread of its own; stop the watched threads when
-    it exceeds the limit.
+    """Watch the memory in an endless loop, in a separate thread; stop the watched threads when the
+    memory exceeds the limit.
     """
     while True:
         _wake.wait()
@@ -380,7 +381,7 @@ def _watch_memory() -> None:
                 _wake.clear()
             limit = min(_limits, default=float("inf"))
             if process_memory() > _SHARE_TO_GIVE_BACK * limit:
-                # freed memory that the library of C still holds
+                # freed memory that the C library still holds
                 give_back()
             if (held_bytes := process_memory()) > limit:
                 _stop(held_bytes, limit)
@@ -388,7 +389,7 @@ def _watch_memory() -> None:
 
 
 def _stop(now: float, limit: float) -> None:
-    """Raise `MemoryLimit` in each watched thread that was not told yet; ``now`` and ``limit``
+    """Raise `MemoryLimit` in each watched thread that was not stopped yet; ``now`` and ``limit``
     are bytes.
     """
     for thread, stopped in _watched_threads.items():
@@ -399,8 +400,8 @@ def _stop(now: float, limit: float) -> None:
 
 
 def _forked() -> None:
-    """Begin anew in a forked child process, which has neither the thread that looks nor threads
-    that are watched.
+    """Reset the state in a forked child process, which has no watching thread and no watched
+    threads.
     """
     global _guard, _wake
     _guard, _wake = threading.RLock(), threading.Event()
@@ -414,18 +415,18 @@ os.register_at_fork(after_in_child=_forked)
 
 # --- allocation limit -----------------------------------------------------------------------------
 
-# A hard limit for own nodes: the system refuses an allocation that would take the process far above
-# its limit.
+# A hard limit for nodes of the user: the system refuses an allocation that would take the process
+# far above its limit.
 #
-# The watch over the memory stops a step between two calls of libraries. One call of an own node may
-# allocate all at once, and nothing foretells it. While such a node computes on the CPU, the system
-# therefore refuses private memory beyond `SLACK` times the limit of the run, also in libraries and
-# threads that the node begins. Python and torch turn this into an error, and the error into a
-# sentence.
+# The watch over the memory stops a step only between two library calls. One call of a node of the
+# user may allocate everything at once, and nothing predicts it. While such a node computes on the
+# CPU, the system therefore refuses private memory beyond `SLACK` times the limit of the run, also
+# in libraries and threads that the node starts. Python and torch turn this into an error, and
+# neusee turns the error into a sentence.
 
 
-#: share of the limit from which allocations are refused; the rest to 1.3 is for what is mapped
-#: already
+#: multiple of the limit above which allocations are refused; the rest up to 1.3 is for memory that
+#: is already mapped
 SLACK = 1.2
 _REFUSED_ALLOCATION_TEXTS = (
     "can't allocate memory",
@@ -437,20 +438,19 @@ _REFUSED_ALLOCATION_TEXTS = (
 
 @contextmanager
 def refusing_allocations(active: bool) -> Iterator[None]:
-    """Let the system refuse allocations beyond the limit of the run in the ``with`` block, if
-    ``active``.
+    """If ``active``, let the system refuse allocations beyond the limit of the run in the ``with``
+    block.
 
-    Raises `MemoryLimit` in the place of the error that such an allocation gives.
+    Raises `MemoryLimit` instead of the error of such an allocation.
     """
     limit, mapped_bytes = limit_now(), resident("VmData:")
     if not active or limit is None or mapped_bytes is None:
         yield
         return
     old_limits = resource.getrlimit(resource.RLIMIT_DATA)
-    # private memory that is mapped now, and what the process may grow by
+    # private memory that is mapped now, plus the allowed growth
     allowed_bytes = int(mapped_bytes + max(0.0, SLACK * limit - process_memory()))
-    # the limit that holds already is as strict:
-    # of the user, or of an own node beside this one
+    # the present limit, set by the user or for another node of the user, is as strict
     if old_limits[0] != resource.RLIM_INFINITY and old_limits[0] <= allowed_bytes:
         yield
         return

@@ -24,14 +24,14 @@ from neusee.workflows.store.serialization import fits as fits_type
 
 # --- node call ------------------------------------------------------------------------------------
 
-# Call of the node of a step, on the device of the step and with its random stream.
+# Call of the node of a step, on the step's device and with its random stream.
 
 
 def call(
     step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str
 ) -> Any:
-    """Call the node of a step and return its result with gradients, in the memory layout that
-    stored results have.
+    """Call the node of a step and return its result with gradients, in the memory layout of stored
+    results.
     """
     moved_inputs = [to_device(value, device) for value in inputs]
     rng = (
@@ -40,7 +40,7 @@ def call(
         else {}
     )
     tensors = tensors_in(moved_inputs)
-    # torch counts the changes in place of each tensor
+    # torch counts the in-place changes of each tensor
     versions_before = [x._version for x in tensors]
     try:
         value = settle(step.node(*moved_inputs, **params, **rng))
@@ -55,8 +55,8 @@ def call(
     for x in tensors:
         forget_attributes(x)
     annotated_type = step.node.hints.get("return", Any)
-    # as the annotation says
-    if not fits_type(value, annotated_type):  # stored, such a value would count as damaged
+    # the value must have the annotated type
+    if not fits_type(value, annotated_type):  # once stored, such a value would count as damaged
         type_name = getattr(annotated_type, "__name__", annotated_type)
         text = (
             f"the node returned a value of the type {type(value).__name__}, but its annotation says"
@@ -122,14 +122,14 @@ def to_device(value: Any, device: str) -> Any:
 # its bands.
 
 
-_ALIGN = 64  #: bytes; a kernel may take another path at another alignment
+_ALIGN = 64  #: alignment (bytes): a kernel may compute differently at another alignment
 
 Evaluate = Callable[[Sequence[Any]], Any]  #: a function from the inputs of a step to its result
 
 
 def call_in_parts(step: Step, inputs: Sequence[Any], evaluate: Evaluate, parts: int) -> Any:
-    """Return the result of ``step``, computed in ``parts`` passes over its bands, or in one call
-    where it has no bands of its own.
+    """Return the result of ``step``, computed in ``parts`` passes over its bands, or in one call if
+    its bands depend on each other.
     """
     count = band_count(step, inputs)
     if count < 2:
@@ -167,19 +167,19 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
     names_and_inputs = zip(step.node.inputs, inputs, strict=False)
     axes = [(_axis(step, name, value), value) for name, value in names_and_inputs]
     axes_and_inputs = [(axis, value) for axis, value in axes if axis is not None]
-    # of each banded input
+    # every input with bands must be a tensor or have tensors by band
     if not all(_is_cut_by_band(value) for _, value in axes_and_inputs):
-        return 0  # a low-rank cube has no slice of one band
+        return 0  # a low-rank cube cannot be cut by band
     counts = set[int]()
     for axis, value in axes_and_inputs:
         counts.update(x.shape[axis] for x in band_tensors(value) if _has(x, axis))
-    # inputs that disagree have no common bands
+    # inputs with different numbers of bands have no common bands
     return counts.pop() if len(counts) == 1 else 0
 
 
 def bands_in(node: Node, inputs: Sequence[Any]) -> int:
-    """Return the number of bands that a node computes one by one, from inputs that may have no
-    values; at least 1.
+    """Return the number of bands that a node computes one by one, at least 1; the inputs may be
+    forms without values.
     """
     for name, value in zip(node.inputs, inputs, strict=False):
         axis = node.bands.get(name) if node.bands else None
@@ -232,7 +232,7 @@ def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
     """Return the bands of a tensor with the indices ``which``, as a view if the memory layout
     allows.
     """
-    # adjacent bands
+    # adjacent bands allow a view
     if which == list(range(which[0], which[0] + len(which))):
         view = x.narrow(axis, which[0], len(which))
         if view.is_contiguous() and view.data_ptr() % _ALIGN == 0:

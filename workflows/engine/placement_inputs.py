@@ -28,16 +28,16 @@ from neusee.workflows.store.journal import Journal, Row
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
-#: bytes below which a result that only a decision needs is stored only where this pays
+#: size (bytes) below which a result that only a decision needs is stored only if this saves time
 _SMALL = 1 << 23
-_HELD = 256  #: how many such results fit into the memory of a run
+_HELD = 256  #: number of such results that must fit into the memory of a run
 MOST_PARTS = 64  #: upper bound on the parts of a step
 
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """Scheduled jobs of a run in the order in which they begin, with their predicted costs and
-    the schedule.
+    """Scheduled jobs of a run in the order of their start, with their predicted costs and the
+    schedule.
     """
 
     works: list[StepJob]
@@ -56,7 +56,7 @@ def prepare(
     """Assign a device to each job of a run and schedule the jobs; raise `TooLarge` if the memory is
     too small.
 
-    The keys ``in_memory`` are of values that are in memory already. Other values that no job
+    ``in_memory``: keys of values that are in memory already. Other values that no job
     computes are read.
     """
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
@@ -69,7 +69,7 @@ def prepare(
     try:
         return _scheduled(works, expected, lanes, keep, read_bytes)
     except TooLarge as error:
-        # the message counts what the program itself holds
+        # the message includes the memory of the program itself
         raise error.with_program(lanes[error.device].held) from error
 
 
@@ -80,8 +80,8 @@ def _scheduled(
     keep: Collection[Key],
     read: Mapping[Key, float],
 ) -> Prepared:
-    """Return the jobs on their devices; ``read`` has the bytes of each value that is read from
-    the store.
+    """Return the jobs with their devices; ``read`` has the size (bytes) of each value that is read
+    from the store.
     """
     first_lane, lane = next(iter(lanes.items()))
     for job in works:
@@ -103,7 +103,7 @@ def _shared_out(
     keep: Collection[Key],
     read: Mapping[Key, float],
 ) -> Prepared:
-    """Return the jobs on the devices where they end soonest within the memory."""
+    """Return the jobs on the devices that finish them earliest within the memory."""
     job_of_step = {job.step.name: job for job in works}
     names = {job.key: job.step.name for job in works}
     tasks = [_task(job, expected[job.key], lanes, names, read) for job in works]
@@ -118,8 +118,8 @@ def _shared_out(
 def room_for(
     expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]
 ) -> MemoryProfile:
-    """Return a function that is True if one more job fits into memory with the running jobs and
-    ``values``.
+    """Return a function that returns True if one more job fits into memory, beside the running jobs
+    and ``values``.
     """
 
     def room(work: StepJob, running: Sequence[StepJob]) -> bool:
@@ -140,7 +140,7 @@ def room_for(
 
 
 def small_result(executor: Executor) -> float:
-    """Return the bytes below which a result may stay in memory until it is read; 0 if values
+    """Return the size (bytes) below which a result may stay in memory until it is read; 0 if values
     leave this process.
     """
     return (
@@ -166,7 +166,7 @@ def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
     if first is None or then is None:
         return first or then
     delay = first.makespan
-    # all times of the second schedule are later by this delay
+    # all times of the second schedule are shifted by this delay
     slots = (replace(slot, start=slot.start + delay, end=slot.end + delay) for slot in then.slots)
     moves = (
         replace(m, start=m.start + delay, end=m.end + delay, until=m.until + delay)
@@ -183,7 +183,7 @@ def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
 
 
 def _placed(work: StepJob, slot: Slot, lanes: Mapping[str, Lane]) -> StepJob:
-    """Return a job on the device and in the number of parts that the plan gives it."""
+    """Return a job with the device and the number of parts that the plan assigns to it."""
     device = "cpu" if _cpu_only(work) else lanes[slot.device].device
     return replace(work, lane=slot.device, device=device, parts=slot.parts)
 
@@ -195,12 +195,12 @@ def _task(
     names: Mapping[Key, str],
     read: Mapping[Key, float],
 ) -> Task:
-    """Return a job as the plan sees it: its name, sources, seconds by device, bytes of the
-    result and beside it, and parts.
+    """Return the task of a job for the plan: name, sources, seconds by device, size of the result,
+    further memory, and number of parts.
     """
     seconds = _seconds_by_lane(work, estimate, lanes)
     sources = tuple(dict.fromkeys(names[key] for key in work.sources if key in names))
-    # and inputs that are read from the store
+    # including inputs that are read from the store
     working_bytes = estimate.work + sum(read[key] for key in set(work.sources) if key in read)
     return Task(
         work.step.name,
@@ -218,7 +218,7 @@ def _seconds_by_lane(
     """Return the predicted time (s) of a job on each device that may compute it."""
     if _cpu_only(work):
         cpu_lanes = [name for name, lane in lanes.items() if lane.kind == "cpu"]
-        # without a lane on the CPU, the thread of a GPU computes on the CPU
+        # without a lane on the CPU, the thread of a GPU lane computes on the CPU
         return dict.fromkeys(cpu_lanes or lanes, estimate.seconds["cpu"])
     allowed = places(work.step, [lane.device for lane in lanes.values()])
     allowed_lanes = {name: lane for name, lane in lanes.items() if lane.device in allowed}
@@ -231,8 +231,8 @@ def parts_of(step: Step, estimate: Estimate) -> int:
 
 
 def _cpu_only(work: StepJob) -> bool:
-    """Return True if a job must run on the CPU, because of a device hint or of a random stream
-    for the CPU.
+    """Return True if a job must run on the CPU, because of a device hint or because its random
+    stream is that of the CPU.
     """
     hint = work.step.device or work.step.node.device
     return hint == "cpu" or (work.step.node.random and work.device == "cpu")
@@ -258,13 +258,13 @@ def _one_after_another(
         cost = expected[job.key]
         new_keys = {*job.sources, job.key} - in_memory
         in_memory |= new_keys
-        # inputs that are loaded now, and the result
+        # size of the inputs that are loaded now, and of the result
         held_bytes += sum(sizes[key] for key in new_keys)
         peak_bytes = max(peak_bytes, held_bytes + cost.work)
         ended_keys = {
             key
             for key in (*job.sources, job.key)
-            # a value that no job reads ends with its own job
+            # a value that no job reads is freed after its own job
             if last_reader.get(key, job.key) == job.key and key not in keep
         }
         held_bytes -= sum(sizes[key] for key in ended_keys)
@@ -276,21 +276,21 @@ def _one_after_another(
 
 
 def past_costs(store: Store, sizes: Mapping[str, Size]) -> Costs:
-    """Return the costs of steps with the given sizes, from the newest lines of the journal of a
-    result store.
+    """Return the costs of steps with the given sizes, learned from the newest lines of the journal
+    of a result store.
 
-    Each line is read once in a process, so that the time that a run takes does not grow with the
-    runs before it.
+    A process reads each line only once, so that the time of a run does not grow with the
+    number of earlier runs.
     """
     rows = store.journal.latest()
     rows_read, learned, costs = _read.get(store.journal, (rows, 0, Costs([])))
-    if rows_read is not rows or learned > len(rows):  # the journal began anew
+    if rows_read is not rows or learned > len(rows):  # the journal was started again
         learned, costs = 0, Costs([])
-    # the lines that came since the last call
+    # the lines added since the last call
     costs.learn(rows[learned:])
     _read[store.journal] = rows, len(rows), costs
     return costs.with_sizes(sizes)
 
 
-#: the lines of each journal that were read, their number, and the costs that they tell
+#: for each journal: the lines that were read, their number, and the costs learned from them
 _read: WeakKeyDictionary[Journal, tuple[list[Row], int, Costs]] = WeakKeyDictionary()

@@ -40,11 +40,11 @@ def versions() -> dict[str, str]:
 
 
 def version_of(package: str) -> str:
-    """Return the version of an installed package, or an empty string if it or its description is
-    not there.
+    """Return the version of an installed package, or an empty string if the package or its metadata
+    is missing.
     """
-    # FileNotFoundError comes from the package importlib_metadata; a description without a version
-    # is a warning in Python 3.13, and will be a KeyError
+    # FileNotFoundError comes from the package importlib_metadata; metadata without a version cause
+    # a warning in Python 3.13, and will cause a KeyError
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
@@ -90,15 +90,15 @@ def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
     facts = (about or {}).get("facts")
     try:
         return TensorStats(**{**facts, "shape": tuple(facts["shape"])}) if facts else None
-    except (TypeError, LookupError):  # no statistics that this program writes
+    except (TypeError, LookupError):  # not in the form that this program writes
         return None
 
 
 def unneeded(
     name: str, key: Key, about: Mapping[str, Any] | None, bound: float | None
 ) -> StepRecord:
-    """Return the record of a step whose value no other step needed; its checks are those of the
-    stored result.
+    """Return the record of a step whose value no other step needed; its checks come from the stored
+    result.
     """
     reason, checks, error = "nothing needed it", checks_in(about), error_in(about)
     return StepRecord(name, "not needed", reason, 0.0, key, checks=checks, bound=bound, error=error)
@@ -143,11 +143,11 @@ def ran(
         job.device,
         outcome.bytes,
         bound,
-        # s after the start of the run
+        # start time (s) after the start of the run
         outcome.began - began,
         job.lane,
         outcome.peak,
-        # a guess is no prediction
+        # a guess does not count as a prediction
         expected.seconds[device_kind(job.device)] if expected and expected.known else None,
         outcome.deviation,
         expected.peak if expected and expected.known else None,

@@ -1,4 +1,4 @@
-"""Cache keys of the steps of a recipe, found without computing a step."""
+"""Cache keys of the steps of a recipe, determined without computing a step."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def resolve(
     """Return the cache key of each step for a run on ``device``; ``order`` lists each step after
     its inputs.
 
-    ``code`` has the digests of nodes that were read a moment ago, if there are any.
+    ``code``: digests of nodes that were just computed, if any.
     """
     resolved, code, ledger = Resolved(), code or Code(store.code_memo), ErrorBudget(recipe)
 
@@ -41,7 +41,7 @@ def resolve(
         if step.node.hooks.skip_bound is not None:
             try:
                 resolved.verdicts[name] = ledger.verdict(step, step.params, facts_of)
-            # statistics are missing: only a run can decide
+            # statistics of an input are missing: only a run can decide
             except RunError:
                 resolved.verdicts[name] = None
         else:
@@ -53,7 +53,7 @@ def resolve(
             continue
         key, origin = key_of(step, resolved.keys, recipe.seed, code, place(step, device))
         resolved.keys[name], resolved.origins[key] = key, origin
-        # of steps with one key the first computes the value
+        # the first of several steps with the same key computes the value
         resolved.makers.setdefault(key, name)
     code.save()
     return resolved

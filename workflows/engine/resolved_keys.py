@@ -1,5 +1,5 @@
-"""The cache keys of the steps of a recipe as `resolve_keys.resolve` found them; torch is not
-needed.
+"""The cache keys of the steps of a recipe, as determined by `resolve_keys.resolve`; this module
+does not import torch.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Resolved:
     origins: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
     #: the first step of each key that is not left out
     makers: dict[Key, str] = field(default_factory=dict)
-    #: None where statistics are missing
+    #: decision on each step that may be left out; None if statistics are missing
     verdicts: dict[str, SkipDecision | None] = field(default_factory=dict)
 
     def left_out(self, name: str) -> bool | None:

@@ -1,4 +1,4 @@
-"""What the values of a run say: figures of merit as numbers, and NumPy arrays in place of
+"""Values of a run in plain form: figures of merit as numbers, and NumPy arrays instead of
 tensors.
 """
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neusee.workflows.graph.recipe_graph import Recipe
 
-_MOST_ELEMENTS = 4096  #: elements, at most, of a result whose numbers become rows
+_MOST_ELEMENTS = 4096  #: greatest number of elements of a result whose numbers become rows
 
 
 def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:

@@ -45,11 +45,11 @@ from neusee.workflows.tolerance.skip_decision import skip_share
 
 # --- step order -----------------------------------------------------------------------------------
 
-# Order in which the results of a run are made: those that need only short steps before those that
-# need a long one.
+# Order in which the results of a run are made: results that need only short steps come before those
+# that need a long one.
 #
-# Pictures and files of the short steps are then made beside the long ones, and values that only
-# short steps read are no longer in memory.
+# So pictures and files of the short steps are made while the long steps run, and values that only
+# short steps read are freed early.
 
 
 def shortest_first(
@@ -82,7 +82,8 @@ def shortest_first(
 # computed.
 
 
-_ROUNDING = 1.4e-6  #: error that rounding leaves in sums over bands, whatever their limit
+#: relative error that rounding causes in sums over bands, whatever their error limit
+_ROUNDING = 1.4e-6
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,8 +105,10 @@ class Result:
     #: predicted peak bytes of this process; None if another process computed
     predicted_peak: float | None = None
     origins: Mapping[Key, Mapping[str, Any]] = field(default_factory=dict)  #: the parts of each key
-    code: Mapping[str, Parts] = field(default_factory=dict)  #: what each digest of code covers
-    #: 2 or 3 where the error of the first could not be proved to be within the tolerance
+    #: the parts that each digest of code covers
+    code: Mapping[str, Parts] = field(default_factory=dict)
+    #: number of attempts; 2 or 3 if the error of the first could not be proved to be within the
+    #: tolerance
     attempts: int = 1
 
     def value(self, step: str) -> Any:
@@ -129,7 +132,7 @@ class Result:
         A figure with a value for each band is a list. A figure that this run did not need is read
         from the store or computed.
         """
-        # figures count in the recipe as it was written
+        # figures of merit belong to the recipe before substitutions
         recipe = self.recipe.unsubstituted or self.recipe
         names = metrics_of(recipe, {*self.keys, *wanted(recipe)})
         values = values_of(self, recipe, names)
@@ -200,14 +203,13 @@ def run(
                 return replace(
                     _attempt(execution, names, began, show is not None), attempts=attempt_number
                 )
-        # the run begins again; the value that was computed is taken over
+        # the run begins again, and uses the value that was computed
         except TaintedRun as tainted:
             carried_outcomes[tainted.outcome.work.step.name] = tainted.outcome
-            # keys of tainted code are private from now on
+            # from now on, keys of tainted code are private
             series.read_code_again(store)
         except ToleranceNotProven as failure:
-            # the next attempt is stricter, and
-            # a third attempt is exact
+            # the second attempt is stricter, and the third is exact
             tolerance_scale = stricter_scale(recipe, failure.over) if attempt_number == 1 else 0.0
             attempt_number, recipe = (
                 attempt_number + 1,
@@ -219,7 +221,9 @@ def run(
 
 
 def _outputs_of(recipe: Recipe, outputs: Iterable[str] | None) -> tuple[str, ...]:
-    """Return the steps that a run is asked for, or raise ValueError for a name of no step."""
+    """Return the steps whose values a run must return; raise ValueError for a name that is no
+    step.
+    """
     names = recipe.outputs if outputs is None else tuple(outputs)
     for name in names:
         if name not in recipe.steps:
@@ -228,8 +232,8 @@ def _outputs_of(recipe: Recipe, outputs: Iterable[str] | None) -> tuple[str, ...
 
 
 def _stricter(recipe: Recipe, scale: float, work: Execution, outputs: tuple[str, ...]) -> Recipe:
-    """Return the recipe of the next attempt, with the tolerance ``scale``: an exact one if that is
-    0 or if a stricter one would fail as well.
+    """Return the recipe of the next attempt, with the tolerance ``scale``. It is exact if that is
+    0, or if a stricter recipe would fail as well.
     """
     original_recipe = recipe.unsubstituted or recipe
     stricter = with_substitutions(
@@ -241,18 +245,18 @@ def _stricter(recipe: Recipe, scale: float, work: Execution, outputs: tuple[str,
 
 
 def _futile(stricter: Recipe, work: Execution, outputs: tuple[str, ...]) -> bool:
-    """Return True if the error of the run ``work`` is above the tolerance even where only rounding
-    is left of it.
+    """Return True if the run ``work`` would exceed the tolerance even if only rounding errors were
+    left.
 
-    Cheaper steps with smaller limits, as the recipe ``stricter`` has them, keep the rounding of
-    their sums.
+    Cheaper steps with the smaller limits of the recipe ``stricter`` still have the rounding errors
+    of their sums.
     """
-    # of the tolerance, which omitted steps may use
+    # share of the tolerance that omitted steps may use
     share = skip_share(stricter)
 
     def at_best(name: str) -> StepRecord:
         record = work.done.get(name) or work.record_of_unneeded(name)
-        # with the smaller limit this step would run, without an error
+        # under the smaller limit this step would run, without an error
         if record.state == "left out" and (record.bound or 0.0) > stricter.allowed(name) * share:
             return replace(record, state="run")
         if not record.error or record.error[0] <= _ROUNDING:
@@ -260,7 +264,7 @@ def _futile(stricter: Recipe, work: Execution, outputs: tuple[str, ...]) -> bool
         # the second number is proportional to the first
         return replace(record, error=(_ROUNDING, record.error[1] * _ROUNDING / record.error[0]))
 
-    # as in `_attempt`: what the judged steps need
+    # as in `_attempt`: the steps that the judged steps need
     order = needed(
         work.recipe, tolerance_frontier(work.recipe, needed(work.recipe, outputs), outputs)
     )
@@ -277,10 +281,10 @@ def _attempt(work: Execution, outputs: tuple[str, ...], began: float, shows: boo
         work.resolve(order)
         # the steps whose errors must meet the tolerance
         judged_steps = tolerance_frontier(recipe, order, outputs)
-        # the values that must be computed for the outputs
+        # keys of the values that must be computed for the outputs
         missing = work.missing(outputs) if judged_steps else set()
         _make_early(work, order, judged_steps, outputs, missing, shows)
-        # with nothing to compute all records are known: then the proof covers every step
+        # if nothing must be computed, all records are known, and the proof covers every step
         steps_to_prove = order if judged_steps and not missing else needed(recipe, judged_steps)
         error_bounds = proof(
             recipe, steps_to_prove, outputs, partial(_record_so_far, work), work.known_facts
@@ -288,7 +292,7 @@ def _attempt(work: Execution, outputs: tuple[str, ...], began: float, shows: boo
         error_in_tolerances = error_bounds.over(recipe)
         if error_in_tolerances > 1.0 and not recipe.exact:
             raise ToleranceNotProven(error_in_tolerances)
-        # what is left to compute or to load
+        # compute or load the remaining values
         work.make([work.keys[name] for name in outputs], keep=False)
     # a proof before the steps ran does not cover them
     return _result_of(work, outputs, began, None if missing else error_bounds)
@@ -302,8 +306,7 @@ def _make_early(
     missing: set[Key],
     shows: bool,
 ) -> None:
-    """Compute the missing results of the steps ``first``, by which the errors of a run are
-    judged.
+    """Compute the missing results of the steps ``first``, whose errors must meet the tolerance.
 
     With ``shows``, outputs that need only shorter steps are computed as well; a sweep shows
     nothing.
@@ -319,11 +322,11 @@ def _make_early(
 def _result_of(
     work: Execution, outputs: tuple[str, ...], began: float, proved: ErrorBounds | None
 ) -> Result:
-    """Return the result of a run that is over; without ``proved``, its errors are bounded here."""
+    """Return the result of a finished run; if ``proved`` is None, the errors are bounded here."""
     recipe, store = work.recipe, work.store
     values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in outputs}
     order = needed(recipe, outputs)
-    # also of steps that did not run
+    # includes steps that did not run
     records = work.account(order)
     peak = process_peak()
     seconds = time.perf_counter() - began
@@ -347,7 +350,9 @@ def _result_of(
 
 
 def _record_so_far(work: Execution, name: str) -> StepRecord:
-    """Return the record of a step that has run or was left out, or of one that did not run yet."""
+    """Return the record of a step that ran or was left out, or a record for a step that has not
+    run.
+    """
     return work.done.get(name) or work.record_of_unneeded(name)
 
 

@@ -42,13 +42,13 @@ from neusee.workflows.store.serialization import pack, tensors_in
 
 # Writes of large results in the background, while the next steps compute.
 #
-# A run ends after all writes. A result that waits stays in memory and keeps its lease, so that
-# another process that needs the same result finds either the lease or the result.
+# A run ends after all writes. A result that waits to be written stays in memory and keeps its
+# lease, so that another process that needs the same result finds either the lease or the result.
 
 
 LARGE = 1 << 20  #: bytes; a larger result is written during the next step
-_ROOM = 1 << 29  #: bytes that may wait; a larger result waits alone
-_NICE = 10  #: how much nicer the writing thread is; 19 is the nicest
+_ROOM = 1 << 29  #: greatest total size (bytes) of waiting results; a larger result waits alone
+_NICE = 10  #: increase of the nice value of the writing thread; 19 is the greatest nice value
 
 
 class WriteBehind:
@@ -56,8 +56,8 @@ class WriteBehind:
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
-        self._sizes: dict[Key, int] = {}  # bytes of each write that has not ended
-        # each write since the last `finish`, for its error
+        self._sizes: dict[Key, int] = {}  # size (bytes) of each write that has not ended
+        # each write since the last `finish`, kept to report its error
         self._writes: dict[Key, Future[Any]] = {}
         self._guard = threading.Lock()
 
@@ -124,7 +124,7 @@ Fetch = Callable[[Key], Any]
 Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
 T = TypeVar("T")
 _STATISTICS = tuple(field.name for field in fields(TensorStats))
-_WATCHED_BYTES = 1 << 20  #: bytes of inputs from which the memory of a step is measured
+_WATCHED_BYTES = 1 << 20  #: size (bytes) of the inputs above which the memory of a step is measured
 
 
 class InputMissing(Exception):
@@ -154,9 +154,9 @@ class StepJob:
     unlocked: bool = False  #: compute without a lease, because the node takes so little time
     #: True to compute a stored result because computing is faster than reading
     recompute: bool = False
-    refetch_seconds: float = 0.0  #: s to obtain the inputs again if this result is not kept
+    refetch_seconds: float = 0.0  #: time (s) to obtain the inputs again if this result is not kept
     parts: int = 1  #: number of passes over the bands, for less memory
-    #: the code of a step that is not of neusee, which is observed while it computes
+    #: the user's code behind the step, which is observed while it computes
     own: OwnCode | None = None
 
     @property
@@ -176,7 +176,7 @@ class Outcome:
     value: Any = None  #: None where another process computed the value
     facts: TensorStats | None = None
     checks: tuple[Check, ...] = ()
-    began: float = 0.0  #: s, by `time.time`
+    began: float = 0.0  #: start time (s), from `time.time`
     seconds: float = 0.0
     bytes: int = 0
     #: error of a cheaper form: `Node.approximation_error`
@@ -190,7 +190,7 @@ class Outcome:
     found: bool = False  #: True if another process has already stored this result
     error: BaseException | None = None
     lost: tuple[Key, ...] = ()  #: inputs that could not be read
-    #: what an own step reached that its key does not cover; its value is not stored
+    #: dependencies of a step of the user that its key does not cover; its value is not stored
     taints: tuple[Taint, ...] = ()
 
 
@@ -200,7 +200,7 @@ class Lane:
 
     device: str
     memory: float  #: bytes that a schedule may use
-    held: float = 0.0  #: bytes that the program itself holds beside them
+    held: float = 0.0  #: bytes that the program itself uses in addition
 
     @property
     def kind(self) -> str:
@@ -241,7 +241,7 @@ def carry_out(
     """Compute one step and store its result if storing saves time; return an error as part of
     the outcome.
     """
-    # nobody else needs this result, or computing it twice costs less than the lease
+    # no other process needs this result, or computing it twice costs less than the lease
     if work.unlocked or is_private(work.key):
         return _carried_out(work, fetch, store, None, Lease())
     lease = store.claim(work.key)
@@ -293,7 +293,7 @@ def _computed(work: StepJob, inputs: list[Any]) -> Outcome:
     input_bytes = sum(t.nbytes for t in tensors_in(inputs))
     # a small and quick step is not worth the measurement
     is_watched = input_bytes >= _WATCHED_BYTES or not work.unlocked
-    # own code in this process: only then the system limits its allocations
+    # True for code of the user in this process: only then the system limits its allocations
     own_in_process = (
         work.own is not None and work.device.startswith("cpu") and not _needs_own_process(work)
     )
@@ -317,7 +317,7 @@ def _computed(work: StepJob, inputs: list[Any]) -> Outcome:
         checks=checks,
         began=began,
         seconds=seconds,
-        # a fork counts its memory itself
+        # the memory of a forked process is counted separately
         peak=None if peak.bytes is None else peak.bytes + observations.peak,
         taints=tuple(dict.fromkeys(observations.taints)),
     )
@@ -337,7 +337,7 @@ def _value(work: StepJob, inputs: list[Any], observations: _Seen) -> Any:
 
 
 def _refuse_changed_files(work: StepJob, stamps: Any) -> None:
-    """Raise `RunError` if an input file is not what it was when the step began."""
+    """Raise `RunError` if an input file changed after the step began."""
     params = work.step.params
     is_unchanged = stamps == file_stamps(params)
     if not is_unchanged or work.origin["params"] != {
@@ -348,15 +348,15 @@ def _refuse_changed_files(work: StepJob, stamps: Any) -> None:
 
 @dataclass(slots=True)
 class _Seen:
-    """What was seen of the calls of own code in one step."""
+    """Observations of the calls of the user's code in one step."""
 
     taints: list[Taint] = field(default_factory=list)
-    peak: int = 0  #: peak bytes of a process of its own
+    peak: int = 0  #: peak memory (bytes) of a separate process
 
 
 def _observing(function: Callable[..., T], work: StepJob, observations: _Seen) -> Callable[..., T]:
-    """Return a function that is observed where the code is not of neusee, and that adds what it
-    finds to ``observations``.
+    """Return a function that observes calls of the user's code and adds the findings to
+    ``observations``; functions of neusee are returned unchanged.
     """
     own_code = work.own
     if own_code is None:
@@ -371,7 +371,7 @@ def _observing(function: Callable[..., T], work: StepJob, observations: _Seen) -
             raise RunError(work.step, [], error) from error
         observations.taints.extend(taints)
         if taints:
-            # until the run knows of the taints, nothing of these modules is stored
+            # until the run has processed the taints, no result of these modules is stored
             hold_back(tainted_modules(own_code, taints))
         return value
 
@@ -379,8 +379,8 @@ def _observing(function: Callable[..., T], work: StepJob, observations: _Seen) -
 
 
 def _needs_own_process(work: StepJob) -> bool:
-    """Return True for code that may change what other code finds: it runs in a process of its
-    own.
+    """Return True for code that may change the state that other code uses: it runs in a separate,
+    forked process.
     """
     return (
         work.own is not None
@@ -393,10 +393,10 @@ def _needs_own_process(work: StepJob) -> bool:
 def _called_observed(
     function: Callable[[], T], own: OwnCode, in_own_process: bool, observations: _Seen
 ) -> tuple[T, list[Taint]]:
-    """Call a function of own code, in a process of its own if ``in_own_process`` and its value can
-    be sent.
+    """Call a function of the user's code, in a forked process if ``in_own_process`` and if its
+    value can be sent.
     """
-    # None: no fork, or a value that cannot be sent
+    # None if there was no fork, or if the value could not be sent
     returned = (
         call_in_fork(partial(call_observed, function, own), own.variables)
         if in_own_process
@@ -410,7 +410,7 @@ def _called_observed(
         min(own.modules),
         [taint for taint in taints if taint.kind == "memory"],
     )
-    # what the fork changed in memory is gone with it, so that this taints nothing
+    # the forked process has ended, and its changes in memory with it, so they taint nothing
     say_lost(first_module, memory_taints)
     say_hidden(first_module, returned.asked, own.free)
     return value, [
@@ -438,13 +438,13 @@ def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Leas
 
 
 def _store(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> None:
-    """Store a result as it pays: its metadata alone, with a small value, or with a file that may
-    be written later.
+    """Store a result in the way that saves time: only its metadata, a small value with its
+    metadata, or a file, which may be written later.
     """
     job, value, metadata = outcome.work, outcome.value, _about(outcome)
     is_inline = outcome.bytes <= INLINE
     not_worth_it = not (job.wanted or is_inline or _pays(outcome, store, outcome.bytes))
-    # without a lease: no file of its own where a record beside others will do
+    # without a lease, write no separate file if a record in a common file will do
     if job.unlocked and (not_worth_it or (is_inline and not _pays(outcome, store, 0))):
         outcome.kept = store.put_small(job.key, value, metadata)
     elif not_worth_it:

@@ -1,10 +1,10 @@
-"""Call of own code in a process of its own: whatever it changes in Python, or in a library, ends
-with the call.
+"""Call of the user's code in a forked process: all changes that it makes in Python or in a library
+end with the call.
 
 Code of a user may set an option of a library, fill a table, patch a function or move the working
-folder. No list of such changes is complete, so a step of code that may make one is computed by a
-fork of this process. The fork has the inputs at hand, sends the value back, and ends. The next
-step, of the user or of neusee, finds the process as it was.
+folder. No list of such changes is complete, so a step whose code may make one is computed in a
+fork of this process. The fork has the inputs in memory, sends the value back, and ends. The next
+step, of the user or of neusee, finds this process unchanged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from neusee.workflows.observation.observed_call import one_at_a_time, watched_in
 from neusee.workflows.observation.step_thread import is_alone
 
 T = TypeVar("T")
-_LOOK = 0.05  #: s after which the caller sees an exception that another thread raises in it
+#: interval (s) at which the caller checks for an exception that another thread raised in it
+_LOOK = 0.05
 _BESIDE_TABLE = "rich_proxied_file"  #: attribute of a stream of rich beside a live table
 _UNSENT = 3  #: exit code of a fork whose value cannot be sent
 
@@ -45,24 +46,25 @@ class ProcessEnded(RuntimeError):
 
 
 class Returned(NamedTuple, Generic[T]):
-    """What a call in a process of its own gave."""
+    """The result of a call in a forked process."""
 
     value: T
-    peak: int | None  #: peak bytes of the process beside what it began with
-    asked: Asked  #: variables of the environment that the code asked for and does not have
+    peak: int | None  #: peak memory (bytes) of the forked process, beyond its memory at the start
+    asked: Asked  #: environment variables that the code read but that were hidden or not declared
 
 
 class _Sent(NamedTuple):
-    """What goes through the file of the fork."""
+    """The content of the file that the forked process sends."""
 
     returned: Returned[Any] | None
     error: BaseException | None
     said: list[warnings.WarningMessage]
-    printed: dict[str, str]  #: texts for streams that draw beside a table: see `_collected`
+    printed: dict[str, str]  #: text for each stream that is shown beside a table: see `_collected`
 
 
 def may_fork() -> bool:
-    """Return True where a fork is safe, and what the call prints goes where this process prints.
+    """Return True if a fork is safe, and if the output of the call goes to the same place as that
+    of this process.
 
     A lock that a thread of another library holds would stay locked in a fork, as in a notebook.
     """
@@ -74,25 +76,25 @@ def may_fork() -> bool:
 
 
 def call_in_fork(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
-    """Return what a function gives in a fork of this process; None if its value cannot be sent, or
-    nothing is forked.
+    """Return the result of a function in a fork of this process; None if its value cannot be sent,
+    or if the fork fails.
 
-    ``variables`` are those of the environment that the code declares. Raises what the function
-    raises, with its text and without its traceback, and `ProcessEnded`.
+    ``variables``: environment variables that the code declares. Raises the errors of the function,
+    with their text and without their traceback, and `ProcessEnded`.
     """
     with one_at_a_time():
         return _called(function, variables)
 
 
 def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
-    """Do what `call_in_fork` says, while no other step runs."""
+    """Implement `call_in_fork`, while no other step runs."""
     limit, parent = limit_now(), os.getpid()
     with open(os.memfd_create("neusee step"), "rb") as file, watched_in_fork() as begin_watch:
         try:
             child = _forked()
         except OSError:  # no memory or no permission for one more process
             return None
-        # this is the fork, which does not return from here
+        # this branch runs in the fork, which ends inside `_answer`
         if not child:
             _answer(begin_watch, partial(_sent, function, variables, limit), file.fileno(), parent)
         exit_code = _waited(child)
@@ -100,7 +102,7 @@ def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T]
             return None
         if exit_code:
             raise ProcessEnded(_reason(exit_code))
-        # the file is in memory and has no other path
+        # the file is in memory and has only this path
         answer: _Sent = torch.load(f"/proc/self/fd/{file.fileno()}", mmap=True, weights_only=False)
     for name, text in answer.printed.items():
         getattr(sys, name).write(text)
@@ -112,7 +114,7 @@ def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T]
 
 
 def _is_a_file(stream: Any) -> bool:
-    """Return True for a stream with a file descriptor, or for none."""
+    """Return True for a stream with a file descriptor, or for None."""
     try:
         return stream is None or stream.fileno() >= 0
     except (OSError, ValueError, AttributeError):
@@ -123,8 +125,8 @@ def _is_a_file(stream: Any) -> bool:
 
 
 def _forked() -> int:
-    """Fork; return the number of the child, and 0 in the child."""
-    # or the fork would print what still waits here once more
+    """Fork this process; return the process number of the child, or 0 in the child."""
+    # otherwise the fork would print the buffered text a second time
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
             stream.flush()
@@ -134,8 +136,8 @@ def _forked() -> int:
 
 
 def _waited(child: int) -> int:
-    """Return the exit code of a process, negative for a signal, when it has ended; kill it if an
-    exception comes.
+    """Wait until a process ends and return its exit code, negative for a signal. Kill the process
+    if an exception interrupts the wait.
     """
     try:
         with _descriptor(child) as descriptors:
@@ -143,7 +145,7 @@ def _waited(child: int) -> int:
                 ended_process, status = os.waitpid(child, os.WNOHANG)
                 if ended_process:
                     return os.waitstatus_to_exitcode(status)
-                # wakes at the end of the child, or after the time
+                # returns when the child ends, or after the given time
                 select.select(descriptors, [], [], _LOOK if descriptors else _LOOK / 50)
     except BaseException:
         with suppress(ProcessLookupError, ChildProcessError):
@@ -154,7 +156,9 @@ def _waited(child: int) -> int:
 
 @contextmanager
 def _descriptor(child: int) -> Iterator[list[int]]:
-    """Give a descriptor that tells the end of a process, or none where the system has none."""
+    """Yield a list with a file descriptor that becomes ready when the process ends; an empty list
+    if the system has none.
+    """
     try:
         descriptor = os.pidfd_open(child)
     except (OSError, AttributeError):
@@ -186,11 +190,11 @@ def _reason(code: int) -> str:
 def _answer(
     begin_watch: Callable[[], None], work: Callable[[], _Sent], file: int, parent: int
 ) -> None:
-    """Do the work, write what it gives to a file, and end this process, whatever happens."""
+    """Run the work in the fork, write its result to a file, and end this process in every case."""
     exit_code, texts_by_stream = 1, _collected()
     try:
         ignore_interrupts()
-        # False: the parent has ended already, and nobody waits
+        # False: the parent has already ended, and no process waits
         if end_with(parent):
             begin_watch()
             _print_as_parent()
@@ -209,8 +213,8 @@ def _answer(
 
 
 def _collected() -> dict[str, io.StringIO]:
-    """Collect what is printed to streams that draw beside a table: a thread of the parent may
-    hold their lock.
+    """Collect the text that is printed to streams beside a live table: a thread of the parent may
+    hold the lock of the table.
     """
     collected = {
         name: io.StringIO()
@@ -223,20 +227,20 @@ def _collected() -> dict[str, io.StringIO]:
 
 
 def _print_as_parent() -> None:
-    """Let libraries of C print to stderr where Python does, while stdout is kept for the result
-    of the command.
+    """Let C libraries print to stderr if Python does so, since stdout is reserved for the result of
+    the command.
     """
     if (
         sys.stdout is not None
         and not isinstance(sys.stdout, io.StringIO)
         and sys.stdout.fileno() == 2
     ):
-        # 1 is stdout of C, 2 is stderr
+        # descriptor 1 is stdout of C libraries, 2 is stderr
         os.dup2(2, 1)
 
 
 def _sent(function: Callable[[], Any], variables: frozenset[str], limit: float | None) -> _Sent:
-    """Return what the function gave or raised in the fork, with the warnings that it gave."""
+    """Return the result or the error of the function in the fork, with its warnings."""
     with warnings.catch_warnings(record=True) as caught_warnings:
         try:
             return _Sent(_returned(function, variables, limit), None, caught_warnings, {})
@@ -247,8 +251,8 @@ def _sent(function: Callable[[], Any], variables: frozenset[str], limit: float |
 def _returned(
     function: Callable[[], Any], variables: frozenset[str], limit: float | None
 ) -> Returned[Any]:
-    """Call the function under the limits of memory; return its value, peak bytes and the
-    variables that it asked for in vain.
+    """Call the function under the memory limits; return its value, its peak memory in bytes, and
+    the hidden variables that it read.
     """
     with ExitStack() as stack:
         if limit is not None:
@@ -258,13 +262,13 @@ def _returned(
         asked_variables = hide_for_good(variables)
         bytes_before = resident("VmRSS:")
         value = function()
-        peak_bytes = resident("VmHWM:")  # a fork begins to count anew
+        peak_bytes = resident("VmHWM:")  # the system counts the peak of a fork from its start
     peak = None if bytes_before is None or peak_bytes is None else max(0, peak_bytes - bytes_before)
     return Returned(value, peak, asked_variables)
 
 
 def _write(sent: _Sent, file: int) -> int:
-    """Write what the parent reads; return the exit code of the fork."""
+    """Write the content that the parent reads; return the exit code of the fork."""
     plain_warnings = [_plain_warning(warning) for warning in sent.said]
     try:
         with open(file, "wb", closefd=False) as binary:

@@ -1,8 +1,8 @@
-"""Steps whose results a run must give, and the values that it must therefore compute.
+"""Steps whose results a run must return, and the values that it must compute for them.
 
-A run gives its outputs, the numbers that the recipe expects, the spectral errors, the rival of a
-mask, and what the result table reads. The names of the steps of the camera graph stand here and in
-``report/contents.toml`` alone.
+A run returns its outputs, the numbers that the recipe expects, the spectral errors, the rival of a
+mask, and the inputs of the result table. Only this module and ``report/contents.toml`` contain the
+names of the steps of the camera graph.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ TABLE: Mapping[str, Mapping[str, str]] = {
 }
 RIVAL = "grey filter, restored"
 
-#: Steps that give the error by the number of bands, by what they are the error of.
+#: Steps that estimate the error from the number of bands, each with the quantity that has the
+#: error.
 SPECTRAL: Mapping[str, str] = {
     "spectral": "of the PSF of a white point",
     "laser_spectral": "of a laser spot",
@@ -53,8 +54,8 @@ LINES = "line[*]"
 
 
 def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """Return the steps that a run must give: outputs, steps of expected numbers, spectral errors,
-    and a mask's rival.
+    """Return the steps that a run must return: outputs, steps of expected numbers, spectral errors,
+    and the rival of a mask.
 
     An expected number counts if an output needs its step, and a spectral error if the outputs need
     all its inputs. The rival of a mask counts if the outputs tell how the mask protects and how the
@@ -71,8 +72,8 @@ def wanted(recipe: Recipe) -> tuple[str, ...]:
 
 
 def _rival(recipe: Recipe, asked: set[str]) -> Iterable[str]:
-    """Return the steps of the grey filter that is the rival of a mask; none if the recipe has a
-    filter of its own.
+    """Return the steps of the grey filter that is the rival of a mask; none if the recipe itself
+    has a filter.
     """
     steps = TABLE[RIVAL].values()
     has_mask = asked.issuperset((TABLE["with mask"]["LSR"], *TABLE["restored"].values()))
@@ -87,13 +88,13 @@ def shade_of(recipe: Recipe) -> str | None:
 
 
 def compared(recipe: Recipe) -> tuple[list[Expectation], list[Expectation]]:
-    """Return the expected numbers that a run compares, and the others, whose steps no output of
-    the recipe needs.
+    """Return the expected numbers that a run compares, and those whose steps no output of the
+    recipe needs.
     """
     needed_steps = _asked(recipe)
     numbers: tuple[list[Expectation], list[Expectation]] = ([], [])
     for number in recipe.expect:
-        # False is 0, the list of those that are compared; True is 1
+        # False is index 0, the compared numbers; True is index 1, the others
         numbers[number.step not in needed_steps].append(number)
     return numbers
 
@@ -116,9 +117,9 @@ def steps_of(recipe: Recipe) -> list[str]:
 
 # --- missing values -------------------------------------------------------------------------------
 
-# The values that a run must compute, since the store has no copy of them. A stored value that is
-# asked for is loaded. What a missing value needs is loaded if it is stored, and else computed in
-# the same way.
+# The values that a run must compute, because the store has no copy of them. A stored value that is
+# requested is loaded. The inputs of a missing value are loaded if they are stored, and otherwise
+# computed in the same way.
 
 
 class Upstream(dict[Key, list[Key]]):
@@ -141,9 +142,7 @@ class Upstream(dict[Key, list[Key]]):
         return self[key]
 
     def knows(self, key: Key) -> bool:
-        """Return True if a value is known; a value that was asked for before is not asked for
-        again.
-        """
+        """Return True if a value is known; each value is checked only once."""
         return key not in self.missing if key in self else self._known(key)
 
 

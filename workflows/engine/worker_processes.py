@@ -1,11 +1,11 @@
 """Worker processes that share independent work, such as the points of a sweep or the draws of a
 study.
 
-Each worker is a fork of this process with one thread of torch, so that it has the recipe, the
-modules and all large values at hand, and only the numbers of the pieces of work and their results
+Each worker is a fork of this process with one torch thread. So it has the recipe, the
+modules and all large values in memory, and only the numbers of the pieces of work and their results
 go through a pipe. A worker computes with the same code on one thread: its results are those of this
 process on one thread, bit for bit. Work that a worker did not finish, because it failed, was killed
-or had too little memory, is left to this process, which then meets the error as if there were no
+or had too little memory, is left to this process, which then raises the error as if there were no
 workers. Workers end with this process, also after ``kill -9``.
 """
 
@@ -37,8 +37,8 @@ _PARENT_DIES = 1  #: PR_SET_PDEATHSIG of Linux
 
 @contextmanager
 def deaf_fork() -> Iterator[None]:
-    """Hold Ctrl-C back while the ``with`` block forks, so that it reaches the fork only after
-    `ignore_interrupts`.
+    """Hold back Ctrl-C while the ``with`` block forks, so that the forked process receives it only
+    after `ignore_interrupts`.
     """
     signals_before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -48,18 +48,18 @@ def deaf_fork() -> Iterator[None]:
 
 
 def ignore_interrupts() -> None:
-    """Ignore Ctrl-C in a fork: the parent decides what an interrupt ends."""
+    """Ignore Ctrl-C in a forked process: the parent decides what an interrupt ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def workers_for(pieces: int, asked: int = 0) -> int:
-    """Return how many workers share a number of pieces of work: ``asked``, or by default one for
-    each free processor.
+    """Return the number of workers that share ``pieces`` pieces of work: ``asked``, or by default
+    one for each free processor.
 
-    1 means that this process works alone, as where a fork is not possible, or by default beside
-    threads of others, such as those of a notebook: a lock that such a thread holds stays locked in
-    a fork.
+    1 means that this process works alone. It does so if a fork is not possible, or by default
+    beside threads of other libraries, such as those of a notebook: a lock that they hold stays
+    locked in a fork.
     """
     if sys.platform != "linux":
         return 1
@@ -67,8 +67,8 @@ def workers_for(pieces: int, asked: int = 0) -> int:
 
 
 def end_with(parent: int) -> bool:
-    """Let this fork end when the process that forked it, ``parent``, ends, also after ``kill
-    -9``; False if it did.
+    """Let this forked process end when its ``parent`` ends, also after ``kill -9``; return False if
+    the parent has already ended.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     with suppress(OSError, AttributeError):
@@ -100,14 +100,14 @@ def shared(
 
 
 def shared_in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
-    """Yield ``work(number)`` for each number below ``count``, in order; this process does what
-    no worker finished.
+    """Yield ``work(number)`` for each number below ``count``, in order; this process does the
+    pieces that no worker finished.
     """
     results, next_number = dict[int, tuple[T] | None](), 0
     with closing(shared(work, range(count), workers)) as ended:
         for number, value in ended:
             results[number] = value
-            # results wait until all before them are there
+            # a result waits until all earlier ones have arrived
             while next_number in results:
                 result = results.pop(next_number)
                 yield result[0] if result else work(next_number)
@@ -122,14 +122,14 @@ class _Team(Generic[T]):
     ) -> None:
         self._work = work
         run_count, piece_count = workers if apart else 1, len(order)
-        # equal runs of neighbours
-        # pieces that nobody has: a common list, or one for each worker
+        # pieces that no worker has taken: one common list, or for each worker an equal run of
+        # neighbours
         self._left = [
             deque(order[i * piece_count // run_count : (i + 1) * piece_count // run_count])
             for i in range(run_count)
         ]
         self._lost = deque[int]()  # pieces for the caller
-        # by pipe: the worker's index, and the piece that it has
+        # for each pipe, the worker's index and its present piece
         self._now: dict[Connection, tuple[int, int]] = {}
         self._processes = list[multiprocessing.process.BaseProcess]()
         self._pipes = list[Connection]()
@@ -140,7 +140,7 @@ class _Team(Generic[T]):
         while self._now or self._lost or any(self._left):
             while self._lost:
                 yield self._lost.popleft(), None
-            # the workers that have an answer
+            # the workers that have sent an answer
             for pipe in wait(list(self._now)) if self._now else ():
                 assert isinstance(pipe, Connection)
                 yield self._result(pipe)
@@ -149,17 +149,19 @@ class _Team(Generic[T]):
                 self._left = []
 
     def _result(self, pipe: Connection) -> tuple[int, tuple[T] | None]:
-        """Return the piece of work that a worker had and its result, and hand it the next one."""
+        """Return the piece of work that a worker finished and its result, and send the worker the
+        next piece.
+        """
         index, number = self._now.pop(pipe)
         answer = self._answer(pipe)
-        # the worker has ended: its piece is left to the caller
+        # the worker has died: its piece is left to the caller
         if answer is None:
             return number, None
         self._hand(index, pipe)
         return number, answer[0]
 
     def close(self) -> None:
-        """End all workers, at once where they still work."""
+        """End all workers, at once if they still work."""
         for pipe in self._pipes:
             pipe.close()
         for process in self._processes:
@@ -170,10 +172,12 @@ class _Team(Generic[T]):
                 process.join()
 
     def _begin(self, index: int) -> None:
-        """Start a worker and hand it its first piece; without memory for it, nothing happens."""
+        """Start a worker and send it its first piece; if the fork fails, there is one worker
+        less.
+        """
         context = multiprocessing.get_context("fork")
         own_end, worker_end = context.Pipe()
-        # with the ends of this process, which the worker closes
+        # includes the pipe ends of this process, which the worker closes
         arguments = (worker_end, [*self._pipes, own_end], self._work, os.getpid())
         process = context.Process(
             target=_serve, args=arguments, name=f"neusee worker {index}", daemon=True
@@ -183,7 +187,7 @@ class _Team(Generic[T]):
             with warnings.catch_warnings(), deaf_fork():
                 warnings.simplefilter("ignore", DeprecationWarning)
                 process.start()
-        except OSError:  # no memory or no permission: the others do the work, or this process
+        except OSError:  # no memory or no permission: the other workers or this process do the work
             own_end.close()
             return
         finally:
@@ -193,14 +197,15 @@ class _Team(Generic[T]):
         self._hand(index, own_end)
 
     def _hand(self, index: int, pipe: Connection) -> None:
-        """Give a worker the next piece of its own run, or the last piece of the longest other
+        """Send a worker the next piece of its own run, or the last piece of the longest other
         run.
         """
-        # one common run if they are not apart
+        # all workers share one run unless they are apart
         own_run = self._left[min(index, len(self._left) - 1)]
         run = own_run or max(self._left, key=len)
         if run:
-            # from another's run the last piece, which is the farthest from its present one
+            # from the run of another worker take the last piece, which is farthest from its present
+            # one
             piece = run.popleft() if run is own_run else run.pop()
             try:
                 pipe.send(piece)
@@ -210,8 +215,8 @@ class _Team(Generic[T]):
                 self._now[pipe] = index, piece
 
     def _answer(self, pipe: Connection) -> tuple[tuple[T] | None] | None:
-        """Return the answer of a worker, with None in it for a piece that failed; None if the
-        worker has ended.
+        """Return the answer of a worker in a tuple: the result, or None for a piece that failed.
+        Return None itself if the worker has died.
         """
         try:
             value, given_warnings = pickle.loads(pipe.recv_bytes())
@@ -219,20 +224,20 @@ class _Team(Generic[T]):
             return None
         for text, category in given_warnings:
             warnings.warn(text, category, stacklevel=2)
-        # in a tuple, because the value may be None
+        # in a tuple, to distinguish a failed piece from a dead worker
         return (value,)
 
 
 def _serve(
     pipe: Connection, others: Sequence[Connection], work: Callable[[int], T], parent: int
 ) -> None:
-    """Do the pieces of work that the pipe names, until its other end closes."""
+    """Do the pieces of work whose numbers come through the pipe, until its other end closes."""
     for other_pipe in others:
-        other_pipe.close()  # else the pipes of a killed process stay open
+        other_pipe.close()  # otherwise the pipes of a killed process would stay open
     ignore_interrupts()
     if not end_with(parent):
         return
-    torch.set_num_threads(1)  # the threads of the parent are not in a fork of it
+    torch.set_num_threads(1)  # a forked process does not have the threads of its parent
     with suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(_done(work, pipe.recv()))
@@ -240,14 +245,14 @@ def _serve(
 
 
 def _done(work: Callable[[int], T], number: int) -> bytes:
-    """Return a pickled piece of work with the warnings that it gave, or None in its place if it
-    failed.
+    """Return the pickled result of a piece of work with its warnings, or None in place of the
+    result if it failed.
     """
     with warnings.catch_warnings(record=True) as given_warnings:
         warnings.simplefilter("default")
         try:
             value: tuple[T] | None = (work(number),)
-        except BaseException:  # the parent does this piece, and meets the error again
+        except BaseException:  # the parent repeats this piece, and raises the error there
             value = None
     messages = [(str(warning.message), warning.category) for warning in given_warnings]
     try:

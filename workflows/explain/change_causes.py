@@ -1,4 +1,4 @@
-"""Causes of a changed result: parameters, files and code that differ, in words."""
+"""Causes of a changed result: parameters, files and code that differ, described in words."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _OTHER = frozenset({"Python", _SETTINGS, "closure", _PROGRAM})
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
-    """Return one text clause for each definition that differs between two versions of code; []
-    if no record exists.
+    """Return one text clause for each definition that differs between two versions of code; an
+    empty list if no record exists.
     """
     old_parts, new_parts = read_parts(root, old), read_parts(root, new)
     if not old_parts or not new_parts:
@@ -45,7 +45,7 @@ def edits(root: Path, old: str, new: str) -> list[str]:
     for name in dict.fromkeys([*new_parts, *old_parts]):
         if not _is_module(name) and not name.startswith(_STATE):
             other_clauses += _beside(name, old_parts.get(name, {}), new_parts.get(name, {}))
-    # a changed value is told only where nothing else explains it
+    # a changed value is reported only if nothing else explains the change
     return source_clauses + other_clauses or [
         f"a value that {_file(name.removeprefix(_STATE))} holds was changed while the program ran:"
         " a constant, a table, a default or a function"
@@ -57,8 +57,8 @@ def edits(root: Path, old: str, new: str) -> list[str]:
 def _edited_modules(
     before: Mapping[str, dict[str, str]], after: Mapping[str, dict[str, str]]
 ) -> list[str]:
-    """Return one text clause for each definition that differs, and for each module that is imported
-    now, or no longer.
+    """Return one text clause for each definition that differs, and for each module that is newly
+    imported or no longer imported.
     """
     new_modules, old_modules = list(filter(_is_module, after)), list(filter(_is_module, before))
     definition_clauses: list[str] = []
@@ -80,7 +80,7 @@ def _edited_modules(
 
 
 def _is_module(name: str) -> bool:
-    """Return True if a part of a digest is that of a module, by its name."""
+    """Return True if the name of a part of a digest is the name of a module."""
     return all(word.isidentifier() for word in name.split(".")) and name not in _OTHER
 
 
@@ -98,7 +98,7 @@ def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
 
 def _other_setting(label: str, old: dict[str, str], new: dict[str, str]) -> str:
     """Return the text clause for a setting of the process that differs."""
-    # a setting that is not recorded has its usual value
+    # a setting without a record has its usual value
     old_value, new_value = old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label))
     return f"{label} {old_value} -> {new_value}, a setting of this process"
 
@@ -147,8 +147,8 @@ def _changed_definition(label: str, file: str, line: int | None) -> str:
 
 
 def _lines(module: str) -> dict[str, int]:
-    """Return the line of each function, hook, class and constant at the top of a module, as its
-    file is now.
+    """Return the line of each function, hook, class and constant at the top level of a module, in
+    the present file.
     """
     path = source_file(module)
     try:
@@ -162,7 +162,9 @@ def _lines(module: str) -> dict[str, int]:
 
 
 def _labels_of(item: ast.stmt) -> list[str]:
-    """Return the names of what a statement defines, as the parts of a digest name it."""
+    """Return the labels of the definitions in a statement, in the form that the parts of a digest
+    use.
+    """
     if isinstance(item, ast.ClassDef):
         return [f"class {item.name}"]
     if isinstance(item, ast.FunctionDef):
@@ -199,8 +201,8 @@ _ABSENT = object()
 
 
 class Wording:
-    """Texts that describe changed parameters in the units of a recipe, or without a recipe in SI
-    units.
+    """Texts that describe changed parameters in the units of a recipe, or in SI units if there is
+    no recipe.
     """
 
     def __init__(self, recipe: Recipe | None = None) -> None:
@@ -263,11 +265,13 @@ class Wording:
 
 
 def _setting_of(marked: list[Setting], step: Step, name: str) -> Setting | None:
-    """Return which of the settings at one location gives the parameter ``name`` its value."""
+    """Return the setting, among those at one location, that gives the parameter ``name`` its value;
+    None if this is ambiguous.
+    """
     recipe_path = ("steps", step.name.partition("[")[0], "with", name)
     of_step = [setting for setting in marked if setting.path == recipe_path]
     candidates = of_step or [setting for setting in marked if setting.path[-1:] == (name,)]
-    # a single setting at the place gives the value, whatever its name
+    # a single setting at the location gives the value, whatever its name
     return (candidates or marked)[0] if candidates or len(marked) == 1 else None
 
 
@@ -279,13 +283,15 @@ def _written_value(setting: Setting | None) -> Any:
 
 
 def _file_wording(step: Step | None, name: str) -> str:
-    """Return the name of the file in a parameter, or the name of the parameter."""
+    """Return the name of the file in a parameter, or the name of the parameter if it contains no
+    file.
+    """
     value = step.params.get(name) if step else None
     return value.name if isinstance(value, Path) else name
 
 
 def _other_file(old: Any, new: Mapping[str, Any]) -> str:
-    """Return how a parameter with a file differs from before."""
+    """Return a text that describes how a parameter with a file has changed."""
     if not isinstance(old, Mapping) or "file" not in old:
         return "is given now"
     return (
@@ -301,7 +307,7 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         return _parts_in_units_of(written, new, old), new_text
     if isinstance(old, Mapping) and isinstance(new, Mapping):
-        # the entries that differ, of mappings
+        # of two mappings, show only the entries that differ
         return _items(old, new)
     # (function from SI units, name of the unit)
     conversion_and_unit = _unit(written, new)
@@ -317,14 +323,14 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
 
 
 def _parts_in_units_of(written: Any, new: list[Any], old: list[Any]) -> str:
-    """Return the old list as text, each item in the unit in which the new one was written."""
+    """Return the old list as text, each item in the unit of the corresponding new item."""
     has_all_items = isinstance(written, list) and len(written) == len(old)
     written_items = written if has_all_items else [None] * len(old)
     return f"[{', '.join(map(_in_unit_of, written_items, new, old))}]"
 
 
 def _in_unit_of(written: Any, new: Any, old: Any) -> str:
-    """Return an old value as text in the unit in which the new one was written."""
+    """Return an old value as text in the unit in which the new value was written."""
     conversion_and_unit = _unit(written, new)
     return (
         f"{spoken(conversion_and_unit[0](old))} {conversion_and_unit[1]}"
@@ -334,7 +340,7 @@ def _in_unit_of(written: Any, new: Any, old: Any) -> str:
 
 
 def _is_number(value: Any) -> bool:
-    """Return True for a number that is no truth value."""
+    """Return True for a number; bool does not count as a number."""
     return isinstance(value, float | int) and not isinstance(value, bool)
 
 
@@ -376,10 +382,10 @@ def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None
     # a gain is stored as its inverse
     if match[2].strip() == "e-/DN":
         return (lambda si: 1.0 / si if si else math.inf), match[2]
-    # the written number tells the factor of its unit
+    # the ratio of the written number to the SI value is the factor of the unit
     if new and float(match[1]):
         return _times(float(match[1]) / new), match[2]
-    # of a value 0, the unit alone tells it
+    # for the value 0, the factor follows from the unit alone
     for si in ("m", "s", "rad", "K", "e-", "waves", "DN/e-"):
         with suppress(ValueError):
             return _times(1.0 / read_quantity(f"1 {match[2]}", si)), match[2]
@@ -413,8 +419,9 @@ def spoken(value: Any) -> str:
 
 
 Origin = Mapping[str, Any]  #: the parts of a key: node, code, params, inputs, stream
-_MOST_NAMED_STEPS = 4  #: steps of an input that a clause names
-_MOST_SEARCHED_STEPS = 100  #: steps upstream that are searched for an inserted step
+_MOST_NAMED_STEPS = 4  #: greatest number of steps of an input that a clause names
+#: greatest number of upstream steps that are searched for an inserted step
+_MOST_SEARCHED_STEPS = 100
 
 
 class Pair(NamedTuple):
@@ -434,7 +441,7 @@ class Roots:
     to each cause.
     """
 
-    found: dict[str, Pair]  #: by the description of the cause
+    found: dict[str, Pair]  #: pair of results with each cause, by the description of the cause
     above: dict[Pair, Pair | None]
 
     def chain(self, text: str) -> list[str]:
@@ -455,7 +462,7 @@ def _only_in(names: Iterable[str], others: Container[str]) -> list[str]:
 
 
 def _changed_pairs(now: Mapping[str, Key], then: Mapping[str, Key]) -> list[Pair]:
-    """Return the names that both have, with different keys."""
+    """Return a pair for each name that both mappings contain with different keys."""
     return [Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key]
 
 
@@ -489,7 +496,7 @@ class Comparison:
             texts, input_pairs = self.compare(pair)
             for text in texts:
                 pair_of_cause.setdefault(text, pair)
-            # too many: another earlier result is nearer
+            # more causes than the limit: another earlier result is more similar
             if len(pair_of_cause) > limit:
                 return None
             for input_pair in input_pairs:
@@ -514,7 +521,7 @@ class Comparison:
             place = self.wording.source("steps", label.partition("[")[0], "node")
             return [f"{old['node']} -> {new['node']}{place}"]
         clauses = self.wording.params(label, old["params"], new["params"])
-        # names of files and the order of mappings count for nodes of users
+        # names of files and the order of mappings count for nodes of the user
         if not clauses and old.get("written") != new.get("written"):
             clauses = ["a file of a parameter has another name, or a mapping another order"]
         if old["code"] != new["code"]:
@@ -571,7 +578,7 @@ class Comparison:
         input reads.
         """
         step = self.recipe.steps.get(pair.label) if self.recipe else None
-        # a stored result of another recipe: its own record names the steps
+        # for a stored result of another recipe, its own record names the steps
         if step is None or self.resolved.keys.get(pair.label) != pair.new:
             return [
                 ((), [self.step(key) or "a step" for key in _listed(keys)])
@@ -592,7 +599,7 @@ class Comparison:
             return self._source(path, labels[0], new[0], old[0])
         old_key_of_step = dict(zip([self.step(key) or key for key in old], old, strict=True))
         new_key_of_step = dict(zip(labels, new, strict=True))
-        # the earlier steps have different names, some of them known today
+        # True if the earlier steps have different names, some of which still exist
         has_names = len(old_key_of_step) == len(old) and not old_key_of_step.keys().isdisjoint(
             new_key_of_step
         )
@@ -609,7 +616,7 @@ class Comparison:
     def _one_by_one(
         self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]
     ) -> Found:
-        """Return the differences of steps whose order tells which was which."""
+        """Return the differences between steps that correspond by their order."""
         texts, pairs = list[str](), list[Pair]()
         for label, key, earlier in zip(labels, new, old, strict=True):
             causes_and_pairs = self._source(path, label, key, earlier)
@@ -618,7 +625,7 @@ class Comparison:
         return texts, pairs
 
     def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
-        """Return how one source of an input differs: a step has changed, or was exchanged, added
+        """Return how one source of an input differs: its step has changed, or was exchanged, added
         or removed.
         """
         if new == old:
@@ -638,7 +645,7 @@ class Comparison:
             texts = _each_once(map(self._went, steps_between), exchange_clause)
             return texts, [Pair(label, new, key)] if key != new else []
         old_origin, new_origin = self.origin(old), self.origin(new)
-        # a step of the same node under another name
+        # a step with the same node under another name
         if old_origin and new_origin and old_origin["node"] == new_origin["node"]:
             return [], [Pair(label, new, old)]
         return [exchange_clause], []
@@ -647,7 +654,7 @@ class Comparison:
         """Return one text clause for the added and one for the removed steps that an input
         reads.
         """
-        # an item such as psf[mask] is not wired by hand
+        # inputs such as psf[mask] are not written by hand in the recipe
         place_of_wire = self._wired(path) if any("[" not in name for name in came) else ""
         texts = [f"reads {_few(came)} now{place_of_wire}"] if came else []
         reason_absent = (
@@ -663,8 +670,8 @@ class Comparison:
         )
 
     def _between(self, key: Key, steps: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
-        """Go upstream along first inputs to a step in ``steps``; return the passed steps and
-        the key found.
+        """Go upstream along first inputs to a step in ``steps``; return the names of the steps in
+        between, and the key that was found.
         """
         passed: list[str] = []
         for _ in range(_MOST_SEARCHED_STEPS):
@@ -679,14 +686,16 @@ class Comparison:
         return [], None
 
     def _came(self, name: str) -> str:
-        """Return why a step is no longer left out, or an empty text for one that never is."""
+        """Return the reason why a step is no longer left out; an empty text for a step that is
+        never left out.
+        """
         if name not in self.resolved.verdicts:
             return ""
         verdict = self.resolved.verdicts[name]
         return f"{name} is no longer left out: {verdict.why if verdict else 'its inputs decide'}"
 
     def _went(self, name: str) -> str:
-        """Return why a step is left out now, or an empty text."""
+        """Return the reason why a step is left out now; an empty text if it is not."""
         verdict = self.resolved.verdicts.get(name)
         return f"{name} is left out now: {verdict.why}" if verdict and verdict.left_out else ""
 
@@ -728,7 +737,7 @@ def _few(names: list[str]) -> str:
 
 
 def _listed(value: Any) -> list[Any]:
-    """Return a value or a list of values as a list; None is an empty one."""
+    """Return a value or a list of values as a list; None gives an empty list."""
     if value is None:
         return []
     return [value] if isinstance(value, str) else list(value)

@@ -14,7 +14,7 @@ from neusee.workflows.placement.machine_file import Machines
 from neusee.workflows.report.terminal_text import columns
 from neusee.workflows.store.cache_settings import format_size
 
-_SHOWN_STEPS = 24  #: steps of the critical path
+_SHOWN_STEPS = 24  #: greatest number of listed steps
 
 
 def cluster_lines(
@@ -26,7 +26,7 @@ def cluster_lines(
     The seconds on a device are the measured seconds on the CPU, divided by the relative speed of
     the device.
     """
-    # s on the machine where the steps were measured
+    # the time (s) is that on the machine where the steps were measured
     device_count, sequential_seconds = (
         len(machines.devices),
         sum(cost.seconds["cpu"] for cost in estimates.values()),
@@ -45,7 +45,7 @@ def cluster_lines(
     transfer_text = (
         f"{format_size(schedule.transferred)} in {_count(len(schedule.moves), 'copy', 'copies')}"
     )
-    # steps that are computed band by band, with the number of parts
+    # steps that are computed in parts of their bands, with the number of parts
     parts_text = ", ".join(
         f"{slot.task} ({slot.parts})" for slot in schedule.slots if slot.parts > 1
     )
@@ -81,8 +81,8 @@ def simulated(recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machi
 
 
 def _task(step: Step, cost: Estimate, among: Mapping[str, Estimate], machines: Machines) -> Task:
-    """Return a step as the schedule sees it: its sources, seconds on each device that may run
-    it, and bytes.
+    """Return the task of a step for the schedule: its sources, its time on each device that may run
+    it, and its sizes in bytes.
     """
     hint = step.device or step.node.device
     allowed = [
@@ -116,7 +116,7 @@ def _devices(schedule: Schedule, machines: Machines) -> list[str]:
         ]
         for device in machines.devices
     ]
-    # over all devices
+    # mean over all devices
     mean_share = sum(busy_shares.values()) / len(busy_shares)
     table = columns([["device", "busy", "steps", "memory", "of"], *rows], ">")
     return [*table, f"the devices are busy {mean_share:.0%} of the time on average"]
@@ -134,7 +134,7 @@ def _path(schedule: Schedule) -> list[str]:
     rows = [["critical path", "device", "at", "takes"], *row_of_slot]
     if len(path) > _SHOWN_STEPS:
         half_count = _SHOWN_STEPS // 2
-        # one more at the front: the head of the table
+        # one more row at the front: the head of the table
         rows = [
             *rows[: half_count + 1],
             [f"… {len(path) - _SHOWN_STEPS} more …", "", "", ""],
@@ -144,7 +144,7 @@ def _path(schedule: Schedule) -> list[str]:
 
 
 def _guesses(estimates: Mapping[str, Estimate]) -> list[str]:
-    """Return lines with the steps whose costs are guesses; none if all were measured."""
+    """Return lines that list the steps whose costs are guesses; an empty list if there are none."""
     names = [name for name, cost in estimates.items() if not cost.known]
     if not names:
         return []

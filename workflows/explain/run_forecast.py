@@ -33,21 +33,20 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 # --- forecast table -------------------------------------------------------------------------------
 
-# Table of a forecast: what each step of a recipe would cost, with the range that is expected, in 80
-# columns.
+# Table of a forecast: the expected cost of each step of a recipe, with its range, in 80 columns.
 
 
 Row = dict[str, Any]
 _SHORT_SECONDS, _SMALL_BYTES = (
     0.01,
     1e6,
-)  #: s and bytes below which a cost is not written out in the table
-#: bytes of a peak below which its range is not written, because freed memory is used again
+)  #: time (s) and size (bytes) below which the table gives no exact cost
+#: peak (bytes) below which its range is not shown, because freed memory is used again
 _SURE = 1e7
 
 
 def forecast_rows(plan: Plan, store: Store) -> list[Row]:
-    """Return what is expected of each step of a recipe as values for JSON: its state, its costs and
+    """Return the forecast of each step of a recipe as values for JSON: its state, its costs and
     their ranges.
 
     A range is a dict with the keys ``expected``, ``least`` and ``most``. A guess counts at its
@@ -57,7 +56,7 @@ def forecast_rows(plan: Plan, store: Store) -> list[Row]:
 
 
 def _row(name: str, plan: Plan, store: Store) -> Row:
-    """Return what is expected of one step, as `forecast_rows` does."""
+    """Return the forecast of one step, in the form of `forecast_rows`."""
     step, metadata = plan.recipe.steps[name], store.about(plan.keys[name])
     row: Row = {
         "step": name,
@@ -71,7 +70,7 @@ def _row(name: str, plan: Plan, store: Store) -> Row:
     if plan.left_out.get(name):
         return row | {"state": "left out"}
     if name in plan.expected:
-        # "?": not placed, because the memory is too small
+        # "?" stands for a step without a device, because the memory is too small
         lane = plan.lanes.get(name, "?")
         return row | {"state": "run", "where": lane, **_costs(plan.expected[name], lane)}
     state = "run" if name in plan.awake else "not needed"
@@ -86,38 +85,40 @@ def _row(name: str, plan: Plan, store: Store) -> Row:
 
 
 def _costs(cost: Estimate, where: str) -> Row:
-    """Return seconds, bytes and memory of a step that will run, with their ranges."""
+    """Return the time, the size of the result and the memory of a step that will run, with their
+    ranges.
+    """
     seconds = cost.seconds.get(device_kind(where), cost.seconds["cpu"])
     memory_range, time_range = cost.spread
     peak = _ranged(cost.peak, memory_range)
-    # the result itself must fit
+    # the memory is at least the size of the result
     peak["least"] = max(peak["least"], cost.bytes)
     cost_fields = {"seconds": _ranged(seconds, time_range), "bytes": cost.bytes, "memory": peak}
     return cost_fields | {"guess": not cost.known, "bytes_guessed": not cost.sized}
 
 
 def _ranged(expected: float, around: Range) -> dict[str, float]:
-    """Return an expected value with the least and the largest one."""
+    """Return an expected value with the least and the largest value of its range."""
     return {"expected": expected, "least": expected * around.least, "most": expected * around.most}
 
 
 def table_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the table of a forecast as lines of text, from the rows of `forecast_rows`.
 
-    A range is written behind its value, ``0.81 (0.7-1.2)``. What is negligible is written as below
-    a limit, and a guess as ``guess`` with its upper end.
+    A range follows its value, ``0.81 (0.7-1.2)``. A negligible value is written as below
+    a limit, and a guess as ``guess`` with its largest value.
     """
     head = ["step", "where", "seconds", "bytes", "memory"]
     return columns([head, *(_cells(row) for row in rows)])
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    """Return one step as a row of the table."""
+    """Return the cells of one row of the table."""
     state = row["where"] or row["state"]
     seconds, memory = row["seconds"], row["memory"]
     size = "" if row["bytes"] is None else format_size(row["bytes"])
     if row["guess"]:
-        # the upper end of each guess
+        # show the largest value of each guess
         size = f"guess <{size}" if row["bytes_guessed"] else size
         return [
             row["step"],
@@ -158,8 +159,8 @@ def _between(cost: Mapping[str, float], unit: float) -> str:
 
 
 def _figures(value: float) -> str:
-    """Return a number as text without an exponent: two decimals below 1, one below 10, and none
-    above.
+    """Return a number as text without an exponent: two decimals for numbers below 1, one decimal
+    below 10, otherwise none.
     """
     if value < 0.995:
         return f"{value:.2f}"
@@ -168,40 +169,39 @@ def _figures(value: float) -> str:
 
 # --- report memory --------------------------------------------------------------------------------
 
-# Memory of the report of a run: the results that its pictures and data files show, and the copies
-# that are written.
+# Memory of the report of a run: the results shown in its pictures and data files, and the copies
+# made for them.
 #
-# Also of the results that files hold which are made beside the run.
+# This includes the results that are kept for files made during the run.
 
 
-#: Three numbers that tests/benchmarks/bench_memory.py fits to the measured memory of the reports of
-#: shipped recipes.
-DRAWING = 74.3e6  #: bytes of the libraries that draw pictures and write files
-#: share of the memory of the steps that the process does not give back to the system
+#: The next three numbers are fitted by tests/benchmarks/bench_memory.py to the measured memory of
+#: the reports of shipped recipes.
+DRAWING = 74.3e6  #: memory (bytes) of the libraries that draw pictures and write files
+#: share of the memory of the steps that the process does not return to the system
 HELD_BACK = 0.0101
-COPIES = 2.25  #: copies of the results in memory, while a picture or file of them is made
-# not a parameter and not a function of a step
+COPIES = 2.25  #: number of copies of the results in memory while a picture or file of them is made
+# matches the name of a step, but not a parameter or a function of a step
 _NEED = re.compile(r"\??(?P<step>[\w.]+(\[[^\]]*\])?)$")
 
 
 def shown_steps(recipe: Recipe) -> list[str]:
-    """Return the steps whose results the pictures and data files of a run show, as far as the
-    recipe has them.
-    """
+    """Return the steps of the recipe whose results the pictures and data files of a run show."""
     groups = [recipe.outputs, *chain.from_iterable(_jobs(recipe))]
     names = dict.fromkeys(chain.from_iterable(groups))
     return [name for name in names if name in recipe.steps]
 
 
 def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
-    """Return the most bytes of results that files hold which are made beside a run, as
-    `FilesBeside` holds them.
+    """Return the largest total size (bytes) of the results that `FilesBeside` keeps in memory for
+    files made during the run.
 
     The values that the run returns are not counted, because they stay in memory with or without
-    files. ``limit`` is the memory (bytes) that the process may use; with 0 no file is made beside
-    the run.
+    files. ``limit`` is the memory (bytes) that the process may use; 0 means that no file is made
+    during the run.
     """
-    # bytes: of a result that waits with others, of all that wait, of a result that waits alone
+    # limits (bytes) for: a result that waits with others; the sum of all waiting results; a result
+    # that waits alone
     largest_small, room_for_small, largest_shown = (
         min(LARGE_RESULT, limit / 32),
         min(ROOM, limit / 16),
@@ -241,11 +241,11 @@ def report_peak(
 
 
 def shown_at_once(recipe: Recipe, costs: Costs) -> float:
-    """Return the largest number of bytes of results that are in memory together while pictures and
-    files are made.
+    """Return the largest total size (bytes) of the results that are in memory at the same time
+    while pictures and files are made.
 
-    The outputs of the recipe stay in memory. Another result is there from the first picture or file
-    that shows it to the last, as `workflows.report.shown_values` holds it.
+    The outputs of the recipe stay in memory. Any other result is in memory from the first picture
+    or file that shows it to the last, as in `workflows.report.shown_values`.
     """
     largest = 0.0
     for groups in _jobs(recipe):
@@ -256,7 +256,7 @@ def shown_at_once(recipe: Recipe, costs: Costs) -> float:
                 largest, sum(costs.size_of(name) for name in in_memory if name in recipe.steps)
             )
             uses_left.subtract(group)
-            # what no later picture shows is freed
+            # results that no later picture shows are freed
             in_memory = {
                 name for name in in_memory if uses_left[name] > 0 or name in recipe.outputs
             }
@@ -272,7 +272,9 @@ def _jobs(recipe: Recipe) -> tuple[Sequence[Sequence[str]], ...]:
 
 
 def _found(recipe: Recipe, needs: Mapping[str, str]) -> Iterator[str]:
-    """Yield the steps that the needs of a picture or file name; ``*`` stands for any item."""
+    """Yield the names of the steps that the needs of a picture or file match; ``*`` stands for any
+    item.
+    """
     for match in filter(None, map(_NEED.match, needs.values())):
         pattern = re.escape(match["step"]).replace(r"\*", "[^,]*")
         yield from (name for name in recipe.steps if re.fullmatch(pattern, name))
@@ -290,21 +292,22 @@ class Plan:
     recipe: Recipe
     order: list[str]
     keys: dict[str, Key]
-    left_out: dict[str, bool | None]  #: None where only the inputs of a step can decide
+    #: True for a step that is left out; None if only the values of its inputs can decide
+    left_out: dict[str, bool | None]
     awake: set[str]  #: steps that would be computed or left out
-    loaded: dict[str, int]  #: stored steps that would be read, with their bytes
+    loaded: dict[str, int]  #: size (bytes) of each stored result that would be read, by step
     expected: Mapping[str, Estimate]  #: by step, for the steps that would run
     lanes: Mapping[str, str]  #: by step
     schedule: Schedule | None
-    refused: str = ""  #: why the memory is too small
+    refused: str = ""  #: the reason why the memory is too small; empty if it suffices
     #: peak memory of this process in bytes while the steps run, the program itself included
     running: float = 0.0
     reporting: float = 0.0  #: peak memory of this process in bytes while the report is written
 
 
 def lanes_for(recipe: Recipe, device: str, memory: int | None) -> dict[str, Lane]:
-    """Return the lanes of a run on the devices ``device``, with the libraries that its steps
-    load in the program.
+    """Return the lanes of a run on the devices ``device``; the memory of the program includes the
+    libraries that the steps load.
     """
     cheaper_recipe = with_substitutions(recipe, wanted(recipe))
     return lanes_of(device.split(","), memory, nodes_of(cheaper_recipe, wanted(recipe)))
@@ -314,7 +317,7 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: flo
     """Return the forecast of a run: the steps to compute and to read, their costs and their
     schedule.
 
-    ``beside`` is the memory (bytes) of a run that makes files beside its steps, and 0 for one that
+    ``beside`` is the memory (bytes) of a run that makes files during its steps; 0 for a run that
     makes them later.
     """
     recipe = with_substitutions(recipe, wanted(recipe))
@@ -324,13 +327,13 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: flo
     resolved = resolve(recipe, order, store, ",".join(devices), code)
     keys, left_out = resolved.keys, {name: resolved.left_out(name) for name in order}
     awake_steps, loaded = _awake(recipe, keys, store, wanted(recipe))
-    # of steps with one key, the first computes the value
+    # the first of several steps with the same key computes the value
     makers = _first_of_each_key(_running(order, awake_steps, left_out), keys)
     jobs = [_work(recipe, name, keys, devices) for name in makers]
     costs = past_costs(store, sizes_of(recipe, order)) if jobs else Costs([])
     metadata_by_key = _metadata_of(jobs, store)
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
-    # also where no schedule fits
+    # computed even if no schedule fits into memory
     expected = costs.in_turn(
         ((job.step.name, job.step, metadata_by_key.get(job.key)) for job in jobs), kinds
     )
@@ -364,17 +367,19 @@ def _devices_of(lanes: Mapping[str, Lane]) -> list[str]:
 def _running(
     order: Iterable[str], awake: Container[str], left_out: Mapping[str, bool | None]
 ) -> list[str]:
-    """Return the steps that will run, as far as it is known."""
+    """Return the steps that will run, as far as this is known."""
     return [name for name in order if name in awake and not left_out[name]]
 
 
 def _memory_of(lanes: Collection[Lane]) -> float:
-    """Return the bytes that the process may use on ``lanes``, with what it holds itself."""
+    """Return the memory (bytes) that the process may use on ``lanes``, including the memory of the
+    program itself.
+    """
     return sum(lane.memory for lane in lanes) + max((lane.held for lane in lanes), default=0.0)
 
 
 def _first_of_each_key(names: Iterable[str], keys: Mapping[str, Key]) -> list[str]:
-    """Return the steps ``names`` without those that have the key of an earlier one."""
+    """Return the steps ``names`` without those that have the same key as an earlier step."""
     makers: dict[Key, str] = {}
     for name in names:
         makers.setdefault(keys[name], name)
@@ -382,7 +387,7 @@ def _first_of_each_key(names: Iterable[str], keys: Mapping[str, Key]) -> list[st
 
 
 def _metadata_of(works: Iterable[StepJob], store: Store) -> dict[Key, Metadata]:
-    """Return the metadata of the results that the store knows, by key."""
+    """Return the metadata of those results of jobs that the store has, by key."""
     keys_and_metadata = ((job.key, store.about(job.key)) for job in works)
     return {key: metadata for key, metadata in keys_and_metadata if metadata}
 
@@ -390,19 +395,19 @@ def _metadata_of(works: Iterable[StepJob], store: Store) -> dict[Key, Metadata]:
 def _with_report(
     plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lane], code: Code
 ) -> Plan:
-    """Return the plan with the memory of the report, and with the reason if the limit is too
-    small for the report.
+    """Return the plan with the memory of the report. If the memory limit is too small for the
+    report, the plan states the reason.
     """
     cpu_lanes = [lane for lane in lanes.values() if lane.kind == "cpu"]
     steps_shown, devices = shown_steps(plan.recipe), _devices_of(lanes)
     order = needed(plan.recipe, steps_shown)
     keys = resolve(plan.recipe, order, store, ",".join(devices), code).keys
-    # what the run has computed is in memory or stored
+    # results that the run has computed are in memory or stored
     keys_of_run = {plan.keys[name] for name in plan.order}
     awake_steps = _awake(plan.recipe, keys, store, steps_shown, keys_of_run)[0]
     makers = set(_first_of_each_key(awake_steps, keys))
     jobs = [_work(plan.recipe, name, keys, devices) for name in order if name in makers]
-    # also of steps that only the report needs
+    # includes steps that only the report needs
     costs = costs.with_sizes(sizes_of(plan.recipe, order))
     try:
         peak = report_peak(
@@ -471,8 +476,8 @@ def _totals(plan: Plan) -> dict[str, Any]:
 
 
 def _range_of(took: float, costs: Collection[Estimate]) -> dict[str, float]:
-    """Return the least and the most seconds of a run that is expected to take ``took``; none if
-    all its steps take no time.
+    """Return the least and the largest time (s) of a run with the expected time ``took``; an empty
+    dict if all its steps take no time.
     """
     seconds_and_spreads = [(cost.seconds["cpu"], cost.spread[1]) for cost in costs]
     total_seconds = sum(seconds for seconds, _ in seconds_and_spreads)
@@ -480,7 +485,7 @@ def _range_of(took: float, costs: Collection[Estimate]) -> dict[str, float]:
         return {}
     least_total = sum(seconds * spread.least for seconds, spread in seconds_and_spreads)
     most_total = sum(seconds * spread.most for seconds, spread in seconds_and_spreads)
-    # the makespan varies as the sum of the times of all steps
+    # assume that the makespan varies in proportion to the sum of the times of all steps
     return {"least": took * least_total / total_seconds, "most": took * most_total / total_seconds}
 
 
@@ -509,7 +514,7 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
             f"left out or not, depending on the values of the inputs: {', '.join(undecided)}"
         )
     time_text = _took_text(totals["seconds"])
-    # said only if there are guesses
+    # used only if there are guesses
     guess_text = f", {totals['guesses']} of them guessed at the upper end, because never measured"
     bytes_read, bytes_new = (
         format_size(sum(plan.loaded.values())),
@@ -555,10 +560,10 @@ def _wrapped(text: str) -> list[str]:
 
 
 def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> StepJob:
-    """Return the job of a step, as far as a forecast needs it."""
+    """Return the job of a step, with the fields that a forecast needs."""
     step = recipe.steps[name]
     reads = tuple(
-        # a wire is a name, several names or nothing
+        # an input is connected to one step, several steps or none
         tuple(keys[source] for source in ((wire,) if isinstance(wire, str) else wire or ()))
         for wire in step.wires.values()
     )
@@ -589,6 +594,6 @@ def _awake(
             loaded_bytes[name] = metadata.get("bytes", 0)
         else:
             awake_steps.add(name)
-            # what a missing result needs
+            # the inputs of a missing result
             names_left += recipe.steps[name].sources
     return awake_steps, loaded_bytes

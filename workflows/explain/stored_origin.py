@@ -1,6 +1,6 @@
 """Origin of a stored result, and its differences from the most similar earlier result of its step.
 
-The store alone is read: neither torch nor a recipe is needed.
+Only the store is read: neither torch nor a recipe is needed.
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ from neusee.workflows.explain.change_causes import Comparison, Pair, Roots, spok
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
-_CANDIDATES = 200  #: earlier results of a step, the newest, that are compared
-_PAIRS = 20_000  #: comparisons after which no further earlier result is examined
-_SHOWN_CAUSES = 10  #: causes that are listed
-_LINKS = 6  #: steps of a chain that are named
+_CANDIDATES = 200  #: number of the newest earlier results of a step that are compared
+_PAIRS = 20_000  #: number of comparisons after which no further earlier result is examined
+_SHOWN_CAUSES = 10  #: greatest number of listed causes
+_LINKS = 6  #: greatest number of named steps of a chain
 
 
 def why_key_lines(store: Store, prefix: str) -> list[str]:
-    """Return text lines on the origin of the result with key ``prefix...``, and on differences from
-    earlier results.
+    """Return text lines on the origin of the result whose key begins with ``prefix``, and on its
+    differences from earlier results.
 
     Raises `LookupError` if no key or more than one key begins with ``prefix``.
     """
     keys = sorted(
         dict.fromkeys(row["key"] for row in rows_of(store) if row["key"].startswith(prefix))
     )
-    # the beginning of no key, or of several
+    # no key begins with the prefix, or several do
     if len(keys) != 1:
         candidates_text = f"; there are {', '.join(key[:12] for key in keys[:5])}" if keys else ""
         raise LookupError(
@@ -65,7 +65,7 @@ def because(
     """Yield lines with the differences of a result from the most similar earlier result."""
     rows = rows_of(comparison.store, label) or rows_of(comparison.store, maker or label)
     keys = keys_in(rows)
-    # results before this one; all of them if it is not stored
+    # earlier results; all results if this one is not stored
     earlier = keys[: keys.index(key)] if key in keys else keys
     key_and_roots = _nearest(comparison, label, key, earlier)
     if key_and_roots is None:
@@ -101,11 +101,11 @@ def _nearest(
     for earlier_key in earlier[: -_CANDIDATES - 1 : -1]:
         if comparison.origin(earlier_key) is None:
             continue
-        # only fewer differences than the best so far are of interest
+        # only results with fewer differences than the best so far matter
         limit = len(best_match[1].found) - 1 if best_match else float("inf")
         roots = comparison.roots(Pair(label, key, earlier_key), limit)
         best_match = (earlier_key, roots) if roots is not None else best_match
-        # a single cause is as near as it can be
+        # no result can have fewer than one cause
         if best_match and (len(best_match[1].found) <= 1 or len(comparison.seen) > _PAIRS):
             break
     return best_match
@@ -134,7 +134,7 @@ def _chain(names: list[str]) -> str:
     chain is long.
     """
     if len(names) > _LINKS:
-        # the first ones, the number of those between, and the last one
+        # the first names, the number of omitted names, and the last name
         names = [*names[: _LINKS - 2], f"({len(names) - _LINKS + 1} more)", names[-1]]
     return " <- ".join(names)
 

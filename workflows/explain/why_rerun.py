@@ -1,4 +1,4 @@
-"""Reasons why a step runs again: the differences from the most similar earlier result of the
+"""Reasons why a step runs again: the differences from the most similar earlier result of that
 step.
 """
 
@@ -17,12 +17,13 @@ from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-_COMPARED_RESULTS = 5  #: earlier results that a step is compared with during a run
-_SHOWN_CAUSES = 10  #: causes that are listed
+_COMPARED_RESULTS = 5  #: number of earlier results with which a step is compared during a run
+_SHOWN_CAUSES = 10  #: greatest number of listed causes
 
 
 def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> list[str]:
-    """Return lines that explain the state of ``step`` and its differences from earlier results.
+    """Return lines that state whether ``step`` is stored, and explain its differences from earlier
+    results.
 
     Raises `ValueError` with the nearest name if the step does not exist.
     """
@@ -51,7 +52,7 @@ def explained(
     def tell(event: Event) -> None:
         record = event.done
         if record is None:
-            # before the step adds its own line to the journal
+            # read before the step adds its own line to the journal
             earlier_keys[event.step] = keys_in(
                 row for row in store.journal.latest() if row["step"] == event.step
             )
@@ -78,7 +79,7 @@ def _step_lines(
     maker = resolved.makers[key]
     if maker != step.name:
         lines.append(f"  same key as {maker}")
-    # None: only the values of its inputs can decide
+    # None means that only the values of its inputs can decide
     if undecided := [
         name for name in needed(recipe, [step.name]) if resolved.left_out(name) is None
     ]:
@@ -100,7 +101,7 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
         differences = (
             _direct(comparison, step, old_origin, new_origin) if old_origin and new_origin else []
         )
-        # an empty list is no comparison
+        # an empty list means that no comparison was possible
         fewest_differences = min(
             filter(None, (fewest_differences, differences)), key=len, default=[]
         )

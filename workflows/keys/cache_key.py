@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 # --- usual settings -------------------------------------------------------------------------------
 
-# Settings of a new process, from which `loaded_state.settings` tells the differences; torch is
-# not needed.
+# Settings of a new process. `loaded_state.settings` reports how the present process differs from
+# them. They are written as text, so that this module does not import torch.
 
 
-#: settings that only code of a user reads
+#: settings that neusee itself ignores, but that code of a user may read
 OWN_USUAL = {
     "floating-point errors": "told",
     "printed numbers": "as NumPy prints",
@@ -50,44 +50,47 @@ USUAL = {
 
 # --- module owner ---------------------------------------------------------------------------------
 
-# Whose module is it: one of neusee, whose nodes its own tests prove, or one of the user?
+# Does a module belong to neusee or to the user? The tests of neusee check its own nodes; nodes of a
+# user are observed while they run.
 
 
 PROVEN = ("neusee.",)  #: packages whose nodes are not observed
 
 
 def is_own(module: str) -> bool:
-    """Return True for a module outside of neusee, whose nodes are proven by its own tests."""
+    """Return True for a module outside of neusee, that is, a module of the user; the nodes of
+    neusee are checked by its own tests.
+    """
     return not f"{module}.".startswith(PROVEN)
 
 
 # --- written params -------------------------------------------------------------------------------
 
-# What the parameters of an own node say beside their values: names of files, and the order of
-# mappings.
+# What a node of the user can learn from its parameters beside their values: the names of files, and
+# the order of the entries of mappings.
 #
-# The nodes of neusee read the content of a file and the entries of a mapping, so equal ones share
-# results. A node of a user may also read an exposure in ``dark_20ms.npy``, or take the first entry
-# of a mapping.
+# The nodes of neusee read only the content of a file and the entries of a mapping, so equal content
+# shares a result. A node of a user may also read an exposure time from the name ``dark_20ms.npy``,
+# or take the first entry of a mapping.
 
 
-#: parameters of nodes of neusee whose entries count in their order: light meets the first surface
-#: of a lens first
+#: parameters of nodes of neusee in which the order of the entries matters: light meets the first
+#: surface of a lens first
 _ORDERED = frozenset({("flare.stray_light", "surfaces"), ("flare.stray_shares", "surfaces")})
 
 
 def written(step: Step) -> dict[str, Any]:
-    """Return the names of files and the order of mappings in the parameters of an own node, as JSON
-    by parameter.
+    """Return, for each parameter of a node of the user, the names of its files and the order of its
+    mappings, as JSON values.
 
-    Of a node of neusee only the order of a mapping counts, where the node says so.
+    For a node of neusee, only the order of the mappings in `_ORDERED` is returned.
     """
     notes: dict[str, Any] = {}
     is_of_user = is_own(step.node.fn.__module__)
     for name, value in step.params.items():
         if not is_of_user and (step.node.path, name) not in _ORDERED:
             continue
-        # where the recipe writes the parameter, and where the step
+        # the place of the parameter in the recipe, and the place of its step
         places_in_recipe = [
             location for location in (step.param_marks.get(name), step.mark) if location is not None
         ]
@@ -98,7 +101,9 @@ def written(step: Step) -> dict[str, Any]:
 
 
 def _said(value: Any, folders: list[str]) -> Any:
-    """Return what a value says beside its content, or None if it says nothing."""
+    """Return the file names and the order of keys that a value contains, or None if it contains
+    neither.
+    """
     if isinstance(value, Path):
         return _name(value, folders)
     if isinstance(value, Mapping):
@@ -110,8 +115,8 @@ def _said(value: Any, folders: list[str]) -> Any:
 
 
 def _said_in_order(mapping: Mapping[Any, Any], folders: list[str]) -> Any:
-    """Return the keys of a mapping in their order with what their values say, or None for a single
-    key whose value says nothing.
+    """Return the keys of a mapping in their order, each with the result of `_said` for its value;
+    None for at most one key whose value contains no file name and no mapping.
     """
     keys_and_notes = [[str(key), _said(item, folders)] for key, item in mapping.items()]
     return (
@@ -122,8 +127,9 @@ def _said_in_order(mapping: Mapping[Any, Any], folders: list[str]) -> Any:
 
 
 def _name(path: Path, folders: list[str]) -> list[str]:
-    """Return the path of a file as a recipe in one of some folders writes it, and the name that
-    links lead to.
+    """Return the path of a file relative to the folder of its recipe, and the path of the file
+    behind symbolic links if that differs. A file outside of all ``folders`` has its absolute path,
+    and the bare name of the file behind the links.
     """
     absolute_path = os.path.abspath(path)
     real_path = os.path.realpath(absolute_path)
@@ -144,14 +150,14 @@ def _is_in(path: str, folder: str) -> bool:
 
 # --- input file digest ----------------------------------------------------------------------------
 
-# Digest of the content of an input file, which is part of the cache key of each step that reads the
+# The digest of the content of an input file is part of the cache key of each step that reads the
 # file.
 
 
-#: ns after a change of a file in which a second change may not change the time stamp
+#: time (ns) after a change of a file during which a second change may leave the time stamp as it is
 _SETTLED = 2_000_000_000
-_TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
-_TRIES = 3  #: readings of a file that changes while it is read
+_TICK = 20_000_000  #: ns, longer than the resolution of the clock of a file system
+_TRIES = 3  #: number of attempts to read a file that changes while it is read
 _files: dict[tuple[int, ...], str] = {}
 
 #: device, inode, size, and the times (ns) of the last change of content and of the entry
@@ -159,7 +165,7 @@ Stamp = tuple[int, ...]
 
 
 def file_digest(path: Path) -> str:
-    """Return the xxh3 digest of a file; an unchanged file is read only once in a process.
+    """Return the xxh3 digest of the content of a file; a process reads an unchanged file only once.
 
     A file that changed in the last two seconds is read each time, because its time stamp may not
     show a second change. Raises `OSError` if the file changes each time while it is read.
@@ -179,11 +185,11 @@ def file_digest(path: Path) -> str:
 
 
 def file_stamps(value: Any) -> list[Stamp]:
-    """Return a stamp of each file in a parameter or a collection of parameters.
+    """Return the stamp of each file in a parameter or in a collection of parameters.
 
-    Equal stamps before and after a reading say that the file was not replaced in between, not even
-    by a file that was taken away again. A file that changed in this moment is waited for, because
-    its next change could have its stamp.
+    Equal stamps before and after a reading prove that nobody replaced the file in between, not even
+    for a moment. If a file has just changed, the function waits for one tick of the clock, because
+    the next change could otherwise leave the same stamp.
     """
     stamps = [file_stamp(path) for path in files_in(value)]
     if stamps and time.time_ns() - max(max(stamp[-2:]) for stamp in stamps) < _TICK:
@@ -192,7 +198,7 @@ def file_stamps(value: Any) -> list[Stamp]:
 
 
 def files_in(value: Any) -> Iterable[Path]:
-    """Return the files in a parameter or a collection of parameters."""
+    """Return the paths of the files in a parameter or in a collection of parameters."""
     if isinstance(value, Path):
         return [value]
     if isinstance(value, Mapping):
@@ -203,7 +209,9 @@ def files_in(value: Any) -> Iterable[Path]:
 
 
 def file_stamp(path: Path | str) -> Stamp:
-    """Return what changes whenever a file is changed; raise `OSError` if it is missing."""
+    """Return numbers that change whenever a file changes; raise `OSError` if the file is
+    missing.
+    """
     stat = os.stat(path)
     return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
 
@@ -219,13 +227,13 @@ def file_stamp(path: Path | str) -> Stamp:
 
 
 Key = str
-#: first letters of the key of a result that holds for one process alone and is not stored
+#: first letters of the key of a result that is valid in one process only and is not stored
 PRIVATE = "private-"
 
 
 def digest(*parts: Any) -> str:
-    """Return the digest of the JSON values ``parts`` as 32 hexadecimal digits; every bit of a
-    float affects it.
+    """Return the digest of the JSON values ``parts`` as 32 hexadecimal digits. Every bit of a float
+    affects it.
     """
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -253,13 +261,13 @@ def key_of(
     is_private_key = not step.cached or any(
         map(is_private, [key_parts["code"], *(keys[name] for name in step.sources)])
     )
-    # shorter by the first letters, so that all keys have 32
+    # 24 digits after the prefix, so that every key has 32 characters
     return (PRIVATE + digest(key_parts)[:24] if is_private_key else digest(key_parts)), key_parts
 
 
 def code_of(step: Step, code: Code) -> str:
-    """Return the digest of the code of a step: of its node, and of the network classes that its
-    parameters name.
+    """Return the digest of the code of a step: the code of its node, and of the network classes
+    that its parameters name.
     """
     networks = [(network.__module__, network.__qualname__) for network in networks_of(step)]
     return code.of(step.node, tuple(dict.fromkeys(networks)))
@@ -272,23 +280,23 @@ def networks_of(step: Step) -> list[type[Any]]:
 
 
 def _network_of(value: Any) -> type[Any] | None:
-    """Return the network class that a parameter names, or None for another value, without an
-    import of torch.
+    """Return the network class that a parameter names, or None for any other value. It does not
+    import torch.
     """
     module = sys.modules.get("neusee.nodes.own_modules")  # imported where there is such a value
     return value.network if module and isinstance(value, module.Architecture) else None
 
 
 def is_private(key: Key) -> bool:
-    """Return True for the key of a result that holds for one process alone, whose code may not
-    be that of its file.
+    """Return True for the key of a result that is valid in one process only, because the loaded
+    code may differ from its source file.
     """
     return key.startswith(PRIVATE)
 
 
 def stream_seed(seed: int, step: str) -> int:
-    """Return the seed of the random numbers of a step, which depends only on the recipe's seed
-    and the step's name.
+    """Return the seed of the random numbers of a step. It depends only on the recipe's seed and the
+    step's name.
     """
     # 60 bits, which fit into the seed of torch
     return int(digest(seed, step)[:15], 16)
@@ -300,27 +308,29 @@ def device_kind(device: str) -> str:
 
 
 def _keys_of(wire: Wire, keys: Mapping[str, Key]) -> Any:
-    """Return the key behind a wire, or those of a list of wires; None for no wire."""
+    """Return the cache key of the step that an input is connected to, a list of keys for a list of
+    steps, or None for an input without a connection.
+    """
     if wire is None or isinstance(wire, str):
         return wire and keys[wire]
     return [keys[name] for name in wire]
 
 
 def plain(value: Any) -> Any:
-    """Return a step's parameter as JSON that is the same in every process; a file becomes the
-    digest of its content.
+    """Return a step's parameter as a JSON value that is the same in every process; a file is
+    represented by the digest of its content and its suffix.
     """
-    # as JSON has them
+    # types that JSON has
     if isinstance(value, bool | int | str | None):
         return value
     if isinstance(value, float):
-        # of a class that is derived from float
+        # it may be of a subclass of float
         return float(value)
     if isinstance(value, Path):
         return {"file": file_digest(value), "suffix": value.suffix.lower()}
     if isinstance(value, Mapping):
         return {
-            # in an order that does not depend on that of the mapping
+            # sorted, so that the order of the mapping does not count
             "items": sorted(([plain(key), plain(item)] for key, item in value.items()), key=repr)
         }
     if isinstance(value, tuple | list):

@@ -1,4 +1,6 @@
-"""Digests of the code of nodes and of the program, and keys kept from recipe to recipe."""
+"""Digests of the code of nodes and of the program, and reuse of cache keys from one recipe to the
+next.
+"""
 
 from __future__ import annotations
 
@@ -90,14 +92,14 @@ if TYPE_CHECKING:
 
 # --- followed imports -----------------------------------------------------------------------------
 
-# Modules that the imports of a module lead to, with the names that are used of each.
+# The modules that a module imports, each with the names that are used of it.
 
 
 Lookup = Callable[[str], tuple[Path, Summary] | None]
 
 
 class Imports:
-    """The imports of one module, resolved to modules."""
+    """The import statements of one module, resolved to the modules that they load."""
 
     def __init__(
         self, module: str, path: Path, summary_of: Lookup, kind_of: Callable[[str], Kind]
@@ -111,10 +113,10 @@ class Imports:
         self._package = module if path.name == "__init__.py" else module.rpartition(".")[0]
 
     def names(self, summary: Summary) -> dict[str, set[str]]:
-        """Return the imported modules with the names that are used; an empty name stands for the
-        whole module.
+        """Return the imported modules, each with the names that are used of it; an empty name
+        stands for the whole module.
 
-        Raises `LookupError` if the package of all nodes is used as a whole.
+        Raises `LookupError` if the code uses the package `neusee.nodes` as a whole.
         """
         names_by_module: dict[str, set[str]] = {}
         for statement in summary.imports:
@@ -136,8 +138,8 @@ class Imports:
         return names_by_module
 
     def _imported(self, item: Import) -> Iterator[tuple[str, str]]:
-        """Yield the modules that an import needs: a submodule, or the module that defines the
-        imported name.
+        """Yield each module that an import statement needs, with the imported name: a submodule, or
+        the module that defines the name.
         """
         level, base, name = item
         base = absolute(level, base, self._package)
@@ -150,8 +152,8 @@ class Imports:
         yield base, name
 
     def _used(self, use: Use) -> list[str] | None:
-        """Return the modules in an expression such as ``name.a.b``, or None if it uses all of
-        `neusee.nodes`.
+        """Return the modules in an expression such as ``name.a.b``, or None if the expression uses
+        all of `neusee.nodes`.
         """
         level, base, name, chain, _ = use
         full_name = ".".join(filter(None, (absolute(level, base, self._package), name)))
@@ -161,18 +163,18 @@ class Imports:
         uses_all_nodes = modules[-1] in ("neusee", ROOT) and (
             not attributes or attributes[0].startswith("__")
         )
-        # the first is the import itself, which counts anyway
+        # the first module is the import itself, which `_imported` already yields
         return None if uses_all_nodes else modules[1:]
 
     def _is_module(self, package: str, name: str) -> bool:
-        """Return True if a package, whose source is followed or which is a folder, has a module
-        of this name.
+        """Return True if ``package`` contains a module ``name``, where the package is followed by
+        source or is a plain folder.
         """
         module = f"{package}.{name}"
         if module == ROOT:
             return True
         may_hold_modules = package == ROOT or self._kind_of(package) in ("source", "folder")
-        # a loaded module that is no package
+        # a loaded module without a path for submodules is no package
         if package in sys.modules and "__path__" not in contents(package):
             return False
         return may_hold_modules and module_path(module) is not None
@@ -185,13 +187,13 @@ def absolute(level: int, base: str, package: str) -> str:
     if not level:
         return base
     package_parts = package.split(".")
-    # one dot is the package itself, each further one the package above
+    # one dot stands for the package itself, each further dot for the package above
     return ".".join([*package_parts[: len(package_parts) - level + 1], *filter(None, [base])])
 
 
 # --- engine digest --------------------------------------------------------------------------------
 
-# Digest of the program's own code, over given modules and all modules of `neusee.workflows` that
+# Digest of the program's own code: of some modules, and of all modules of `neusee.workflows` that
 # they import.
 #
 # The key of a stored study, design or posterior contains this digest, so that changed code never
@@ -204,8 +206,8 @@ _ROOT = "neusee.workflows"
 
 @functools.cache
 def engine(*modules: str) -> str:
-    """Return the digest of the code of some modules of neusee.workflows and of all modules that
-    these import.
+    """Return the digest of the code of ``modules`` of neusee.workflows and of all modules there
+    that they import.
 
     The default module is ``engine.runner``. Only imports of neusee.workflows at the top level of a
     module count. Raises `LookupError` for a module without a source file.
@@ -227,8 +229,8 @@ def engine(*modules: str) -> str:
 
 
 def outline(source: bytes) -> Outline:
-    """Return the digest of a source file and the import statements at its top level; an equal
-    source is parsed once.
+    """Return the digest of a source file and the import statements at its top level. The same
+    source is parsed only once.
     """
     name = f"{PYTHON}:{EDITION}:{xxhash.xxh3_128_hexdigest(source)}"
     if name not in outlines:
@@ -237,7 +239,7 @@ def outline(source: bytes) -> Outline:
 
 
 def imported_by_engine(statements: Iterable[tuple[str, list[str]]]) -> Iterator[str]:
-    """Yield the name of each module of neusee.workflows in import statements, such as
+    """Yield the name of each module of neusee.workflows that import statements name, such as
     ``engine.runner``.
     """
     for base, names in statements:
@@ -257,27 +259,29 @@ def _below(module: str) -> str:
 
 
 def _source(name: str) -> Path | None:
-    """Return the source file of a module below neusee.workflows, or None."""
+    """Return the path of the source file of a module below neusee.workflows, or None if there is
+    none.
+    """
     return module_file(_HERE, name.split("."))
 
 
 # --- code digest ----------------------------------------------------------------------------------
 
-# Digests of the code of nodes: what a node's module and all that it imports were loaded from, and
-# what they hold.
+# Digests of the code of nodes: of the node's module and of all modules that it imports, by their
+# source or version and by the values that they hold.
 #
-# A digest covers by source each module of `neusee.nodes`, of the user, of an editable install and
-# of a package with nodes; other packages by their version; the values of each loaded module; and
-# what `depends=` declares. Comments, layout and docstrings that nobody reads do not count. What
-# cannot be followed is refused. Loaded code that is not that of its file gives a private digest,
-# whose results are not stored.
+# A digest covers the source of each module of `neusee.nodes`, of the user, of an editable install
+# and of a package with nodes. It covers other packages by their version. It also covers the values
+# of each loaded module, and what `depends=` declares. Comments and layout do not count, nor do
+# docstrings that no code reads. A construct that cannot be followed raises an error. If the loaded
+# code differs from its file, the digest is private to the process, and its results are not stored.
 #
-# A file stores the summaries of source files, so that a run from the cache parses no source. The
-# files ``code/<digest>.json`` store the digests of single definitions. Cache keys do not need these
-# files; reports of changes use them to name the changed function.
+# One file stores the summaries of all source files, so that a run from the cache parses no source.
+# The files ``code/<digest>.json`` store the digests of single definitions. Cache keys do not need
+# these files; reports of changes use them to name the changed function.
 
 
-#: modules that decide no result
+#: modules whose code affects no result
 _LEFT_OUT = frozenset(
     {"neusee", ROOT} | {f"{ROOT}.{n}" for n in ("_hooks", "_node", "import_times", "own_modules")}
 )
@@ -288,31 +292,32 @@ _PYTHON = "Python {}.{}".format(*sys.version_info)
 
 
 class Code:
-    """Digests of the source code of nodes, which stay the same during one run."""
+    """Digests of the source code of nodes; they stay fixed during one run."""
 
     def __init__(self, memo: Path, loaded: Collection[str] | None = None) -> None:
-        """Read the summaries in the file ``memo``; with ``loaded`` packages hold no followed
-        modules but these.
+        """Read the summaries of source files in the file ``memo``; ``loaded`` names the modules
+        that count as values of their packages, None for all.
         """
         look_again()
         self._memo, self._loaded = memo, loaded
         self._summaries: dict[str, Summary] = read_memo(memo)
         self._new = False  # True if a summary is not in the memo yet
-        self._wholes: dict[str, Whole] = {}  # digest of each module with all that it imports
+        # digest of each module with all modules that it imports
+        self._wholes: dict[str, Whole] = {}
         self._looks: dict[tuple[str, frozenset[str], bool], Look | None] = {}
         self._followed: dict[frozenset[str], Callable[[str], bool]] = {}
         self._origins: dict[tuple[str, frozenset[str]], Origin] = {}
         self._siblings = Siblings(self._whole)
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
         self._parts: dict[str, Parts] = {}  # by digest, not saved yet
-        self.parts: dict[str, Parts] = {}  #: what each digest covers
+        self.parts: dict[str, Parts] = {}  #: the parts that each digest covers
 
     def of(self, node: Node, classes: tuple[tuple[str, str], ...] = ()) -> str:
-        """Return the digest of the code of a node, with what the node declares and what its
-        function holds.
+        """Return the digest of the code of a node: of its modules, of its ``depends=`` entries, and
+        of the values that its function holds in closures.
 
         ``classes``: module and name of the network classes that a step gives the node; their
-        modules count as a whole. Raises `LookupError` with place and fix for code that reads what
+        modules count as a whole. Raises `LookupError`, with place and fix, for code that reads what
         cannot be followed.
         """
         if id(node) not in self._codes:
@@ -320,7 +325,7 @@ class Code:
         code = self._codes[id(node)][1]
         for module, name in classes:
             closure = self._whole(module)
-            # by the name of the outermost class
+            # statements are listed by the name of the outermost class
             self._refuse(closure, module, node, {name.partition(".")[0]})
             covered_parts = {**self._whole(node.fn.__module__).parts, **closure.parts}
             code = self._named(
@@ -331,14 +336,14 @@ class Code:
         return self._beside(code, node, [node.fn.__module__, *(module for module, _ in classes)])
 
     def _beside(self, code: str, node: Node, roots: Sequence[str]) -> str:
-        """Return the digest of a node with the other modules of a user that may change what it
-        computes.
+        """Return the digest of a node combined with those of the user's other modules that may
+        change what the node computes.
         """
         wholes = {name: self._whole(name) for name in self._siblings.of(roots)}
         if not wholes:
             return code
         for name, closure in wholes.items():
-            # "_": what the module runs when it is imported
+            # "_" stands for the statements that run at import
             self._refuse(closure, name, node, {"_"})
         covered_parts = dict(self.parts.get(code, {}))
         for closure in wholes.values():
@@ -347,19 +352,21 @@ class Code:
         return self._named(digest(code, codes), covered_parts, any(map(is_private, [code, *codes])))
 
     def digest(self, module: str) -> str:
-        """Return the digest of a module and of all that it imports, directly or not.
+        """Return the digest of a module and of all modules that it imports, directly or indirectly.
 
         Raises `LookupError` if an imported module or its source cannot be determined.
         """
         return self._whole(module).code
 
     def looks(self, module: str) -> Mapping[str, Look]:
-        """Return what a module and each module that it leads to add to the digest, by name."""
+        """Return, by name, the contribution to the digest of a module and of each module that it
+        leads to.
+        """
         return self._whole(module).looks
 
     def save(self) -> None:
-        """Save the new digests of source files and of their functions; do nothing if the folder
-        cannot be written.
+        """Save the new summaries of source files and the digests of their definitions; do nothing
+        if the folder cannot be written.
         """
         if self._new or not is_complete(self._memo):
             self._new = False
@@ -369,17 +376,19 @@ class Code:
         self._parts = {}
 
     def _of(self, node: Node) -> str:
-        """Return the digest of the code of a node without the modules of a user beside it."""
+        """Return the digest of the code of a node, without the other modules of the user that
+        `_beside` adds.
+        """
         module = node.fn.__module__
-        # the module with all that it imports
+        # the module with all modules that it imports
         code, closure = self.digest(module), self._whole(module)
         self._refuse(closure, module, node, {node.fn.__name__, "_"})
-        # else it was made in a function, whose variables decide what it computes
+        # if False, a function made the node, and the variables of that function affect its results
         is_as_in_module = getattr(sys.modules.get(module), node.fn.__name__, None) is node
         if is_as_in_module and not node.depends:
             return code
         source = closure.looks[module].path or Path(module)
-        # what the node itself declares, beside its module
+        # the ``depends=`` entries of the node itself, beside those of its module
         declared = resolve(node.depends, module, source, node.environment, _is_a_module)
         added_parts, is_private_code = dict(declared.parts), is_private(code)
         for name in declared.modules:
@@ -388,7 +397,7 @@ class Code:
                 {**added_parts, **parts_of(declared_closure.looks)},
                 is_private_code or is_private(declared_closure.code),
             )
-        # the process computes with what the file said before
+        # the process still computes with the earlier content of the file
         if declared.changed:
             is_private_code = True
             _say_changed(module, source, declared.changed[0])
@@ -403,8 +412,8 @@ class Code:
     def _held_around(
         self, node: Node, closure: Whole, source: Path
     ) -> tuple[dict[str, str], list[str]]:
-        """Return what the function of a node holds from the function around it, and the digests of
-        the modules that it leads to.
+        """Return the digest of the closure of a node's function, and the digests of the further
+        modules that the values in the closure lead to.
         """
         module = node.fn.__module__
         state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
@@ -418,17 +427,17 @@ class Code:
         return held_parts, inner_codes
 
     def _whole(self, module: str) -> Whole:
-        """Return the digest of a module with the modules that it leads to."""
+        """Return the digest of a module together with all modules that it leads to."""
         if module in self._wholes:
             return self._wholes[module]
         looks, names = self._led_to(module)
         if module not in looks or looks[module].summary is None:
             raise UnfollowedCode(_NO_FILE.format(module))
-        # docstrings count if any of the modules reads some
+        # docstrings count if any of the modules reads docstrings
         reads_docstrings = any(look.summary.documents for look in looks.values() if look.summary)
-        # what each module adds, its docstrings only where they are read
+        # contribution of each module, with docstrings only if they are read
         state = {name: digest_of(look, reads_docstrings) for name, look in looks.items()}
-        # code of users reads more settings than that of neusee
+        # code of users may read more settings than code of neusee does
         process_settings = settings() | (own_settings(reads_time(looks)) if is_own(module) else {})
         code = digest(_PYTHON, process_settings, state)
         covered_parts = {
@@ -441,28 +450,28 @@ class Code:
         return self._wholes[module]
 
     def _led_to(self, module: str) -> tuple[dict[str, Look], Names]:
-        """Return what each module adds that a module leads to, itself included, and the names that
-        others use of it.
+        """Return the contribution of each module that ``module`` leads to, itself included, and the
+        names that other modules use of each.
         """
         looks: dict[str, Look] = {}
         names: Names = {module: set()}
         modules_left, packages = [module], _packages(module)
         while modules_left:
             name = modules_left.pop()
-            # each module once; None for one that decides nothing
+            # each module once; `_look` returns None for a module that affects no result
             look = self._look(name, packages, name == module) if name not in looks else None
             if look is None:
                 continue
             looks[name] = look
             for imported_module, used_names in look.imports.items():
-                # which names others use decides what is refused
+                # only constructs that the used names reach are refused
                 names.setdefault(imported_module, set()).update(used_names)
                 modules_left.append(imported_module)
         return looks, names
 
     def _named(self, code: str, parts: Parts, private: bool) -> str:
-        """Return a digest, private to this process where the loaded code is not that of the
-        files.
+        """Return a digest and note its parts. If ``private``, the loaded code differs from its
+        files, and the digest is valid in this process only.
         """
         if private:
             return PRIVATE + digest(code, _THIS_PROCESS)
@@ -470,16 +479,16 @@ class Code:
         return code
 
     def _refuse(self, closure: Whole, module: str, node: Node, own: set[str]) -> None:
-        """Raise `LookupError` for the first construct that is not followed, not declared, and
-        that ``own`` reaches.
+        """Raise `LookupError` for the first construct that cannot be followed, is not declared, and
+        is reached from the names ``own`` of the module.
         """
         for name, look in closure.looks.items():
-            # counts by its version
+            # an installed package counts by its version
             if look.summary is None or look.path is None:
                 continue
             if not look.summary.constructs and not look.changing:
                 continue
-            # the empty name: all of the module
+            # the empty name stands for the whole module
             used_names = own if name == module else closure.names.get(name) or {""}
             declared_entries = [*look.summary.depends, *node.depends]
             if look.changing:
@@ -489,10 +498,10 @@ class Code:
             _refuse_constructs(look.summary, look.path, used_names, declared_entries)
 
     def _look(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
-        """Return what a module adds to a digest, computed once; None for one that decides no
-        result.
+        """Return the contribution of a module to a digest, computed once; None for a module that
+        affects no result.
 
-        ``root``: it is the module of the node itself.
+        ``root``: True for the module of the node itself.
         """
         key = (module, packages, root)
         if key not in self._looks:
@@ -502,8 +511,8 @@ class Code:
         return self._looks[key]
 
     def _looked(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
-        """Return what a module adds to a digest, by its origin: all of the workflows, its
-        version, its bytes or its source.
+        """Return the contribution of a module to a digest. Depending on its origin, the module
+        counts by the whole of neusee.workflows, by its version, by its bytes or by its source.
         """
         if f"{module}.".startswith(f"{_WORKFLOWS}."):
             return Look({_WORKFLOWS: {"files": workflows_digest()}}, {})
@@ -521,7 +530,7 @@ class Code:
         return self._source(module, origin.path, packages, root)
 
     def _source(self, module: str, path: Path, packages: frozenset[str], root: bool) -> Look:
-        """Return what a module adds whose source is followed."""
+        """Return the contribution to a digest of a module whose source is followed."""
         is_imported = imported(module)
         summary = self._summary(module, path)
         follows = self._follows(packages)
@@ -535,10 +544,10 @@ class Code:
         if is_imported:
             module_state, state = self._loaded_state(module, summary, follows, free_names, root)
             parts[f"state of {module}"], changing = {"values": state}, module_state.changing
-            # modules of values that the source does not name
+            # modules of the module's values, which its source need not name
             for name in sorted(module_state.modules):
                 imports.setdefault(name, set()).update(module_state.modules[name])
-            # another code than that of the file
+            # the loaded code differs from the file
             if module_state.replaced and not is_private_code:
                 is_private_code = True
                 _say_replaced(module, path, module_state.replaced[0])
@@ -559,10 +568,10 @@ class Code:
         packages: frozenset[str],
         free: set[str],
     ) -> dict[str, set[str]]:
-        """Return the modules that a module imports and does not declare ``free``, with the names
-        that are used.
+        """Return the modules that a module imports, each with the names that are used, without the
+        modules declared ``free``.
         """
-        # also of names that are not found in the file itself
+        # includes names that other modules define
         module_imports = Imports(
             module,
             path,
@@ -584,12 +593,12 @@ class Code:
         free: set[str],
         root: bool,
     ) -> tuple[LoadedState, str]:
-        """Return the state of a loaded module, and its digest."""
-        # otherwise the byte code never equals that of the file
+        """Return the state of a loaded module (see `LoadedState`), and the digest of that state."""
+        # a loader that changes the source gives byte code that never equals that of the file
         functions = summary.functions if compiled_as_written(module) else ()
         loaded = LoadedState(sys.modules[module], functions, follows)
         values = counted_values(sys.modules[module], summary, free, root)
-        # of the modules that hang on a package, those that the caller had imported count
+        # a package holds its loaded submodules as values; only those in ``loaded`` count
         if (kept_modules := self._loaded) is not None:
             values = without_modules(
                 module, values, lambda name: follows(name) and name not in kept_modules
@@ -597,7 +606,7 @@ class Code:
         return loaded, loaded.digest(values)
 
     def _follows(self, packages: frozenset[str]) -> Callable[[str], bool]:
-        """Return the function that tells whether the source of a module is followed."""
+        """Return the function that decides whether the source of a module is followed."""
         if packages not in self._followed:
             self._followed[packages] = functools.cache(
                 lambda name: self._is_followed(name, packages)
@@ -605,9 +614,9 @@ class Code:
         return self._followed[packages]
 
     def _is_followed(self, module: str, packages: frozenset[str]) -> bool:
-        """Return True for a module whose source counts, not its version."""
+        """Return True for a module that counts by its source and not by its version."""
         is_not_followed = _decides_nothing(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
-        # the module of the methods of a tuple
+        # the methods of a named tuple state a module of this name, which does not exist
         is_of_tuple = module.startswith("namedtuple_") and module not in sys.modules
         return (
             not is_not_followed
@@ -616,7 +625,7 @@ class Code:
         )
 
     def _origin(self, module: str, packages: frozenset[str]) -> Origin:
-        """Return where a module comes from, found once."""
+        """Return the origin of a module, looked up once."""
         key = (module, packages)
         if key not in self._origins:
             self._origins[key] = origin_of(module, packages)
@@ -630,9 +639,9 @@ class Code:
         return origin.path, self._summary(module, origin.path)
 
     def _summary(self, module: str, path: Path) -> Summary:
-        """Return the summary of a source file, from the memo where an equal source is in it."""
+        """Return the summary of a source file, from the memo if that contains the same source."""
         (source, content_digest), is_of_user = source_of(module, path), is_own(module)
-        # another Python, or another code that summarises, gives another summary
+        # another version of Python, or of the code that summarises, gives another summary
         memo_key = f"{PYTHON}:{EDITION}:{content_digest}{':own' * is_of_user}"
         if memo_key not in self._summaries:
             try:
@@ -643,22 +652,22 @@ class Code:
         return self._summaries[memo_key]
 
 
-#: several stores in one process parse a source once
+#: cached, so that several stores in one process parse the same source once
 _summarised = functools.lru_cache(1000)(summarise)
 
 
 def _is_a_module(name: str) -> bool:
-    """Return True if a name is that of a module that can be found."""
+    """Return True if ``name`` is the name of a module that can be found."""
     return module_path(name) is not None
 
 
 def _say_changed(module: str, source: Path, entry: str) -> None:
-    """Say that a declared file was changed after the import of a module."""
+    """Warn that a declared file was changed after the import of its module."""
     say_once(module, f"{source.parent / entry} was changed after the import of {source}: restart")
 
 
 def _say_replaced(module: str, path: Path, function: str) -> None:
-    """Say that the loaded code of a function is another one than that in its file."""
+    """Warn that the loaded code of a function differs from the code in its file."""
     text = f"the loaded code of {function}() is not that of {path}, so results are not stored"
     say_once(module, f"{text}: restart Python, and delete __pycache__ if this is said again")
 
@@ -670,10 +679,10 @@ def _refuse_changing(
     used_names: set[str],
     free: Sequence[str],
 ) -> None:
-    """Raise `LookupError` for an object that changes while a process runs, is read and is not
-    declared.
+    """Raise `LookupError` for an object that changes while a process runs, if the used names read
+    it and no entry of ``free`` declares it.
     """
-    # no names: all of the module
+    # an empty set stands for the whole module
     names = set[str]() if used_names & {"", "*"} else used_names
     names_read = read_names(summary.statements, names)
     for object_name, kind_of_object in changing.items():
@@ -684,7 +693,9 @@ def _refuse_changing(
 def _refuse_constructs(
     summary: Summary, path: Path, used_names: set[str], free: Sequence[str]
 ) -> None:
-    """Raise `LookupError` for the first construct that the used names reach and no entry covers."""
+    """Raise `LookupError` for the first construct that the used names reach and that no entry of
+    ``free`` covers.
+    """
     # the empty name stands for the whole module
     names_or_all = None if "" in used_names else used_names
     lines = frozenset(chain.from_iterable(reached(summary.statements, names_or_all)))
@@ -695,8 +706,8 @@ def _refuse_constructs(
 
 
 def _decides_nothing(module: str) -> bool:
-    """Return True for a module that decides no result, such as the rules for the shapes of a
-    family of nodes.
+    """Return True for a module that affects no result, such as the rules for the shapes of results
+    of a family of nodes.
     """
     return module in _LEFT_OUT or (
         module.startswith(f"{ROOT}.") and module.endswith("._result_shapes")
@@ -704,20 +715,20 @@ def _decides_nothing(module: str) -> bool:
 
 
 def _packages(module: str) -> frozenset[str]:
-    """Return the packages that are followed by source though they are installed: that of a node,
-    and this one.
+    """Return the packages that are followed by source although they are installed: neusee, and the
+    package of the node's module.
     """
     return OURS | {module.partition(".")[0]}
 
 
 # --- known keys -----------------------------------------------------------------------------------
 
-# Cache keys of recipes that follow one another, such as the points of a sweep: most steps keep the
-# key they had.
+# Reuse of cache keys from one recipe to the next, such as the points of a sweep, where most steps
+# keep their key.
 
 
 class _Known(NamedTuple):
-    """The newest key of a step, with all that the key depends on."""
+    """The newest cache key of a step, with everything that the key depends on."""
 
     step: Step
     beside: tuple[Any, ...]  #: seed, kind of the device and keys of the inputs
@@ -726,7 +737,7 @@ class _Known(NamedTuple):
 
 
 class KnownKeys:
-    """The newest cache key of each step; a key is computed again only if something that it depends
+    """The newest cache key of each step. A key is computed again only if something that it depends
     on has changed.
 
     The code of nodes counts as it is in ``code``, and files are read again each time.
@@ -752,17 +763,17 @@ class KnownKeys:
             return newest.key, newest.origin
         key, origin = key_of(step, keys, seed, self.code, device)
         if newest is not None and newest.key == key:
-            key = newest.key  # the same object: many points of a sweep keep their keys
-        # a file may change without a change of its name
+            # the same object, to save memory: many points of a sweep keep their keys
+            key = newest.key
+        # a step that reads a file is not kept: the content may change under the same path
         if not has_path(step.params):
-            # a file is read again each time, so its step is not kept
             self._newest[step.name] = _Known(step, seed_device_inputs, key, origin)
         return key, origin
 
 
 def _is_same(step: Step, other: Step) -> bool:
-    """Return True if two steps of one name have the same node, inputs and parameters, to the
-    sign of each zero.
+    """Return True if two steps of the same name have the same node, inputs and parameters; 0.0 and
+    -0.0 count as different.
     """
     if step is other:
         return True
@@ -774,8 +785,8 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _is_equal(value: Any, other: Any) -> bool:
-    """Return True for the same object, and for numbers and words that are equal and written
-    alike.
+    """Return True for the same object, and for two numbers or texts of the same type with equal
+    value and equal text.
     """
     if value is other:
         return True

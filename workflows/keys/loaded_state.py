@@ -1,4 +1,6 @@
-"""State that decides what code computes: values in loaded modules, settings of the process."""
+"""State of the process that affects the results of code: the values in loaded modules, and
+settings.
+"""
 
 from __future__ import annotations
 
@@ -42,21 +44,21 @@ from neusee.workflows.keys.source_summary import Summary, function_code, read_na
 
 # --- loaded state ---------------------------------------------------------------------------------
 
-# State of a loaded module: the values of its constants, tables, defaults and closures, and the
-# functions it names.
+# State of a loaded module: the values of its constants, tables, default arguments and closures, and
+# the functions that it names.
 #
-# The source of a module says how its names get their values. What a process computes with are the
+# The source of a module only describes how its names get their values. A process computes with the
 # values themselves: a table that another module filled, a constant or function that was replaced, a
-# default that an import computed. Values of classes of other packages count by their type alone,
-# also where their own methods fail.
+# default argument that was computed at import. Values of classes of other packages count by their
+# type alone, also where their own methods fail.
 
 
 _DISPATCH = getattr(
     functools.singledispatch(str), "__code__", None
-)  #: of a function that a type chooses, whose closure holds a cache
-#: names of a class that its source decides
+)  #: the code of a single-dispatch function, whose closure holds a cache
+#: attributes of a class that follow from its source
 _SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")
-#: hooks that decide no result: size, cost, and a call to try
+#: hooks that affect no result: shape, cost, and an example call
 _FORETELLING = frozenset({"shape", "work", "example"})
 _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("text", (str, PurePath)),
@@ -104,11 +106,11 @@ _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("cell", (CellType,)),
     ("property", (property,)),
     ("wrapped", (staticmethod, classmethod, functools.cached_property, functools.partialmethod)),
-)  #: how values of a type are described; any other value is an object
+)  #: the description used for values of each type; any other value is described as an object
 
 
 class _Hows(dict[type, str]):
-    """How values of a type are described, by type."""
+    """Name of the description used for the values of each type."""
 
     def __missing__(self, kind: type) -> str:
         # an iterator changes whenever it is read
@@ -123,8 +125,8 @@ _HOW = _Hows()
 
 
 class LoadedState:
-    """The state of a loaded module, as a digest, with the modules of the functions and classes
-    that it names.
+    """The state of a loaded module, as a digest, with the modules of the functions and classes that
+    it refers to.
     """
 
     def __init__(
@@ -134,17 +136,17 @@ class LoadedState:
         followed: Callable[[str], bool],
         lazy: bool = True,
     ) -> None:
-        """Describe a module; without ``lazy`` not what a ``cached_property`` holds, which the
-        rest decides.
+        """Describe the state of a module; unless ``lazy`` is set, omit the values of each
+        ``cached_property``, since they follow from the rest.
         """
-        #: names of functions and classes that the module holds, by module
+        #: names of the functions and classes that the values refer to, by module
         self.modules: dict[str, set[str]] = {}
-        #: functions of the module's own file whose code is not that of the file
+        #: functions of the module whose loaded code differs from its source file
         self.replaced: list[str] = []
-        #: objects such as generators, and why, by the name that is or holds them
+        #: reason why a value cannot be covered, such as a generator in it, by the name of the value
         self.changing: dict[str, str] = {}
         self._changes: list[str] = []
-        self._holds: dict[int, list[str]] = {}  # changes in repeated objects, by id
+        self._holds: dict[int, list[str]] = {}  # changing parts of objects that occur again, by id
         self._name, self._file = module.__name__, getattr(module, "__file__", "") or ""
         self._folder = self._file.rpartition("/")[0] or "."
         self._functions, self._followed, self._lazy = frozenset(functions), followed, lazy
@@ -160,15 +162,15 @@ class LoadedState:
         for name in sorted(values):
             if name == "__getattr__" or not (name.startswith("__") and name.endswith("__")):
                 described_values.append((name, self._shallow(values[name])))
-                # noted while the value was described
+                # `_shallow` noted changing objects inside the value
                 if self._changes:
                     self.changing[name] = self._changes[0]
                     self._changes = []
         return xxhash.xxh3_128_hexdigest(repr(described_values).encode(errors="surrogatepass"))
 
     def _shallow(self, value: Any) -> Any:
-        """Return a value as text and tuples, or its type if it holds itself, or much, one in the
-        other without end.
+        """Return a description of a value as text and tuples, or only its type if its nesting is
+        too deep for Python's recursion limit.
         """
         try:
             return self._of(value)
@@ -176,19 +178,19 @@ class LoadedState:
             return self._unread(value, "is nested too deeply")
 
     def _of(self, value: Any) -> Any:
-        """Return a value as text and tuples that are the same in each process; a repeated object
-        is its number.
+        """Return a description of a value as text and tuples that are the same in each process; an
+        object that occurs again is described by its number.
         """
         if value is None:
             return _NOTHING
         kind = _HOW[type(value)]
         number_of_object, object_id, changes_before = self._seen, id(value), len(self._changes)
         try:
-            # short: written out each time
+            # short descriptions are repeated
             if kind in _ATOMS:
                 return _DESCRIBED[kind](self, value)
             if object_id in number_of_object:
-                # what changes in it counts under this name too
+                # its changing parts count for this name too
                 self._changes += self._holds.get(object_id, ())
                 return "again", number_of_object[object_id]
             number_of_object[object_id] = len(number_of_object)
@@ -196,19 +198,19 @@ class LoadedState:
             self._kept.append(value)
             description = _DESCRIBED[kind](self, value)
         except RecursionError:
-            raise  # where it ends depends on the calls around it
+            raise  # the depth at which it fails depends on the calling functions
         except Exception as error:  # the methods of a class may do anything
             description = self._unread(
                 value, f"could not be read ({type(error).__name__}: {error})"
             )
         if len(self._changes) > changes_before:
-            # for the next time that the object is met
+            # kept for the next occurrence of the object
             self._holds[object_id] = self._changes[changes_before:]
         return description
 
     def _unread(self, value: Any, why: str) -> str:
-        """Return the type of a value whose parts cannot be told; note it if the parts of such a
-        value count.
+        """Return the type of a value whose parts cannot be described; note the value as changing if
+        its class is built in or is followed by source.
         """
         kind = type(value)
         if kind.__module__ == "builtins" or self._followed(_home(kind)):
@@ -231,8 +233,8 @@ class LoadedState:
         """Describe a tensor or an array by its type, shape and the digest of its elements."""
         if not isinstance(value, np.ndarray):
             return type(value).__name__, *_array(value)
-        base_array = np.ndarray.view(value, np.ndarray)  # a class of arrays may refuse to be read
-        # its bytes are addresses
+        base_array = np.ndarray.view(value, np.ndarray)  # a subclass may refuse to be read
+        # the bytes of an array of objects are memory addresses
         if base_array.dtype.hasobject:
             return (
                 type(value).__name__,
@@ -259,7 +261,7 @@ class LoadedState:
         return self._typed(value), self._pairs(list(value.items()))
 
     def _pairs(self, pairs: Iterable[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
-        """Return keys and values as texts, in their order."""
+        """Return descriptions of keys and values, in their order."""
         descriptions = []
         for key, item in pairs:
             descriptions.append((self._of(key), self._of(item)))
@@ -292,10 +294,10 @@ class LoadedState:
         )
 
     def _object(self, value: Any) -> Any:
-        """Return an object that is no container: by its parts if the source of its class is
-        followed, else by type.
+        """Return the description of an object that is no container: its attributes if the source of
+        its class is followed, otherwise its type.
 
-        A module of torch counts by its parts, whose weights others may have set.
+        A `torch.nn.Module` always counts by its attributes: other code may have set its weights.
         """
         kind = type(value)
         if kind is SimpleNamespace or issubclass(kind, nn.Module) or self._followed(_home(kind)):
@@ -311,16 +313,18 @@ class LoadedState:
         return self._typed(value), self._of(wrapped) if callable(wrapped) else ""
 
     def _function(self, function: FunctionType) -> Any:
-        """Return a function by module and name, with its defaults and closure if it is local."""
+        """Return the description of a function: its module and name; for a local function also its
+        default arguments and closure.
+        """
         module_name, code = str(function.__globals__.get("__name__")), function.__code__
-        # its closure holds a cache
+        # described by its implementations, since its closure holds a cache
         if code is _DISPATCH:
             return "singledispatch", self._pairs(_implementations(function))
         is_of_file = self._noted_function(function, module_name)
-        # the source of its own module decides it
+        # the digest of its own module covers it
         if not is_of_file and _found(module_name, function):
             return "function", module_name, code.co_qualname, "", []
-        # a function of another module by its byte code, if that module is followed
+        # a function of another module counts by its byte code, if that module is followed
         code_digest = function_code(code) if not is_of_file and self._followed(module_name) else ""
         defaults_and_closure = (
             function.__defaults__,
@@ -329,12 +333,12 @@ class LoadedState:
         )
         described = [item and self._of(item) for item in defaults_and_closure]
         if is_of_file and is_own(module_name):
-            # a function of a user may hold what a call left
+            # a call may have left values in the attributes of a user's function
             described += self._left_in(function)
         return "function", module_name, code.co_qualname, code_digest, described
 
     def _left_in(self, function: FunctionType) -> list[tuple[str, Any]]:
-        """Return the attributes of a function, which may hold what a call left in it."""
+        """Return the attributes of a function, in which a call may have left values."""
         return [
             (name, self._of(attribute))
             for name, attribute in vars(function).items()
@@ -342,8 +346,8 @@ class LoadedState:
         ]
 
     def _noted_function(self, function: FunctionType, home: str) -> bool:
-        """Note a function of another module, or one whose loaded code is not that of the file;
-        return True for a function of the file of this module.
+        """Note a function that comes from another module, or whose loaded code differs from its
+        file. Return True if the function comes from the file of this module.
         """
         code = function.__code__
         is_of_file = home == self._name and code.co_filename == self._file
@@ -354,11 +358,11 @@ class LoadedState:
         return is_of_file
 
     def _class(self, kind: type) -> Any:
-        """Describe a class by its name, and one of this module by its bases and attributes too."""
+        """Describe a class by its name; a class of this module also by its bases and attributes."""
         name = ("class", self._noted(_home(kind), kind.__qualname__), kind.__qualname__)
         if kind.__module__ != self._name:
             return name
-        # without the class itself
+        # the first class in ``__mro__`` is the class itself
         bases = [(base.__module__, base.__qualname__) for base in kind.__mro__[1:]]
         for base in kind.__mro__[1:]:
             self._noted(base.__module__, base.__qualname__)
@@ -370,28 +374,28 @@ class LoadedState:
         return name, bases, [(name, self._of(attribute)) for name, attribute in class_attributes]
 
     def _typed(self, value: Any) -> str:
-        """Return the full name of the type of a value, and note its module."""
+        """Return the full name of the type of a value, and note the module of the type."""
         kind = type(value)
         return f"{self._noted(_home(kind), kind.__qualname__)}.{kind.__qualname__}"
 
     def _noted(self, module: str, name: str = "") -> str:
-        """Note a function or class that the state contains, or a whole module, if its source is
-        followed.
+        """Note a function, a class or (with an empty name) a whole module that the state refers to,
+        if the source of its module is followed.
         """
         if module != self._name and self._followed(module):
             self.modules.setdefault(module, set()).add(name.partition(".")[0])
         return module
 
     def _placed(self, text: str) -> str:
-        """Return a text without the folder of the module, so that it is the same for each place
-        of installation.
+        """Return a text with the folder of the module replaced, so that the text does not depend on
+        the place of installation.
         """
         return text.replace(self._folder, "<folder>") if self._folder in text else text
 
 
 _NOTHING = ("NoneType", "None")
 _ATOMS = frozenset({"plain", "text", "builtin", "module"})
-#: the method that describes a value, by the kind of its type
+#: the method that describes a value, by the name in `_KINDS`
 _DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
     kind: getattr(LoadedState, f"_{kind}") for kind, _ in _KINDS
 }
@@ -400,8 +404,8 @@ _DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
 def counted_values(
     module: ModuleType, summary: Summary, free: Collection[str], root: bool
 ) -> dict[str, Any]:
-    """Return the values of a loaded module that count: of a node's own module, those that its
-    nodes reach.
+    """Return the values of a loaded module that its digest includes; for a node's own module, those
+    that its nodes use.
     """
     values = {name: value for name, value in vars(module).items() if name not in free}
     node_names = _names_of_nodes(values) if root else []
@@ -412,7 +416,7 @@ def counted_values(
             summary.statements, [*node_names, *networks, "_"]
         )
     else:
-        # without logs, which nothing reads
+        # without names that are only written, such as logs
         counted_names = values.keys() - written_only(summary.statements)
     return {name: value for name, value in values.items() if name in counted_names}
 
@@ -425,9 +429,7 @@ def _names_of_nodes(values: Mapping[str, Any]) -> list[str]:
 def without_modules(
     package: str, values: Mapping[str, Any], left_out: Callable[[str], bool]
 ) -> dict[str, Any]:
-    """Return the values of a package without those of its own modules whose names are
-    ``left_out``.
-    """
+    """Return the values of a package without its submodules for which ``left_out`` returns True."""
     own_submodules = {
         name for name, value in values.items() if value is sys.modules.get(f"{package}.{name}")
     }
@@ -439,7 +441,7 @@ def without_modules(
 
 
 def _hooks(node: Node) -> Iterator[Any]:
-    """Yield the hooks of a node that may decide a result, and its other forms."""
+    """Yield the hooks of a node that may affect a result, and its alternative forms."""
     for name in node.hooks.__slots__:
         if name not in _FORETELLING:
             yield getattr(node.hooks, name)
@@ -447,15 +449,15 @@ def _hooks(node: Node) -> Iterator[Any]:
 
 
 def _array(value: Any) -> tuple[Any, ...]:
-    """Return type, shape and digest of a tensor or an array."""
+    """Return the data type, the shape and the digest of the elements of a tensor or an array."""
     if isinstance(value, torch.Tensor):
-        # without values that could be read
+        # such tensors have no elements that can be read as a block
         if value.device.type == "meta" or value.layout != torch.strided:
             return str(value.dtype), tuple(value.shape)
         elements = value.detach().cpu().contiguous().reshape(-1)
         element_bytes: Any = b""
         if elements.numel():
-            # torch may only note that a tensor is conjugated or negative
+            # torch may conjugate or negate a tensor by a flag alone, without new elements
             element_bytes = elements.resolve_conj().resolve_neg().view(torch.uint8).numpy().data
     # booleans, integers, floats and complex numbers
     elif value.flags.c_contiguous and value.dtype.kind in "biufc":
@@ -479,17 +481,19 @@ def _attributes(value: Any) -> list[tuple[str, Any]]:
 
 
 def _home(kind: type) -> str:
-    """Return the module of a class, or an empty text for a class that states something else."""
+    """Return the name of the module of a class, or an empty text if its ``__module__`` is not a
+    text.
+    """
     return kind.__module__ if isinstance(kind.__module__, str) else ""
 
 
 def _is_network(value: Any) -> bool:
-    """Return True for a class of network."""
+    """Return True for a subclass of `torch.nn.Module`."""
     return issubclass(type(value), type) and issubclass(value, nn.Module)
 
 
 def _is_lazy(kind: type, name: str) -> bool:
-    """Return True for an attribute that a ``cached_property`` of its class fills."""
+    """Return True for an attribute whose value a ``cached_property`` of its class computes."""
     return isinstance(getattr(kind, name, None), functools.cached_property)
 
 
@@ -499,7 +503,7 @@ def _slot_names(slots: Any) -> tuple[str, ...]:
 
 
 def _content(cell: CellType) -> Any:
-    """Return what a cell of a closure holds; None for an empty one."""
+    """Return the value in a cell of a closure, or None for an empty cell."""
     try:
         return cell.cell_contents
     except ValueError:
@@ -507,8 +511,8 @@ def _content(cell: CellType) -> Any:
 
 
 def _found(module: str, function: FunctionType) -> bool:
-    """Return True if a function is what its module has under its name, so that the source of the
-    module decides it.
+    """Return True if the module holds the function under the function's own name, so that the
+    module's source determines it.
     """
     holder: Any = sys.modules.get(module)
     for name in function.__qualname__.split("."):
@@ -521,14 +525,16 @@ def _is_method(attribute: Any) -> bool:
 
 
 def _implementations(function: FunctionType) -> list[tuple[type, Any]]:
-    """Return the function for each type of a ``singledispatch``, by the name of the type."""
+    """Return the implementations of a ``singledispatch`` function, sorted by the name of the
+    type.
+    """
     kinds: Mapping[type, Any] = function.registry  # type: ignore[attr-defined]
     return sorted(kinds.items(), key=lambda item: f"{item[0].__module__}.{item[0].__qualname__}")
 
 
 def _wrapped(value: Any, kind: type) -> Any:
-    """Return what an object wraps, or None."""
-    # a class that answers to each name answers to this one too
+    """Return the object that ``value`` wraps (``__wrapped__``), or None."""
+    # `getattr_static`, since a class with `__getattr__` may answer to any name
     if kind.__module__ == "typing" or inspect.getattr_static(value, "__wrapped__", None) is None:
         return None
     return value.__wrapped__
@@ -536,8 +542,8 @@ def _wrapped(value: Any, kind: type) -> Any:
 
 # --- process settings -----------------------------------------------------------------------------
 
-# Settings of a process that decide what any code computes: number types of torch, and the code of
-# `neusee.workflows`.
+# Settings of a process that affect the results of any code: the number types of torch, and the code
+# of `neusee.workflows`.
 #
 # The number of threads and deterministic algorithms change results only within rounding and do not
 # count.
@@ -559,9 +565,9 @@ _PRINTED = {
     "sign": "-",
     "floatmode": "maxprec",
 }
-_SMALLEST = sys.float_info.min  #: its half is 0 where a process flushes small numbers to 0
+_SMALLEST = sys.float_info.min  #: half of it is 0 if the process flushes subnormal numbers to 0
 
-# imports what it needs now, because a process may lose the right to read files later
+# This call makes torch import what it needs now: a process may later lose the right to read files.
 torch.get_default_device()
 
 
@@ -580,7 +586,7 @@ def settings() -> dict[str, str]:
             )
             or "off"
         ),
-        # the product is 0 where small numbers are flushed to 0
+        # the product is 0 if subnormal numbers are flushed to 0
         "numbers below 1e-308": "kept" if _SMALLEST * _HALF else "0",
         "assert statements": (
             f"left out by -{'O' * sys.flags.optimize}" if sys.flags.optimize else "run"
@@ -590,8 +596,8 @@ def settings() -> dict[str, str]:
 
 
 def own_settings(reads_time: bool) -> dict[str, str]:
-    """Return the settings that code of a user may read, and neusee does not, where they are not the
-    usual ones.
+    """Return the settings that differ from their defaults and that neusee itself ignores, but that
+    code of a user may read.
 
     With ``reads_time`` the code may read the time zone.
     """
@@ -607,8 +613,8 @@ def own_settings(reads_time: bool) -> dict[str, str]:
 
 
 def _errors() -> str:
-    """Return which floating-point errors of NumPy end a calculation or call a function; warnings
-    decide nothing.
+    """Return the kinds of floating-point error for which NumPy raises an exception or calls a
+    function. Warnings affect no result.
     """
     error_actions = [
         f"{name} {action}"
@@ -619,9 +625,10 @@ def _errors() -> str:
 
 
 def _printing() -> str:
-    """Return how NumPy prints numbers, where it was told to.
+    """Return the options with which NumPy prints numbers, where they differ from those of a new
+    process.
 
-    The option ``legacy`` does not count: colour-science sets it, and whether it is loaded decides
+    The option ``legacy`` does not count: colour-science sets it, and whether it is loaded affects
     no result.
     """
     print_options: Mapping[str, object] = {**np.get_printoptions()}
@@ -634,13 +641,13 @@ def _printing() -> str:
 
 
 def _encoding() -> str:
-    """Return the encoding of a text file that is opened without one."""
+    """Return the default encoding of text files in this process."""
     return codecs.lookup(locale.getpreferredencoding(False)).name
 
 
 def _code_at_start() -> str:
-    """Return a digest of the modules with which a user or a system changes Python when it
-    starts.
+    """Return a digest of the modules `sitecustomize` and `usercustomize`, with which a user or an
+    administrator changes Python when it starts.
     """
     start_files = [
         getattr(sys.modules.get(name), "__file__", None)
@@ -655,8 +662,8 @@ def _code_at_start() -> str:
 
 
 def _time_zone() -> str:
-    """Return the names of the time zone and a digest of its offsets from UTC in each week from
-    1970 to 2040.
+    """Return the names of the time zone and a digest of its offsets from UTC, sampled once a week
+    from 1970 to 2040.
     """
     # s since 1970: up to 2040, week by week
     weeks = range(0, 2_208_988_800, 7 * 86_400)
@@ -671,7 +678,7 @@ def _time_zone() -> str:
 
 @functools.cache
 def workflows_digest() -> str:
-    """Return the digest of all source files of `neusee.workflows`, for a node that imports any
+    """Return the digest of all source files of `neusee.workflows`, used for a node that imports any
     of them.
     """
     folder = Path(__file__).parents[1]

@@ -1,4 +1,6 @@
-"""Digest of one module: from its source or its installed package, kept in sealed files."""
+"""Digest of one module, from its source or its installed package, and sealed files that store such
+digests.
+"""
 
 from __future__ import annotations
 
@@ -43,21 +45,21 @@ from neusee.workflows.keys.source_summary import Summary
 # Sealed files about code: the summaries of source files, so that a run from the cache parses no
 # source.
 #
-# A file that is damaged, of another format, or without the signature that is asked for is ignored
-# and written again.
+# A file is ignored and written again if it is damaged, has another format, or lacks the required
+# signature.
 
 
-#: files of the code that summarises a source file
+#: modules that summarise a source file
 _SUMMARISING = ("source_syntax", "unfollowed_constructs", "source_summary")
 #: digest of the code that summarises a source file, so that an older summary is not used
 EDITION = xxhash.xxh3_64_hexdigest(
     b"".join(Path(__file__).with_name(f"{n}.py").read_bytes() for n in _SUMMARISING)
 )
-_KEPT = 1000  #: number of summaries in the file
-#: stamps of files of digests that this process has read or written
+_KEPT = 1000  #: greatest number of summaries in the file
+#: stamps of the files of digests that this process has read or written and that are intact
 _right: dict[Path, Stamp] = {}
 
-#: digests of definitions, versions or contents, by module or other dependency
+#: digests of definitions, versions or contents, by module or other dependency and by name
 Parts = dict[str, dict[str, str]]
 
 
@@ -70,14 +72,14 @@ class Outline(NamedTuple):
     imports: list[tuple[str, list[str]]]  #: of ``from a import b``: the module and the names
 
 
-#: of source files of the program, by the edition and the digest of the source
+#: outlines of source files of the program, by the edition and the digest of the source
 outlines: dict[str, Outline] = {}
 #: digests of the files of packages, by the digest of the stamps of the files
 known_contents: dict[str, str] = {}
 
 
 class _Known(NamedTuple):
-    """What is noted of packages and of the program, beside the summaries."""
+    """Notes on packages and on the program, stored beside the summaries."""
 
     distributions: dict[str, list[str]]
     outlines: dict[str, Outline]
@@ -87,7 +89,7 @@ class _Known(NamedTuple):
 _SUMMARIES = TypeAdapter(dict[str, Summary])
 _KNOWN = TypeAdapter(_Known)
 _PARTS = TypeAdapter(Parts)
-_saved: dict[Path, int] = {}  #: number of outlines and of digests of packages in each memo
+_saved: dict[Path, int] = {}  #: number of outlines plus number of package digests in each memo
 
 
 def read_memo(memo: Path) -> dict[str, Summary]:
@@ -111,18 +113,18 @@ def read_memo(memo: Path) -> dict[str, Summary]:
 
 @functools.lru_cache(4)
 def _read(name: str, raw: bytes, signed_by: tuple[bytes, ...]) -> tuple[_Known, dict[str, Summary]]:
-    """Return what a memo says; the same bytes are read once in a process, for each list of
+    """Return the content of a memo. A process decodes the same bytes once for each set of
     secrets.
     """
-    # three lines: the seal, notes of packages and of the program, summaries
+    # three lines: the seal, the notes on packages and on the program, the summaries
     seal_line, _, content = raw.partition(b"\n")
     notes_json, summaries_json = unseal_file("sources", name, seal_line, content).split(b"\n", 1)
     return _KNOWN.validate_json(notes_json), _SUMMARIES.validate_json(summaries_json)
 
 
 def is_complete(memo: Path) -> bool:
-    """Return True if a memo has an outline of each source file of the program, and of each
-    package, that was read.
+    """Return True if a memo contains all outlines and package digests that this process has
+    read.
     """
     return _saved.get(memo, 0) >= len(outlines) + len(known_contents)
 
@@ -143,8 +145,8 @@ def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
 
 
 def read_parts(root: Path, code: str) -> Parts:
-    """Return the digest of each definition that the digest ``code`` covers; {} if the record is
-    missing or damaged.
+    """Return the digest of each definition that the digest ``code`` covers; an empty dict if the
+    record is missing or damaged.
     """
     try:
         record = unseal_record("definitions", bytes_of(root / "code" / f"{code}.json"))
@@ -160,7 +162,7 @@ def write_parts(root: Path, code: str, parts: Parts) -> None:
     path = root / "code" / f"{code}.json"
     with suppress(OSError):
         stamp = file_stamp(path)
-        # an undamaged record is there
+        # an intact record exists
         if _right.get(path) == stamp or read_parts(root, code):
             _right[path] = stamp
             return
@@ -170,7 +172,7 @@ def write_parts(root: Path, code: str, parts: Parts) -> None:
 def _write(path: Path, content: bytes, folder: Path) -> None:
     """Write a file by atomic rename; do nothing if the folder cannot be written.
 
-    ``folder`` is that of temporary files, in the root of the store.
+    ``folder`` is the folder of temporary files, directly below the root of the store.
     """
     root = str(folder.parent)
     # one temporary file for each process and thread
@@ -185,14 +187,15 @@ def _write(path: Path, content: bytes, folder: Path) -> None:
 
 # --- installed content ----------------------------------------------------------------------------
 
-# Content of installed packages that code of a user imports: which files have they, and what do they
-# import?
+# Content of the installed packages that code of a user imports: which files does a package have,
+# and which packages does it require?
 #
-# A version does not say which files a package has: a helper that is installed again under the same
-# version, or edited in place, is other code. The packages that neusee itself declares count by
-# their version alone, because their wheels differ between platforms and devices, and machines share
-# results. Any other package counts by the content of its files, with the packages that it requires.
-# Byte code, scripts and metadata do not count, so machines with equal wheels agree.
+# A version does not determine the files of a package: a helper package that is installed again
+# under the same version, or edited in place, is other code. The packages that neusee itself
+# declares count by their version alone, because their wheels differ between platforms and devices,
+# and machines share results. Any other package counts by the content of its files, together with
+# the packages that it requires. Byte code, scripts and metadata do not count, so machines with
+# equal wheels get equal digests.
 
 
 #: distributions that neusee declares for its users, in pyproject.toml, in the form of `plain`
@@ -233,7 +236,7 @@ BY_VERSION = frozenset(
         *("torch", "typer", "xarray", "xxhash"),
     }
 )
-#: ns after a change of a file in which a second change may not change its time stamp
+#: time (ns) after a change of a file during which a second change may leave its time stamp as it is
 _SETTLED = 2_000_000_000
 _REQUIRED = re.compile(r"^Requires-Dist: *([\w.-]+)(.*)$", re.MULTILINE)
 _OF_AN_EXTRA = re.compile(r";.*\bextra *==")
@@ -242,24 +245,26 @@ _LEFT_OUT = (".pyc", ".pyo", ".pyi", ".pth")
 
 
 class Content(NamedTuple):
-    """The digest of the files of a distribution, and when the newest of them was changed (ns)."""
+    """The digest of the files of a distribution, and the time of the newest change of a file
+    (ns).
+    """
 
     digest: str
     changed: int
 
 
 class Counted(NamedTuple):
-    """What the packages behind an imported module add to a digest."""
+    """The contribution to a digest of the packages behind an imported module."""
 
     parts: Parts
-    edited: str  #: a package whose files were changed after its import, or nothing
+    edited: str  #: name of a package whose files were changed after its import, or an empty text
 
 
 def counted(module: str, version: str) -> Counted:
-    """Return what an imported module of an installed package adds: its distributions, and those
-    that they require.
+    """Return the contribution of an imported module of an installed package: its distributions, and
+    the distributions that they require.
 
-    ``version`` is what the module counts by if neusee declares its package.
+    ``version`` alone counts if neusee declares the package.
     """
     top_package = module.partition(".")[0]
     distributions = module_origin.distributions_with(top_package)
@@ -270,8 +275,8 @@ def counted(module: str, version: str) -> Counted:
 
 @functools.cache
 def _counted(top: str, version: str) -> Counted:
-    """Return what a top-level module of a package adds that neusee does not declare, as it was
-    when first asked.
+    """Return the contribution of a top-level module whose package neusee does not declare. The
+    first result holds for the whole process.
     """
     own_distributions = [
         module_origin.plain(name) for name in module_origin.distributions_with(top)
@@ -281,7 +286,7 @@ def _counted(top: str, version: str) -> Counted:
         f"package {top}": {"version": version, "content": _joined(content_of.values())}
     }
     newest_change = max(content.changed for content in content_of.values())
-    # the process computes with the files that it imported
+    # the process still computes with the files as they were at the import
     edited_package = top if top in sys.modules and newest_change > import_time(top) else ""
     for name in sorted(_required(own_distributions)):
         version_and_content = {"version": module_origin.released(name)}
@@ -297,16 +302,16 @@ def _joined(contents: Iterable[Content]) -> str:
 
 
 def _required(names: Iterable[str]) -> set[str]:
-    """Return the installed distributions that some distributions require, directly or not, without
-    their extras.
+    """Return the installed distributions that some distributions require, directly or indirectly,
+    without optional extras.
 
-    What a package that neusee declares requires does not count, as it does not where a node imports
+    The requirements of a package that neusee declares do not count, just as when a node imports
     that package.
     """
     given_names = set(names)
     distributions, names_left = set(given_names), [*given_names]
     while names_left:
-        # the description follows the first empty line
+        # the fields end at the first empty line, where the description begins
         metadata_head = (
             module_origin.metadata_text(names_left.pop(), "METADATA")
             .decode(errors="replace")
@@ -328,10 +333,10 @@ def _required(names: Iterable[str]) -> set[str]:
 
 
 def _content(name: str, top: str) -> Content:
-    """Return the digest of the files of a distribution; ``top`` is its module if no record lists
-    its files.
+    """Return the digest of the files of a distribution. ``top`` is the name of its module, used if
+    no record lists its files.
 
-    A digest is noted with the stamps of the files, so that the next process reads none of them.
+    The digest is stored under the stamps of the files, so that the next process need not read them.
     """
     files = sorted(_files(name, top).items())
     stamps = [(path, _content_stamp(file)) for path, file in files]
@@ -350,10 +355,10 @@ def _content(name: str, top: str) -> Content:
 
 
 def _files(name: str, top: str) -> dict[str, str]:
-    """Return the path of each file that the code of a distribution may be or read, by its path in
-    the distribution.
+    """Return the full path of each file that may be code of a distribution or be read by it, by the
+    path within the distribution.
 
-    The files are those of the record of its installation, and modules that stand in its packages
+    These are the files in the record of its installation, and modules that lie in its packages
     without a record.
     """
     package_folder = os.path.dirname(module_origin.metadata_folder(name))
@@ -368,7 +373,9 @@ def _files(name: str, top: str) -> dict[str, str]:
 
 
 def _modules_in_packages(site: str, recorded: Iterable[str]) -> Iterator[str]:
-    """Yield the modules that stand in the recorded packages, with those without a record."""
+    """Yield the modules in the folders of the recorded packages, whether they are recorded or
+    not.
+    """
     folders = {path.rpartition("/")[0] for path in recorded if path.endswith("/__init__.py")}
     outermost = [folder for folder in folders if folder.rpartition("/")[0] not in folders]
     for package in sorted(outermost):
@@ -376,8 +383,8 @@ def _modules_in_packages(site: str, recorded: Iterable[str]) -> Iterator[str]:
 
 
 def _recorded(record: str) -> Iterator[str]:
-    """Yield the files of a record: not metadata, byte code, or scripts outside of the folder of
-    packages.
+    """Yield the files that a record lists, without metadata, byte code, and scripts outside of the
+    folder of packages.
     """
     for line in record.splitlines():
         # "path,hash,size", where the path may have commas
@@ -390,9 +397,9 @@ def _recorded(record: str) -> Iterator[str]:
 
 
 def _below(site: str, package: str) -> Iterator[str]:
-    """Yield the files in the folder of a package, as a record names them."""
+    """Yield the files in the folder of a package, with paths as a record writes them."""
     for folder, subfolders, files in os.walk(os.path.join(site, package)):
-        # in place, so that os.walk leaves them out
+        # changed in place, so that os.walk skips these folders
         subfolders[:] = [subfolder for subfolder in subfolders if subfolder != "__pycache__"]
         relative_folder = os.path.relpath(folder, site)
         yield from (f"{relative_folder}/{file}" for file in files if not file.endswith(_LEFT_OUT))
@@ -404,8 +411,8 @@ def _is_module(file: str) -> bool:
 
 
 def _content_stamp(file: str) -> Stamp:
-    """Return what changes whenever a file is changed, last the times of its content and entry;
-    nothing if missing.
+    """Return numbers that change whenever a file changes, the times of content and entry last; an
+    empty tuple for a missing file.
     """
     try:
         return file_stamp(file)
@@ -414,7 +421,7 @@ def _content_stamp(file: str) -> Stamp:
 
 
 def _digest_of(file: str) -> bytes:
-    """Return the digest of a file, or a word for a missing one."""
+    """Return the digest of the content of a file, or ``b"missing"``."""
     try:
         with opened(file) as content:
             return hashlib.file_digest(content, xxhash.xxh3_128).digest()
@@ -424,17 +431,17 @@ def _digest_of(file: str) -> bytes:
 
 # --- loaded source --------------------------------------------------------------------------------
 
-# Source of a loaded module: its file is read once, and a file that was edited after the import is
-# told.
+# Source of a loaded module. Its file is read once, and a warning reports a file that was edited
+# after the import.
 #
-# Python runs the code that it loaded, whatever the file says later. The first reading holds for
-# this process.
+# Python runs the code that it loaded, whatever the file contains later. So the first reading holds
+# for the whole process.
 
 
 _edited_since: set[str] = set()  #: loaded modules whose source was edited after the import
-#: spec, source and its digest at the first reading, by module
+#: import spec, source and digest of the source at the first reading, by module
 _frozen: dict[str, tuple[Any, bytes, str]] = {}
-_said: set[tuple[str, str]] = set()  #: warnings of this process
+_said: set[tuple[str, str]] = set()  #: module and text of the warnings that this process has given
 
 
 def source_of(module: str, path: Path) -> tuple[bytes, str]:
@@ -443,13 +450,13 @@ def source_of(module: str, path: Path) -> tuple[bytes, str]:
     Warn if the source was edited after the import of the module.
     """
     spec = getattr(sys.modules.get(module), "__spec__", None)
-    # the module was not loaded anew
+    # the same spec: the module was not loaded again since
     if module in _frozen and _frozen[module][0] is spec and spec is not None:
         return _frozen[module][1:]
     source = path.read_bytes()
     source_and_digest = source, xxhash.xxh3_128_hexdigest(source)
     _edited_since.discard(module)
-    # loaded: what Python runs is what was read first
+    # a loaded module: the first reading holds
     if spec is not None:
         _frozen[module] = (spec, *source_and_digest)
         if _edited(module, spec, path):
@@ -466,8 +473,8 @@ def edited_since(module: str) -> bool:
 
 
 def imported(module: str) -> bool:
-    """Import a module that a function imports later, so that its values count at once; return
-    False if it fails.
+    """Import a module that a function would import later, so that its values count now. Return True
+    if it is loaded.
     """
     if module not in sys.modules:
         with suppress(Exception):
@@ -476,25 +483,25 @@ def imported(module: str) -> bool:
 
 
 def compiled_as_written(module: str) -> bool:
-    """Return True if the loader of a module compiles its source without a change, as an
-    assertion rewriter does not.
+    """Return True if the loader of a module compiles the source unchanged; a loader that rewrites
+    assertions does not.
     """
     return type(getattr(sys.modules.get(module), "__loader__", None)) is SourceFileLoader
 
 
 def say_once(module: str, text: str) -> None:
-    """Warn of a module whose results are not stored, once for each text."""
+    """Warn that results of a module are not stored, once for each module and text."""
     if (module, text) not in _said:
         _said.add((module, text))
         warnings.warn(text, stacklevel=2)
 
 
 def _edited(module: str, spec: Any, path: Path) -> bool:
-    """Return True if a source file was changed after the import began, or after Python wrote the
-    byte code.
+    """Return True if a source file was changed after the import of its module began, or after
+    Python wrote its byte code.
     """
     file_status = os.stat(path)
-    # changed after the import
+    # the file was changed after the import
     if file_status.st_ctime_ns > import_time(module):
         return True
     try:
@@ -504,7 +511,7 @@ def _edited(module: str, spec: Any, path: Path) -> bool:
         writable = os.access(os.path.dirname(spec.cached), os.W_OK) and not sys.dont_write_bytecode
     except OSError:
         return False
-    # as byte code has it: time and size of the source, 4 bytes each
+    # the form in which byte code states time and size of its source, 4 bytes each
     source_stamp = b"".join(
         (int(n) & 0xFFFFFFFF).to_bytes(4, "little")
         for n in (file_status.st_mtime, file_status.st_size)
@@ -515,29 +522,30 @@ def _edited(module: str, spec: Any, path: Path) -> bool:
 
 # --- module look ----------------------------------------------------------------------------------
 
-# What one module adds to the digest of a node, and the digest of a module with all that it imports.
+# The contribution of one module to the digest of a node, and the digest of a module with all
+# modules that it imports.
 
 
 OURS = frozenset({"neusee"})  #: packages that are followed by source for a node of neusee
-#: names that are used of each module; an empty name stands for all of them
+#: names that are used of each module; an empty name stands for the whole module
 Names = dict[str, set[str]]
 
 
 class Look(NamedTuple):
-    """What one module adds to a digest, and the modules that it leads to."""
+    """The contribution of one module to a digest, and the modules that it leads to."""
 
     parts: Parts
     imports: Names
-    summary: Summary | None = None  #: None for a module that counts by its version
+    summary: Summary | None = None  #: None unless the module counts by its source
     path: Path | None = None
     state: str = ""
-    #: loaded objects that no digest covers, such as generators, and why, by name
+    #: reason for each loaded object that no digest can cover, such as a generator, by name
     changing: Mapping[str, str] = {}
     private: bool = False  #: True if the loaded code is not that of the file
 
 
 class Whole(NamedTuple):
-    """The digest of a module with all that it imports."""
+    """The digest of a module with all modules that it imports."""
 
     code: str
     looks: dict[str, Look]
@@ -553,7 +561,9 @@ def parts_of(looks: dict[str, Look]) -> Parts:
 
 
 def digest_of(look: Look, documents: bool) -> list[Any]:
-    """Return what a module adds to the digest of a node."""
+    """Return the contribution of a module to the digest of a node; with ``documents`` its
+    docstrings count.
+    """
     if look.summary is None:
         return [look.parts]
     syntax_digest = look.summary.whole if documents else look.summary.tree
@@ -566,8 +576,8 @@ def digest_of(look: Look, documents: bool) -> list[Any]:
 
 
 def installed_look(module: str, version: str, packages: frozenset[str]) -> Look:
-    """Return what a module of an installed package adds, where ``packages`` are followed by source;
-    without a version, that it is missing.
+    """Return the contribution of a module of an installed package. Without a version the package
+    counts as not installed.
     """
     if not version or packages == OURS:
         return Look(

@@ -1,8 +1,8 @@
 """Origin of an imported module: Python itself, an installed distribution with its version, or a
 source file.
 
-A module of an installed distribution counts by the version of the distribution. A module of the
-user, of an editable install, or of a package that has nodes counts by its source.
+The digest covers a module of an installed distribution by the version alone. A module of the
+user, of an editable install, or of a package that has nodes is covered by its source.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _listed: dict[str, frozenset[str]] = {}
 _ENDS = (".py", *importlib.machinery.EXTENSION_SUFFIXES)
 #: names of distributions by module, where both names differ
 distributions_of: dict[str, list[str]] = {}
-#: its version ends with its build, such as ``+cu124``, which is a device
+#: distributions whose version ends with the build, such as ``+cu124``, which depends on the device
 _BUILD_IN_VERSION = frozenset({"torch"})
 
 
@@ -35,17 +35,17 @@ class Origin(NamedTuple):
     """Where the code of a module is from."""
 
     kind: Kind
-    path: Path | None = None  #: of a source file, or of a compiled module
+    path: Path | None = None  #: the source file, or the compiled module
     version: str = ""  #: name and version of a distribution
 
 
 def origin_of(module: str, packages: frozenset[str]) -> Origin:
-    """Return the origin of a module without importing it; the source of each of ``packages``
-    counts if installed.
+    """Return the origin of a module without importing it; installed ``packages`` count by their
+    source.
     """
     top_package = module.partition(".")[0]
     counts_by_source = top_package in packages
-    # an installed package, or Python itself
+    # the origin of Python and of installed packages stays the same
     if top_package in _fixed and not counts_by_source:
         return _fixed[top_package]
     if _is_of_python(top_package):
@@ -64,14 +64,18 @@ def origin_of(module: str, packages: frozenset[str]) -> Origin:
 
 
 def _is_of_python(top: str) -> bool:
-    """Return True for a module of the standard library that no file of somebody else hides."""
+    """Return True for a module of the standard library, unless another file of the same name hides
+    it.
+    """
     if top in ("builtins", "__future__"):
         return True
     return top in sys.stdlib_module_names and not _shadowed(top)
 
 
 def _stated_or_searched(module: str, top: str) -> str | None:
-    """Return the file of a module; an installed package is believed where it says that it is."""
+    """Return the path of the file of a module. For an installed package, its own ``__file__`` is
+    taken.
+    """
     if module == top:
         file: str | None = getattr(sys.modules.get(module), "__file__", None)
         if file is not None and _is_installed(file):
@@ -80,7 +84,7 @@ def _stated_or_searched(module: str, top: str) -> str | None:
 
 
 def _version_at(file: str, top: str) -> str:
-    """Return name and version of the distribution that a file is of, or an empty text."""
+    """Return name and version of the distribution that contains a file, or an empty text."""
     return version_of(top) if _is_installed(file) else ""
 
 
@@ -96,7 +100,7 @@ def _is_installed(file: str) -> bool:
     return any(
         _holds_distributions(str(folder))
         for folder in Path(file).parents
-        # a folder in which imports are searched
+        # only folders that imports search
         if str(folder) in sys.path
     ) or (not _INSTALLED.isdisjoint(Path(file).parts))
 
@@ -110,8 +114,8 @@ def _holds_distributions(folder: str) -> bool:
 
 
 def module_path(module: str) -> str | None:
-    """Return the file of a module, or None; a loaded module knows its file, and another one is
-    searched.
+    """Return the path of the file of a module, or None. A loaded module states its file; for any
+    other module the file is searched.
     """
     if module in sys.modules:
         file = getattr(sys.modules[module], "__file__", None)
@@ -122,7 +126,7 @@ def module_path(module: str) -> str | None:
         if spec is None or not spec.has_location or not os.path.isfile(spec.origin or ""):
             return None
         return spec.origin
-    # the first folder that has it
+    # the first folder that contains the module
     return next(filter(None, (_file_in(folder, name) for folder in _folders_above(module))), None)
 
 
@@ -175,18 +179,20 @@ def metadata_folder(name: str) -> str:
 
 
 def metadata_text(name: str, file: str) -> bytes:
-    """Return a file of the metadata of an installed distribution, or nothing if it has none."""
+    """Return the bytes of a metadata file of an installed distribution; empty if it has no such
+    file.
+    """
     return _text(metadata_folder(name), file)
 
 
 def plain(name: str) -> str:
-    """Return the name of a distribution in the form in which equal names are equal."""
+    """Return the normalised name of a distribution: lower case, with ``_`` for each separator."""
     return re.sub(r"[-_.]+", "_", name).lower()
 
 
 @functools.cache
 def _releases() -> dict[str, tuple[str, str]]:
-    """Return version and folder of metadata of each installed distribution, from the names of
+    """Return version and metadata folder of each installed distribution, taken from the names of
     these folders.
     """
     releases: dict[str, tuple[str, str]] = {}
@@ -225,15 +231,13 @@ def _distributions(top: str) -> list[str]:
 
 
 def _contains(folder: str, top: str, inside: re.Pattern[bytes]) -> bool:
-    """Return True if a distribution names a top-level module, or if a file of it is in this
-    module.
-    """
+    """Return True if a distribution lists a top-level module, or has a file inside it."""
     names = _text(folder, "top_level.txt").decode(errors="replace").split()
     return top in names if names else inside.search(_text(folder, "RECORD")) is not None
 
 
 def _text(folder: str, name: str) -> bytes:
-    """Return a file of a folder, or nothing if it cannot be read."""
+    """Return the bytes of a file in a folder; empty if it cannot be read."""
     try:
         with open(os.path.join(folder, name), "rb") as file:
             return file.read()
@@ -242,15 +246,15 @@ def _text(folder: str, name: str) -> bytes:
 
 
 def contents(module: str) -> Mapping[str, Any]:
-    """Return what a loaded module holds, without asking the module; ``sys.modules`` may hold any
-    object.
+    """Return the attributes of a loaded module without calling its own code; ``sys.modules`` may
+    contain any object.
     """
     return getattr(sys.modules[module], "__dict__", {})
 
 
 def _without_file(module: str, top: str, counts_by_source: bool) -> Origin:
-    """Return the origin of a module without a file: a folder of modules, a built-in part, or a
-    missing module.
+    """Return the origin of a module without a file: a folder of modules, a module made at run time,
+    or a missing module.
     """
     if module in sys.modules:
         return _loaded_without_file(module, top, counts_by_source)
@@ -264,18 +268,20 @@ def _without_file(module: str, top: str, counts_by_source: bool) -> Origin:
 
 
 def _loaded_without_file(module: str, top: str, counts_by_source: bool) -> Origin:
-    """Return the origin of a loaded module without a file: a folder of modules, or something
-    that a package made at run time.
+    """Return the origin of a loaded module without a file: a folder of modules, or a module that a
+    package made at run time.
     """
     module_attributes = contents(module)
     if module_attributes.get("__path__") is not None and not module_attributes.get("__file__"):
         return Origin("folder")
+    # a package that counts by its source has no version here; a top-level module without a file was
+    # made by no package
     version = "" if counts_by_source or module == top else version_of(top)
     return Origin("distribution", None, version) if version else Origin("nowhere")
 
 
 def _folders_above(module: str) -> list[str]:
-    """Return the folders of the package that a module is in."""
+    """Return the folders of the package that contains a module."""
     parent = module.rpartition(".")[0]
     return list(contents(parent).get("__path__", ())) if parent in sys.modules else _folders(parent)
 
@@ -291,7 +297,7 @@ def _folders(package: str) -> list[str]:
 
 
 def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
-    """Return what the import finds for a top-level module, or None."""
+    """Return the import spec of a top-level module, or None."""
     try:
         return importlib.util.find_spec(top)
     except (ValueError, ImportError):
@@ -307,20 +313,20 @@ def _file_in(folder: str, name: str) -> str | None:
         file = module_file(folder, [name])
         if file is not None:
             return str(file)
-    # also compiled modules
+    # this also finds compiled modules
     return next(
         (os.path.join(folder, name + end) for end in _ENDS if name + end in _listed[folder]), None
     )
 
 
 def look_again() -> None:
-    """Forget which files are in which folders, because a file may be new."""
+    """Forget the listings of folders, because there may be new files."""
     _listed.clear()
 
 
 def _shadowed(top: str) -> bool:
-    """Return True if a loaded module with a name of the standard library is a file of somebody
-    else.
+    """Return True if the loaded module with a name of the standard library comes from a file
+    outside of the standard library.
     """
     file = getattr(sys.modules.get(top), "__file__", None)
     return bool(file) and (not str(file).startswith(_STANDARD) or _is_installed(str(file)))

@@ -1,4 +1,6 @@
-"""Files that others may have written: regular ones alone are read, records have a seal."""
+"""Safe reading of files that other users may have written: only regular files are read, and records
+have a seal.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +20,25 @@ import xxhash
 
 # --- regular file ---------------------------------------------------------------------------------
 
-# Reading of files of the program's own kinds: texts, documents and records, never of what is no
-# regular file.
+# Reading of the program's own kinds of files: texts, documents and records. Anything but a regular
+# file is refused.
 #
-# A pipe, a device or a socket in the place of a file makes nobody wait, and a file that is too long
-# for its kind is not read. This module imports little, because the fast commands read files with
-# it.
+# So a pipe, a device or a socket in the place of a file never blocks the program, and a file that
+# is too long for its kind is not read. This module imports little, because the fast commands read
+# files with it.
 
 
-MOST = 64 << 20  #: bytes of a document or a record, at most
+MOST = 64 << 20  #: greatest size of a document or a record (bytes)
 _KINDS = ((stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISDIR, "a folder"))
 
 
 class NotRegular(OSError, ValueError):
-    """Error for what is no regular file, or is longer than a file of its kind."""
+    """Error for a path that is not a regular file, or for a file that is too long for its kind."""
 
 
 def refuse_other_than_file(path: Path | str) -> None:
-    """Raise `NotRegular` for a pipe, a device, a socket or a folder; a file that is missing
-    passes.
+    """Raise `NotRegular` for a pipe, a device, a socket or a folder; do nothing for a missing
+    file.
     """
     try:
         mode = os.stat(path).st_mode
@@ -46,7 +48,7 @@ def refuse_other_than_file(path: Path | str) -> None:
 
 
 def _refuse(path: Path | str, mode: int) -> None:
-    """Raise `NotRegular` for the mode of anything but a regular file."""
+    """Raise `NotRegular` if a file mode is not that of a regular file."""
     if not stat.S_ISREG(mode):
         kind = next((kind for fits, kind in _KINDS if fits(mode)), "a device")
         raise NotRegular(f"{path} is not a regular file but {kind}: give the path of a file")
@@ -56,10 +58,10 @@ def opened(path: Path | str) -> BufferedReader:
     """Open a regular file to read its bytes, without waiting; raise `NotRegular` for anything
     else.
     """
-    refuse_other_than_file(path)  # some devices do something when they are opened
+    refuse_other_than_file(path)  # checked first, since opening some devices has an effect
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        # it may have been replaced since the first look
+        # the file may have been replaced since the first check
         _refuse(path, os.fstat(descriptor).st_mode)
     except NotRegular:
         os.close(descriptor)
@@ -89,8 +91,8 @@ def head_of(path: Path | str, count: int) -> bytes:
 def text_of(
     path: Path | str, encoding: str = "utf-8", errors: str = "strict", max_bytes: int = MOST
 ) -> str:
-    """Return the text of a regular file, with ``\\n`` at the end of each line; raise what
-    `bytes_of` raises.
+    """Return the text of a regular file, with ``\\n`` at the end of each line. Raises the same
+    errors as `bytes_of`.
     """
     return (
         bytes_of(path, max_bytes).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
@@ -102,7 +104,7 @@ def text_of(
 # Permissions below the root of a store: folders and files have the group and the permissions of the
 # root.
 #
-# A umask of 022 would take from the group what the owner of the root gave it.
+# A umask of 022 would remove the group's permission to write, which the owner of the root granted.
 
 
 def make_folders(folder: str, root: str) -> None:
@@ -118,19 +120,19 @@ def make_folders(folder: str, root: str) -> None:
     make_folders(os.path.dirname(folder), root)
     with suppress(FileExistsError):
         os.mkdir(folder)
-        # all permissions, with those that set group and sticky bit
+        # all permission bits, with set-group-ID and sticky bit
         inherit(folder, root, 0o7777)
         if os.stat(folder).st_gid != os.getegid():
-            # what is made in it has its group
+            # set-group-ID: new entries get the group of the folder
             os.chmod(folder, os.stat(folder).st_mode | stat.S_ISGID)
 
 
 def inherit(path: str, root: str, mask: int) -> None:
-    """Give a file or folder the group of ``root``, and those of its permissions that are in
+    """Give a file or folder the group of ``root``, and those permissions of ``root`` that are in
     ``mask``.
     """
     root_status, own_status = os.stat(root), os.stat(path)
-    with suppress(OSError):  # of a group of which this user is no member
+    with suppress(OSError):  # fails if the user is not a member of the group
         if own_status.st_gid != root_status.st_gid:
             os.chown(path, -1, root_status.st_gid)
     wanted_mode = root_status.st_mode & mask
@@ -141,21 +143,22 @@ def inherit(path: str, root: str, mask: int) -> None:
 
 # --- seal -----------------------------------------------------------------------------------------
 
-# Seal of a record of the cache: format version, checksum and, where a secret is set, a signature.
+# The seal of a record of the cache consists of the format version, a checksum and, if a secret is
+# set, a signature.
 #
 # A record is a dict that is written as one line of JSON. `seal_record` adds the fields ``format``,
 # ``seal`` (xxh3 of all bytes before it) and ``sign`` (HMAC-SHA256 of format, kind of file, key and
-# SHA-256 of these bytes). The checksum finds damage; only the signature finds a forgery, and what
-# was signed in the place of another thing, because it is that of one kind of file and one key.
+# SHA-256 of these bytes). The checksum detects damage. Only the signature detects a forgery, or a
+# signed record that was moved to another place, because it covers the kind of file and the key.
 # ``NEUSEE_CACHE_SECRET`` holds the secret, or several separated by commas: the first one signs, and
-# each one is accepted. A file of another kind begins with such a record, which holds the SHA-256 of
-# the rest.
+# each one is accepted. A file whose content is no record begins with such a record, which holds the
+# SHA-256 of the rest.
 
 
 #: version of the format of all files of the cache; files of version 0.1 have no version and count
 #: as 1
 FORMAT = 2
-#: what a signature is for: a line or a file of a cache, or the secret of a worker
+#: purpose of a signature: a line or a file of a cache, or the secret of a worker
 Kind = Literal[
     "result",
     "small result",
@@ -171,13 +174,13 @@ Kind = Literal[
 ]
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 _SEAL, _SIGN = b',"seal":"', b'","sign":"'
-_SEALED, _SIGNED = len(_SEAL) + 32, len(_SIGN) + 64  #: bytes of each field with its digits
+_SEALED, _SIGNED = len(_SEAL) + 32, len(_SIGN) + 64  #: length (bytes) of each field with its digits
 _END = b'"}'
 
 
 class NotRead(ValueError):
-    """Error for an undamaged record that this program does not read; it counts as missing and
-    stays as it is.
+    """Error for an intact record that this program cannot read; the record counts as missing and is
+    left unchanged.
     """
 
 
@@ -198,21 +201,21 @@ def secrets() -> tuple[bytes, ...]:
 
 @functools.lru_cache(8)
 def _split(text: str) -> tuple[bytes, ...]:
-    """Return the secrets in a text, which commas separate."""
+    """Return the secrets in a text, which are separated by commas."""
     return tuple(secret.strip().encode() for secret in text.split(",") if secret.strip())
 
 
 def signature(kind: Kind, key: str, sha256: bytes) -> str:
-    """Return the signature of a content under a key as 64 hexadecimal digits, or an empty text
-    without a secret.
+    """Return the signature of content with the digest ``sha256`` under a key, as 64 hexadecimal
+    digits; an empty text if no secret is set.
     """
     secret_values = secrets()
     return _signed_by(secret_values[0], kind, key, sha256) if secret_values else ""
 
 
 def check_signature(sign: str, kind: Kind, key: str, sha256: bytes) -> None:
-    """Raise `Unsigned` if a secret is set and ``sign`` is the signature of this content, kind
-    and key by none.
+    """Raise `Unsigned` if a secret is set and no secret gives the signature ``sign`` for this
+    digest, kind and key.
     """
     secret_values = secrets()
     if secret_values and not any(
@@ -223,7 +226,7 @@ def check_signature(sign: str, kind: Kind, key: str, sha256: bytes) -> None:
 
 
 def _signed_by(secret: bytes, kind: Kind, key: str, sha256: bytes) -> str:
-    """Return the signature of a content by one secret: HMAC-SHA256 of format, kind, key and
+    """Return the signature of content by one secret: HMAC-SHA256 of format, kind, key and
     digest.
     """
     signed_text = b"neusee cache %d\n%s\n%s\n%s" % (
@@ -241,7 +244,7 @@ def seal_record(kind: Kind, record: Mapping[str, Any]) -> bytes:
     The record may have a field ``key``. The signature covers it and the kind of the file that the
     record is written to.
     """
-    # without the brace at the end, behind which seal and signature come
+    # without the last brace: seal and signature come before it
     body = _encode({**record, "format": FORMAT})[:-1].encode()
     sealed = body + _SEAL + xxhash.xxh3_128_hexdigest(body).encode()
     if secrets():
@@ -269,14 +272,14 @@ def unseal_record(kind: Kind, raw: bytes) -> dict[str, Any]:
 
 
 def seal_file(kind: Kind, name: str, content: bytes) -> bytes:
-    """Return the record that `unseal_file` compares with a content; the signature covers kind,
-    name and content.
+    """Return the record that seals the content of a file; `unseal_file` checks it. The signature
+    covers kind, name and content.
     """
     return seal_record(kind, {"key": name, "sha256": hashlib.sha256(content).hexdigest()})
 
 
 def unseal_file(kind: Kind, name: str, seal: bytes, content: bytes) -> bytes:
-    """Return the content of a file whose seal is right.
+    """Return the content of a file after a check of its seal.
 
     Raises `NotRead` for another format version or a missing signature, and `ValueError` for any
     other content or name.
@@ -287,20 +290,20 @@ def unseal_file(kind: Kind, name: str, seal: bytes, content: bytes) -> bytes:
 
 
 def may_change(file: int) -> bool:
-    """Return True if a secret is set, and another user owns an opened file and could change it
-    after its check.
+    """Return True if a secret is set and an opened file belongs to another user, who could change
+    it after the check.
     """
     return bool(secrets()) and os.fstat(file).st_uid != os.geteuid()
 
 
 def checked_body(raw: bytes) -> tuple[bytes, str]:
-    """Return the JSON text before the seal, without its last brace, and the signature; compare only
-    the checksum.
+    """Return the JSON text before the seal, without its last brace, and the signature. Only the
+    checksum is checked.
 
     Raises `ValueError` for a checksum that does not match.
     """
     unsigned, sign = raw[: -len(_END)], b""
-    # the signature is the last field, where there is one
+    # the signature, if any, is the last field
     if unsigned[-_SIGNED:].startswith(_SIGN):
         unsigned, sign = unsigned[:-_SIGNED], unsigned[-_SIGNED + len(_SIGN) :]
     body = unsigned[:-_SEALED]

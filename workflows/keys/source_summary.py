@@ -1,4 +1,6 @@
-"""Summary of a source file: digests of its definitions, its imports and what it changes."""
+"""Summary of a source file: the digests of its definitions, its imports, and what it may change
+elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -39,17 +41,17 @@ from neusee.workflows.keys.unfollowed_constructs import (
 
 # --- code objects ---------------------------------------------------------------------------------
 
-# Digests of compiled functions, which tell whether the code that a process runs is that of a source
-# file.
+# Digests of compiled functions. They show whether the code that a process runs is the code of a
+# source file.
 #
 # Line numbers, file names and docstrings of modules and classes do not count.
 
 
-#: what the byte code of a source depends on beside the source
+#: version and options of Python, on which the byte code of a source depends
 PYTHON = (
     f"{'{}.{}'.format(*sys.version_info)}-{importlib.util.MAGIC_NUMBER.hex()}-{sys.flags.optimize}"
 )
-_MOST_DIGESTS = 20_000  #: number of code objects whose digests are kept
+_MOST_DIGESTS = 20_000  #: greatest number of code objects whose digests are kept
 _known: dict[int, tuple[CodeType, str]] = {}  #: code objects with their digests, by id
 _CODE_DIGEST_DIGITS = 12  #: digits of the digest of a code object
 
@@ -61,8 +63,8 @@ def functions_of(source: bytes) -> list[str]:
 
 
 def function_code(code: CodeType) -> str:
-    """Return the digest of a code object, which never changes, with its name, its constants and
-    its inner functions.
+    """Return the digest of a code object with its name, its constants and its inner functions; a
+    code object never changes.
     """
     digested = _known.get(id(code))
     if digested is None or digested[0] is not code:
@@ -73,15 +75,15 @@ def function_code(code: CodeType) -> str:
 
 
 def _digest_of(code: CodeType) -> str:
-    """Return the digest of a code object: byte code, constants, names and numbers of arguments,
-    without lines and file.
+    """Return the digest of a code object: byte code, constants, names and numbers of arguments, but
+    not line numbers or file name.
     """
     constants = tuple(
         function_code(item) if isinstance(item, CodeType) else item for item in code.co_consts
     )
     names = (code.co_qualname, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
     sizes = (code.co_flags, code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
-    # format 2 has no references, which differ between equal objects
+    # marshal format 2 writes no references, which may differ between equal objects
     marshalled = marshal.dumps((code.co_code, constants, names, sizes, code.co_exceptiontable), 2)
     return xxhash.xxh3_64_hexdigest(marshalled)[:_CODE_DIGEST_DIGITS]
 
@@ -98,8 +100,8 @@ def _inner(code: CodeType) -> Iterator[CodeType]:
 
 # --- reachable code -------------------------------------------------------------------------------
 
-# Statements of a module that a node may run: what the module runs at import, and what the names in
-# use refer to.
+# Statements of a module that a node may run: those that run at import, and those that define the
+# names in use.
 
 
 _QUIET = ("node", "pytest", "hypothesis", "functools", "staticmethod", "dataclass", "torch.no_grad")
@@ -112,7 +114,7 @@ class Statement(NamedTuple):
 
     first: int
     last: int  #: lines
-    binds: list[str]  #: names; empty for a statement that is run for its effect
+    binds: list[str]  #: names that it defines; empty for a statement that is run for its effect
     refers: list[str]  #: names that it reads, at any depth
     writes: list[str]  #: names whose object it changes, as in ``log.append(x)``
 
@@ -123,8 +125,8 @@ def statements(blocks: Iterable[Block]) -> list[Statement]:
 
 
 def reached(parts: Sequence[Statement], names: Collection[str] | None) -> list[range]:
-    """Return the lines of the statements that the use of some names, or None for all names, may
-    run.
+    """Return the lines of the statements that may run when some names are used; None stands for all
+    names.
     """
     statements_run = parts
     if names is not None and "*" not in names:
@@ -133,16 +135,16 @@ def reached(parts: Sequence[Statement], names: Collection[str] | None) -> list[r
 
 
 def read_names(parts: Sequence[Statement], names: Collection[str]) -> set[str]:
-    """Return the names that the statements read which the use of some names, or of all if none
-    is given, may run.
+    """Return the names that are read by the statements that may run when some names are used; an
+    empty collection stands for all names.
     """
     given_names = set(names) or set(chain.from_iterable(statement.binds for statement in parts))
     return _led_to(parts, given_names)
 
 
 def _led_to(parts: Sequence[Statement], names: set[str]) -> set[str]:
-    """Return some names with all that is read by the statements that their use may run."""
-    # until no name is added
+    """Return ``names`` and all names that the statements read that may run when these are used."""
+    # repeated until no name is added
     while True:
         statements_run = _run_by(parts, names)
         names_with_read = names.union(*(statement.refers for statement in statements_run))
@@ -152,7 +154,9 @@ def _led_to(parts: Sequence[Statement], names: set[str]) -> set[str]:
 
 
 def _run_by(parts: Sequence[Statement], names: set[str]) -> list[Statement]:
-    """Return the statements that bind one of the names, and those that are run for their effect."""
+    """Return the statements that define one of the names, and those that are run for their
+    effect.
+    """
     return [
         statement
         for statement in parts
@@ -161,7 +165,7 @@ def _run_by(parts: Sequence[Statement], names: set[str]) -> list[Statement]:
 
 
 def written_only(parts: Sequence[Statement]) -> set[str]:
-    """Return the names whose objects a module changes and that none of its code reads, such as a
+    """Return the names of objects that a module changes but that none of its code reads, such as a
     log.
     """
     writes = chain.from_iterable(statement.writes for statement in parts)
@@ -169,11 +173,11 @@ def written_only(parts: Sequence[Statement]) -> set[str]:
 
 
 def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
-    """Return a statement at the top level with its lines and the names that it binds, reads and
-    writes.
+    """Return a top-level statement with its lines and the names that it defines, reads and
+    changes.
     """
     decorators = getattr(item, "decorator_list", ())
-    # decorators stand above the definition
+    # decorators are on lines above the definition
     first_line = min([item.lineno, *(decorator.lineno for decorator in decorators)])
     ids_of_written = {id(name) for name in _noted(kinds)}
     names_loaded = [name for name in each(kinds, ast.Name) if isinstance(name.ctx, ast.Load)]
@@ -189,8 +193,8 @@ def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
 
 
 def _noted(kinds: Kinds) -> Iterator[ast.AST]:
-    """Yield the name in ``name.append(x)`` and ``name[i] = x``, which write to an object and do
-    not read it.
+    """Yield the name in ``name.append(x)`` and ``name[i] = x``, which change an object but do not
+    read it.
     """
     for item in each(kinds, ast.Expr):
         method = item.value.func if isinstance(item.value, ast.Call) else None
@@ -212,7 +216,7 @@ def _binds(item: ast.stmt) -> Iterable[str]:
 
 
 def _targets(item: ast.stmt) -> list[ast.expr]:
-    """Return what a statement gives a value, such as the names on the left side."""
+    """Return the expressions that a statement assigns to, such as the names on the left side."""
     if isinstance(item, ast.Assign):
         return item.targets
     target = getattr(item, "target", None)
@@ -221,17 +225,17 @@ def _targets(item: ast.stmt) -> list[ast.expr]:
 
 # --- outward code ---------------------------------------------------------------------------------
 
-# Code that changes, or looks for, what lies outside of its own module: patches, registries,
+# Code that changes objects outside of its own module, or searches for them: patches, registries,
 # subclasses, settings.
 #
-# A key follows imports. Code beside them, in another file of the same recipe, may change what the
-# followed code computes: it sets an attribute of a module or a class, fills a registry, or derives
-# a class. Such code is found here by its form, and in doubt it is found: a call whose value nobody
-# uses is there to change something.
+# A key covers imported code. Code in another file of the same recipe, which nobody imports, may
+# change what the covered code computes: it sets an attribute of a module or a class, fills a
+# registry, or derives a class. Such code is recognised by its form. In doubt it counts: a call
+# whose value nobody uses presumably changes something.
 
 
-#: packages whose functions change nothing that they are not given, except those with a name that
-#: says so
+#: packages whose functions change nothing but their arguments, except for functions whose name says
+#: so
 CALM = frozenset(
     {
         *(
@@ -283,7 +287,7 @@ CALM = frozenset(
         ),
     }
 )
-#: functions that decide no result, or a setting that each key has by its value
+#: functions that affect no result, or only a setting whose value is in each key
 _QUIET_CALLS = (
     *(
         "warnings.warn",
@@ -335,7 +339,7 @@ _SETTER = re.compile(
     r"putenv|unsetenv|chdir|umask"
 )
 _CHANGER = re.compile(r"(append|extend|insert|clear|pop|popitem|remove|discard|setdefault|update)$")
-#: methods that change their object, in packages that are not calm
+#: methods that change their object, in packages outside of `CALM`
 _MUTATOR = re.compile(
     r"(add|push|train|eval|half|double|float|to|apply|load_state_dict|requires_grad|sort|reverse|fill|put|itemset|"
     r"resize|start|step|send|write)$|.*[^_]_$"
@@ -354,23 +358,24 @@ _DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
 
 
 class Reach(NamedTuple):
-    """What the code of a module changes or looks for beyond itself."""
+    """What the code of a module may change, or searches for, outside of the module."""
 
-    outward: list[str]  #: full names of what it changes in other modules; an empty one is unknown
-    #: names of other modules that it gives to functions, which may change their arguments
+    #: full names of what it may change in other modules; an empty name stands for an unknown one
+    outward: list[str]
+    #: names from other modules that it passes to functions, which may change their arguments
     passed: list[str]
-    unused: list[str]  #: modules that it imports and does not name: for what their import does
-    inward: bool  #: True if its functions change what its own module holds
+    unused: list[str]  #: modules that it imports but never names, so for the effect of the import
+    inward: bool  #: True if its functions change objects of its own module
     changes_arguments: bool
-    seeks: bool  #: True if it looks for classes and objects that no import names
+    seeks: bool  #: True if it searches for classes and objects without naming them
 
 
 NOWHERE = Reach([], [], [], False, False, False)
 
 
 def reach_of(tree: ast.Module, bound: Mapping[str, str]) -> Reach:
-    """Return what a module reaches; ``bound`` has the full name of each imported name, relative
-    ones with a dot.
+    """Return what the code of a module may change or search for; ``bound`` maps each imported name
+    to its full name, which begins with a dot for a relative import.
     """
     code_pass = _Pass(bound)
     code_pass.visit_all(tree.body, NameScope(tree, None))
@@ -390,8 +395,8 @@ def reach_of(tree: ast.Module, bound: Mapping[str, str]) -> Reach:
 
 
 def outward_names(reaches: Collection[Reach]) -> set[str]:
-    """Return the full names of what code may change in other modules, also by functions that it
-    calls.
+    """Return the full names of what code may change in other modules, directly or through functions
+    that it calls.
     """
     names = set(chain.from_iterable(reach.outward for reach in reaches))
     if any(reach.changes_arguments for reach in reaches):
@@ -400,11 +405,11 @@ def outward_names(reaches: Collection[Reach]) -> set[str]:
 
 
 class _Pass:
-    """One pass over the code of a module."""
+    """A pass over the code of a module that collects the fields of its `Reach`."""
 
     def __init__(self, bound: Mapping[str, str]) -> None:
         self._bound = bound
-        # what it changes elsewhere, what it gives to functions, names that occur
+        # names changed in other modules, names passed to functions, and all names that occur
         self.outward, self.passed, self.named = set[str](), set[str](), set[str]()
         self.inward = self.changes_arguments = self.seeks = False
 
@@ -416,7 +421,7 @@ class _Pass:
         """Note what a part of the code may change, and then visit its own parts."""
         if isinstance(item, _DEFINITIONS):
             self._definition(item, scope)
-            # the parts of a definition are in its own scope
+            # names inside a definition belong to its own scope
             scope = NameScope(item, scope)
         elif isinstance(item, ast.Call):
             self._call(item, scope, bare=False)
@@ -432,7 +437,9 @@ class _Pass:
     # --- stores -----------------------------------------------------------------------------------
 
     def _name(self, item: ast.Attribute | ast.Name | ast.Subscript, scope: NameScope) -> None:
-        """Note a name or an attribute, and what it is a part of where it is set or deleted."""
+        """Note a name; note the object of an attribute or index expression that is set or
+        deleted.
+        """
         self.seeks |= last_name(item) in _SEEKS
         if isinstance(item, ast.Name):
             self.named.add(item.id)
@@ -440,45 +447,49 @@ class _Pass:
             self._changed(item, scope)
 
     def _changed(self, item: ast.expr, scope: NameScope) -> None:
-        """Note that a part of an object, ``item``, is set or deleted."""
+        """Note that the code sets or deletes ``item``, which is a part of an object."""
         for root in roots(item, scope, self._bound):
             if root.kind == "import":
                 self.outward.add(root.name)
             elif root.kind == "argument":
                 self.changes_arguments = True
             else:
-                # at the top level of a module it sets up its own names
+                # statements at the top level of a module only build the module itself
                 self.inward |= root.kind == "class" or not scope.is_module
 
     # --- calls ------------------------------------------------------------------------------------
 
     def _call(self, call: ast.Call, scope: NameScope, bare: bool) -> None:
-        """Note what a call may change; ``bare``: nobody uses its value, so it is there to change
-        something.
+        """Note what a call may change; ``bare``: no code uses its value, so the call presumably
+        changes something.
         """
         function_name = last_name(call.func)
         if function_name in ("setattr", "delattr", "__setattr__", "__delattr__"):
-            # the object whose attribute is set
+            # the first argument is the object whose attribute is set
             for argument in call.args[:1]:
                 self._changed(argument, scope)
         for root in roots(call.func, scope, self._bound):
             if root.kind == "import":
                 self._imported_call(call, root.name, scope, bare)
+            # a call such as f(x) may change its arguments
             elif isinstance(call.func, ast.Name):
                 self.passed |= self._given(call, scope)
+            # a call such as x.f() may change the object x; at the top level it only builds the
+            # module
             elif root.kind in ("own", "class") and not scope.is_module:
                 self.inward |= bare or _changes(function_name)
 
     def _imported_call(self, call: ast.Call, full: str, scope: NameScope, bare: bool) -> None:
-        """Note the call of a function of another module, if it may change something."""
+        """Note the call of a function of another module if the call may change something."""
         function_name = last_name(call.func)
-        # a method of what another call returned
+        # append the method's name for a method of the result of another call
         full_name = full if function_name in full.split(".") else f"{full}.{function_name}"
         passed_names = self._given(call, scope)
         if _is_quiet(full_name, call):
             return
         if is_calm(full):
-            # by the convention of torch, such a function changes its argument
+            # by the convention of torch, a name that ends with "_" means that the argument is
+            # changed
             if bare or function_name.endswith("_"):
                 self.outward.update(filterfalse(is_calm, passed_names))
         else:
@@ -487,46 +498,46 @@ class _Pass:
             self.outward.add(full_name)
 
     def _given(self, call: ast.Call, scope: NameScope) -> set[str]:
-        """Return the names of what other modules hold and a call is given, not of what their
-        functions return.
+        """Return the names from other modules that a call gets as arguments, but not the results of
+        functions of other modules.
         """
         names = set[str]()
         for argument in [*call.args, *(word.value for word in call.keywords)]:
             if not isinstance(argument, ast.Call):
                 names |= self._imports(argument, scope)
-        # "()": the result of a call
+        # "()" in a name stands for the result of a call
         return {name for name in names if "()" not in name}
 
     def _imports(self, item: ast.expr, scope: NameScope) -> set[str]:
-        """Return the full names of what an expression is part of in other modules."""
+        """Return the full names of the objects of other modules that an expression is part of."""
         return {root.name for root in roots(item, scope, self._bound) if root.kind == "import"}
 
     # --- definitions ------------------------------------------------------------------------------
 
     def _definition(self, item: ast.AST, scope: NameScope) -> None:
-        """Note the decorators and base classes that another module has: both may register what
-        is defined.
+        """Note decorators and base classes from other modules: both may register the function or
+        class.
         """
         for mark in getattr(item, "decorator_list", ()):
             decorator = mark.func if isinstance(mark, ast.Call) else mark
             imports = self._imports(decorator, scope)
             self.outward.update(filterfalse(_is_quiet_decorator, imports))
         if isinstance(item, ast.ClassDef):
-            # also the metaclass, which is a keyword
+            # keywords of a class, such as the metaclass, too
             for base in [*item.bases, *(word.value for word in item.keywords)]:
                 imports = self._imports(base, scope)
                 self.outward.update(filterfalse(_is_quiet_base, imports))
 
 
 def is_calm(name: str) -> bool:
-    """Return True for a name of a package whose functions change nothing that they are not
-    given.
-    """
+    """Return True for a name from a package whose functions change nothing but their arguments."""
     return name.partition(".")[0] in CALM
 
 
 def _changes_package(name: str, method: str, bare: bool) -> bool:
-    """Return True for a call that may change the package of its function, by its full name."""
+    """Return True for a call that may change the package of the called function, given by its full
+    name.
+    """
     if not is_calm(name):
         return bare or _changes(method)
     return name.startswith("torch.library.") or (bare and _is_setter(method))
@@ -543,8 +554,8 @@ def _changes(method: str) -> bool:
 
 
 def _is_quiet_decorator(name: str) -> bool:
-    """Return True for a decorator that registers nothing; a hook of a node of neusee changes
-    that node.
+    """Return True for a decorator that registers nothing. Decorators that add a hook to a node of
+    neusee do change that node.
     """
     if name.startswith("neusee."):
         return not _HOOK.fullmatch(name.rpartition(".")[2])
@@ -552,12 +563,12 @@ def _is_quiet_decorator(name: str) -> bool:
 
 
 def _is_quiet_base(name: str) -> bool:
-    """Return True for a class that registers none of the classes that are derived from it."""
+    """Return True for a class that keeps no register of its subclasses."""
     return is_calm(name) or _starts(name, _QUIET_CALLS)
 
 
 def _is_quiet(name: str, call: ast.Call) -> bool:
-    """Return True for a function that decides no result, such as one that ignores warnings."""
+    """Return True for a function that affects no result, such as one that suppresses warnings."""
     if name in ("warnings.filterwarnings", "warnings.simplefilter"):
         action = call.args[0] if call.args else None
         return isinstance(action, ast.Constant) and action.value in ("ignore", "once", "default")
@@ -565,25 +576,25 @@ def _is_quiet(name: str, call: ast.Call) -> bool:
 
 
 def _starts(name: str, entries: tuple[str, ...]) -> bool:
-    """Return True if a full name is one of the entries, or is in one of them."""
+    """Return True if a full name is one of the entries, or lies inside one of them."""
     return any(f"{name}.".startswith(f"{entry}.") for entry in entries)
 
 
 # --- source summary -------------------------------------------------------------------------------
 
-# Summary of a source file: the digests of the file and of its definitions, its imports, and what is
-# not followed.
+# Summary of a source file: the digests of the file and of its definitions, its imports, and the
+# constructs that cannot be followed.
 
 
 ROOT = "neusee.nodes"
-#: lock of the parser of Python 3.11, which miscounts the depth in two threads
+#: lock around the parser: that of Python 3.11 miscounts the depth if two threads parse
 _parsing = threading.Lock()
 _READS = ("__doc__", "getdoc", "cleandoc", "getcomments")  #: names by which code reads docstrings
 _DEFINITION_DIGEST_DIGITS = 16  #: digits of the digest of a definition
-#: packages of which no chain is noted
+#: packages whose attribute expressions are not noted
 _LARGE = frozenset({"torch", "numpy", "scipy", *sys.stdlib_module_names})
 
-#: level of a relative import, module, name (empty for ``import module``)
+#: level of a relative import (0 if absolute), module, name (empty for ``import module``)
 Import = tuple[int, str, str]
 #: use of an imported name: its import, the attributes after the name, the line
 Use = tuple[int, str, str, str, int]
@@ -611,7 +622,7 @@ def summarise(source: bytes, own: bool = False) -> Summary:
     """Return the summary of a source file; comments, layout and docstrings do not affect the
     digests.
 
-    What only matters in code of a user is looked for if the file is the user's ``own``.
+    With ``own``, constructs that matter only in code of the user are searched for too.
     """
     # one thread at a time
     with _parsing:
@@ -622,7 +633,7 @@ def summarise(source: bytes, own: bool = False) -> Summary:
     imports, imports_by_name = _imports(tree.all)
     names = _full_names(imports_by_name)
     unfollowed_constructs, reach = constructs(tree, names), NOWHERE
-    # what only matters in code of a user
+    # constructs that matter only in code of a user
     if own:
         unfollowed_constructs = _with_constructs_of_users(
             unfollowed_constructs, syntax_tree, tree, names
@@ -633,7 +644,7 @@ def summarise(source: bytes, own: bool = False) -> Summary:
         )
     return Summary(
         tree=syntax_digest,
-        # docstrings count where any code reads one
+        # used instead of ``tree`` if any code reads docstrings
         whole=digest(syntax_digest, tree.documents),
         documents=_reads_docstrings(tree.all, own) or _reads_docstrings(tree.not_run, own),
         imports=[*imports, *_literal_imports(tree.all, names)],
@@ -658,11 +669,11 @@ def _names_from_modules(bound: Mapping[str, set[Import]]) -> list[str]:
 
 
 def _full_names(bound: Mapping[str, set[Import]]) -> dict[str, str]:
-    """Return the full name of each name that an import binds that is not relative."""
+    """Return the full name of each name that an absolute import binds."""
     names: dict[str, str] = {}
     for name, import_forms in bound.items():
         for import_form in sorted(import_forms):
-            # level 0: not relative
+            # level 0: an absolute import
             if not import_form[0]:
                 names[name] = ".".join(filter(None, import_form[1:]))
     return names
@@ -721,7 +732,9 @@ def _literal_imports(kinds: Kinds, names: Mapping[str, str]) -> Iterator[Import]
 def _with_constructs_of_users(
     usual: list[Construct], parsed: ast.Module, tree: Syntax, names: Mapping[str, str]
 ) -> list[Construct]:
-    """Return what is not followed, with what only matters in code of a user."""
+    """Return the constructs that cannot be followed, including those that matter only in code of a
+    user.
+    """
     usual_places = {(item.line, item.text.rpartition(".")[2]) for item in usual}
     of_users = [*facts(tree.all, names), *moments(tree.all, names)]
     further = [
@@ -731,8 +744,8 @@ def _with_constructs_of_users(
 
 
 def _reads_docstrings(kinds: Kinds, own: bool) -> bool:
-    """Return True for code that reads a docstring as data, or attributes that it does not name
-    in code of a user.
+    """Return True for code that reads a docstring as data; in the user's ``own`` code also if it
+    reads attributes whose names it does not spell out.
     """
     if own and (reads_attributes_unnamed(kinds) or _spells_docstring(kinds)):
         return True
@@ -756,7 +769,7 @@ def _spells_docstring(kinds: Kinds) -> bool:
 
 def _declared(item: ast.stmt) -> list[str]:
     """Return the entries of ``__depends__ = ("table.csv", "env:NAME")``."""
-    # a statement at the top level of the module
+    # only an assignment to ``__depends__`` has entries
     if not isinstance(item, ast.Assign) or "__depends__" not in [
         getattr(name, "id", "") for name in item.targets
     ]:
@@ -776,15 +789,13 @@ def _declared(item: ast.stmt) -> list[str]:
 
 
 def _full(ways: set[Import]) -> str:
-    """Return the full name of what an import binds, with the dots of a relative import."""
+    """Return the full name that an import binds, with the leading dots of a relative import."""
     level, *names = min(ways)
     return "." * level + ".".join(filter(None, names))
 
 
 def _chained(way: Import) -> bool:
-    """Return True for an import of which the attributes may name a module that is followed by
-    source.
-    """
+    """Return True for an import whose attributes may name a module that is followed by source."""
     return bool(way[0]) or _top(way[1]) not in _LARGE
 
 
@@ -813,14 +824,14 @@ def _chains(kinds: Kinds) -> Iterator[tuple[str, list[str], int]]:
     """Yield the first name, the attributes and the line number of each expression such as
     ``a.b.c`` in a module.
     """
-    # parts of earlier expressions, because an expression comes before its parts
+    # each expression comes before its parts, so the parts of earlier ones are skipped
     ids_of_parts: set[int] = set()
     for item in each(kinds, ast.Attribute, ast.Name):
         if id(item) in ids_of_parts:
             continue
         expression: ast.expr = item
         attributes: list[str] = []
-        # from the last attribute to the first name
+        # walk from the last attribute to the first name
         while isinstance(expression, ast.Attribute):
             attributes.append(expression.attr)
             ids_of_parts.add(id(expression.value))

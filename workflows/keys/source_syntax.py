@@ -1,4 +1,6 @@
-"""Syntax of a source file: its blocks, what its names stand for, texts and scratch files."""
+"""Syntax of a source file: its statements, what its names stand for, its texts and its temporary
+files.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +11,39 @@ from typing import Any, Literal, NamedTuple
 
 # --- syntax pass ----------------------------------------------------------------------------------
 
-# One pass over the syntax tree of a source file, which finds all that a summary of the file needs.
+# One pass over the syntax tree of a source file collects everything that a summary of the file
+# needs.
 #
-# The text of a tree says the same as `ast.dump`: kinds, names and constants in order, without
-# docstrings and positions.
+# The text of a tree has the same content as `ast.dump`: kinds, names and constants in order, but
+# without docstrings and positions.
 
 
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 _DOCUMENTED = frozenset({ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef})
-#: fields that other fields decide, or nothing
+#: fields that follow from others, or that have no meaning for a run
 _UNSEEN = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
 _NOT_RUN = {
     "TYPE_CHECKING": "TYPE_CHECKING",
     "typing": "typing.TYPE_CHECKING",
     "__name__": "__name__ == '__main__'",
-}  #: tests of blocks that no process runs, by their first name
+}  #: tests of blocks that a run skips, by their first name
 
 Scope = tuple[ast.AST, ...]  #: the functions around an expression, the outermost first
 Kinds = dict[type, list[Any]]  #: parts of a tree by their type, each before its own parts
 
 
 class Block(NamedTuple):
-    """A statement at the top level of a module that a process runs, with its parts."""
+    """A top-level statement of a module that a process runs, with the parts of its syntax tree."""
 
     item: ast.stmt
     kinds: Kinds
 
 
 class Syntax:
-    """The texts of the statements of a module, its docstrings, and its parts that a process runs.
+    """The texts of the statements of a module, its docstrings, and the parts of its syntax tree
+    that a process runs.
 
-    Blocks for type checkers alone, and for a file that is run as a program, have texts and no
+    Blocks for type checkers only, and for a file that is run as a program, have texts but no
     parts.
     """
 
@@ -48,13 +52,13 @@ class Syntax:
         self.documents: list[tuple[int, int, str]] = []  #: the place and the text of each docstring
         #: calls that a process runs, with the functions around them
         self.calls: list[tuple[Scope, ast.Call]] = []
-        #: sums, paths that are put together, and so on, likewise
+        #: binary operations, such as sums and joined paths, with the functions around them
         self.joins: list[tuple[Scope, ast.BinOp]] = []
         self.blocks: list[Block] = []
         self.all: Kinds = defaultdict(list)  #: the parts of every block
         self.not_run: Kinds = defaultdict(list)
-        self._words: list[str] = []  # of the text of the present statement
-        self._kinds: Kinds = self.all  # where parts are added now
+        self._words: list[str] = []  # words of the text of the present statement
+        self._kinds: Kinds = self.all  # the dict to which parts are added now
         for item in self._without_docstring(tree):
             self._top(item)
         for block in self.blocks:
@@ -62,18 +66,18 @@ class Syntax:
                 self.all[kind] += nodes
 
     def _top(self, item: ast.stmt) -> None:
-        """Add a statement at the top level: its text, and its blocks that a process runs."""
+        """Add a top-level statement: its text, and the blocks in it that a process runs."""
         self._words = []
         if isinstance(item, ast.If) and _is_not_run(item.test):
             self._words.append("If")
             self._visit_quietly(item.test)
             self._visit_quietly(*item.body)
-            # as in the text of any `if`: the number of statements, and these
+            # as for any `if`: the number of statements, and then the statements
             self._words.append(f"[{len(item.orelse)}")
             for statement in item.orelse:
                 self._block(statement)
             if not item.orelse:
-                # something stands there, so that each statement has a block
+                # an empty block, so that each statement has one
                 self.blocks.append(Block(ast.copy_location(ast.Pass(), item), {}))
         else:
             self._block(item)
@@ -98,7 +102,7 @@ class Syntax:
             value = getattr(item, field)
             children = self._listed(item, field, value) if type(value) is list else [value]
             for child in children:
-                # parts without fields, such as operators, are words
+                # parts without fields, such as operators, are written as words
                 if isinstance(child, ast.AST) and child._fields:
                     self._visit(child, scope)
                 else:
@@ -106,7 +110,9 @@ class Syntax:
         return None
 
     def _scope_inside(self, item: ast.AST, scope: Scope) -> Scope:
-        """Note a call or a join with the functions around it, and return those around its parts."""
+        """Note a call or a binary operation with the functions around it; return the functions
+        around its parts.
+        """
         kind = type(item)
         if kind is ast.Call:
             self.calls.append((scope, item))  # type: ignore[arg-type]
@@ -115,15 +121,17 @@ class Syntax:
         return (*scope, item) if kind in _FUNCTIONS else scope
 
     def _listed(self, item: ast.AST, field: str, values: list[Any]) -> list[Any]:
-        """Add the number of values in a field, and return them without a docstring."""
+        """Add the number of values in a field as a word, and return the values without a
+        docstring.
+        """
         if field == "body" and type(item) in _DOCUMENTED:
             values = self._without_docstring(item)
         self._words.append(f"[{len(values)}")
         return values
 
     def _visit_else(self, item: ast.If, scope: Scope) -> None:
-        """Add a branch that no process runs by its text alone, and the other branch with its
-        parts.
+        """Add an `if` whose body no process runs: the body by its text alone, the `else` branch
+        with its parts.
         """
         self._kinds[ast.If].pop()
         self._visit_quietly(item.test)
@@ -140,12 +148,12 @@ class Syntax:
         for item in items:
             self._visit(item, ())
         self._kinds = kinds_before
-        # those that were added meanwhile
+        # drop the calls and joins that were added meanwhile
         del self.calls[call_count:], self.joins[join_count:]
 
     def _without_docstring(self, item: Any) -> list[ast.stmt]:
-        """Return the statements of a definition or a module without its docstring, which is
-        noted.
+        """Return the statements of a definition or a module without its docstring; note the
+        docstring.
         """
         body: list[ast.stmt] = item.body
         first_statement = body[0] if body else None
@@ -160,19 +168,19 @@ class Syntax:
 
 
 def _word(value: Any) -> str:
-    """Return the word of a constant, or of a part of the tree that has no parts of its own."""
+    """Return the word for a constant, or for a part of the tree without parts of its own."""
     return type(value).__name__ if isinstance(value, ast.AST) else repr(value)
 
 
 def each(kinds: Kinds, *types: type) -> Iterator[Any]:
-    """Yield the parts of the given types, those of the first type first."""
+    """Yield the parts of the given types, in the order of the types."""
     for kind in types:
         yield from kinds.get(kind, ())
 
 
 def _is_not_run(test: ast.expr) -> bool:
-    """Return True for the test of a block for type checkers, or of a file that is run as a
-    program.
+    """Return True for the test of a block for type checkers, or of a block that runs only if the
+    file is run as a program.
     """
     first_part = test
     if isinstance(test, ast.Compare):
@@ -190,7 +198,7 @@ _SHAPES: dict[type, tuple[str, tuple[str, ...]]] = {}  #: name and fields of eac
 
 
 def _shape(kind: type[ast.AST]) -> tuple[str, tuple[str, ...]]:
-    """Return the name of a kind of part, and its fields that count."""
+    """Return the name of a kind of part, and the names of its fields that count."""
     return _SHAPES.setdefault(
         kind, (kind.__name__, tuple(field for field in kind._fields if field not in _UNSEEN))
     )
@@ -198,14 +206,14 @@ def _shape(kind: type[ast.AST]) -> tuple[str, tuple[str, ...]]:
 
 # --- scopes of names ------------------------------------------------------------------------------
 
-# What a name in a function or a module stands for: an import, an argument, something of the module,
+# What a name in a function or a module stands for: an import, an argument, an object of the module,
 # or a new object.
 #
-# A name that is assigned stands for all that the expressions on the right side are parts of.
+# A name that is assigned stands for everything that the expressions on the right side are parts of.
 
 _INNER = (*_FUNCTIONS, ast.ClassDef)
 _SELF, _CLASS = frozenset({"self", "ctx"}), frozenset({"cls", "mcs", "metacls"})
-#: give a part of what they get
+#: functions that return a part of their argument
 _THROUGH = ("getattr", "vars", "iter", "reversed", "enumerate", "zip", "list", "tuple")
 #: packages whose functions return new objects
 _NEW = frozenset(
@@ -225,7 +233,9 @@ _NEW = frozenset(
 
 
 class Root(NamedTuple):
-    """What the first name of an expression stands for."""
+    """What the first name of an expression stands for: an import, an object of the module, an
+    argument, or a class.
+    """
 
     kind: Literal["import", "own", "argument", "class"]
     #: full name of an import, with the attributes that follow; ``()`` stands for the result of a
@@ -240,7 +250,7 @@ class NameScope:
         self.above = above
         self.is_module = above is None
         self.arguments = arguments(item)
-        # by name: what is assigned; None for an import or definition
+        # the values assigned to each name; None for an import or a definition
         self.values: dict[str, list[ast.expr | None]] = defaultdict(list)
         body = getattr(item, "body", [])
         statements = body if isinstance(body, list) else [body]
@@ -249,7 +259,7 @@ class NameScope:
                 self.values[target].append(value)
 
     def holder(self, name: str) -> NameScope | None:
-        """Return the scope that binds a name, the innermost first."""
+        """Return the innermost scope that binds a name, or None."""
         scope: NameScope | None = self
         while scope is not None and name not in scope.arguments and name not in scope.values:
             scope = scope.above
@@ -262,7 +272,7 @@ def roots(
     bound: Mapping[str, str],
     visited: frozenset[str] = frozenset(),
 ) -> list[Root]:
-    """Return what an expression is part of; nothing for a new object."""
+    """Return the objects that an expression may be part of; an empty list for a new object."""
     attributes: list[str] = []
     while isinstance(item, ast.Attribute | ast.Subscript | ast.Starred):
         if isinstance(item, ast.Attribute):
@@ -272,10 +282,10 @@ def roots(
         return _of_call(item, scope, bound, visited)
     if not isinstance(item, ast.Name):
         return _of_all(_parts(item), scope, bound, visited)
-    # a name that is assigned from itself
+    # a name that is assigned from itself ends the search
     if item.id in visited:
         return []
-    # its class is shared with other objects
+    # the class of an object is shared with other objects
     if "__class__" in attributes:
         return [Root("class", item.id)]
     return [
@@ -289,7 +299,7 @@ def roots(
 def _of_all(
     items: Iterable[ast.expr], scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
 ) -> list[Root]:
-    """Return what some expressions are part of, one after another."""
+    """Return the objects that any of some expressions may be part of."""
     origins: list[Root] = []
     for item in items:
         origins += roots(item, scope, bound, visited)
@@ -306,7 +316,9 @@ def last_name(item: ast.expr) -> str:
 def _of_name(
     name: str, scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
 ) -> list[Root]:
-    """Return what a name in a scope stands for, through the values that are assigned to it."""
+    """Return the objects that a name in a scope may stand for, traced through the values assigned
+    to it.
+    """
     import_roots = [Root("import", bound[name])] if name in bound else []
     holder = scope.holder(name)
     if holder is None or (holder.is_module and name in bound):
@@ -321,8 +333,8 @@ def _of_name(
 
 
 def _of_argument(name: str) -> list[Root]:
-    """Return what an argument stands for; nothing for the object of a method, which its caller
-    made.
+    """Return what an argument stands for. ``self`` gives an empty list, since the caller made that
+    object.
     """
     if name in _SELF:
         return []
@@ -332,38 +344,38 @@ def _of_argument(name: str) -> list[Root]:
 def _of_call(
     call: ast.Call, scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
 ) -> list[Root]:
-    """Return what the result of a call may be part of: of the object whose method it is, unless
-    it is a new object.
+    """Return the objects that the result of a call may be part of, such as the object whose method
+    is called; an empty list for a new object.
     """
     name = last_name(call.func)
     if isinstance(call.func, ast.Name):
-        # the result is a part of an argument
+        # the result is part of an argument
         if name in _THROUGH:
             return _of_all(call.args, scope, bound, visited)
         if name in _GIVEN:
             return [_GIVEN[name]]
     origins = roots(call.func, scope, bound, visited)
-    # a class makes a new object
+    # a call of a class, or of a copying method, makes a new object
     if name[:1].isupper() or name in _COPYING:
         return []
     library_names = [root.name.removesuffix("()") for root in origins if _is_of_library(root)]
     return [Root("import", f"{name}()") for name in library_names]
 
 
-#: what builtin functions give a part of
+#: objects that the result of a builtin function is part of
 _GIVEN = {"globals": Root("own", "globals"), "type": Root("class", "type")}
 #: functions and methods whose result is a new object
 _COPYING = ("copy", "clone", "deepcopy", "detach", "tolist", "item")
 
 
 def _is_of_library(root: Root) -> bool:
-    """Return True for something of a package whose functions may give what others see."""
+    """Return True for an object of a package whose functions may return shared objects."""
     return root.kind == "import" and root.name.partition(".")[0] not in _NEW
 
 
 def _parts(item: ast.expr) -> list[ast.expr]:
-    """Return the expressions of which a value may be one, such as those of a list or of ``a if b
-    else c``.
+    """Return the expressions of which a value may be one or may consist, such as those of a list or
+    of ``a if b else c``.
     """
     if isinstance(item, ast.Tuple | ast.List | ast.Set):
         return item.elts
@@ -377,7 +389,7 @@ def _parts(item: ast.expr) -> list[ast.expr]:
 
 
 def _inside(items: list[ast.AST]) -> Iterator[ast.AST]:
-    """Yield the parts of a body, without those inside of inner functions and classes."""
+    """Yield the parts of a body, but not the parts of inner functions and classes."""
     items_left = list(items)
     while items_left:
         item = items_left.pop()
@@ -387,7 +399,7 @@ def _inside(items: list[ast.AST]) -> Iterator[ast.AST]:
 
 
 def _bindings(item: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
-    """Yield each name that a statement binds, with the value; None for an import and a
+    """Yield each name that a statement binds, with its value; None for an import or a
     definition.
     """
     if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -396,7 +408,7 @@ def _bindings(item: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
         yield from ((alias.asname or alias.name.partition(".")[0], None) for alias in item.names)
     for target, value in _assigned(item):
         if isinstance(item, _LOOPS) and value is not None:
-            value = ast.Starred(value)  # one of its parts
+            value = ast.Starred(value)  # the name gets an element of the value
         for name in _stored_names(target):
             yield name, value
 
@@ -411,7 +423,7 @@ _LOOPS = (ast.For, ast.AsyncFor, ast.comprehension)
 
 
 def _assigned(item: ast.AST) -> Iterator[tuple[ast.expr, ast.expr | None]]:
-    """Yield each target of a statement with the expression that gives it its value."""
+    """Yield each target that a statement assigns to, with the expression of its value."""
     if isinstance(item, ast.Assign):
         yield from ((target, item.value) for target in item.targets)
     elif isinstance(item, ast.AnnAssign | ast.AugAssign | ast.NamedExpr):
@@ -424,7 +436,8 @@ def _assigned(item: ast.AST) -> Iterator[tuple[ast.expr, ast.expr | None]]:
 
 # --- local names ----------------------------------------------------------------------------------
 
-# Names in a function: what an expression is called in full, and what gives a local name its value.
+# Names in a function: the full name of an expression, and the expressions that give a local name
+# its value.
 
 
 def dotted(item: ast.expr, bound: Mapping[str, str]) -> str:
@@ -437,7 +450,7 @@ def dotted(item: ast.expr, bound: Mapping[str, str]) -> str:
         item = item.value
     if not isinstance(item, ast.Name):
         return ""
-    # attributes were collected from the last to the first
+    # collected from the last to the first
     return ".".join([bound.get(item.id, item.id), *reversed(attributes)]).removeprefix("builtins.")
 
 
@@ -449,7 +462,7 @@ def arguments(function: ast.AST) -> set[str]:
 
 
 def assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
-    """Yield each local name of a function with an expression that gives it its value."""
+    """Yield each local name of a function with an expression that is assigned to it."""
     for item in ast.walk(function):
         for target, value in _assigned(item):
             names = [child.id for child in ast.walk(target) if isinstance(child, ast.Name)]
@@ -458,33 +471,37 @@ def assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
 
 
 def read_by(call: ast.Call) -> ast.expr | None:
-    """Return what a function of a library reads: an open file, or the first argument."""
+    """Return the expression of what a library function reads: an open file, or the first
+    argument.
+    """
     file_arguments = [word.value for word in call.keywords if word.arg in ("fileobj", "fp")]
     return next(iter([*file_arguments, *call.args, *(word.value for word in call.keywords)]), None)
 
 
 # --- literal texts --------------------------------------------------------------------------------
 
-# Texts that an expression of literals gives, such as ``"__do" + "c__"``, and names that only a run
-# knows.
+# Texts that consist of literals, such as ``"__do" + "c__"``, and attribute names that are known
+# only at run time.
 
 
-#: functions that are given the name of an attribute
+#: functions that take the name of an attribute as an argument
 _NAMING = frozenset({"getattr", "attrgetter", "getattr_static"})
-#: functions that give all attributes of an object
+#: functions that return all attributes of an object
 _ALL = frozenset({"vars", "getmembers", "getmembers_static"})
 _HOLDING = frozenset({"__dict__", "__getattribute__"})
 
 
 def texts(kinds: Kinds) -> Iterator[tuple[str, int]]:
-    """Yield each text of a module with its line, also one that is put together of literals."""
+    """Yield each text of a module with its line, including texts that are joined from literals."""
     for item in each(kinds, ast.Constant, ast.BinOp, ast.JoinedStr, ast.Call):
         if text := text_of(item):
             yield text, item.lineno
 
 
 def text_of(item: ast.expr) -> str | None:
-    """Return the text of an expression of literals, or None for any other expression."""
+    """Return the text of an expression that consists of literals, or None for any other
+    expression.
+    """
     if isinstance(item, ast.Constant):
         return item.value if isinstance(item.value, str) else None
     if isinstance(item, ast.BinOp) and isinstance(item.op, ast.Add):
@@ -510,7 +527,7 @@ def _text_of_join(call: ast.Call, method: ast.Attribute) -> str | None:
 
 
 def reads_attributes_unnamed(kinds: Kinds) -> bool:
-    """Return True for code that reads attributes whose names it does not spell out, perhaps
+    """Return True for code that reads attributes without spelling out their names, so perhaps
     ``__doc__``.
     """
     if any(item.attr in _HOLDING for item in each(kinds, ast.Attribute)):
@@ -527,7 +544,7 @@ def reads_attributes_unnamed(kinds: Kinds) -> bool:
 
 
 def _joined(parts: Iterable[ast.expr], between: str | None = "") -> str | None:
-    """Return the texts of some expressions in one, or None if any of them is no text of
+    """Return the joined texts of some expressions, or None if any of them does not consist of
     literals.
     """
     values = [text_of(piece) for piece in parts]
@@ -537,8 +554,8 @@ def _joined(parts: Iterable[ast.expr], between: str | None = "") -> str | None:
 
 # --- scratch files --------------------------------------------------------------------------------
 
-# Files that a function makes for itself: in a folder of `tempfile`, under a name that it drew, or
-# in memory.
+# Files that a function makes for itself: in a folder of `tempfile`, under a random name, or in
+# memory.
 
 
 _MADE = frozenset(
@@ -551,7 +568,7 @@ _MADE = frozenset(
         *("tempfile.mkstemp", "tempfile.SpooledTemporaryFile"),
     }
 )
-#: functions that give a path or an open file of what they get first
+#: functions that turn their first argument into a path or an open file
 _THROUGH_FILES = frozenset(
     {
         *(
@@ -576,12 +593,12 @@ _THROUGH_FILES = frozenset(
 
 
 class Scratch:
-    """What in a module is a path of a temporary file, or a file in memory; false if nothing
-    makes one.
+    """The expressions in a module that stand for a temporary file or a file in memory; false if the
+    module makes no such file.
     """
 
     def __init__(self, bound: Mapping[str, str], reads: Callable[[str], bool]) -> None:
-        """Tell by the full names of imported names; ``reads`` says whether a function opens a
+        """Use the full names of imported names; ``reads`` returns True for a function that opens a
         file.
         """
         self._bound, self._reads = bound, reads
@@ -591,12 +608,12 @@ class Scratch:
         return self._makes
 
     def holds(self, item: ast.expr, scope: Scope) -> bool:
-        """Return True if an expression can be nothing but such a path or file."""
+        """Return True if an expression can only stand for a temporary file or a file in memory."""
         return self._makes and self._is_made(item, scope, frozenset())
 
     def texts(self, tree: Syntax) -> set[int]:
-        """Return the ids of the texts that name a file in a temporary folder, or in an archive
-        in memory.
+        """Return the ids of the texts that name a file in a temporary folder or in an archive in
+        memory.
         """
         names_in_scratch = [
             item.right for scope, item in tree.joins if self.holds(item.left, scope)
@@ -607,8 +624,8 @@ class Scratch:
         return set(map(id, names_in_scratch))
 
     def _is_below_made(self, call: ast.Call, scope: Scope) -> bool:
-        """Return True for a call that joins words to a temporary path, and for a method of an
-        object in memory.
+        """Return True for a call that joins words to a temporary path, or that calls a method of a
+        file in memory.
         """
         if isinstance(call.func, ast.Attribute) and self.holds(call.func.value, scope):
             return True
@@ -616,7 +633,9 @@ class Scratch:
         return is_through and bool(call.args) and self.holds(call.args[0], scope)
 
     def _is_made(self, item: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
-        """Return True if an expression is such a path or file, or what is made from one alone."""
+        """Return True if an expression stands for a temporary file or a file in memory, or is made
+        only from one.
+        """
         if isinstance(item, ast.Attribute | ast.Subscript | ast.Starred | ast.NamedExpr):
             return self._is_made(item.value, scope, visited)
         if isinstance(item, ast.BinOp):
@@ -631,7 +650,9 @@ class Scratch:
         return isinstance(item, ast.Name) and self._is_name_made(item.id, scope, visited)
 
     def _is_made_by(self, call: ast.Call, scope: Scope, visited: frozenset[str]) -> bool:
-        """Return True for a call that makes such a path or file, or gives what it gets first."""
+        """Return True for a call that makes a temporary file or a file in memory, or that turns one
+        into a path or an open file.
+        """
         full_name = dotted(call.func, self._bound)
         method = call.func.attr if isinstance(call.func, ast.Attribute) else ""
         if full_name in _MADE:
@@ -639,13 +660,13 @@ class Scratch:
         if full_name in _THROUGH_FILES or method in _THROUGH_FILES or self._reads(full_name):
             first_argument = read_by(call)
             return first_argument is not None and self._is_made(first_argument, scope, visited)
-        # a method of such an object
+        # a method of a temporary path or file
         return bool(method) and self._is_made(call.func, scope, visited)
 
     def _is_name_made(self, name: str, scope: Scope, visited: frozenset[str]) -> bool:
-        """Return True if all that gives a local name its value is made."""
+        """Return True if all values of a local name are temporary files or files in memory."""
         if name in visited:
-            return True  # a path that is lengthened
+            return True  # a name assigned from itself, such as a path that grows
         # from the innermost function to the outermost
         for depth in range(len(scope), 0, -1):
             function = scope[depth - 1]

@@ -1,4 +1,6 @@
-"""Constructs of source code that read what no key covers: files, clocks, hash order."""
+"""Constructs of source code whose result no cache key can cover, such as files, clocks and hash
+order.
+"""
 
 from __future__ import annotations
 
@@ -25,23 +27,24 @@ from neusee.workflows.keys.source_syntax import (
 
 # --- unfollowed code ------------------------------------------------------------------------------
 
-# The error for code that rests on something that a cache key cannot cover.
+# The error for code whose results depend on something that a cache key cannot cover.
 
 
 class UnfollowedCode(LookupError):
-    """A node has no cache key; the message has file, line, reason and what to write."""
+    """The code of a node has no cache key; the message states file, line, reason and fix."""
 
 
 # --- unfollowed constructs ------------------------------------------------------------------------
 
-# Constructs of source code that read what no import shows: files, environment variables, names at
-# run time, a clock.
+# Constructs of source code that read something which no import shows: files, environment variables,
+# names computed at run time, a clock.
 #
 # A digest of code does not cover what these constructs read, so a node declares it with
-# ``depends=``. Code below ``if __name__ == "__main__"`` and files that are written do not count. A
-# file counts unless its path comes from an argument of the function that reads it, because the file
-# of a parameter is part of the key, or is that of a temporary file or of an object in memory: what
-# own code really opens is observed.
+# ``depends=``. Code below ``if __name__ == "__main__"`` does not count, nor do files that are
+# written. A file that is read counts, with two exceptions. The path may come from an argument of
+# the function, because the key covers files of parameters. Or it is the path of a temporary file,
+# or stands for an object in memory. In addition, the files that code of the user really opens are
+# observed.
 
 
 _CLOCK = "a clock, a process or a machine decides"
@@ -59,7 +62,7 @@ _DRAWING = (
 _TIMES = ("time", "perf_counter", "monotonic", "process_time", "thread_time")
 _CALENDAR = ("localtime", "gmtime", "strftime", "ctime", "asctime")
 
-#: What the names of Python and of libraries do, by their first parts.
+#: kind and reason of refused names of Python and of libraries; a name covers all names below it
 _NAMES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(
         ("os.environ", "os.environb", "os.getenv", "os.getenvb", "os.path.expandvars"),
@@ -147,8 +150,8 @@ _METHODS = frozenset(
         "stat",
         "lstat",
     }
-)  #: of a path
-_READERS = re.compile(  #: functions of libraries that read a file
+)  #: methods of a path that read it
+_READERS = re.compile(  #: library functions that read a file
     r"(open|io\.open|codecs\.open|os\.open|glob\.i?glob|os\.(listdir|scandir|walk|stat|lstat|access|readlink)|"
     r"os\.path\.(exists|lexists|isfile|isdir|islink|getsize|getmtime|getctime|samefile)|"
     r"(numpy|torch)\.(load|loadtxt|genfromtxt|fromfile|memmap|from_file)|"
@@ -156,7 +159,7 @@ _READERS = re.compile(  #: functions of libraries that read a file
     r"pandas\.read_\w+|.*\.imread|.*\.imopen|gzip\.open|bz2\.open|lzma\.open|zipfile\.ZipFile|tarfile\.open|"
     r"torchvision\.io\.\w+|OpenEXR\.\w*File|fileinput\.\w+)"
 )
-#: a text that is the name of a file of data
+#: a text that is the name of a data file
 _FILE_NAME = re.compile(
     r"[\w./~"
     r" -]*\w\."
@@ -167,8 +170,8 @@ _FILE_NAME = re.compile(
 
 
 class Construct(NamedTuple):
-    """A construct that is not followed: its kind, what it names (or nothing), its text, the
-    reason, and the line.
+    """A construct that cannot be followed: its kind, the name of what it reads (may be empty), its
+    text, the reason, and the line.
     """
 
     kind: str  #: file, env, import, run, state, hash, stamp or source
@@ -179,8 +182,8 @@ class Construct(NamedTuple):
 
 
 def constructs(tree: Syntax, bound: Mapping[str, str]) -> list[Construct]:
-    """Return each construct of a module that is not followed; ``bound`` has the full name of
-    each imported name.
+    """Return the constructs of a module that cannot be followed; ``bound`` maps each imported name
+    to its full name.
     """
     own_names = _bound_here(tree.all)
     scratch = Scratch(bound, lambda full: _READERS.fullmatch(full) is not None)
@@ -218,8 +221,8 @@ _IMPORTERS = (
 
 
 def _bound_here(kinds: Kinds) -> set[str]:
-    """Return the names that statements and arguments bind, so that they hide a builtin of the
-    same name.
+    """Return the names that statements and arguments bind. Such a name hides a builtin of the same
+    name.
     """
     names = {item.name for item in each(kinds, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)}
     names |= {item.arg for item in each(kinds, ast.arg)}
@@ -227,9 +230,11 @@ def _bound_here(kinds: Kinds) -> set[str]:
 
 
 def _named(kinds: Kinds, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
-    """Yield each use of a name that reads what no import shows, such as ``os.environ``."""
+    """Yield each use of a name such as ``os.environ``, which reads something that no import
+    shows.
+    """
     ids_accounted = {id(call.func) for call in each(kinds, ast.Call) if literal_import(call, bound)}
-    # only the longest chain of attributes counts
+    # of a.b.c, only the whole expression counts
     ids_accounted |= {id(use.value) for use in each(kinds, ast.Attribute)}
     variable_names = {id(use): name for use, name in _variables(kinds, bound)}
     for item in each(kinds, ast.Attribute, ast.Name):
@@ -249,14 +254,14 @@ def _named(kinds: Kinds, bound: Mapping[str, str], own: set[str]) -> Iterator[Co
 
 
 def _is_imported_or_builtin(base: str, bound: Mapping[str, str], own: set[str]) -> bool:
-    """Return True for a name that is imported, or that is a builtin which the module does not
-    hide.
-    """
+    """Return True for an imported name, or for a builtin name that the module does not redefine."""
     return base in bound or (base not in own and base in _BUILTINS)
 
 
 def entry_of(full: str) -> tuple[str, str] | None:
-    """Return what a full name such as ``os.environ.get`` does, or None for any other name."""
+    """Return kind and reason of the entry in `_NAMES` for a full name such as ``os.environ.get``,
+    or None.
+    """
     name = full
     while name:
         if name in _NAMES:
@@ -273,8 +278,8 @@ def _first_name(item: ast.expr) -> str:
 
 
 def _environ(item: ast.expr) -> ast.expr:
-    """Return ``os.environ`` for ``os.environ.get`` and the like, and any other expression as it
-    is.
+    """Return ``os.environ`` for ``os.environ.get`` and similar, and any other expression
+    unchanged.
     """
     if isinstance(item, ast.Attribute) and item.attr in ("get", "__getitem__", "pop"):
         return item.value
@@ -282,13 +287,13 @@ def _environ(item: ast.expr) -> ast.expr:
 
 
 def _variables(kinds: Kinds, bound: Mapping[str, str]) -> Iterator[tuple[ast.expr, str]]:
-    """Yield the expression and the variable of each ``os.environ["X"]``, ``os.environ.get("X")``
-    and so on.
+    """Yield the expression and the name of the variable for each ``os.environ["X"]``,
+    ``os.environ.get("X")`` and so on.
     """
     pairs = [(item.value, item.slice) for item in each(kinds, ast.Subscript)]
     pairs += [(_environ(item.func), item.args[0]) for item in each(kinds, ast.Call) if item.args]
     for use, key in pairs:
-        # " ": an entry of no kind
+        # " " stands for a name without an entry
         if (name := _literal(key)) and (entry_of(dotted(use, bound)) or " ")[0] == "env":
             yield use, name
 
@@ -299,8 +304,8 @@ def _read(
     own: set[str],
     scratch: Scratch,
 ) -> Iterator[Construct]:
-    """Yield each call that reads a file whose path does not come from an argument of the
-    function around it.
+    """Yield each call that reads a file, unless its path comes from an argument of a function
+    around the call.
     """
     for scope, item in calls:
         path = _path_read(item, bound, own)
@@ -341,8 +346,8 @@ def _literal(path: ast.AST) -> str:
 
 
 def _given(path: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
-    """Return True if a path comes from an argument of a function around it, through any local
-    names.
+    """Return True if a path comes from an argument of a function around it, directly or through
+    local names.
     """
     variables = [
         variable
@@ -353,7 +358,7 @@ def _given(path: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
 
 
 def _name_given(name: str, scope: Scope, visited: frozenset[str]) -> bool:
-    """Return True if a name is an argument of a function around it, or has its value from one."""
+    """Return True if a name is an argument of a function around it, or gets its value from one."""
     if name in visited:
         return False
     for function in reversed(scope):
@@ -366,10 +371,9 @@ def _name_given(name: str, scope: Scope, visited: frozenset[str]) -> bool:
 
 
 def _file_names(kinds: Kinds, scratch: set[int]) -> Iterator[Construct]:
-    """Yield each text that is the name of a file of data, where it may become a path: in a call or
-    as a constant.
+    """Yield each text that is the name of a data file, unless it occurs in a message.
 
-    ``scratch`` are the texts, by id, that name a file in a temporary folder.
+    ``scratch``: ids of the texts that name a file in a temporary folder; they do not count.
     """
     ids_in_messages = set[int]()
     for item in each(kinds, ast.Raise, ast.JoinedStr):
@@ -382,19 +386,19 @@ def _file_names(kinds: Kinds, scratch: set[int]) -> Iterator[Construct]:
 
 # --- hash order -----------------------------------------------------------------------------------
 
-# Results that the hash seed of a process decides: the order of a set of texts, and ``hash()`` of
-# one.
+# Results that depend on the hash seed of a process: the order of a set of texts, and ``hash()`` of
+# a text.
 #
-# Python draws the seed anew for each process unless ``PYTHONHASHSEED`` gives it. A set is seen by
+# Python draws a new seed for each process unless ``PYTHONHASHSEED`` is set. A set is recognised by
 # its form: ``{"a", b}``, ``set(x)``, a union of these, and a name that is one of them. Sets of
-# numbers have one order.
+# literal numbers do not count, since their order does not depend on the seed.
 
 
 _WHY = "the hash seed of a process decides"
 _ORDERED = frozenset(
     {"list", "tuple", "iter", "enumerate", "zip", "map", "filter", "join", "fromkeys", "fromiter"}
 )
-#: functions to which the order is nothing, or no more than rounding
+#: functions whose result depends on the order not at all, or only within rounding
 _UNORDERED = frozenset(
     {
         "sorted",
@@ -418,8 +422,8 @@ _LISTED = (ast.ListComp, ast.DictComp, ast.GeneratorExp)
 
 
 def orders(tree: ast.Module) -> list[Construct]:
-    """Return each place where a module takes the order of a set, or a hash, that differs between
-    processes.
+    """Return each place where a module uses the order of a set or a hash value, which differ
+    between processes.
     """
     expressions = _hash_ordered(tree, NameScope(tree, None))
     return [
@@ -428,7 +432,7 @@ def orders(tree: ast.Module) -> list[Construct]:
 
 
 def _hash_ordered(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
-    """Yield each expression in a part of the tree whose order or value the hash seed decides."""
+    """Yield each expression in a part of the tree whose order or value depends on the hash seed."""
     if isinstance(item, _SCOPES):
         scope = NameScope(item, scope)
     yield from (ordered_part for ordered_part in _taken(item) if _is_set(ordered_part, scope))
@@ -438,7 +442,7 @@ def _hash_ordered(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
         if last_name(item.func) in _UNORDERED:
             for argument in item.args:
                 yield from _below(argument, scope)
-            # the arguments were looked at, so far as their order counts
+            # `_below` has searched the arguments
             return
     if not _defines_hash(item):
         for child in ast.iter_child_nodes(item):
@@ -451,19 +455,21 @@ def _defines_hash(item: ast.AST) -> bool:
 
 
 def _hashes(call: ast.Call, scope: NameScope) -> bool:
-    """Return True for a call whose value the hash seed decides."""
+    """Return True for a call whose value depends on the hash seed."""
     return _is_hash(call, scope) or _pops_of_set(call, scope)
 
 
 def _pops_of_set(call: ast.Call, scope: NameScope) -> bool:
-    """Return True for ``pop()`` of a set, which gives any of its elements."""
+    """Return True for ``pop()`` of a set, which returns an arbitrary element."""
     if last_name(call.func) != "pop" or call.args:
         return False
     return _of_set(call.func, scope, frozenset())
 
 
 def _below(argument: ast.expr, scope: NameScope) -> Iterator[ast.expr]:
-    """Yield what is found inside of an argument whose own order is nothing."""
+    """Yield the expressions inside an argument that depend on the hash seed; the order of the
+    argument itself does not matter.
+    """
     if isinstance(argument, ast.Call) and last_name(argument.func) in _ORDERED:
         for value in argument.args:
             yield from _below(value, scope)
@@ -476,7 +482,7 @@ def _below(argument: ast.expr, scope: NameScope) -> Iterator[ast.expr]:
 
 
 def _behind_first(listed: ast.ListComp | ast.DictComp | ast.GeneratorExp) -> list[ast.expr]:
-    """Return the expressions of a comprehension but for what it goes through first."""
+    """Return the expressions of a comprehension, except for its first iterable."""
     clause_parts: list[ast.expr] = []
     for clause in listed.generators:
         clause_parts += [clause.target, clause.iter, *clause.ifs]
@@ -486,7 +492,7 @@ def _behind_first(listed: ast.ListComp | ast.DictComp | ast.GeneratorExp) -> lis
 
 
 def _taken(item: ast.AST) -> list[ast.expr]:
-    """Return the expressions whose order a statement or an expression takes."""
+    """Return the expressions whose order affects a statement or an expression."""
     if isinstance(item, ast.For | ast.AsyncFor):
         return [item.iter]
     if isinstance(item, _LISTED):
@@ -497,7 +503,7 @@ def _taken(item: ast.AST) -> list[ast.expr]:
 
 
 def _is_hash(call: ast.Call, scope: NameScope) -> bool:
-    """Return True for a call of the builtin ``hash``, or of the method behind it."""
+    """Return True for a call of the builtin ``hash``, or of a ``__hash__`` method."""
     if isinstance(call.func, ast.Attribute) and call.func.attr == "__hash__":
         return True
     return (
@@ -506,7 +512,7 @@ def _is_hash(call: ast.Call, scope: NameScope) -> bool:
 
 
 def _is_set(item: ast.expr, scope: NameScope, visited: frozenset[str] = frozenset()) -> bool:
-    """Return True for an expression that is a set, and not one of numbers."""
+    """Return True for an expression that is a set, except for a set of literal numbers."""
     if isinstance(item, ast.Set):
         return not all(map(_is_number, item.elts))
     # union, intersection and differences
@@ -529,7 +535,7 @@ def _is_number(item: ast.expr) -> bool:
 
 
 def _makes_set(call: ast.Call) -> bool:
-    """Return True for ``set(…)``, but not of a range of numbers."""
+    """Return True for a call of ``set`` or ``frozenset``, except for a set of a ``range``."""
     if not isinstance(call.func, ast.Name) or call.func.id not in ("set", "frozenset"):
         return False
     argument = call.args[0] if call.args else None
@@ -552,12 +558,12 @@ def _of_set(function: ast.expr, scope: NameScope, visited: frozenset[str]) -> bo
 
 # --- facts beside content -------------------------------------------------------------------------
 
-# Facts that no key covers although it covers the file: when it was changed, who may read it, where
-# code stands.
+# Facts about a file that no key covers, although it covers the content: time of change,
+# permissions, line numbers of code.
 #
-# The key has the content of a parameter file, and source without its comments, layout and line
-# numbers. Own code that reads what lies beside these is found by the names it uses, also in a text
-# such as ``attrgetter("st_mtime")``.
+# The key covers the content of a parameter file, and source without its comments, layout and line
+# numbers. Code of the user that reads other facts is recognised by the names it uses, also inside a
+# text such as ``attrgetter("st_mtime")``.
 
 
 _STAMP = "times, rights and marks of a file are not its content"
@@ -618,24 +624,24 @@ _WHY_BESIDE = {
     **dict.fromkeys(_STAMPS, ("stamp", _STAMP)),
     **dict.fromkeys(_SOURCES, ("source", _SOURCE)),
 }
-#: names that mean something else in other packages, in full
+#: full names, where the last part alone has another meaning in other packages
 _FULL = {
     **dict.fromkeys(("os.access", "grp", "pwd"), ("stamp", _STAMP)),
     **dict.fromkeys(
         ("inspect.stack", "inspect.trace", "tokenize.open", "linecache", "dis"), ("source", _SOURCE)
     ),
 }
-#: functions whose result has the size of a file, and more
+#: functions that return the status of a file, of which only the size is covered
 _STATING = frozenset({"stat", "lstat", "fstat"})
-_SIZE = 6  #: place of the size in such a result
+_SIZE = 6  #: index of the size in such a result
 _TAKING = frozenset(
     {"tuple", "list", "str", "repr", "hash", "sum", "max", "min", "iter", "map", "zip", "enumerate"}
 )
 
 
 def facts(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
-    """Return each use of a fact beside the content of a file; ``bound`` has the full name of
-    each imported name.
+    """Return each use of a fact about a file that is not its content; ``bound`` maps each imported
+    name to its full name.
     """
     uses = [*_by_name(kinds, bound), *_by_text(kinds), *_by_place(kinds), *_of_paths(kinds)]
     return [
@@ -648,7 +654,7 @@ _Found = Iterator[tuple[str, tuple[str, str], int]]
 
 
 def _by_name(kinds: Kinds, bound: Mapping[str, str]) -> _Found:
-    """Yield each use of such a fact by its name: the name, why it is not covered, and the line."""
+    """Yield each use of such a fact by name: the name, kind and reason, and the line."""
     for item in each(kinds, ast.Attribute, ast.Name):
         if not isinstance(item.ctx, ast.Load):
             continue
@@ -663,7 +669,9 @@ def _by_name(kinds: Kinds, bound: Mapping[str, str]) -> _Found:
 
 
 def _by_text(kinds: Kinds) -> _Found:
-    """Yield each text that is such a name, or ends with one: ``"__code__.co_firstlineno"``."""
+    """Yield each text that is the name of such a fact, or ends with one:
+    ``"__code__.co_firstlineno"``.
+    """
     for text, line in texts(kinds):
         last_part = text.rpartition(".")[2]
         if last_part in _WHY_BESIDE:
@@ -671,7 +679,7 @@ def _by_text(kinds: Kinds) -> _Found:
 
 
 def _by_place(kinds: Kinds) -> _Found:
-    """Yield each use of the result of ``os.stat`` as a row of numbers."""
+    """Yield each use of the result of ``os.stat`` as a sequence of numbers."""
     targets: list[ast.expr] = []
     for item in each(kinds, ast.Assign):
         if _is_stat(item.value, frozenset()):
@@ -683,8 +691,8 @@ def _by_place(kinds: Kinds) -> _Found:
 
 
 def _rows_of_stat(kinds: Kinds, named: frozenset[str]) -> Iterator[ast.expr]:
-    """Yield each place that takes such a result as a row: by index, by ``*`` or in a text, and by
-    a call.
+    """Yield each expression that uses such a result as a sequence: by index, by ``*``, in an
+    f-string, or as an argument of a call.
     """
     yield from (item for item in each(kinds, ast.Subscript) if _is_field_of_stat(item, named))
     for item in each(kinds, ast.Starred, ast.FormattedValue):
@@ -696,7 +704,9 @@ def _rows_of_stat(kinds: Kinds, named: frozenset[str]) -> Iterator[ast.expr]:
 
 
 def _is_field_of_stat(item: ast.Subscript, named: frozenset[str]) -> bool:
-    """Return True for an entry of such a result by its place, but for the size."""
+    """Return True for an index expression of such a result, unless the index is that of the
+    size.
+    """
     is_size = isinstance(item.slice, ast.Constant) and item.slice.value == _SIZE
     return _is_stat(item.value, named) and not is_size
 
@@ -709,8 +719,8 @@ def _is_stat(item: ast.expr, named: frozenset[str]) -> bool:
 
 
 def _of_paths(kinds: Kinds) -> _Found:
-    """Yield ``path.owner()`` and ``path.group()`` of arguments that are paths; a match of a
-    pattern has groups too.
+    """Yield ``path.owner()`` and ``path.group()`` for arguments annotated as paths; matches of
+    regular expressions have a method ``group`` too.
     """
     annotated_arguments = [item for item in each(kinds, ast.arg) if item.annotation is not None]
     path_arguments = {item.arg for item in annotated_arguments if _names_path(item.annotation)}
@@ -721,20 +731,19 @@ def _of_paths(kinds: Kinds) -> _Found:
 
 
 def _names_path(annotation: ast.expr) -> bool:
-    """Return True for an annotation that names a path or a file of data."""
+    """Return True for an annotation that names a path or a data file."""
     text = ast.unparse(annotation)
     return "Path" in text or "DataFile" in text
 
 
 # --- facts of the moment --------------------------------------------------------------------------
 
-# Facts that another moment or machine would change: clocks, addresses, numbers of threads,
-# processors, programs.
+# Facts that differ between moments or machines: clocks, addresses, numbers of threads, processors,
+# programs.
 #
-# The kernel hands most of them out without a call that can be watched, and each library has names
-# of its own for them. So own code is searched for the last part of a name, whatever library it is
-# of: ``pandas.Timestamp.now`` as well as ``datetime.now``. ``getattr(time, name)`` is no way around
-# it.
+# Most of them cannot be observed as a system call, and each library has its own names for them. So
+# code of the user is searched for the last part of a name, whatever its library:
+# ``pandas.Timestamp.now`` as well as ``datetime.now``. ``getattr(time, name)`` is refused too.
 
 
 _WHY_OF_MOMENT = "a clock, a process or a machine decides"
@@ -766,7 +775,7 @@ _LAST = frozenset(
 _FULL_NAMES_OF_MOMENT = frozenset(
     {"shutil.which", "os.nice", "os.times", "sys.getrefcount", "sys.getsizeof"}
 )
-#: modules of Python with such facts
+#: modules of Python that provide such facts
 _HOLDING = frozenset(
     {
         *(
@@ -785,14 +794,14 @@ _HOLDING = frozenset(
         *("locale", "random", "uuid", "secrets", "getpass", "gc"),
     }
 )
-#: take a text with a date
+#: functions that parse a text as a date
 _DATES = frozenset({"datetime64", "Timestamp", "to_datetime", "Time", "DatetimeIndex"})
-_PRESENT = frozenset({"now", "today"})  #: such a text
+_PRESENT = frozenset({"now", "today"})  #: texts that stand for the present date
 
 
 def moments(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
-    """Return each use of a fact of the moment; ``bound`` has the full name of each imported
-    name.
+    """Return each use of a fact that depends on the moment or the machine; ``bound`` maps each
+    imported name to its full name.
     """
     uses = [
         *_moment_by_name(kinds, bound),
@@ -806,9 +815,7 @@ _MomentFact = Iterator[tuple[str, str, int]]
 
 
 def _moment_by_name(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
-    """Yield each use of a fact of the moment by its name: the name, why it is not covered, and
-    the line.
-    """
+    """Yield each use of such a fact by name: the name, the reason, and the line."""
     for item in each(kinds, ast.Attribute, ast.Name):
         if isinstance(item.ctx, ast.Load) and (isinstance(item, ast.Attribute) or item.id in bound):
             full_name = dotted(item, bound) or last_name(item)
@@ -817,7 +824,7 @@ def _moment_by_name(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
 
 
 def _by_date(kinds: Kinds) -> _MomentFact:
-    """Yield ``np.datetime64("now")`` and the like."""
+    """Yield each call such as ``np.datetime64("now")``."""
     for call in each(kinds, ast.Call):
         if last_name(call.func) in _DATES and any(
             text_of(argument) in _PRESENT for argument in call.args
@@ -826,8 +833,8 @@ def _by_date(kinds: Kinds) -> _MomentFact:
 
 
 def _looked_up(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
-    """Yield ``getattr(os, name)``, and ``getattr(os, "envi" + "ron")`` with the reason why that
-    is refused.
+    """Yield each refused ``getattr`` of a module of Python, such as ``getattr(os, name)`` or
+    ``getattr(os, "envi" + "ron")``, with the reason.
     """
     for call in each(kinds, ast.Call):
         if last_name(call.func) != "getattr" or len(call.args) < 2:

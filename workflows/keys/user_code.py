@@ -1,4 +1,6 @@
-"""Code of the user behind a step: declared dependencies, taints and modules beside it."""
+"""The user's code behind a step: its declared dependencies, its observed dependencies (taints), and
+other modules of the user.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,8 @@ if TYPE_CHECKING:
 
 # --- declared dependencies ------------------------------------------------------------------------
 
-# Dependencies that a node declares with ``depends=`` or a module with ``__depends__``, and the
-# constructs they cover.
+# Dependencies that a node declares with ``depends=``, or a module with ``__depends__``, and the
+# constructs that they cover.
 #
 # An entry is a file or folder beside the module (``table.csv``), ``env:NAME``, the name of a
 # module, or ``unaffected:open``: the author states that no result depends on this construct.
@@ -57,8 +59,8 @@ _NAME = {"file": "table.csv", "env": "NAME"}
 
 
 class Declared(NamedTuple):
-    """Declared dependencies: the digest of each, by its name, the modules among them, and the
-    changed files.
+    """Declared dependencies: the digest of each by its name, the modules among them, and the files
+    that were changed.
     """
 
     parts: dict[str, dict[str, str]]
@@ -73,17 +75,17 @@ def resolve(
     then: Mapping[str, str | None],
     exists: Callable[[str], bool],
 ) -> Declared:
-    """Return the dependencies that a module declares; ``then`` are the variables of the environment
-    at its import.
+    """Return the dependencies that a module declares; ``then`` holds the environment variables at
+    the time of its import.
 
-    Raises `LookupError` for an entry that is neither a file nor a module.
+    Raises `LookupError` for an entry that is neither an existing file nor a module.
     """
     declared = Declared({}, [], [])
     for entry in entries:
         # "env:NAME", "unaffected:name", a file, or a module
         if entry.startswith(VARIABLE):
             name = entry.removeprefix(VARIABLE)
-            # at the import and now; one value if both are equal
+            # the values at the import and now; only one if both are equal
             values = dict.fromkeys([then.get(name, os.environ.get(name)), os.environ.get(name)])
             declared.parts[f"environment variable {name}"] = {"value": digest(*values)[:16]}
         elif not entry.startswith(FREE):
@@ -123,8 +125,8 @@ def refusal(item: Construct, source: Path) -> str:
 
 
 def changing_refusal(name: str, kind_of_object: str, source: Path) -> str:
-    """Return the message that refuses a name of a module whose object changes while a process
-    runs, or is not read.
+    """Return the message that refuses a name whose object changes while a process runs, or could
+    not be read.
     """
     return (
         f"{source}: {name} is or holds a {kind_of_object}, and a cache key cannot see it: "
@@ -134,7 +136,7 @@ def changing_refusal(name: str, kind_of_object: str, source: Path) -> str:
 
 
 def _covers(entry: str, item: Construct) -> bool:
-    """Return True if a declared entry covers a construct that is not followed."""
+    """Return True if a declared entry covers a construct that cannot be followed."""
     if entry.startswith(FREE):
         free_name = entry.removeprefix(FREE)
         names_of_construct = (item.kind, item.name, PurePath(item.name).name, item.text)
@@ -145,7 +147,7 @@ def _covers(entry: str, item: Construct) -> bool:
         return item.kind == "env" and item.name in ("", entry.removeprefix(VARIABLE))
     if item.kind == "file":
         return (
-            # the code does not say which file it reads
+            # an empty name: the code does not show which file it reads
             not item.name
             or not PurePath(entry).suffix
             or PurePath(entry).name == PurePath(item.name).name
@@ -173,36 +175,34 @@ def _changed(path: Path, since: int) -> bool:
 
 # --- tainted code ---------------------------------------------------------------------------------
 
-# Own code that was seen to reach what its key does not cover: its results hold for this process
-# alone.
+# Code of the user that was observed to depend on something its key does not cover. Its results are
+# valid in this process only.
 #
-# What a module has read stays with it, in a memo or in a variable, where no later call can be seen
-# to read it again. Therefore a taint stays until the process ends, for all code that uses one of
+# A module may keep what it has read, in a cache or in a variable, and later calls cannot be
+# observed to use it. Therefore a taint stays until the process ends, for all code that uses one of
 # the tainted modules.
 
 
-_taints: dict[str, tuple[Any, ...]] = {}  #: by module, what it reached: `observation.taints.Taint`
-#: modules whose taint the run may not know yet, since it looks at results one by one
+_taints: dict[str, tuple[Any, ...]] = {}  #: taints by module, see `observation.taints.Taint`
+#: modules whose taint the run may not have processed yet
 _held_back: set[str] = set()
 
 
 def hold_back(modules: Iterable[str]) -> None:
-    """Let no result of own modules be stored from now on: one of their steps was just seen to
-    reach too much.
+    """Let no further result of these modules be stored: one of their steps was just observed to
+    depend on something its key does not cover.
     """
     _held_back.update(modules)
 
 
 def may_be_stored(modules: Iterable[str]) -> bool:
-    """Return True if no step that was seen to reach too much has ended while one of these
-    modules computed.
-    """
+    """Return True if none of these modules is held back, so that their results may be stored."""
     return _held_back.isdisjoint(modules)
 
 
 def taint_code(modules: Iterable[str], taints: tuple[Any, ...]) -> bool:
-    """Mark own modules as code whose results no other process may use; return True if one was
-    not marked before.
+    """Mark modules of the user as code whose results no other process may use; return True if at
+    least one was not marked before.
     """
     new_modules = [module for module in modules if module not in _taints]
     _taints.update(dict.fromkeys(new_modules, taints))
@@ -210,47 +210,49 @@ def taint_code(modules: Iterable[str], taints: tuple[Any, ...]) -> bool:
 
 
 def taints_of(modules: Iterable[str]) -> tuple[Any, ...]:
-    """Return what modules have reached in this process although their keys do not cover it."""
+    """Return the taints of some modules in this process, each once."""
     taints = chain.from_iterable(_taints.get(module, ()) for module in modules)
     return tuple(dict.fromkeys(taints))
 
 
 def holds_here_alone(module: str) -> bool:
-    """Return True if no other process may use what a module computes: its file was edited, or it
-    is tainted.
+    """Return True if the results of a module are valid in this process only: its file was edited
+    after the import, or it is tainted.
     """
     return edited_since(module) or module in _taints
 
 
 # --- sibling modules ------------------------------------------------------------------------------
 
-# Modules of a user beside those of a node: which of them may change what the node computes?
+# Other modules of the user: which of them may change what a node computes?
 #
 # All files under ``nodes:`` of a recipe are loaded into one process. A file that patches a library
-# changes every result of the process, also those of neusee's own nodes; one that fills a registry
-# or derives a class changes results of other own nodes. Such a file joins their keys. A file that
-# changes nothing beyond itself joins no other key.
+# changes every result of the process, including those of neusee's own nodes. A file that fills a
+# registry or derives a class changes results of other nodes of the user. The digest of such a file
+# becomes part of their keys. A file that changes nothing outside of itself affects no other key.
 
 
-Scope = Literal["nothing", "own", "all"]  #: nodes whose results a module may change
+#: the nodes whose results a module may change: none, those of the user, or all
+Scope = Literal["nothing", "own", "all"]
 _GETTER = re.compile(r"get|current|default|instance|global|regist|shared|root", re.IGNORECASE)
-_UNSEEN = ("run", "import")  #: kinds of constructs whose code nobody knows
+_UNSEEN = ("run", "import")  #: kinds of constructs that run unknown code
 
 
 class Siblings:
-    """The own modules of this process, and which of them join the key of a node."""
+    """The user's modules in this process, and which of them are part of the key of a node."""
 
     def __init__(self, whole_of: Callable[[str], Whole]) -> None:
         self._whole_of = whole_of
-        self._scopes: dict[str, Scope] = {}  # by module: whose results it may change
+        # for each module, the nodes whose results it may change
+        self._scopes: dict[str, Scope] = {}
 
     def of(self, roots: Sequence[str]) -> list[str]:
-        """Return the own modules that may change what the code of ``roots`` computes, in the order
-        of their import.
+        """Return the modules of the user that may change what the code of ``roots`` computes, in
+        the order of their import.
 
         Raises `LookupError` for a module that cannot be followed.
         """
-        # all modules of users in this process
+        # all modules of the user in this process
         modules_of_user = own_modules()
         if not modules_of_user:
             return []
@@ -264,31 +266,31 @@ class Siblings:
     def _joins(self, module: str, mine: Mapping[str, Reach], own: bool) -> bool:
         """Return True if a module may change what a node computes.
 
-        ``mine`` is what the own modules of the node reach; ``own`` is False for a node without
+        ``mine``: the reach of the node's own user modules; ``own`` is False for a node without
         any.
         """
         scope = self._scope_of(module)
         if scope == "all" or not own:
             return scope == "all"
-        # modules that both lead to, through which one may change the other
+        # modules used by both, through which one may change the other
         shared_modules = _own(self._whole_of(module).looks).keys() & mine.keys()
         changes_itself = any(mine[name].inward for name in shared_modules)
-        # the last: code that looks for classes may find those of any module
+        # the last condition: code that searches for classes may find those of any module
         return scope == "own" or changes_itself or any(reach.seeks for reach in mine.values())
 
     def _scope_of(self, module: str) -> Scope:
-        """Return whose results a module may change, found once."""
+        """Return the nodes whose results a module may change, determined once."""
         if module not in self._scopes:
             self._scopes[module] = _scope(self._whole_of(module).looks)
         return self._scopes[module]
 
 
 def _scope(looks: Mapping[str, Look]) -> Scope:
-    """Return whose results the code of a module and of its helpers may change."""
+    """Return the nodes whose results the code of a module and of its helpers may change."""
     reaches = _own(looks).values()
     names = outward_names(reaches)
     for reach in reaches:
-        # imported for what their import does
+        # modules imported only for the effect of their import
         names |= {name for name in reach.unused if _kind(name) == "distribution"}
     names_of_users = {name for name in names if _is_of_user(name)}
     if _holds_unseen(looks) or any(_is_shared(name) for name in names - names_of_users):
@@ -297,7 +299,7 @@ def _scope(looks: Mapping[str, Look]) -> Scope:
 
 
 def _holds_unseen(looks: Mapping[str, Look]) -> bool:
-    """Return True if own code among some modules has a construct whose reach nobody can see."""
+    """Return True if code of the user among some modules runs code that cannot be determined."""
     # only code of users
     summaries = [look.summary for name, look in looks.items() if is_own(name) and look.summary]
     constructs = chain.from_iterable(summary.constructs for summary in summaries)
@@ -305,30 +307,30 @@ def _holds_unseen(looks: Mapping[str, Look]) -> bool:
 
 
 def _own(looks: Mapping[str, Look]) -> dict[str, Reach]:
-    """Return what the modules of a user reach, by name."""
+    """Return the reach of each module of the user, by name."""
     return {
         name: look.summary.reach for name, look in looks.items() if is_own(name) and look.summary
     }
 
 
 def _is_of_user(name: str) -> bool:
-    """Return True if a full name is that of something in a module of a user."""
+    """Return True if a full name belongs to a module of the user."""
     return name.startswith(".") or (
         _kind(name) in ("source", "folder") and is_own(name.partition(".")[0])
     )
 
 
 def _is_shared(name: str) -> bool:
-    """Return True for something of a library that others see: not for the result of a call, such
-    as an open file.
+    """Return True for an object of a library that other code sees too, unlike the result of a call
+    such as an open file.
     """
     function_name, separator, _ = name.rpartition("()")
     return not separator or _GETTER.search(function_name.rpartition(".")[2]) is not None
 
 
 def _kind(name: str) -> str:
-    """Return the kind of origin of the top-level package in a full name; "nowhere" for a
-    relative one.
+    """Return the kind of origin of the top-level package in a full name; "nowhere" for a relative
+    name.
     """
     top_package = name.partition(".")[0]
     return origin_of(top_package, frozenset()).kind if top_package else "nowhere"
@@ -336,7 +338,7 @@ def _kind(name: str) -> str:
 
 # --- user code ------------------------------------------------------------------------------------
 
-# The code of a step that is not of neusee: its modules, and the files that its key covers.
+# The user's code behind a step: its modules, and the files that its key covers.
 
 
 _TIMED = frozenset({"datetime", "time", "calendar", "email", "zoneinfo", "sqlite3", "logging"})
@@ -344,23 +346,25 @@ _TIMED = frozenset({"datetime", "time", "calendar", "email", "zoneinfo", "sqlite
 
 @dataclass(frozen=True, slots=True)
 class OwnCode:
-    """The modules of a user that compute a step, and what their key covers beside their source."""
+    """The modules of the user that compute a step, and what their key covers beside their
+    source.
+    """
 
-    modules: frozenset[str]  #: those outside of neusee
+    modules: frozenset[str]  #: modules outside of neusee
     followed: frozenset[str]  #: all modules whose source counts
     files: frozenset[str]  #: real paths of parameter files, and of declared files and folders
-    free: frozenset[str]  #: what the author states to decide no result: a kind, a name or a path
-    #: full names of what the code may change in modules of others
+    free: frozenset[str]  #: what the author states to affect no result: a kind, a name or a path
+    #: full names of what the code may change in other modules
     changed: frozenset[str] = frozenset()
-    #: full names of logs: lists and dicts that their modules only write to
+    #: full names of logs: lists and dicts that their modules write to and never read
     unread: frozenset[str] = frozenset()
-    #: True if the code may change what other code finds: its imports do more than compute
+    #: True if the code may change the state that other code uses
     may_change: bool = False
-    variables: frozenset[str] = frozenset()  #: variables of the environment that the code declares
+    variables: frozenset[str] = frozenset()  #: environment variables that the code declares
 
 
 def own_code(step: Step, code: Code) -> OwnCode | None:
-    """Return the code of a step that is not of neusee, or None for a step of the package alone."""
+    """Return the user's code behind a step, or None for a step whose code is all of neusee."""
     return own_code_of(
         step.node, step.params, [network.__module__ for network in networks_of(step)], code
     )
@@ -369,8 +373,8 @@ def own_code(step: Step, code: Code) -> OwnCode | None:
 def own_code_of(
     node: Node, params: Mapping[str, Any], networks: Sequence[str], code: Code
 ) -> OwnCode | None:
-    """Return the code of a call of a node, as `own_code` does; ``networks`` are the modules of
-    its network classes.
+    """Return the user's code behind a call of a node, as `own_code` does; ``networks`` are the
+    modules of its network classes.
     """
     root_modules = [node.fn.__module__, *networks]
     if not any(map(is_own, root_modules)):
@@ -379,7 +383,7 @@ def own_code_of(
     summaries = {name: look.summary for name, look in looks.items() if look.summary is not None}
     own_summaries = {name: summary for name, summary in summaries.items() if is_own(name)}
     files_and_entries = [(looks[name].path, summary.depends) for name, summary in summaries.items()]
-    # what the node declares stands beside its own module
+    # files that the node declares lie beside its own module
     files_and_entries.append((looks[root_modules[0]].path, [*node.depends]))
     entries = [*chain.from_iterable(depends for _, depends in files_and_entries)]
     parameter_files = map(os.path.realpath, files_in(params))
@@ -400,7 +404,7 @@ def own_code_of(
 def _looks_of(
     roots: Iterable[str], looks_of: Callable[[str], Mapping[str, Look]]
 ) -> dict[str, Look]:
-    """Return what each module adds that some modules lead to."""
+    """Return the contribution to the digest of each module that some modules lead to."""
     looks: dict[str, Look] = {}
     for root in roots:
         looks.update(looks_of(root))
@@ -408,7 +412,7 @@ def _looks_of(
 
 
 def _declared_files(source: Path | None, entries: Sequence[str]) -> set[str]:
-    """Return the real paths of the files beside a source file that its entries name."""
+    """Return the real paths of the existing files that the entries of a source file name."""
     paths_beside = [source.parent / entry for entry in entries] if source else []
     return {os.path.realpath(path) for path in paths_beside if path.exists()}
 
@@ -419,7 +423,7 @@ def _after(prefix: str, entries: Iterable[str]) -> frozenset[str]:
 
 
 def _unread_logs(summaries: Mapping[str, Summary]) -> frozenset[str]:
-    """Return the full names of objects of modules that the modules write to and never read."""
+    """Return the full names of objects that their modules write to and never read."""
     logs = set[str]()
     for name, summary in summaries.items():
         logs |= {f"{name}.{log}" for log in written_only(summary.statements)}
@@ -427,7 +431,9 @@ def _unread_logs(summaries: Mapping[str, Summary]) -> frozenset[str]:
 
 
 def _may_change_others(summaries: Mapping[str, Summary]) -> bool:
-    """Return True if own modules import, by full name, another one that is not calm."""
+    """Return True if modules of the user import a module outside of themselves that is not in a
+    package of `CALM`.
+    """
     imports = set[str]()
     for summary in summaries.values():
         imports |= {module for level, module, _ in summary.imports if not level}
@@ -435,13 +441,13 @@ def _may_change_others(summaries: Mapping[str, Summary]) -> bool:
 
 
 def reads_time(looks: Mapping[str, Look]) -> bool:
-    """Return True if code of a user may read the time zone: by the standard library, or by a
-    package of its own.
+    """Return True if code of the user may read the time zone, through the standard library or
+    through a package.
     """
     own_looks = [look for name, look in looks.items() if is_own(name)]
     imports = chain.from_iterable(look.imports for look in own_looks)
     if not _TIMED.isdisjoint(name.partition(".")[0] for name in imports):
         return True
-    # packages whose content counts: nobody knows whether they read the clock
+    # packages that count by their content: whether they read the clock is unknown
     contents = chain.from_iterable(look.parts.values() for look in own_looks)
     return any("content" in content for content in contents)

@@ -1,7 +1,7 @@
-"""What a step may reach without a word: the program, Python with its packages, and the system below
-them.
+"""Paths that a step may read without a taint: the program, Python with its packages, and files of
+the system.
 
-The key holds versions of packages, and the system is not an input: every entry has its reason here.
+The key covers the versions of packages. The system is no input: each entry states the reason.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pathlib import Path
 import neusee.nodes
 from neusee.workflows.keys.sealed_files import bytes_of
 
-#: folders and files of the system that a library reads on its own, with the reason why no result
-#: depends on them
+#: folders and files of the system that libraries read by themselves, each with the reason why no
+#: result depends on it
 SYSTEM = {
     "/proc": "processes and memory, as the machine is now",
     "/sys": "processors and devices, as the machine is now",
@@ -63,7 +63,7 @@ SYSTEM = {
     **dict.fromkeys(("/etc/os-release", "/etc/debian_version"), "the name of the system"),
 }
 
-#: files in the folders above that give chance
+#: files in the folders above that contain random numbers
 CHANCE = ("/dev/random", "/dev/urandom", "/dev/hwrng", "/proc/sys/kernel/random")
 _OF_PYTHON = (
     "lib",
@@ -81,7 +81,7 @@ _OF_PYTHON = (
 
 @functools.cache
 def program() -> tuple[str, ...]:
-    """Return the real paths of the program, and of Python with its packages.
+    """Return the real paths of the code of neusee, and of Python with its packages.
 
     A virtual environment may be made in the folder of a project, so only its parts count, not its
     whole folder.
@@ -90,7 +90,7 @@ def program() -> tuple[str, ...]:
     parts_of_python = itertools.starmap(os.path.join, itertools.product(prefixes, _OF_PYTHON))
     paths = sysconfig.get_paths()
     package_folders = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
-    # the standard library in one file, where Python was built so
+    # the standard library as one file, for a Python built in this way
     zipped_library = os.path.join(
         sys.base_prefix, "lib", f"python{sys.version_info[0]}{sys.version_info[1]}.zip"
     )
@@ -116,15 +116,15 @@ def is_of_neusee(path: str) -> bool:
 
 
 def _cache() -> Path:
-    """Return the folder of caches of this user."""
+    """Return the cache folder of the user."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
 def decides(path: str) -> bool:
-    """Return True for a file of settings that may decide what a library does when it is imported.
+    """Return True for a file of settings that may change what a library does at its import.
 
-    Not in the folder of caches, where libraries keep what they can make anew, such as a list of
-    fonts, and not if all of its lines are empty or comments, as in those that dask writes for its
+    False in the cache folder, where libraries keep what they can make again, such as a list of
+    fonts. False also if all lines are empty or comments, as in the file that dask writes for its
     user.
     """
     if _is_below(path, _real([_cache()])):
@@ -139,8 +139,8 @@ def decides(path: str) -> bool:
 
 
 def caches() -> tuple[str, ...]:
-    """Return the folders of code that libraries compile for this machine, and that no result
-    depends on.
+    """Return the folders in which libraries keep code compiled for this machine; no result depends
+    on them.
     """
     home_folder, cache_folder = Path.home(), _cache()
     stated_folders = [
@@ -159,7 +159,7 @@ def caches() -> tuple[str, ...]:
 
 
 def looked_at() -> tuple[str, ...]:
-    """Return folders that always exist: the working folder, that of temporary files, and the
+    """Return folders that always exist: the working folder, the folder of temporary files, and the
     home folder.
     """
     return _real([os.getcwd(), tempfile.gettempdir(), Path.home()])
@@ -167,7 +167,7 @@ def looked_at() -> tuple[str, ...]:
 
 @functools.cache
 def _of_distributions(folder: str) -> bool:
-    """Return True for a folder that ``pip install --target`` filled."""
+    """Return True for a folder of installed packages, such as ``pip install --target`` fills."""
     try:
         return any(name.endswith(".dist-info") for name in os.listdir(folder))
     except OSError:
@@ -195,21 +195,21 @@ def is_of_system(path: str) -> bool:
 
 
 def is_chance(path: str) -> bool:
-    """Return True for a file that gives chance."""
+    """Return True for a file that contains random numbers."""
     return _is_below(path, CHANCE)
 
 
 def _is_searched_library(path: str) -> bool:
-    """Return True for a library, there or not, in a folder where the loader of the system was
-    told to search.
+    """Return True for the path of a library, existing or not, in a folder that ``LD_LIBRARY_PATH``
+    lists.
     """
     folders = filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(":"))
     return ".so" in os.path.basename(path) and _is_below(path, _real(folders))
 
 
 def is_searched_program(path: str) -> bool:
-    """Return True for a program, there or not, where programs are searched: to look is nothing,
-    to run it a taint.
+    """Return True for the path of a program, existing or not, in a folder that ``PATH`` lists. A
+    search there is no taint; running the program is one.
     """
     return os.path.dirname(path) in _real(
         filter(None, os.environ.get("PATH", "").split(os.pathsep))
@@ -224,12 +224,12 @@ def _plain_entries() -> tuple[str, ...]:
 
 @functools.cache
 def _starts() -> tuple[str, ...]:
-    """Return the beginnings of paths in `SYSTEM`, without the star."""
+    """Return the beginnings of the paths in `SYSTEM` that end with a star."""
     return tuple(entry[:-1] for entry in SYSTEM if entry.endswith("*"))
 
 
 def _is_below(path: str, folders: Iterable[str]) -> bool:
-    """Return True if a path is one of the folders, or in one."""
+    """Return True if a path is one of the folders, or lies in one of them."""
     return any(path == folder or path.startswith(f"{folder}/") for folder in folders)
 
 

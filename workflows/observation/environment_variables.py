@@ -1,10 +1,10 @@
-"""Variables of the environment: those that decide no result or that keys count, and those that
-libraries do not have while own code runs, because no key counts them.
+"""Environment variables: which of them need no declaration, and how the others are hidden from
+libraries while code of the user runs.
 
-A key has the variables that own code names or declares. What a library reads on its own, such as a
-backend or a folder of settings, no key has: it finds the variable unset, whatever the environment
-says, unless the code declares it, ``depends=["env:NAME"]``. Own code itself always finds the truth,
-and what it reads without a declaration is noted.
+A key covers the variables that code of the user declares. It does not cover what a library reads by
+itself, such as the name of a backend. So a library finds such a variable unset, whatever its value,
+unless it is declared: ``depends=["env:NAME"]``. Code of the user always finds the true value, and a
+variable that it reads without a declaration is noted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from neusee.workflows.observation.covered_paths import is_installed, is_of_neuse
 
 # --- known variables ------------------------------------------------------------------------------
 
-# Variables that decide no result, or that keys count by what they do.
+# Variables that affect no result, or whose effect is covered by keys.
 
 
 _COUNTED = ("OMP", "MKL", "OPENBLAS", "NUMEXPR")
@@ -45,33 +45,36 @@ _OF_PROGRAMS = (
     "PYTORCH",
 )
 _OF_DEVICES = ("CUDA", "NVIDIA", "HIP", "ROCM", "OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_")
-#: of terminals and windows, for which many libraries ask
+#: variables of terminals and windows, which many libraries read
 _TERMINALS = ("COLUMNS", "LINES", "TERM", "COLORTERM", "NO_COLOR", "FORCE_COLOR", "CI", "PWD")
 OF_WINDOWS = frozenset({*_TERMINALS, "DISPLAY", "WAYLAND_DISPLAY", "MPLBACKEND"})
 
 
 def is_known(name: str) -> bool:
-    """Return True for a variable that decides no result, or that keys count."""
+    """Return True for a variable that affects no result, or whose effect is covered by keys."""
     return name in _KNOWN_NAMES or name.startswith((*_OF_PROGRAMS, *_OF_DEVICES))
 
 
 # --- hidden variables -----------------------------------------------------------------------------
 
-ALL = "(all of them)"  #: in place of a name, where code asks for all variables
-_IMPORT = "<frozen importlib"  #: begins the name of the file of Python's own import
+ALL = "(all of them)"  #: stands for the name if code reads all variables
+_IMPORT = "<frozen importlib"  #: beginning of the file name of Python's own import code
 
 
 @dataclass
 class Asked:
-    """Variables that code asked for and no key has."""
+    """Variables that code has read and that no key covers."""
 
-    #: set, and hidden from the library that asked
+    #: variables that are set, and were hidden from the library that read them
     of_libraries: dict[str, None] = field(default_factory=dict)
-    of_own_code: dict[str, None] = field(default_factory=dict)  #: set or not
+    #: variables that code of the user read, set or not
+    of_own_code: dict[str, None] = field(default_factory=dict)
 
 
 class _Shown(dict[bytes, bytes]):
-    """The variables that libraries have; who asks for another one decides whether it is found."""
+    """The variables that libraries can read. A hidden variable is found or not depending on whose
+    code reads it.
+    """
 
     def __init__(
         self, environment: Mapping[bytes, bytes], declared: frozenset[str], asked: Asked
@@ -87,12 +90,14 @@ class _Shown(dict[bytes, bytes]):
         self._declared, self._asked = declared, asked
 
     def __missing__(self, name: bytes) -> bytes:
-        """Return a hidden variable to own code and to neusee; raise `KeyError` to a library."""
+        """Return the value of a hidden variable to code of the user and of neusee; raise `KeyError`
+        for a library.
+        """
         asker, variable = _who_asks(), os.fsdecode(name)
-        # those of terminals and windows are not worth a word
+        # hidden variables of terminals and windows are not reported
         if asker == "library" and name in self.hidden and variable not in OF_WINDOWS:
             self._asked.of_libraries[variable] = None
-        # once all are asked for, single names say no more
+        # once all variables have been read, single names add nothing
         if (
             asker == "own"
             and not is_shown(variable, self._declared)
@@ -104,8 +109,8 @@ class _Shown(dict[bytes, bytes]):
         return self.hidden[name]
 
     def __iter__(self) -> Iterator[bytes]:
-        """Yield the names of all variables to own code and to neusee, and of those that are not
-        hidden to a library.
+        """Yield the names of all variables to code of the user and of neusee; for a library, omit
+        the hidden ones.
         """
         asker = _who_asks()
         if asker == "own":
@@ -114,22 +119,22 @@ class _Shown(dict[bytes, bytes]):
 
 
 def is_shown(name: str, declared: frozenset[str]) -> bool:
-    """Return True for a variable that each library has."""
+    """Return True for a variable that every library can read."""
     return name in declared or is_known(name)
 
 
 def hide_for_good(declared: frozenset[str]) -> Asked:
-    """Hide variables from libraries in the rest of this process, a fork; return what will be asked
-    for.
+    """Hide variables from libraries in the rest of this process, which was forked; return the
+    record of later reads.
 
-    Libraries of C do not find them either.
+    C libraries do not find them either.
     """
     asked_variables = Asked()
     shown = _show_few(declared, asked_variables)
     posix = sys.modules.get("posix")
     for name in shown.hidden:
         os.unsetenv(name)
-        # what another import of `os` would read
+        # a new import of `os` would read this dict
         if posix is not None:
             posix.environ.pop(name, None)
     return asked_variables
@@ -137,14 +142,14 @@ def hide_for_good(declared: frozenset[str]) -> Asked:
 
 @contextmanager
 def hidden_while_importing(declared: frozenset[str]) -> Iterator[Asked]:
-    """Hide variables from the libraries of Python that the ``with`` block imports."""
+    """Hide variables from the Python libraries that the ``with`` block imports."""
     asked_variables, environment_before = Asked(), _data(os.environ)
     shown_variables = _show_few(declared, asked_variables)
     try:
         yield asked_variables
     finally:
         _set_data(
-            # with what was set meanwhile; hidden variables have their earlier values
+            # variables set meanwhile are kept; hidden variables get their earlier values
             {**shown_variables.hidden, **shown_variables}
             | {
                 name: value
@@ -155,8 +160,8 @@ def hidden_while_importing(declared: frozenset[str]) -> Iterator[Asked]:
 
 
 def _show_few(declared: frozenset[str], asked: Asked) -> _Shown:
-    """Let libraries find the declared and known variables alone; return these, with the hidden
-    ones.
+    """Make only the declared and the known variables visible to libraries; return them, together
+    with the hidden ones.
     """
     shown = _Shown(_data(os.environ), declared, asked)
     _set_data(shown)
@@ -178,12 +183,12 @@ def _set_data(data: dict[bytes, bytes]) -> None:
 
 
 def _who_asks() -> str:
-    """Return whose code asks: the nearest that is not of the standard library is ``own``,
-    ``library`` or ``neusee``.
+    """Return whose code reads a variable: ``own`` (the user's), ``library`` or ``neusee``.
+    Functions of the standard library count as their caller.
 
-    A module of the standard library that asks while it is imported counts as a library.
+    A module of the standard library that reads a variable at its import counts as a library.
     """
-    # the caller of the method of `_Shown`
+    # frame 0 is this function, 1 the method of `_Shown`, 2 its caller
     frame = sys._getframe(2)
     while frame is not None:
         if frame.f_code.co_filename.startswith(_IMPORT):
@@ -203,8 +208,8 @@ def _standard() -> tuple[str, ...]:
 
 @functools.cache
 def _owner(file: str) -> str:
-    """Return whose code a file is: python, neusee, library or own."""
-    # code without a file, such as that of a dataclass
+    """Return to whom the code in a file belongs: python, neusee, library or own (the user's)."""
+    # code without a file, such as the methods of a dataclass
     if file.startswith("<"):
         return "python"
     path = _real(file)
@@ -216,7 +221,7 @@ def _owner(file: str) -> str:
 
 
 def _real(file: str) -> str:
-    """Return the real path of a file; an observed call does not look for it itself."""
+    """Return the real path of a file. During an observed call, this lookup is not recorded."""
     watch = python_watch.watch_here()
     if watch is None:
         return os.path.realpath(file)

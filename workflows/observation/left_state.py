@@ -1,4 +1,6 @@
-"""What a step leaves in modules, where another step may read it although no wire joins them."""
+"""State that a step leaves in modules, where another step may read it although no input connects
+the two.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,11 @@ from neusee.workflows.observation.taints import Taint, taint
 
 # --- lazy constants -------------------------------------------------------------------------------
 
-# Names of a module that a function fills at its first call, with a value that no argument decides.
+# Names of a module that a function sets at its first call, to a value that depends on no argument.
 #
-# ``global TABLE`` and ``TABLE = build()`` leave something in the module, but each step would leave
-# the same. Where an argument may decide the value, or whether it is set, the name tells one step
-# what another one was given.
+# ``global TABLE`` and ``TABLE = build()`` leave a value in the module, but each step would leave
+# the same value. If the value, or whether it is set, may depend on an argument, the name passes
+# information from one step to another.
 
 
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
@@ -31,17 +33,17 @@ _ENDS = (ast.Return, ast.Raise)
 
 
 class _Place(NamedTuple):
-    """A statement in functions, with what decides whether it runs."""
+    """A statement inside functions, with the conditions that decide whether it runs."""
 
     item: ast.AST
-    decides: list[ast.expr]  #: the conditions around it
+    decides: list[ast.expr]  #: the conditions and loops around it
     local: set[str]  #: arguments and other local names of the functions around it
     shared: set[str]  #: names that the functions declare as global
 
 
 def is_lazy_constant(tree: ast.Module, name: str) -> bool:
-    """Return True if functions of a module set a name, and no argument of a function decides the
-    value.
+    """Return True if functions of a module set a name, and its value depends on no argument or
+    local name.
     """
     statements = list(_places(tree, [], set(), set()))
     assignments = [
@@ -53,7 +55,9 @@ def is_lazy_constant(tree: ast.Module, name: str) -> bool:
 
 
 def _is_free(store: _Place, places: list[_Place]) -> bool:
-    """Return True if no local name decides what a statement sets, or whether it is reached."""
+    """Return True if no local name affects the value that a statement sets, or whether the
+    statement runs.
+    """
     if not isinstance(store.item, ast.Assign | ast.AnnAssign) or store.item.value is None:
         return False
     exits = [
@@ -73,7 +77,7 @@ def _is_free(store: _Place, places: list[_Place]) -> bool:
 def _places(
     item: ast.AST, decides: list[ast.expr], local: set[str], shared: set[str]
 ) -> Iterator[_Place]:
-    """Yield the statements below a part of a syntax tree that stand in functions."""
+    """Yield the statements inside functions, below a part of a syntax tree."""
     for child in ast.iter_child_nodes(item):
         conditions, local_names, global_names = decides, local, shared
         if isinstance(child, _FUNCTIONS):
@@ -97,7 +101,7 @@ def _locals(function: ast.AST) -> set[str]:
 
 
 def _targets(item: ast.AST) -> set[str]:
-    """Return the names that a statement itself sets, not those that statements in it set."""
+    """Return the names that a statement itself sets, without the statements in its body."""
     if isinstance(item, ast.For | ast.AsyncFor):
         return _stored(item.target)
     if isinstance(item, ast.With | ast.AsyncWith):
@@ -105,7 +109,7 @@ def _targets(item: ast.AST) -> set[str]:
         return set[str]().union(*map(_stored, targets))
     return (
         set()
-        # statements in it have their own places
+        # statements in a body are listed by themselves
         if isinstance(item, ast.ClassDef) or hasattr(item, "body") or hasattr(item, "cases")
         else _stored(item)
     )
@@ -132,22 +136,24 @@ def _line(item: ast.AST) -> int:
 
 # --- left state -----------------------------------------------------------------------------------
 
-# What a step leaves in modules: another step may read it there, although no wire joins the two.
+# State that a step leaves in modules: another step may read it there, although no input connects
+# the two.
 #
-# The state of the user's modules is compared before and after a step, by what the keys count of it;
-# so are the modules and classes of libraries that the code may change, and the settings of the
+# The state of the user's modules is compared before and after a step, as far as keys cover it. So
+# are the modules and classes of libraries that the code may change, and the settings of the
 # process.
 
 
-_UNLIKE = (bool, int, float, complex, str, bytes, type(None))  #: types whose equal values are alike
-_SYSTEM = "sys"  #: the module in which Python itself leaves much
+#: types whose values are compared by ``==``
+_UNLIKE = (bool, int, float, complex, str, bytes, type(None))
+_SYSTEM = "sys"  #: the module that Python itself changes often; it is not compared
 _Told = Callable[[], list[Taint]]
 _ABSENT = object()
 
 
 def watch_state(own: OwnCode) -> _Told:
-    """Note what own modules and changed libraries hold; return what tells what has changed since
-    then.
+    """Note the state of the user's modules and of libraries that they may change; return a function
+    that returns a taint for each later change.
     """
     # digests and attributes before the step
     modules, of_libraries, settings_before = _of_modules(own), _of_others(own), _settings()
@@ -166,7 +172,7 @@ def watch_state(own: OwnCode) -> _Told:
 
 
 def is_of_library(left: Taint, own: OwnCode) -> bool:
-    """Return True for something that a step left outside of its own modules, where code of any
+    """Return True for a change outside of the user's modules behind the step, where code of any
     module may read it.
     """
     return left.kind == "memory" and not any(
@@ -175,7 +181,9 @@ def is_of_library(left: Taint, own: OwnCode) -> bool:
 
 
 def _of_modules(own: OwnCode) -> dict[str, dict[str, str]]:
-    """Return a digest of each value of the user's modules, by module and name; empty for None."""
+    """Return a digest of each value of the user's modules, by module and name; the digest of None
+    is empty.
+    """
     modules = {name: sys.modules.get(name) for name in own.modules}
     return {
         name: _digests(module, own)
@@ -193,23 +201,23 @@ def _digests(module: ModuleType, own: OwnCode) -> dict[str, str]:
 
 
 def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
-    """Return a text that differs if a value of a module has changed; empty for None."""
+    """Return a text that changes whenever a value of a module changes; empty for None."""
     if value is None:
         return ""
-    kind = type(value)  # an object may state another class, or raise if it is asked for it
+    kind = type(value)  # `type` and not `__class__`, which an object may define itself
     if issubclass(kind, ModuleType):
         return "module"
     if kind in _UNLIKE:
         return f"{kind.__name__} {value!r}"
-    # fast, for most functions
+    # a fast description, which suits most functions
     if kind is FunctionType and _is_usual(value):
         return f"function {id(value.__code__)} {value.__defaults__!r}"
     return LoadedState(module, (), own.modules.__contains__, lazy=False).digest({name: value})
 
 
 def _is_usual(function: FunctionType) -> bool:
-    """Return True for a function that holds numbers and words alone, and is compared in little
-    time.
+    """Return True for a function whose only state is default arguments that are numbers or
+    texts.
     """
     if function.__kwdefaults__ or function.__closure__ or vars(function):
         return False
@@ -217,29 +225,29 @@ def _is_usual(function: FunctionType) -> bool:
 
 
 def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterator[str]:
-    """Yield the full names of what changed in own modules, but for constants that are made at
-    the first call.
+    """Yield the full names of values of the user's modules that changed, except for constants that
+    are set at the first call.
     """
     for module, digests_now in _of_modules(own).items():
         digests_before = before.get(module, digests_now)
         for name in dict.fromkeys([*digests_before, *digests_now]):
             digest_now, digest_before = digests_now.get(name), digests_before.get(name)
-            # an import is no change
+            # an imported module is no change
             if (
                 digest_now == digest_before
                 or digest_now == "module"
                 or _is_unread(own, module, name)
             ):
                 continue
-            # a constant that is made at the first call
+            # a constant that is set at the first call
             if not digest_before and digest_now and _is_lazy(module, name):
                 continue
             yield f"{module}.{name}"
 
 
 def _is_unread(own: OwnCode, module: str, name: str) -> bool:
-    """Return True for a log: its module only writes to it, and no other module of the user has
-    it.
+    """Return True for a log: its module only writes to it, and no other module of the user refers
+    to it.
     """
     if f"{module}.{name}" not in own.unread:
         return False
@@ -251,14 +259,12 @@ def _is_unread(own: OwnCode, module: str, name: str) -> bool:
         if other_name in sys.modules
     ]
     attributes = chain.from_iterable(vars(other_name).values() for other_name in other_modules)
-    # nobody else holds the log, or the module with it
+    # no other module refers to the log or to its module
     return not any(attribute is value or attribute is own_module for attribute in attributes)
 
 
 def _is_lazy(module: str, name: str) -> bool:
-    """Return True if a name of a module is set by functions, to a value that no argument
-    decides.
-    """
+    """Return True if functions set a name of a module, to a value that depends on no argument."""
     path = module_path(module)
     if path is None:
         return False
@@ -266,10 +272,10 @@ def _is_lazy(module: str, name: str) -> bool:
 
 
 def _of_others(own: OwnCode) -> dict[str, dict[str, Any]]:
-    """Return the attributes of the modules, classes and objects of libraries that own code may
-    change.
+    """Return the attributes of the modules, classes and objects of libraries that code of the user
+    may change.
     """
-    # without what a call returned, and relative names
+    # without results of calls and relative names
     names = [name for name in own.changed if "()" not in name and not name.startswith(".")]
     values = {name: _found(name) for name in names}
     attributes = {name: _attributes(value) for name, value in values.items() if value is not None}
@@ -286,9 +292,9 @@ def _of_others(own: OwnCode) -> dict[str, dict[str, Any]]:
 
 
 def _found(name: str) -> Any:
-    """Return what has a full name, or None for a name that nothing has."""
+    """Return the object with a full name, or None if there is none."""
     name_parts = name.split(".")
-    # the longest beginning of the name that is a loaded module
+    # number of leading parts of the name that form a loaded module
     module_depth = next(
         (
             count
@@ -306,12 +312,13 @@ def _found(name: str) -> Any:
 
 
 def _attributes(value: Any) -> dict[str, Any]:
-    """Return the attributes of an object, or a digest of one that is a list, a dict or an array.
+    """Return the attributes of an object; for an object without attributes, such as a list, a
+    digest of it.
 
-    The entries of a dict in an attribute of an object count too: a table of a library is often a
+    The entries of a dict in an attribute count too: a table of a library is often a
     class around one.
     """
-    # without it, such as for a list: a digest of all
+    # missing for objects such as a list, for which a digest is returned
     attribute_dict = getattr(value, "__dict__", None)
     if isinstance(attribute_dict, dict | MappingProxyType):
         attributes = {
@@ -319,7 +326,7 @@ def _attributes(value: Any) -> dict[str, Any]:
             for name, attribute in attribute_dict.copy().items()
             if not name.startswith("__")
         }
-        # of modules and classes, entries of dicts do not count
+        # entries of dicts in modules and classes do not count
         tables = (
             []
             if isinstance(value, ModuleType | type)
@@ -336,8 +343,8 @@ def _attributes(value: Any) -> dict[str, Any]:
 
 
 def _changed_others(own: OwnCode, before: dict[str, dict[str, Any]]) -> Iterator[str]:
-    """Yield the full names of what changed in libraries, but for what a package itself imports
-    when it is first asked for.
+    """Yield the full names of values of libraries that changed, except for late imports of a
+    package by itself.
     """
     for holder, attributes_now in _of_others(own).items():
         attributes_before = before.get(holder, attributes_now)
@@ -356,8 +363,8 @@ def _changed_others(own: OwnCode, before: dict[str, dict[str, Any]]) -> Iterator
 
 
 def _is_of_package(value: Any, place: str) -> bool:
-    """Return True for a function or a class of the package itself, which it imports when it is
-    first asked for.
+    """Return True for a function or class that comes from the package that holds it; packages
+    import such parts when they are first used.
     """
     return str(getattr(value, "__module__", "")).partition(".")[0] == place.partition(".")[0]
 
@@ -370,5 +377,5 @@ def _is_alike(value: Any, other: Any) -> bool:
 
 
 def _settings() -> dict[str, str]:
-    """Return the settings of the process that keys have."""
+    """Return the settings of the process that keys cover."""
     return settings() | own_settings(reads_time=False)

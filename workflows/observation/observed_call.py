@@ -1,4 +1,6 @@
-"""Observed calls, imports and hooks of own code, and what they reached beyond their key."""
+"""Observed calls, imports and hooks of code of the user, and the dependencies that their keys do
+not cover (taints).
+"""
 
 from __future__ import annotations
 
@@ -40,14 +42,13 @@ from neusee.workflows.observation.taints import Covered, Judgement, Taint, taint
 
 # --- observed call --------------------------------------------------------------------------------
 
-# Call of a step of the user that is observed: its value, and what it reached that its key does not
-# know.
+# Observed call of a step of the user: its value, and its dependencies that the key does not cover.
 
 
 T = TypeVar("T")
-#: one observed call at a time: hooks and generators belong to the process
+#: lock for one observed call at a time, since hooks and generators belong to the process
 _turn = [threading.Lock()]
-#: s after which a caller that waits for its turn sees an exception that another thread raises in it
+#: interval (s) at which a waiting caller checks for an exception that another thread raised in it
 _LOOK = 0.05
 
 
@@ -56,20 +57,20 @@ def observed(
     covered: Covered,
     state: Callable[[], Callable[[], list[Taint]]] | None = None,
 ) -> tuple[T, tuple[Taint, ...]]:
-    """Return the value of a function, and what the function reached that is not covered.
+    """Return the value of a function, and its dependencies that are not covered (taints).
 
-    ``state`` notes what modules hold, before the call, and returns what tells the changes after it.
+    ``state`` is called before the call and returns a function that lists the changes after it.
 
-    The function runs in a thread of its own, as its caller would run it, and its exceptions pass
-    unchanged. If the process that watches it dies meanwhile, calls of the function fail, so the
-    function is called again: what it uses up, such as a generator, it makes itself. An observed
-    call within an observed call is a part of it, without taints.
+    The function runs in a new thread, under the same conditions as its caller, and its exceptions
+    pass unchanged. If the watching server dies meanwhile, system calls of the function fail, so the
+    function is called again: it must itself create whatever it uses up, such as a generator. An
+    observed call within an observed call is a part of it, without taints.
     """
-    # an observed call within another one is a part of that
+    # an observed call inside another one is part of the outer call
     if python_watch.watch_here() is not None:
         return function(), ()
     with one_at_a_time():
-        # tells after the call what it left in modules
+        # returns, after the call, the changes that it left in modules
         left_taints = state() if state is not None else list[Taint]
         step, taints = _observed(function, covered)
         taints += tuple(left_taints())
@@ -80,7 +81,7 @@ def observed(
 def one_at_a_time() -> Iterator[None]:
     """Wait until no other thread of this process observes a call."""
     turn = _turn[0]
-    # wakes now and then, so that Ctrl-C is seen
+    # wakes regularly, so that Ctrl-C takes effect
     while not turn.acquire(timeout=_LOOK):
         pass
     try:
@@ -91,8 +92,8 @@ def one_at_a_time() -> Iterator[None]:
 
 @contextmanager
 def watched_in_fork() -> Iterator[Callable[[], None]]:
-    """Give what a fork of this process calls first, so that the kernel watches it as it would watch
-    this process.
+    """Yield a function that a forked process calls first, so that the kernel watches it as it would
+    watch this process.
 
     Only one fork is observed at a time, and this process waits for it: see `one_at_a_time`.
     """
@@ -100,8 +101,8 @@ def watched_in_fork() -> Iterator[Callable[[], None]]:
 
     def begin() -> None:
         if server is not None:
-            with suppress(OSError, ValueError):  # then the call says that it is not watched
-                # this process again, when the fork has ended
+            # in that case the call reports that it is not watched
+            with suppress(OSError, ValueError):
                 server.observe_here()
 
     try:
@@ -118,10 +119,10 @@ def watched_in_fork() -> Iterator[Callable[[], None]]:
 
 
 def observed_import(load: Callable[[], T], covered: Covered) -> tuple[T, tuple[Taint, ...]]:
-    """Return what a function imports, and what the bodies of the modules of the user reached
+    """Return the result of an import function, and the taints of the module bodies that run
     meanwhile.
 
-    A module that is loaded already is not executed again, so it reaches nothing: observe its first
+    A module that is already loaded is not executed again and has no taints: observe its first
     import.
     """
     return observed(load, covered)
@@ -130,7 +131,9 @@ def observed_import(load: Callable[[], T], covered: Covered) -> tuple[T, tuple[T
 def _observed(
     function: Callable[[], T], covered: Covered
 ) -> tuple[StepThread[T], tuple[Taint, ...]]:
-    """Return the step that has ended, and its taints; without the kernel's layer where it fails."""
+    """Return the finished step and its taints. If observation through the kernel fails, the step
+    runs again without it.
+    """
     reason_unwatched = ""
     if not kernel_layer.missing():
         try:
@@ -139,7 +142,7 @@ def _observed(
             return step, _judged(watch, covered, client.records())
         except NoServer as error:
             reason_unwatched = str(error)
-    # a second time, without the kernel
+    # without the kernel, perhaps for a second time
     step, watch = _run(function, None)
     unseen = (
         [Record("unseen", f"the kernel did not watch: {reason_unwatched}")]
@@ -156,7 +159,7 @@ def _run(
     be watched.
     """
     watch = Watch(kernel=client is not None)
-    # the filter of the kernel begins in the thread of the step
+    # the kernel's filter is installed in the thread of the step
     step = StepThread(function, lambda: kernel_layer.stop_here(client) if client else None)
     watch.add(step.thread)
     audit_events.listen()
@@ -172,7 +175,7 @@ def _run(
             step.run()
         finally:
             python_watch.end()
-        # draws that only a comparison of states shows
+        # draws that show only in a comparison of states
         watch.draws.update(shared_generators.drawn(), watch.kept.changed())
     if step.unprepared is not None:
         raise step.unprepared
@@ -180,14 +183,13 @@ def _run(
 
 
 def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Taint, ...]:
-    """Return the taints of an observed call, from what the kernel and Python saw."""
+    """Return the taints of an observed call, from the records of the kernel and of Python."""
     chance_sources = watch.chance()
     if not any((records, watch.bodies, watch.settings, chance_sources)):
         return ()
     quiet_paths = {path for path, is_quiet in watch.quiet.items() if is_quiet}
     judgement = Judgement(covered, watch.bodies, quiet_paths, watch.temporary)
-    # where Python knows which source of chance was asked, what the kernel says of it is the same
-    # once more
+    # if Python has named the source of random numbers, the record of the kernel would repeat it
     judgement.judge(record for record in records if record.does != "entropy" or not chance_sources)
     judgement.judge(Record("input", path) for path in sorted(watch.settings) if decides(path))
     judgement.judge_modules()
@@ -197,7 +199,7 @@ def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Tain
 
 
 def _in_child() -> None:
-    """Let the fork of a process observe calls of its own, unless it is a part of the observed
+    """Prepare a forked process for observed calls of its own, unless it is part of the observed
     call.
     """
     _turn[0] = threading.Lock()
@@ -211,10 +213,10 @@ if hasattr(os, "register_at_fork"):
 
 # --- own call -------------------------------------------------------------------------------------
 
-# Observed call of own code: what it reached beyond its key, less what its author states to decide
-# no result.
+# Observed call of code of the user: its taints, without those that its author states to affect no
+# result.
 
-#: what a taint does, in words before what it reached
+#: verb of a message for each kind of taint; the name follows
 WORDS = {
     "file": "reads",
     "folder": "lists",
@@ -231,7 +233,7 @@ WORDS = {
 
 
 def call_observed(function: Callable[[], T], own: OwnCode) -> tuple[T, list[Taint]]:
-    """Return the value of a function of own code, and what it reached that its key does not
+    """Return the value of a function of the user's code, and its dependencies that the key does not
     cover.
     """
     covered = Covered(frozenset(map(Path, own.files)), own.followed.__contains__)
@@ -240,8 +242,8 @@ def call_observed(function: Callable[[], T], own: OwnCode) -> tuple[T, list[Tain
 
 
 def tainted_modules(own: OwnCode, taints: Iterable[Taint]) -> frozenset[str]:
-    """Return the modules of the user that may have what a step reached: all, if a library or a
-    setting has it.
+    """Return the modules of the user that a taint may affect: all of them if a library or a setting
+    was changed.
     """
     if any(is_of_library(reached, own) for reached in taints):
         return own.modules.union(own_modules())
@@ -249,15 +251,17 @@ def tainted_modules(own: OwnCode, taints: Iterable[Taint]) -> frozenset[str]:
 
 
 def undeclared(own: OwnCode, asked: Asked) -> list[Taint]:
-    """Return a taint for each variable of the environment that own code read and its key does
-    not have.
+    """Return a taint for each environment variable that code of the user read and that its key does
+    not cover.
     """
     taints = [taint("variable", name) for name in asked.of_own_code]
     return [variable for variable in taints if not own.free & _words_of(variable)]
 
 
 def say_lost(module: str, left: Iterable[Taint]) -> None:
-    """Say what own code changed in a process of its own, where no other step finds it."""
+    """Warn of changes that code of the user made in a separate process, where no other step finds
+    them.
+    """
     for change in left:
         text = (
             f"{module} changes {change.what}, and no other step finds the change, since its steps"
@@ -267,8 +271,8 @@ def say_lost(module: str, left: Iterable[Taint]) -> None:
 
 
 def say_hidden(module: str, asked: Asked, free: Collection[str] = ()) -> None:
-    """Say which variables of the environment are set, and are not found by libraries that own
-    code calls.
+    """Warn which environment variables are set but hidden from the libraries that code of the user
+    calls.
     """
     names = [name for name in asked.of_libraries if name not in free]
     if names:
@@ -280,24 +284,25 @@ def say_hidden(module: str, asked: Asked, free: Collection[str] = ()) -> None:
 
 
 def _words_of(reached: Taint) -> set[str]:
-    """Return the words by which an author states that something decides no result."""
+    """Return the words with which an author can state that a taint affects no result."""
     return {reached.kind, reached.what, Path(reached.what).name, reached.what.rpartition(".")[2]}
 
 
 # --- own import -----------------------------------------------------------------------------------
 
-# Observed import of own modules: what they read while they are imported stays in them, and no later
-# call shows it.
+# Observed import of modules of the user: what they read at import stays in them, and no later call
+# shows it.
 
 
-#: as a module declares a variable of the environment
+#: the declaration of an environment variable in source
 _VARIABLE = re.compile(rb"[\"']env:(\w+)[\"']")
 
 
 def import_observed(name: str) -> ModuleType:
-    """Import a module of a user; taint it, and those that it imports, by what they reach meanwhile.
+    """Import a module of the user, and taint all modules that this loads if the import depends on
+    something no key covers.
 
-    What a module declares in ``__depends__`` is no taint. A module that is loaded already is not
+    A dependency that ``__depends__`` declares is no taint. A module that is already loaded is not
     observed again.
     """
     if name in sys.modules:
@@ -308,7 +313,7 @@ def import_observed(name: str) -> ModuleType:
         module, reaches = observed_import(load, Covered(frozenset(), lambda _: True))
     say_hidden(name, asked_variables)
     reaches += tuple(taint("variable", variable) for variable in asked_variables.of_own_code)
-    # modules of users alone
+    # only modules of the user
     new_modules = [
         module_name
         for module_name in sys.modules
@@ -331,14 +336,14 @@ def import_observed(name: str) -> ModuleType:
 
 
 def _is_declared(reached: Taint, modules: Iterable[str]) -> bool:
-    """Return True if one of the modules declares what was reached."""
+    """Return True if one of the modules declares a taint as a dependency."""
     return any(declares(module, reached) for module in modules)
 
 
 @contextmanager
 def _hidden(name: str) -> Iterator[Asked]:
-    """Hide variables of the environment from the libraries that a module imports, but not beside
-    foreign threads.
+    """Hide environment variables from the libraries that a module imports, unless other libraries
+    run threads in this process.
     """
     if not is_alone():
         yield Asked()
@@ -348,14 +353,14 @@ def _hidden(name: str) -> Iterator[Asked]:
 
 
 def _declared_variables(name: str) -> frozenset[str]:
-    """Return the variables that a module, or one beside or below it, declares; it is not
-    imported yet.
+    """Return the environment variables that a module, or one beside or below it, declares; the
+    module is not imported for this.
     """
     spec = importlib.util.find_spec(name)
     if spec is None or not spec.has_location or spec.origin is None:
         return frozenset()
     folder = Path(spec.origin).parent
-    # of a package: at any depth
+    # in a package, files at any depth
     sources = folder.rglob("*.py") if spec.submodule_search_locations else folder.glob("*.py")
     names = set[str]()
     for source in sources:
@@ -365,13 +370,13 @@ def _declared_variables(name: str) -> frozenset[str]:
 
 
 def declares(module: str, taint: Taint) -> bool:
-    """Return True if the ``__depends__`` of a module has what was reached."""
+    """Return True if the ``__depends__`` of a module declares a taint as a dependency."""
     loaded_module = sys.modules[module]
     entries = [
         entry for entry in getattr(loaded_module, "__depends__", ()) if isinstance(entry, str)
     ]
     free_names = {entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE)}
-    # a kind, a path or the name of a file
+    # declared by kind, by path or by file name
     if free_names & {taint.kind, taint.what, Path(taint.what).name}:
         return True
     return any(
@@ -381,7 +386,7 @@ def declares(module: str, taint: Taint) -> bool:
 
 
 def _beside(module: ModuleType, entries: list[str]) -> Iterator[Path]:
-    """Yield the files and folders that a module declares beside itself."""
+    """Yield the paths, beside a module, that its entries name."""
     file = getattr(module, "__file__", None)
     if file is not None:
         yield from (Path(file).resolve().parent / entry for entry in entries)
@@ -389,13 +394,13 @@ def _beside(module: ModuleType, entries: list[str]) -> Iterator[Path]:
 
 # --- own hook -------------------------------------------------------------------------------------
 
-# Observed hook of an own node that runs before its step: what the hook reads may stay in a memo of
-# its module.
+# Observed hook of a node of the user. It runs before the step, and what it reads may stay in a
+# cache of its module.
 
 
 def call_hook(node: Node, hook: Callable[[], T], params: Mapping[str, Any]) -> T:
-    """Return what a hook of an own node returns; taint own modules by what it reaches beyond the
-    parameters.
+    """Return the result of a hook of a node of the user; taint modules of the user if the hook
+    depends on more than the parameters.
     """
     module_name = node.fn.__module__
     files = frozenset(Path(os.path.realpath(file)) for file in files_in(params))
@@ -410,7 +415,7 @@ def call_hook(node: Node, hook: Callable[[], T], params: Mapping[str, Any]) -> T
         )
     ]
     if undeclared_taints:
-        # any own module may read what the hook left
+        # any module of the user may read what the hook left
         taint_code({module_name, *own_modules()}, tuple(undeclared_taints))
         for reached in undeclared_taints:
             text = (

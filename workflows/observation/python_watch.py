@@ -1,4 +1,4 @@
-"""What Python itself sees of an observed call: audit events, imports and threads."""
+"""Observation of a call by Python itself: audit events, imports and threads."""
 
 from __future__ import annotations
 
@@ -24,15 +24,17 @@ from neusee.workflows.observation.system_calls import CHILD, TRUSTED, UNTRUSTED,
 
 # --- replaced functions ---------------------------------------------------------------------------
 
-# Functions of modules and classes, in whose place others stand while a call is observed.
+# Functions of modules and classes that are replaced by others while a call is observed.
 
 
-#: the place of a function, its name there, and what wraps it
+#: module or class of a function, the function's name there, and the wrapper
 Wrapping = tuple[Any, str, Callable[[Any], Any]]
 
 
 def wrapped(wrappings: Iterable[Wrapping]) -> list[tuple[Any, str, Any]]:
-    """Return place, name and wrapped function, without those that this Python does not have."""
+    """Return the module or class, the name and the wrapped function for each wrapping that this
+    Python supports.
+    """
     return [
         (holder, name, wrap(getattr(holder, name)))
         for holder, name, wrap in wrappings
@@ -41,10 +43,10 @@ def wrapped(wrappings: Iterable[Wrapping]) -> list[tuple[Any, str, Any]]:
 
 
 class ReplacedFunctions:
-    """Functions that are replaced inside of a ``with`` block."""
+    """Functions that are replaced inside a ``with`` block."""
 
     def __init__(self, replacements: Sequence[tuple[Any, str, Any]]) -> None:
-        """Take the place and the name of each function, and what stands there meanwhile."""
+        """Take the module or class and the name of each function, and its replacement."""
         self._meanwhile = replacements
         self._before = [(holder, name, getattr(holder, name)) for holder, name, _ in replacements]
 
@@ -62,47 +64,48 @@ class ReplacedFunctions:
 
 # Generators that installed packages make for themselves when they are imported.
 #
-# No result depends on an import that makes one. A step that draws from one later depends on chance,
-# or on the steps that drew before it.
+# No result depends on an import that makes one. But a step that later draws from it depends on
+# random numbers, or on the steps that drew before.
 
 
 _kept: dict[int, tuple[str, Any]] = {}  #: module and generator, by id
 
 
 class KeptGenerators:
-    """The generators that packages keep, with their states before an observed call, or after
-    their import in it.
+    """Generators that installed packages keep, with their states before an observed call, or just
+    after import for packages first imported during that call.
     """
 
     def __init__(self) -> None:
-        self.drew = False  #: an installed package has asked for chance when it was imported
+        self.drew = False  #: True if an installed package drew random numbers during its import
         self._modules = set(sys.modules)  # loaded before the call
         self._states = {number: _state(generator) for number, (_, generator) in _kept.items()}
-        self._drawn: list[str] = []  #: modules with a generator that drew while they were imported
+        self._drawn: list[str] = []  #: modules with a generator that drew during their import
 
     def keep(self, generator: Any, module: str) -> None:
-        """Remember the bits of NumPy, or a generator of Python, that a module of an installed
-        package makes.
+        """Remember the bit generator of NumPy, or the generator of Python, that a module of an
+        installed package makes.
         """
         _kept[id(generator)] = module, generator
 
     def note(self) -> None:
-        """Take note of the states of what packages have made, at the end of an import."""
+        """Note the states of new generators of packages, at the end of an import."""
         if self.drew:
             self.drew = False
             self._keep_of_modules()
         for number in _kept.keys() - self._states.keys():
             module, generator = _kept[number]
             self._states[number] = _state(generator)
-            # such a generator has a method of that name; any other answers with bool(), which is
-            # False
+            # only legacy generators have this method; for others `bool()` returns False
             if getattr(generator, "has_drawn_by_chance", bool)():
                 self._drawn.append(module)
 
     def changed(self) -> list[str]:
-        """Return what has drawn since."""
+        """Return a text for each module with a generator that has drawn since its state was
+        noted.
+        """
         modules_drawn = [
-            # the module of the generator
+            # the name of the module
             _kept[number][0]
             for number, state in self._states.items()
             if _state(_kept[number][1]) != state
@@ -113,14 +116,12 @@ class KeptGenerators:
         ]
 
     def _keep_of_modules(self) -> None:
-        """Remember the generators that stand in modules of installed packages that were not
-        loaded before.
-        """
+        """Remember the generators in newly loaded modules of installed packages."""
         for name, module in sys.modules.copy().items():
             values = getattr(module, "__dict__", {})
             if name not in self._modules and is_installed(str(values.get("__file__"))):
                 for value in values.copy().values():
-                    # not of a class derived from it
+                    # subclasses do not count
                     if type(value) in (np.random.Generator, np.random.RandomState):
                         self.keep(value._bit_generator, name)
                     elif type(value) is random.Random:
@@ -128,7 +129,7 @@ class KeptGenerators:
 
 
 def _state(generator: Any) -> bytes:
-    """Return the state of a generator of Python, or of the bits of NumPy, as bytes."""
+    """Return the state of a generator of Python, or of a bit generator of NumPy, as bytes."""
     is_of_python = isinstance(generator, random.Random)
     state = generator.getstate() if is_of_python else generator.state
     return pickle.dumps(state)
@@ -136,47 +137,48 @@ def _state(generator: Any) -> bytes:
 
 # --- python watch ---------------------------------------------------------------------------------
 
-# What this process itself sees of the observed call under way: its threads, its imports, and what
-# its hooks record.
+# What this process itself sees of the present observed call: its threads, its imports, and the
+# records of its hooks.
 
 
 class Seedable(Protocol):
-    """A generator that knows whether a seed decides what it draws."""
+    """A generator that knows whether a seed determines its numbers."""
 
     def is_seeded(self) -> bool:
-        """Return True if it does."""
+        """Return True if a seed determines its numbers."""
 
 
 class Watch:
-    """One observed call."""
+    """The observation of one call."""
 
     def __init__(self, kernel: bool) -> None:
-        #: True if the kernel watches too: then it sees all that is opened, and more
+        #: True if the kernel watches too, and so sees every file that is opened
         self.kernel = kernel
         self.records: list[Record] = []
-        self.draws: set[str] = set()  #: sources of chance that were asked
+        self.draws: set[str] = set()  #: sources of random numbers that were used
         self.kept = KeptGenerators()  #: generators of installed packages
-        self.generators: list[Seedable] = []  #: that were made before their seed, if any, was known
+        #: generators made before their seed, if any, was known
+        self.generators: list[Seedable] = []
         #: file of each module of the user that was executed, by name
         self.bodies: dict[str, str] = {}
-        #: files, and whether all who asked for their source or marks need no record
+        #: source files and copied files: True if no read of them needs a record
         self.quiet: dict[str, bool] = {}
         #: files that installed packages read while they were imported
         self.settings: set[str] = set()
-        self.temporary: set[str] = set()  #: files and folders with names that chance gave
-        self._threads: set[threading.Thread] = set()  # those of the call
-        self._local = threading.local()  # by thread: whether it is trusted
+        self.temporary: set[str] = set()  #: files and folders with random names
+        self._threads: set[threading.Thread] = set()  # the threads of the call
+        self._local = threading.local()  # whether the current thread is trusted
 
     def add(self, thread: threading.Thread) -> None:
-        """Count a thread as one of the call."""
+        """Count a thread as part of the call."""
         self._threads.add(thread)
 
     def is_here(self) -> bool:
-        """Return True if the current thread is one of the call."""
+        """Return True if the current thread is part of the call."""
         return threading._active.get(threading.get_ident()) in self._threads  # type: ignore[attr-defined]
 
     def chance(self) -> set[str]:
-        """Return the sources of chance that the call has asked, up to now."""
+        """Return the sources of random numbers that the call has used so far."""
         has_unseeded = any(not generator.is_seeded() for generator in self.generators)
         return self.draws | ({"numpy.random.RandomState without a seed"} if has_unseeded else set())
 
@@ -187,11 +189,11 @@ class Watch:
         return bool(getattr(self._local, "trusted", False))
 
     def needs_record(self) -> bool:
-        """Return True if no kernel sees what the current thread does, and it is not trusted."""
+        """Return True if the kernel does not watch and the current thread is not trusted."""
         return not self.kernel and not self.trusted()
 
     def trust(self, trusted: bool) -> bool:
-        """Trust the current thread, or no longer, and return what held before."""
+        """Set whether the current thread is trusted, and return whether it was trusted before."""
         was_trusted = self.trusted()
         if was_trusted != trusted:
             self._local.trusted = trusted
@@ -200,7 +202,7 @@ class Watch:
         return was_trusted
 
     def heard(self, path: str, quiet: bool) -> None:
-        """Take note of who asks for the source or the marks of a file."""
+        """Note a read of a file; ``quiet``: the read needs no record."""
         self.quiet[path] = quiet and self.quiet.get(path, True)
 
     def trust_child(self) -> None:
@@ -208,21 +210,23 @@ class Watch:
         self._mark(CHILD)
 
     def _mark(self, mark: int) -> None:
-        """Stop at a call that says whose the next calls are; its answer is always no."""
+        """Tell the kernel layer whose the next calls are, through a call of ``access`` that always
+        fails.
+        """
         if self.kernel:
             os.access("/", mark)
 
 
-_current: list[Watch] = []  #: the call under way, at most one
+_current: list[Watch] = []  #: the present observed call; empty or one entry
 
 
 def begin(watch: Watch) -> None:
-    """Make a call the one under way."""
+    """Make a call the present observed call."""
     _current.append(watch)
 
 
 def end() -> None:
-    """Say that the call under way has ended."""
+    """End the present observed call."""
     _current.clear()
 
 
@@ -234,11 +238,12 @@ def watch_here() -> Watch | None:
 # --- watched imports ------------------------------------------------------------------------------
 
 # Imports in an observed call: which reads belong to an installed package, and which to a module of
-# the user.
+# the user?
 #
 # Python searches folders and reads byte code, and packages read their own tables: none of this is
-# an input. The body of a module of the user is watched like the step itself. Two functions of
-# importlib tell both apart; a Python without them counts every import as the step's own reading.
+# an input. The body of a module of the user is watched like the step itself. Wrappers of two
+# functions of importlib distinguish the two cases. In a Python without these functions, every
+# import counts as reading by the step.
 
 
 _BOOTSTRAP: Any = importlib._bootstrap
@@ -255,13 +260,13 @@ class WatchedImports(ReplacedFunctions):
 
 
 def _searching(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the search for a module, with a thread that is trusted meanwhile."""
+    """Return a wrapper of the module search that trusts the thread meanwhile."""
 
     def search(name: str, import_: Callable[..., Any]) -> Any:
         watch = watch_here()
         if watch is None:
             return function(name, import_)
-        # folders that are searched are no inputs
+        # the searched folders are no inputs
         was_trusted = watch.trust(True)
         try:
             return function(name, import_)
@@ -275,8 +280,8 @@ def _searching(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _executing(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the execution of a module, with a thread that is not trusted if the module is one
-    of the user.
+    """Return a wrapper of the execution of a module that does not trust the thread while a module
+    of the user runs.
     """
 
     def execute(called: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
@@ -286,7 +291,7 @@ def _executing(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(called, *arguments, **named)
         # name and file of a module of the user
         watch.bodies[name_and_file[0]] = name_and_file[1]
-        # what the body of a module does is the user's
+        # the body of a module is code of the user
         was_trusted = watch.trust(False)
         try:
             return function(called, *arguments, **named)
@@ -312,13 +317,12 @@ def _module(called: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str
 
 # --- watched threads ------------------------------------------------------------------------------
 
-# Threads that an observed call starts: their calls are the call's, and those of other threads are
-# not.
+# Threads that an observed call starts count as part of the call; other threads do not.
 
 
 class WatchedThreads(ReplacedFunctions):
-    """The two functions that start a thread, wrapped while a call is observed; audit events tell
-    from Python 3.12.
+    """The two functions that start a thread, wrapped while a call is observed. From Python 3.12 on,
+    audit events also report new threads.
     """
 
     def __init__(self) -> None:
@@ -330,7 +334,7 @@ class WatchedThreads(ReplacedFunctions):
 
 
 def _starting(function: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
-    """Return the start of a thread, which counts it as one of the call."""
+    """Return a wrapper of `Thread.start` that counts the new thread as part of the call."""
 
     def start(self: threading.Thread) -> None:
         if (watch := watch_here()) is not None:
@@ -341,11 +345,13 @@ def _starting(function: Callable[[threading.Thread], None]) -> Callable[[threadi
 
 
 def _starting_nameless(function: Callable[..., int]) -> Callable[..., int]:
-    """Return the start of a thread without an object, of which Python knows no owner."""
+    """Return a wrapper of `start_new_thread`, which makes no thread object that could be
+    counted.
+    """
 
     def start_new_thread(*arguments: Any) -> int:
         watch = watch_here()
-        if watch is not None and not watch.kernel:  # nobody knows whose calls are its
+        if watch is not None and not watch.kernel:  # the calls of such a thread cannot be assigned
             watch.records.append(Record("unseen", "a thread that _thread started"))
         return function(*arguments)
 
@@ -357,9 +363,9 @@ def _starting_nameless(function: Callable[..., int]) -> Callable[..., int]:
 # Who opens a source file of the user: a message that quotes a line, an import or a compiler, or
 # code that reads it?
 #
-# The key follows source without its comments, its layout and its docstrings. A warning or a
-# traceback quotes a line for a reader, and a compiler leaves comments out, so neither makes a
-# result depend on them. Any other reader may.
+# The key covers source without its comments, its layout and its docstrings. A warning or a
+# traceback quotes a line for a reader, and a compiler omits comments, so neither makes a result
+# depend on them. Any other reader may.
 
 
 SOURCES = (".py", ".pyc", ".pyw")
@@ -378,8 +384,8 @@ _QUIET = (
 
 
 def quotes_source(frame: FrameType | None) -> bool:
-    """Return True if the code that opens a source file, down to the code of the user, needs no
-    record.
+    """Return True if a source file is opened by code that only quotes, imports or compiles it, so
+    that the read needs no record.
     """
     while frame is not None:
         name = str(frame.f_globals.get("__name__", ""))
@@ -396,19 +402,18 @@ _QUIET_STARTS = tuple(f"{name}." for name in _QUIET)
 
 @functools.lru_cache(1000)
 def _is_own(file: str) -> bool:
-    """Return True for a file of code that is not installed; code without a file is that of those
-    who call it.
+    """Return True for a file of code that is not installed; code without a file counts as its
+    caller's.
     """
     return not file.startswith("<") and not is_installed(os.path.realpath(file))
 
 
 # --- audit events ---------------------------------------------------------------------------------
 
-# What Python's own audit events say of an observed call.
+# Audit events of Python during an observed call.
 #
-# Where the kernel watches, they add only what it cannot know: that a child process is one of the
-# program. Elsewhere they are the layer that sees files, processes and sockets, as far as Python
-# code asks for them.
+# If the kernel watches, they add only what it cannot know, such as that neusee itself starts a
+# child process. Otherwise they show files, processes and sockets, as far as Python code uses them.
 
 
 _installed: list[bool] = []
@@ -416,8 +421,8 @@ _OF_CODE = (*SOURCES, ".pyc", ".so", ".pyd", ".zip", ".egg")  #: files that an i
 
 
 def listen() -> None:
-    """Listen to the events of this process; a hook cannot be taken away, and returns at once
-    between the calls.
+    """Listen to the audit events of this process. A hook cannot be removed; between observed calls
+    it returns at once.
     """
     if not _installed:
         _installed.append(True)
@@ -425,13 +430,13 @@ def listen() -> None:
 
 
 def _heard(event: str, arguments: tuple[Any, ...]) -> None:
-    """Take note of an audit event of an observed call, as far as its kind counts."""
+    """Handle an audit event of an observed call, if its kind counts."""
     if event not in _EVENTS or (watch := watch_here()) is None:
         return
-    # what the kernel cannot know
+    # events that add what the kernel cannot know
     if event in _FOR_BOTH and not watch.trusted():
         _FOR_BOTH[event](watch, arguments)
-    # an installed package reads while it is imported
+    # a file that an installed package reads at its import
     if event == "open" and watch.trusted():
         _settings(watch, arguments)
     if event == "subprocess.Popen":
@@ -441,11 +446,11 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
 
 
 def _program(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a child process; the program itself compiles its C++ when it is first used."""
+    """Note a child process, unless neusee itself starts it to compile its C++ code."""
     if _called_by_program():
         watch.trust_child()
     elif watch.needs_record():
-        # the program, or the first word of its arguments
+        # the executable, or the first argument
         command = arguments[0] or arguments[1]
         is_text = isinstance(command, str | bytes | os.PathLike)
         first_word = command if is_text else next(iter(command), "")
@@ -453,14 +458,14 @@ def _program(watch: Watch, arguments: tuple[Any, ...]) -> None:
 
 
 def _called_by_program() -> bool:
-    """Return True if the function that starts a process is one of the nodes of the program."""
+    """Return True if a function of neusee's nodes starts a process."""
     frame = sys._getframe()
     while frame.f_back is not None:
         frame = frame.f_back
         name = str(frame.f_globals.get("__name__", ""))
         if name.startswith("neusee.nodes."):
             return True
-        # past the functions of this hook and of subprocess
+        # skip the functions of this hook and of subprocess
         if not name.startswith((__package__, "subprocess")):
             return False
     return False
@@ -468,7 +473,7 @@ def _called_by_program() -> bool:
 
 @contextmanager
 def _unwatched(watch: Watch) -> Iterator[None]:
-    """Trust the current thread while this hook itself looks at folders."""
+    """Trust the current thread while this hook itself looks up files."""
     was_trusted = watch.trust(True)
     try:
         yield
@@ -477,22 +482,23 @@ def _unwatched(watch: Watch) -> Iterator[None]:
 
 
 def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a source file that is opened, and of whether a message or a compiler asked
-    for it.
+    """Note a source file that is opened, and whether it is opened only for a message or a
+    compiler.
     """
     path = arguments[0]
     if isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path).endswith(SOURCES):
-        # who opens the file, behind this handler and the hook
+        # frame 2 opens the file; frames 0 and 1 are this handler and the hook
         frame = sys._getframe(2)
         with _unwatched(watch):
             watch.heard(os.path.realpath(os.fsdecode(path)), quotes_source(frame))
 
 
 def _settings(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a file that an installed package reads while it is imported, such as settings in
-    the home folder.
+    """Note a file that an installed package reads at its import, such as settings in the home
+    folder.
 
-    Its code, its tables and caches are installed: the judgement leaves them out.
+    Installed code, tables and caches are left out later, by `covered_paths.decides` and the
+    judgement.
     """
     path, _, flags = arguments
     if (
@@ -507,24 +513,24 @@ def _settings(watch: Watch, arguments: tuple[Any, ...]) -> None:
 
 
 def _copied(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of whether the attributes of a file are asked for in order to copy it."""
+    """Note whether the extended attributes of a file are read only to copy the file."""
     path = arguments[0]
     if not isinstance(path, int):
-        # behind this handler and the hook
+        # frame 2 is the caller; frames 0 and 1 are this handler and the hook
         copies = sys._getframe(2).f_globals.get("__name__") == "shutil"
         with _unwatched(watch):
             watch.heard(os.path.realpath(os.fsdecode(path)), copies)
 
 
 def _named_by_chance(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a temporary file, whose name no other process expects."""
+    """Note a temporary file or folder, whose random name no other process expects."""
     parent_folder, name = os.path.split(os.path.abspath(os.fsdecode(arguments[0])))
     with _unwatched(watch):
         watch.temporary.add(os.path.join(os.path.realpath(parent_folder), name))
 
 
 def _file(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a file that is opened."""
+    """Record a file that is opened."""
     path, mode, flags = arguments
     if isinstance(path, int):
         return
@@ -532,18 +538,18 @@ def _file(watch: Watch, arguments: tuple[Any, ...]) -> None:
     real_path = os.path.realpath(given_path)
     if mode is None and not os.path.isabs(given_path) and not os.path.lexists(real_path):
         real_path = given_path  # below an open folder, which the event of ``os.open`` does not name
-    # flags as a positive number of 31 bits
+    # the flags as a positive number of 31 bits
     watch.records.append(
         Record("open", real_path, "", flags & 0x7FFFFFFF, os.path.lexists(real_path))
     )
 
 
 def _of_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
-    """Return what takes note of an event whose first argument is a path."""
+    """Return a handler that records an event whose first argument is a path."""
 
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
         path = "." if arguments[0] is None else arguments[0]
-        # a number is an open file, whose opening was noted
+        # a number is the descriptor of an open file, whose opening was recorded
         if not isinstance(path, int):
             real_path = os.path.realpath(os.fsdecode(path))
             watch.records.append(Record(does, real_path, there=os.path.lexists(real_path)))
@@ -552,8 +558,8 @@ def _of_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
 
 
 def _of_named_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
-    """Return what takes note of an event whose first argument is a path, where a link at its end
-    is meant itself.
+    """Return a handler that records an event whose first argument is a path; a symbolic link at its
+    end is not followed.
     """
 
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
@@ -568,7 +574,7 @@ def _of_named_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
 
 
 def _of_two_paths(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
-    """Return what takes note of an event whose first two arguments are paths."""
+    """Return a handler that records an event whose first two arguments are paths."""
 
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
         first_path, second_path = (os.path.abspath(os.fsdecode(path)) for path in arguments[:2])
@@ -580,14 +586,14 @@ def _of_two_paths(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
 
 
 def _library(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a native library that is loaded by its path."""
+    """Record a native library that is loaded by its path."""
     name = os.fsdecode(arguments[0] or "")
     if "/" in name:
         watch.records.append(Record("open", os.path.realpath(name), flags=os.O_RDONLY))
 
 
 def _database(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a database file that is opened."""
+    """Record a database file that is opened."""
     name = os.fsdecode(arguments[0])
     if name and name != ":memory:":
         real_path = os.path.realpath(name)
@@ -597,7 +603,7 @@ def _database(watch: Watch, arguments: tuple[Any, ...]) -> None:
 
 
 def _of_address(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
-    """Return what takes note of an event with a socket and an address."""
+    """Return a handler that records an event with a socket and an address."""
 
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
         address = arguments[1]
@@ -611,13 +617,15 @@ def _of_address(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
 
 
 def _named(does: Does, path: str) -> Callable[[Watch, tuple[Any, ...]], None]:
-    """Return what takes note of an event without its arguments."""
+    """Return a handler that records an event with the fixed ``path``, without the event's
+    arguments.
+    """
     return lambda watch, arguments: watch.records.append(Record(does, path))
 
 
 def _command(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a program that is started, but for one that the program itself starts: since
-    Python 3.13 `subprocess` says so by the event of ``os.posix_spawn`` too.
+    """Record a program that is started, unless neusee itself starts it. Since Python 3.13,
+    `subprocess` also sends the event ``os.posix_spawn``.
     """
     if _called_by_program():
         return
@@ -666,5 +674,5 @@ _FOR_BOTH: dict[str, _Handler] = {
     "os.listxattr": _copied,
     "tempfile.mkstemp": _named_by_chance,
     "tempfile.mkdtemp": _named_by_chance,
-}  #: what only the interpreter knows of a call: who makes it
+}  #: handlers of events for which the calling code matters, which only the interpreter knows
 _EVENTS = frozenset({"subprocess.Popen", *_HANDLERS, *_FOR_BOTH})

@@ -1,4 +1,6 @@
-"""Sources of chance that an observed call asks: generators of NumPy, torch and the system."""
+"""Sources of random numbers that an observed call uses: generators of Python, NumPy and torch, and
+the system.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,13 @@ from neusee.workflows.observation.python_watch import (
 
 # --- drawn names ----------------------------------------------------------------------------------
 
-# Names that libraries draw by ``uuid4`` for things of their own, and that no result has.
+# Names that libraries draw with ``uuid4`` for internal objects, and that are part of no result.
 #
-# A library may as well draw a seed in this way, or an identifier that it writes into a file. So
-# each is listed here, with the reason why its names decide nothing.
+# A library could also draw a seed in this way, or an identifier that it writes into a file. So each
+# library is listed here, with the objects that it names, which affect no result.
 
 
-#: modules, with what they name
+#: modules, each with the objects that it names
 NAMING = {
     "dask": "tasks of a graph, where an object has no token of its own",
     "distributed": "tasks, clients, locks and messages",
@@ -38,17 +40,17 @@ NAMING = {
     "joblib": "folders of workers, and calls",
     "tempfile": "temporary files",
 }
-_BETWEEN = ("uuid", "cloudpickle")  #: modules that draw for the one that calls them
+_BETWEEN = ("uuid", "cloudpickle")  #: modules that draw for their caller
 
 
 def draws_name(depth: int) -> bool:
-    """Return True if the function that asks for chance draws a name; ``depth`` counts the calls
-    up to it.
+    """Return True if the function that reads random bytes draws a name; ``depth`` is the number of
+    calls between it and this function.
     """
     frame = sys._getframe(depth + 1)
     if _module(frame) != "uuid":
         return False
-    # back to the function behind those that draw for others
+    # go back to the first caller outside of the modules that draw for others
     while frame.f_back is not None and _module(frame).startswith(_BETWEEN):
         frame = frame.f_back
     return any(f"{_module(frame)}.".startswith(f"{name}.") for name in NAMING)
@@ -61,17 +63,19 @@ def _module(frame: object) -> str:
 
 # --- asked chance ---------------------------------------------------------------------------------
 
-# The sources of chance that a call asks, such as the system, a process or a device.
+# Sources of random numbers that a call uses, such as the system.
 
 
 class WatchedChance(ReplacedFunctions):
-    """The functions through which Python code asks for chance, wrapped while a call is observed.
+    """The functions through which Python code reads random bytes or seeds generators, wrapped while
+    a call is observed.
 
-    The kernel sees most of it too, but not where the library of C draws without a system call.
+    The kernel sees most of it too, except for the C library, which may draw without a system call.
     """
 
     def __init__(self) -> None:
-        # temporary files have drawn names, which no result has: their generator is made before
+        # the generator of names of temporary files is made before, since these names are part of no
+        # result
         next(tempfile._get_candidate_names())  # type: ignore[attr-defined]
         places: list[Wrapping] = [
             (os, "urandom", _asking),
@@ -82,8 +86,8 @@ class WatchedChance(ReplacedFunctions):
 
 
 def _note(source: str) -> None:
-    """Take note of a source of chance that the observed call asks; during an import of a
-    package, of that alone.
+    """Note a source of random numbers that the observed call uses. In an import of an installed
+    package, only note that it drew.
     """
     watch = watch_here()
     if watch is not None and watch.trusted():
@@ -93,8 +97,8 @@ def _note(source: str) -> None:
 
 
 def _asking(function: Callable[[int], bytes]) -> Callable[[int], bytes]:
-    """Return a function that asks the system for chance, with a note of it unless a name is
-    drawn.
+    """Return a wrapper of a function that reads random bytes from the system; it notes the use
+    unless a name is drawn.
     """
 
     def urandom(size: int, /) -> bytes:
@@ -112,7 +116,7 @@ def _asking(function: Callable[[int], bytes]) -> Callable[[int], bytes]:
 
 
 def _seeding(function: Callable[..., None]) -> Callable[..., None]:
-    """Return `random.Random.seed` with a note of a call without a seed."""
+    """Return a wrapper of `random.Random.seed` that notes a call without a seed."""
 
     def seed(self: random.Random, a: Any = None, *arguments: Any, **named: Any) -> None:
         if a is None:
@@ -124,20 +128,22 @@ def _seeding(function: Callable[..., None]) -> Callable[..., None]:
 
 # --- legacy numpy ---------------------------------------------------------------------------------
 
-# Legacy generators of NumPy: ``RandomState(3)`` asks for chance first, and only then for its seed.
+# Legacy generators of NumPy: ``RandomState(3)`` first reads random bytes, and only then sets its
+# seed.
 #
-# So does all that takes ``random_state=3``. While a call is observed, such a generator says whether
-# a seed followed.
+# So does every function with an argument ``random_state=3``. While a call is observed, such a
+# generator notes whether a seed followed.
 
 
 _PLACE: Any = np.random.mtrand
-#: what ``RandomState`` begins with; where it is missing, a seeded one counts as chance
+#: the class that ``RandomState`` uses first; if it is missing, a seeded generator counts as
+#: unseeded too
 _NAME = "_MT19937"
 
 
 class _Replacement(abc.ABCMeta):
-    """Class of a class that stands for `MT19937`: a ``RandomState`` asks whether its generator
-    is an instance.
+    """Metaclass that lets `MT19937` objects pass as instances of the replacement class, which
+    ``RandomState`` checks.
     """
 
     def __instancecheck__(cls, instance: object) -> bool:
@@ -145,18 +151,18 @@ class _Replacement(abc.ABCMeta):
 
 
 class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
-    """The generator of a ``RandomState`` that an observed call makes."""
+    """The bit generator of a ``RandomState`` that an observed call makes."""
 
     def __init__(self, *seed: Any) -> None:
-        """Make the generator; what it takes from the system counts at the end of the call, if no
-        seed followed.
+        """Make the generator. Random bytes from the system count, at the end of the call, only if
+        no seed followed.
         """
         self._seeded, self._first = bool(seed), b""
         watch = watch_here()
         if watch is None or seed:
             super().__init__(*seed)
             return
-        if watch.trusted():  # an import of a package, which keeps it for itself
+        if watch.trusted():  # in an import of an installed package, which keeps the generator
             watch.kept.keep(self, str(sys._getframe(1).f_globals.get("__name__")))
         else:
             watch.generators.append(self)
@@ -168,20 +174,20 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
             watch.trust(was_trusted)
 
     def _legacy_seeding(self, seed: Any) -> None:
-        """Seed the generator as NumPy does, and remember whether a seed was given."""
+        """Seed the generator as NumPy does, and note whether there is a seed."""
         self._seeded = self._seeded or seed is not None
         super()._legacy_seeding(seed)
 
     def is_seeded(self) -> bool:
-        """Return True if a seed decides what the generator draws."""
+        """Return True if a seed determines the numbers of the generator."""
         return self._seeded
 
     def has_drawn_by_chance(self) -> bool:
-        """Return True if the generator has drawn without a seed."""
+        """Return True if the generator has drawn numbers without a seed."""
         return not self._seeded and pickle.dumps(self.state) != self._first
 
     def __reduce__(self) -> Any:
-        """Return what a file keeps: the generator of NumPy that this is."""
+        """Return the pickled form, which names NumPy's own class."""
         parts: tuple[Any, ...] = super().__reduce__()
         function, arguments, *state = parts
         return (
@@ -194,7 +200,7 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
         )
 
 
-# its state names its class, and a file keeps its state
+# the state contains the name of the class, and files store the state
 LegacyGenerator.__name__ = np.random.MT19937.__name__
 
 
@@ -212,17 +218,17 @@ class WatchedLegacyGenerators:
 
 # --- shared generators ----------------------------------------------------------------------------
 
-# Generators that all code of a process shares: did an observed call draw from one before it had set
-# the seed?
+# Generators that all code of a process shares: did an observed call draw from one before it set the
+# seed?
 #
 # ``torch.manual_seed(3)`` and ``np.random.seed(3)`` determine all numbers that follow. A call that
-# draws before it depends on what the process drew earlier, also if it puts the state back at the
-# end, as ``torch.random.fork_rng`` does.
+# draws earlier depends on what the process drew before, even if it restores the state at the end,
+# as ``torch.random.fork_rng`` does.
 
 
 _By = Literal["seed", "state", "system"]  #: what determines the numbers that follow
 _TORCH: Any = torch.random
-#: what the functions of torch for seeds ask; where it is missing, each draw counts
+#: the attribute that torch's seeding functions use; if it is missing, each draw counts as unseeded
 _GENERATOR = "default_generator"
 
 
@@ -230,25 +236,28 @@ class Shared:
     """One shared generator during an observed call."""
 
     def __init__(self, state: Callable[[], Any]) -> None:
-        """Watch a generator; ``state`` returns its state, which is the first one now."""
+        """Watch a generator; ``state`` returns its present state."""
         self._state, self._first = state, state()
-        #: what it draws now is determined by a seed, or by a state, that the call has set
+        #: True if a seed or a state that the call has set determines the next numbers
         self._seeded = False
         self._drew = False
 
     def drew(self) -> bool:
-        """Return True if the call drew, up to now, what no seed of its own decides."""
+        """Return True if the call has, up to now, drawn numbers that no seed of its own
+        determines.
+        """
         self._drew = self._drew or (not self._seeded and _differs(self._state(), self._first))
         return self._drew
 
     def set(self, change: Callable[[], Any], by: _By) -> Any:
-        """Let a call set the generator; the state that it had at the beginning determines
-        nothing.
+        """Run ``change``, which sets seed or state of the generator, and note whether the next
+        numbers are determined by the call.
         """
-        # what was drawn before, as long as its state shows it
+        # note earlier draws before the change hides them
         self.drew()
         value, state = change(), self._state()
-        is_disturbed = watch_here() is None and bool(state)  # by a thread that is not of the call
+        # changed by a thread outside of the call
+        is_disturbed = watch_here() is None and bool(state)
         self._drew = self._drew or by == "system" or is_disturbed
         # a state from before the call determines nothing
         self._seeded = by == "seed" or _differs(state, self._first)
@@ -256,8 +265,8 @@ class Shared:
 
 
 class SharedGenerators(ReplacedFunctions):
-    """The shared generators during an observed call, with the functions that set their seeds and
-    states wrapped.
+    """The shared generators during an observed call; the functions that set their seeds and states
+    are wrapped.
     """
 
     def __init__(self) -> None:
@@ -271,11 +280,13 @@ class SharedGenerators(ReplacedFunctions):
         super().__init__([item for item in replaced if hasattr(item[0], item[1])])
 
     def drawn(self) -> list[str]:
-        """Return the names of the generators that drew what no seed decides."""
+        """Return the names of the generators that drew numbers which no seed of the call
+        determines.
+        """
         return [name for name, shared in self._shared.items() if shared.drew()]
 
     def _replaced(self) -> list[tuple[Any, str, Any]]:
-        """Return places, names, and what stands there during the call."""
+        """Return module, name and replacement of each function that sets a seed or a state."""
         cuda, numpy = self._shared["torch.cuda"], self._shared["numpy.random"]
         generator = _Seeded(getattr(_TORCH, _GENERATOR, None), self._shared["torch"])
         of_numpy = {
@@ -286,7 +297,7 @@ class SharedGenerators(ReplacedFunctions):
             "manual_seed_all": _setting(torch.cuda.manual_seed_all, cuda, "seed"),
             "set_rng_state": _setting(torch.cuda.set_rng_state, cuda, "state"),
         }
-        # each function stands in two modules
+        # each function is an attribute of two modules
         places = (
             (np.random, of_numpy),
             (np.random.mtrand, of_numpy),
@@ -300,7 +311,7 @@ class SharedGenerators(ReplacedFunctions):
 
 
 class _Seeded:
-    """The generator of torch, as the functions that set its seed see it."""
+    """The generator of torch in the form that torch's seeding functions use."""
 
     def __init__(self, generator: Any, shared: Shared) -> None:
         self._generator, self._shared = generator, shared
@@ -319,8 +330,8 @@ class _Seeded:
 
 
 def _setting(function: Callable[..., Any], shared: Shared, by: _By) -> Callable[..., Any]:
-    """Return a function that sets a seed or a state, wrapped; without a value, or with None, the
-    system gives it.
+    """Return a wrapper of a function that sets a seed or a state. Without a value, or with None,
+    the system determines the seed.
     """
 
     def set_generator(*arguments: Any, **named: Any) -> Any:
@@ -332,8 +343,8 @@ def _setting(function: Callable[..., Any], shared: Shared, by: _By) -> Callable[
 
 
 def _differs(state: Any, first: Any) -> bool:
-    """Return True if a generator has another state; a graphics processor that came into use has
-    drawn nothing yet.
+    """Return True if the state of a generator has changed; a graphics processor that came into use
+    has drawn nothing yet.
     """
     if isinstance(state, dict):
         # (seed, number of draws): a device without an earlier entry begins with 0 draws
@@ -345,14 +356,14 @@ def _differs(state: Any, first: Any) -> bool:
 
 
 def _of_numpy() -> tuple[Any, ...]:
-    """Return the state of NumPy's own generator, in a form that can be compared."""
+    """Return the state of NumPy's global generator in a form that can be compared."""
     state: Any = np.random.get_state()
     # name, numbers, position, and the spare normal deviate
     return (state[0], state[1].tobytes(), *state[2:])
 
 
 def _of_cuda() -> dict[int, tuple[int, int]]:
-    """Return seed and count of the draws of each graphics processor in use."""
+    """Return the seed and the number of draws of each graphics processor in use."""
     generators = torch.cuda.default_generators if torch.cuda.is_initialized() else ()  # type: ignore[no-untyped-call]
     return {
         number: (generator.initial_seed(), generator.get_offset())

@@ -1,7 +1,7 @@
-"""A fresh thread that runs a function as its caller would: with its context, its modes of torch,
-its exceptions.
+"""A new thread that runs a function under the conditions of its caller: context variables, modes of
+torch, exceptions.
 
-The thread is fresh because the filter of the kernel stays with a thread for ever.
+The thread is new because the filter of the kernel stays with a thread until the thread ends.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from typing import Any, Generic, TypeVar
 import torch
 
 T = TypeVar("T")
-#: names of the threads of this program, and of a worker of dask that computes its steps
+#: names of the threads of this program, and of a dask worker that computes its steps
 _OWN = re.compile(
     r"(MainThread|neusee|\d+-Dask-|Dask-Offload|Nanny stop queue|Thread-\d+ \(monitor_parent\)).*"
 )
-_LOOK = 0.05  #: s after which a waiting caller sees an exception that another thread raises in it
+#: interval (s) at which a waiting caller checks for an exception that another thread raised in it
+_LOOK = 0.05
 _raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
 def is_alone() -> bool:
-    """Return True if all threads of this process are of this program."""
+    """Return True if all threads of this process belong to this program."""
     return all(_OWN.fullmatch(thread.name) for thread in threading.enumerate())
 
 
 class StepThread(Generic[T]):
-    """A thread that runs ``function`` after ``prepare``, and keeps what came of it."""
+    """A thread that runs ``prepare`` and then ``function``, and keeps the value or the error."""
 
     def __init__(self, function: Callable[[], T], prepare: Callable[[], None]) -> None:
         self._function, self._prepare = function, prepare
@@ -39,10 +40,10 @@ class StepThread(Generic[T]):
         self._modes = _modes()
         self._value: T
         self._error: BaseException | None = None
-        #: the error of ``prepare``; the function did not run
+        #: the error of ``prepare``; if there is one, the function did not run
         self.unprepared: Exception | None = None
         self._ended = False
-        # both are held: the thread waits for the first, the caller for the second
+        # both locks are held: the thread waits for the first, the caller for the second
         self._begin, self._end = threading.Lock(), threading.Lock()
         self._begin.acquire()
         self._end.acquire()
@@ -51,15 +52,15 @@ class StepThread(Generic[T]):
     def run(self) -> None:
         """Run the function in the thread, and wait until it has ended.
 
-        An exception that is raised in the waiting thread is raised in the step too. A Ctrl-C does
-        not wait for the step to end, any other one does: the memory of a step that was stopped must
-        be free.
+        An exception that is raised in the waiting thread is raised in the step too. After a Ctrl-C
+        the caller does not wait for the step to end; after any other exception it does, so that the
+        step's memory is free.
         """
         try:
             try:
                 self.thread.start()
-            # the step waits for it: an exception in the middle of `Thread.start` would leave half a
-            # thread
+            # the thread waits for this lock: an exception inside `Thread.start` could leave it half
+            # started
             finally:
                 self._begin.release()
             self._join()
@@ -72,17 +73,18 @@ class StepThread(Generic[T]):
             raise
 
     def value(self) -> T:
-        """Return the value of the function, or raise what it raised, with its traceback."""
+        """Return the value of the function, or raise its error with the traceback."""
         if self._error is not None:
             try:
                 raise self._error
             finally:
-                self._error = None  # or the error, through its traceback, would hold itself
+                # otherwise the error would refer to itself through its traceback
+                self._error = None
         return self._value
 
     def _join(self) -> None:
-        """Wait for the end; an exception in the middle of `Thread.join` would leave a thread
-        that only seems to end.
+        """Wait until the thread ends, without `Thread.join`: an exception inside `join` could mark
+        a thread as ended while it still runs.
         """
         while not self._ended:
             self._end.acquire(timeout=_LOOK)
@@ -105,9 +107,9 @@ class StepThread(Generic[T]):
             self._end.release()
 
     def _is_prepared(self) -> bool:
-        """Prepare the thread; return False, and keep the error, if that fails."""
+        """Run ``prepare``; if it fails, keep the error and return False."""
         collects_garbage = gc.isenabled()
-        # a finalizer could make a call that is stopped before there is anybody to answer it
+        # a finalizer could make a system call that is stopped before a server can answer it
         gc.disable()
         try:
             self._prepare()
@@ -119,7 +121,7 @@ class StepThread(Generic[T]):
         return self.unprepared is None
 
     def _in_modes(self) -> T:
-        """Run the function with the modes of torch that the caller has."""
+        """Run the function in the torch modes of the caller."""
         records_gradients, is_inference, thread_count, device = self._modes
         if torch.get_num_threads() != thread_count:
             torch.set_num_threads(thread_count)
@@ -130,8 +132,8 @@ class StepThread(Generic[T]):
 
 
 def _modes() -> tuple[bool, bool, int, Any]:
-    """Return what torch keeps for each thread: gradients, inference, number of threads, current
-    device.
+    """Return the settings that torch keeps for each thread: gradients, inference mode, number of
+    threads, current device.
     """
     device = torch.cuda.current_device() if torch.cuda.is_initialized() else None  # type: ignore[no-untyped-call]
     return (

@@ -1,4 +1,6 @@
-"""System calls that a step is stopped at: their table, the filter, and what each one did."""
+"""System calls at which an observed step is stopped: their table, the kernel filter, and the record
+of each call.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +16,14 @@ from typing import Literal, NamedTuple
 
 # --- system calls ---------------------------------------------------------------------------------
 
-# Table of the system calls that a step is stopped at: numbers, what each does, and where its
-# arguments stand.
+# Table of the system calls at which a step is stopped: their numbers, what each one does, and which
+# of its arguments matter.
 #
-# A call that is not in the table passes at full speed. A row that changes what counts as reached is
-# a row of this table; the filter and the process that serves it are made from it.
+# A call that is not in the table passes at full speed. The filter and the server process are built
+# from this table.
 
 
-#: what a call does, for the process that records it and for the judgement of the records
+#: what a call does; the server uses it for the record, and the judgement for the taint
 Does = Literal[
     "open",
     "openat2",
@@ -44,15 +46,16 @@ Does = Literal[
 ]
 Test = Literal["without", "nonzero", "zero"]
 
-AT_EMPTY_PATH = 0x1000  #: the call asks about an open file, not about a path
-CLONE_VFORK, CLONE_THREAD = 0x4000, 0x10000  #: a child that only starts a program, and a thread
+AT_EMPTY_PATH = 0x1000  #: flag: the call is about an open file, not about a path
+#: flags of a child process that only starts a program, and of a thread
+CLONE_VFORK, CLONE_THREAD = 0x4000, 0x10000
 _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}  #: AUDIT_ARCH_… of linux/audit.h
 AUDIT_ARCH_I386 = 0x40000003
 
 
 class Condition(NamedTuple):
-    """What an argument must be for the call to count: ``without`` the bits of a mask,
-    ``nonzero`` or ``zero``.
+    """The condition on an argument for a call to count: without the bits of ``mask``, nonzero, or
+    zero.
     """
 
     argument: int
@@ -61,8 +64,8 @@ class Condition(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Where the arguments of a path stand: the pointer, and the folder that a relative path
-    begins at (-1: of work).
+    """Indices of the arguments with a path: its pointer, and the open folder to which a relative
+    path refers (-1: the working folder).
     """
 
     pointer: int
@@ -70,8 +73,8 @@ class Path(NamedTuple):
 
 
 class Call(NamedTuple):
-    """One system call: its number on each processor (-1 where it is missing), and where its
-    arguments stand.
+    """One system call: its number on each processor (-1 if it is missing there), and the indices of
+    its arguments.
     """
 
     name: str
@@ -80,17 +83,20 @@ class Call(NamedTuple):
     aarch64: int
     path: Path | None = None
     second: Path | None = None
-    number: int = -1  #: argument that is recorded as it is, such as the flags of ``open``
+    #: index of the argument that is recorded unchanged, such as the flags of ``open``
+    number: int = -1
     when: Condition | None = None
 
 
 def _about_path(argument: int) -> Condition:
-    """Return the condition that a call asks about a path, by the flags in one of its arguments."""
+    """Return the condition that a call is about a path, given the index of the argument with its
+    flags.
+    """
     return Condition(argument, "without", AT_EMPTY_PATH)
 
 
 CALLS = (
-    # what is in a file or a folder
+    # read the content of a file or a folder
     Call("open", "open", 2, -1, Path(0), number=1),
     Call("openat", "open", 257, 56, Path(1, 0), number=2),
     Call("openat2", "openat2", 437, 437, Path(1, 0), number=2),
@@ -98,7 +104,7 @@ CALLS = (
     Call("getdents", "list", 78, -1, number=0),
     Call("getdents64", "list", 217, 61, number=0),
     Call("read", "input", 0, 63, number=0, when=Condition(0, "zero")),
-    # whether it is there, how old and how large it is
+    # check whether a path exists, its age and its size
     Call("stat", "check", 4, -1, Path(0)),
     Call("lstat", "check", 6, -1, Path(0)),
     Call("newfstatat", "check", 262, 79, Path(1, 0), when=_about_path(3)),
@@ -114,13 +120,13 @@ CALLS = (
     Call("listxattr", "xattr", 194, 11, Path(0)),
     Call("llistxattr", "xattr", 195, 12, Path(0)),
     Call("flistxattr", "xattr_open", 196, 13, number=0),
-    # these fail where it is not there
+    # calls that fail if the path does not exist
     Call("truncate", "check", 76, 45, Path(0)),
     Call("chmod", "check", 90, -1, Path(0)),
     Call("fchmodat", "check", 268, 53, Path(1, 0)),
     Call("utimensat", "check", 280, 88, Path(1, 0), when=Condition(1, "nonzero")),
-    # what the step makes itself, and may therefore read; whether it could be made or removed says
-    # what was there before
+    # make or remove a path. The step may read what it made itself; success or failure of the call
+    # shows what existed before
     Call("mkdir", "make", 83, -1, Path(0)),
     Call("mkdirat", "make", 258, 34, Path(1, 0)),
     Call("mknod", "make", 133, -1, Path(0)),
@@ -149,15 +155,15 @@ CALLS = (
     Call("process_vm_readv", "unseen", 310, 270),
     Call("ptrace", "unseen", 101, 117),
     Call("pidfd_getfd", "unseen", 438, 438),
-    # other ways to a file, which no filter can follow
+    # other ways to access a file, which no filter can follow
     Call("open_by_handle_at", "unseen", 304, 265),
     Call("io_uring_setup", "unseen", 425, 425),
     # chance
     Call("getrandom", "entropy", 318, 278, number=1),
 )  # fmt: skip
 
-#: calls of 32 bits that open, look or start something; a 64-bit process that makes one is out of
-#: the ordinary
+#: 32-bit calls, such as those that open or check a file, connect, or start a program; a 64-bit
+#: process normally makes none
 CALLS_OF_32_BITS = {
     "open": 5,
     "creat": 8,
@@ -174,8 +180,8 @@ CALLS_OF_32_BITS = {
 
 
 def machine() -> str:
-    """Return the processor if the table has its numbers: ``x86_64`` or ``aarch64``, of 64 bits,
-    else an empty text.
+    """Return the name of the 64-bit processor, ``x86_64`` or ``aarch64``, if the table covers it,
+    otherwise an empty text.
     """
     name = platform.machine()
     return (
@@ -184,38 +190,40 @@ def machine() -> str:
 
 
 def audit_arch(name: str) -> int:
-    """Return the word with which the kernel names a processor."""
+    """Return the number with which the kernel identifies a processor."""
     return _ARCHITECTURES[name]
 
 
 def numbers(name: str) -> dict[int, Call]:
-    """Return the calls of a processor by their numbers."""
+    """Return the calls of a processor, by their numbers."""
     calls = {call.x86_64 if name == "x86_64" else call.aarch64: call for call in CALLS}
     return {number: call for number, call in calls.items() if number >= 0}
 
 
 # --- seccomp filter -------------------------------------------------------------------------------
 
-# Filter of the kernel that stops a thread, and what the thread starts, at the system calls of the
+# Kernel filter that stops a thread, and its child threads and processes, at the system calls of the
 # table.
 #
-# The filter belongs to the thread that installs it and cannot be taken away: install it in a thread
-# made for it. Its threads and child processes inherit it. A stopped call waits until the listener,
-# a file descriptor, is answered.
+# The filter belongs to the thread that installs it and cannot be removed: install it in a thread
+# made for it. Child threads and child processes inherit it. A stopped call waits until the process
+# with the listener, a file descriptor, answers it.
 
 
 PR_SET_NO_NEW_PRIVS = 38
 SECCOMP_SET_MODE_FILTER, SECCOMP_GET_ACTION_AVAIL = 1, 2
 SECCOMP_FILTER_FLAG_NEW_LISTENER = 1 << 3
-#: from Linux 5.19: a signal does not cut a stopped call short
+#: from Linux 5.19: a signal does not interrupt a stopped call
 SECCOMP_FILTER_FLAG_WAIT_KILLABLE_RECV = 1 << 5
 SECCOMP_RET_USER_NOTIF, SECCOMP_RET_ALLOW = 0x7FC00000, 0x7FFF0000
 _SECCOMP = {"x86_64": 317, "aarch64": 277}  #: number of the call that installs a filter
-_X32 = 0x40000000  #: bit of the number of a call of the x32 convention, which no table has
+#: bit in the number of each call of the x32 convention, which is not in the table
+_X32 = 0x40000000
 
 #: instructions of linux/bpf_common.h
 BPF_LD_W_ABS, BPF_JEQ, BPF_JGE, BPF_JSET, BPF_RET = 0x20, 0x15, 0x35, 0x45, 0x06
-#: places in ``struct seccomp_data``; both processors keep the lower half of an argument first
+#: byte offsets in ``struct seccomp_data``; both processors store the lower half of an argument
+#: first
 _NUMBER, _ARCH, _ARGUMENTS = 0, 4, 16
 
 
@@ -237,8 +245,8 @@ class sock_fprog(ctypes.Structure):
 
 
 class Step(NamedTuple):
-    """One instruction: its code, how many to skip where its test holds and where not, and its
-    operand.
+    """One filter instruction: its code, the number of instructions to skip if its test holds and if
+    not, and its operand.
     """
 
     code: int
@@ -251,9 +259,9 @@ _STOP, _PASS = Step(BPF_RET, 0, 0, SECCOMP_RET_USER_NOTIF), Step(BPF_RET, 0, 0, 
 
 
 def program(name: str) -> list[Step]:
-    """Return the instructions of the filter for a processor."""
+    """Return the filter instructions for a processor."""
     for_32_bits = _calls_of_32_bits() if name == "x86_64" else []
-    # a call of that convention is stopped whatever it is
+    # all calls of the x32 convention are stopped
     for_x32 = [Step(BPF_JGE, 0, 1, _X32), _STOP] if name == "x86_64" else []
     calls: list[Step] = []
     for number, call in numbers(name).items():
@@ -261,7 +269,7 @@ def program(name: str) -> list[Step]:
     for_64_bits = [_load(_NUMBER), *for_x32, *calls, _PASS]
     return [
         _load(_ARCH),
-        # to the calls of 64 bits, past those of 32 bits and the instruction that lets pass
+        # for 64-bit calls, skip the instructions for 32-bit calls and the final `_PASS`
         Step(BPF_JEQ, len(for_32_bits) + 1, 0, audit_arch(name)),
         *for_32_bits,
         _PASS,
@@ -270,8 +278,8 @@ def program(name: str) -> list[Step]:
 
 
 def _calls_of_32_bits() -> list[Step]:
-    """Return instructions that stop the calls of 32 bits, and go on behind them for other
-    processors.
+    """Return instructions that stop the 32-bit calls; for other processors they continue behind
+    these.
     """
     stops: list[Step] = []
     for number in CALLS_OF_32_BITS.values():
@@ -280,16 +288,16 @@ def _calls_of_32_bits() -> list[Step]:
 
 
 def _call(number: int, when: Condition | None) -> list[Step]:
-    """Return instructions that stop a call with a number, if its argument is what the table
-    says.
+    """Return instructions that stop the call with a number if its argument satisfies the
+    condition.
     """
     inner_steps = [*_test(when), _STOP]
-    # another number skips what is inside
+    # a call with another number skips the inner instructions
     return [Step(BPF_JEQ, 0, len(inner_steps), number), *inner_steps]
 
 
 def _test(when: Condition | None) -> list[Step]:
-    """Return instructions that let a call pass unless its argument is what the table says."""
+    """Return instructions that let a call pass unless its argument satisfies the condition."""
     if when is None:
         return []
     # an argument has 8 bytes, of which one instruction reads 4
@@ -306,12 +314,12 @@ def _test(when: Condition | None) -> list[Step]:
 
 
 def _load(place: int) -> Step:
-    """Return the instruction that loads the 4 bytes at a place of ``struct seccomp_data``."""
+    """Return the instruction that loads the 4 bytes at an offset in ``struct seccomp_data``."""
     return Step(BPF_LD_W_ABS, 0, 0, place)
 
 
 class Filter:
-    """The filter of this processor, made once and installed in each observed thread."""
+    """The filter for this processor, made once and installed in each observed thread."""
 
     def __init__(self) -> None:
         steps = program(machine())
@@ -322,12 +330,13 @@ class Filter:
         self._flags = SECCOMP_FILTER_FLAG_NEW_LISTENER | SECCOMP_FILTER_FLAG_WAIT_KILLABLE_RECV
 
     def install(self) -> int:
-        """Install the filter in the current thread and return its listener; raise `OSError` where
-        that fails.
+        """Install the filter in the current thread and return its listener; raise `OSError` if that
+        fails.
 
-        From here the thread waits at the calls of the table until somebody serves the listener.
+        From then on, the thread waits at the calls of the table until a server answers the
+        listener.
         """
-        # asked for by the kernel where the process has no special rights
+        # the kernel requires this of a process without special rights
         if self._libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0):
             raise OSError(ctypes.get_errno(), "the thread may not give up new rights")
         listener = self._seccomp(SECCOMP_SET_MODE_FILTER, self._flags, ctypes.byref(self._program))
@@ -341,12 +350,12 @@ class Filter:
         return listener
 
     def offered(self) -> bool:
-        """Return True if the kernel hands stopped calls to a listener."""
+        """Return True if the kernel can pass stopped calls to a listener."""
         action = ctypes.c_uint32(SECCOMP_RET_USER_NOTIF)
         return self._seccomp(SECCOMP_GET_ACTION_AVAIL, 0, ctypes.byref(action)) == 0
 
     def _seccomp(self, operation: int, flags: int, argument: object) -> int:
-        """Call ``seccomp``, for which the library of C has no function."""
+        """Call ``seccomp``, for which the C library has no function."""
         return int(self._libc.syscall(self._call, operation, flags, argument))
 
 
@@ -354,12 +363,12 @@ class Filter:
 
 # Thread that the kernel has stopped at a system call: its memory, its open files and its folders.
 #
-# The thread waits, so what it handed to the call is read from the outside, from the files of
+# The thread waits, so the arguments of its call can be read from outside, from the files of
 # ``/proc``.
 
 
-AT_FDCWD = -100  #: in place of an open folder: the folder of work
-_LONGEST = 4096  #: bytes of a path: PATH_MAX
+AT_FDCWD = -100  #: stands for the working folder instead of an open folder
+_LONGEST = 4096  #: greatest length of a path (bytes): PATH_MAX
 
 
 class Task:
@@ -369,7 +378,7 @@ class Task:
         self.thread = thread
 
     def memory(self, address: int, length: int) -> bytes:
-        """Return bytes of the memory of the thread, fewer where its memory ends."""
+        """Return bytes of the memory of the thread, fewer if the memory ends before."""
         file = os.open(f"/proc/{self.thread}/mem", os.O_RDONLY | os.O_CLOEXEC)
         try:
             return os.pread(file, length, address)
@@ -377,65 +386,62 @@ class Task:
             os.close(file)
 
     def text(self, address: int) -> str:
-        """Return the path at an address."""
+        """Return the path stored at an address."""
         return os.fsdecode(self.memory(address, _LONGEST).partition(b"\0")[0])
 
     def link(self, name: str) -> str:
-        """Return the path of an open file, ``fd/3``, or of the folder of work, ``cwd``."""
+        """Return the path of an open file (``fd/3``) or of the working folder (``cwd``)."""
         return os.readlink(f"/proc/{self.thread}/{name}")
 
     def status(self, word: str) -> int:
-        """Return a number of the status of the thread, such as ``Tgid``."""
+        """Return a number from the status of the thread, such as ``Tgid``."""
         with open(f"/proc/{self.thread}/status", encoding="ascii", errors="replace") as lines:
             return next(int(line.split()[1]) for line in lines if line.startswith(f"{word}:"))
 
     def path(self, text: str, folder: int, follow: bool = True) -> str:
-        """Return the real path of a text, which begins at the open folder ``folder`` if it is
-        relative.
+        """Return the real path for a text; a relative text begins at the open folder ``folder``.
 
-        Without ``follow``, a link at the end of the path stays.
+        Without ``follow``, a symbolic link at the end of the path is not resolved.
         """
         if not text.startswith("/"):
             start = "cwd" if folder == AT_FDCWD else f"fd/{folder}"
             text = os.path.join(self.link(start), text)
-        # of the thread, not of the process that reads this
+        # these folders mean the stopped thread, not the server that reads this
         for own_folder in ("/proc/self", "/proc/thread-self"):
             if f"{text}/".startswith(f"{own_folder}/"):
                 text = f"/proc/{self.thread}{text.removeprefix(own_folder)}"
         if follow:
             return os.path.realpath(text)
-        # the last name itself, even if it is a link
+        # keep the last name, even if it is a link
         parent_folder, name = os.path.split(text.rstrip("/"))
         return os.path.join(os.path.realpath(parent_folder), name)
 
 
 # --- recorded call --------------------------------------------------------------------------------
 
-# Record of one thing that a step reached, made from a stopped system call: what was done, with real
-# paths.
+# Record of one access of a step, made from a stopped system call: what was done, with real paths.
 
 
 class Record(NamedTuple):
-    """One thing that was reached."""
+    """One access of a step."""
 
     does: Does
     path: str  #: real path, or an address
-    second: str = ""  #: the other path of a call with two, or the family of an address
+    second: str = ""  #: second path of a call with two paths, or the family of an address
     flags: int = 0  #: of ``open``
     there: bool = True  #: the path existed before the call
-    trusted: bool = False  #: an import of an installed package, or the program, did it
+    #: True if an import of an installed package, or neusee itself, made the call
+    trusted: bool = False
 
 
 def recorded(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    """Return the record of a stopped call; raise `OSError` if what the task handed over cannot
-    be read.
-    """
+    """Return the record of a stopped call; raise `OSError` if its arguments cannot be read."""
     return _READ[call.does](task, call, arguments)
 
 
 def without_reading(record: Record) -> Record | None:
-    """Return what remains of a call of a trusted task: the step may read what was made, and
-    nothing else counts.
+    """Return the record of what a trusted task makes, which the step may read later; None if it
+    makes nothing.
     """
     if record.does == "open" and record.flags & (os.O_CREAT | os.O_TRUNC):
         return record._replace(flags=(record.flags & ~os.O_ACCMODE) | os.O_WRONLY, trusted=True)
@@ -443,7 +449,7 @@ def without_reading(record: Record) -> Record | None:
 
 
 def _number(call: Call, arguments: Sequence[int]) -> int:
-    """Return an argument that is recorded as it is, as a positive number of 31 bits."""
+    """Return an argument that is recorded unchanged, as a positive number of 31 bits."""
     return arguments[call.number] & 0x7FFFFFFF
 
 
@@ -455,14 +461,14 @@ def _path(task: Task, place: Path | None, arguments: Sequence[int], follow: bool
 
 
 def _signed(argument: int) -> int:
-    """Return an argument of 32 bits with its sign."""
+    """Return a 32-bit argument as a signed number."""
     low_half = argument & 0xFFFFFFFF
-    # 2^32 less where the highest of the 32 bits is set
+    # subtract 2^32 if the highest of the 32 bits is set
     return low_half - (low_half >> 31 << 32)
 
 
 def _opened(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    """Return the record of a file that is opened or made."""
+    """Return the record of a call that opens or makes a file."""
     if call.does == "creat":
         flags = os.O_CREAT | os.O_WRONLY | os.O_TRUNC
     elif (
@@ -477,7 +483,7 @@ def _opened(task: Task, call: Call, arguments: Sequence[int]) -> Record:
 
 def _at_path(task: Task, call: Call, arguments: Sequence[int]) -> Record:
     """Return the record of a call with one path."""
-    # a link at the end of the path is meant itself
+    # these calls act on a link at the end of the path itself
     of_link_itself = call.does in (
         "make",
         "remove",
@@ -508,32 +514,33 @@ def _address(task: Task, call: Call, arguments: Sequence[int]) -> Record:
         struct.unpack_from("H", address_bytes)[0] if len(address_bytes) > 1 else socket.AF_UNSPEC
     )
     if family == socket.AF_UNIX:
-        # behind the 2 bytes of the family; an abstract name begins with a zero byte
+        # the name follows the 2 bytes of the family; an abstract name begins with a zero byte
         name = os.fsdecode(address_bytes[2:].partition(b"\0")[0])
         path = task.path(name, AT_FDCWD) if name else f"@{os.fsdecode(address_bytes[3:])}"
         return Record(call.does, path, "unix")
     if family in (socket.AF_INET, socket.AF_INET6):
-        # place and length of the host in `sockaddr_in` and `sockaddr_in6`
+        # offset and length of the host in `sockaddr_in` and `sockaddr_in6`
         start, length = (4, 4) if family == socket.AF_INET else (8, 16)
         host = socket.inet_ntop(family, address_bytes[start : start + length])
-        # the port, in the order of bytes of the network
+        # the port, in network byte order
         return Record(
             call.does, f"{host}:{struct.unpack_from('!H', address_bytes, 2)[0]}", "internet"
         )
-    # the kernel itself answers a netlink socket, and a socket without a family is only let go
+    # the kernel itself answers a netlink socket; a connect without a family only disconnects the
+    # socket
     reaches_nothing = family in (socket.AF_UNSPEC, socket.AF_NETLINK)
     family_name = "" if reaches_nothing else "other"
     return Record(call.does, f"family {family}", family_name)
 
 
 def _named(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    """Return the record of a call that is told by its name alone."""
+    """Return the record of a call that is described by its name alone."""
     return Record(call.does, call.name)
 
 
 def _entropy(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    """Return the record of a call for chance; ``there`` tells whether it is more than names and
-    places need.
+    """Return the record of a call for random bytes; ``there`` is True if the call asks for more
+    than names and memory layout need.
     """
     length, flags = arguments[call.number], arguments[call.number + 1]
     return Record(
@@ -541,8 +548,8 @@ def _entropy(task: Task, call: Call, arguments: Sequence[int]) -> Record:
     )
 
 
-#: bytes of chance that Python and the library of C take for names of files and places in memory,
-#: and no result has
+#: number of random bytes that Python and the C library use for names of files and places in memory,
+#: which are part of no result
 _SMALL = 32
 _READ: dict[Does, Callable[[Task, Call, Sequence[int]], Record]] = {
     **dict.fromkeys(("open", "openat2", "creat"), _opened),
@@ -557,52 +564,51 @@ _READ: dict[Does, Callable[[Task, Call, Sequence[int]], Record]] = {
 
 # --- trusted tasks --------------------------------------------------------------------------------
 
-# Threads and processes whose calls need no record, because the program, or an installed package,
-# makes them.
+# Threads and processes whose calls need no record, because neusee or an installed package makes
+# them.
 #
-# The observed process says so itself, in order with its calls: it asks for rights to a file that
-# nobody can have, and the call stops.
+# The observed process reports this itself, in order with its calls: it calls ``access`` with a mode
+# that does not exist, and that call is stopped.
 
 
-#: marks in place of the rights that ``access`` asks for: whose calls follow. The kernel refuses
-#: them.
+#: marks in place of the mode of ``access``, which tell whose calls follow. The kernel refuses them.
 TRUSTED, UNTRUSTED, CHILD = 0x6E650001, 0x6E650002, 0x6E650003
 MARKS = (TRUSTED, UNTRUSTED, CHILD)
 
 
 class TrustedTasks:
-    """Threads that import an installed package, and child processes that the program or such a
-    thread starts.
+    """Threads that import an installed package, and child processes that neusee or such a thread
+    starts.
     """
 
     def __init__(self, process: int) -> None:
-        self._process = process  #: that is observed
-        self._children = 0  #: child processes that the program is about to start
+        self._process = process  #: number of the observed process
+        self._children = 0  #: number of child processes that neusee is about to start
         self._of_thread: dict[int, bool] = {}
         self._of_process: dict[int, bool] = {}
 
     def mark(self, thread: int, mark: int) -> None:
-        """Take note of a mark that the observed process made."""
+        """Process a mark that the observed process made."""
         if mark == CHILD:
             self._children += 1
         else:
             self._of_thread[thread] = mark == TRUSTED
 
     def holds(self, task: Task) -> bool:
-        """Return True if the calls of a task need no record."""
+        """Return True if a task is trusted, so that its calls need no record."""
         if task.thread not in self._of_thread:
             process = task.status("Tgid")
             self._of_thread[task.thread] = process != self._process and self._child(process)
         return self._of_thread[task.thread]
 
     def _child(self, process: int) -> bool:
-        """Return True for a child process that the program, or a trusted thread, started."""
+        """Return True for a child process that neusee, or a trusted thread, started."""
         if process not in self._of_process:
             parent_process = Task(process).status("PPid")
             is_trusted = self._of_process.get(parent_process, False)
             if parent_process == self._process:
                 is_trusted = self._children > 0 or any(self._of_thread.values())
-                # one announced child less, if there was one
+                # one announced child has now been found
                 self._children -= self._children > 0
             self._of_process[process] = is_trusted
         return self._of_process[process]

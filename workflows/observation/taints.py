@@ -1,4 +1,6 @@
-"""What the key of a step covers, and the judgement of what the step reached beyond it."""
+"""What the key of a step covers, and the judgement of the accesses that it does not cover
+(taints).
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ from neusee.workflows.observation.system_calls import Record
 
 # --- taints ---------------------------------------------------------------------------------------
 
-# What is covered by the key of a step, and what a step reached beyond it.
+# Dependencies that the key of a step covers, and those that it does not cover.
 
 
 Kind = Literal[
@@ -41,18 +43,18 @@ Kind = Literal[
 
 
 class Covered(NamedTuple):
-    """What the key of a step knows: a step may reach it."""
+    """The files and modules that the key of a step covers, so that the step may read them."""
 
-    files: frozenset[Path]  #: real paths of files and folders; a folder covers what is in it
+    files: frozenset[Path]  #: real paths of files and folders; a folder covers everything in it
     modules: Callable[[str], bool]  #: True for a module whose source the key follows
 
 
 class Taint(NamedTuple):
-    """One thing that a step reached and its key does not know."""
+    """One dependency of a step that its key does not cover."""
 
     kind: Kind
-    what: str  #: path, command, address, generator or module
-    fix: str  #: what to write
+    what: str  #: name of the dependency: path, command, address, generator or module
+    fix: str  #: advice: what to write instead
 
 
 _OF_PATHS = ("file", "folder", "write", "attribute")
@@ -95,7 +97,7 @@ _OF_LAYERS = (
     "make a layer whose weights the node fills itself without drawing them, "
     "torch.nn.utils.skip_init(torch.nn.Linear, 3, 2)"
 )
-#: what else to write against a draw, by what was drawn from
+#: further advice against drawing random numbers, by the source of the numbers
 _OF_CHANCE = {
     "torch": f"{_SEED.format(call='torch.manual_seed(seed)')}; or {_OF_LAYERS}",
     "torch.cuda": f"{_SEED.format(call='torch.manual_seed(seed)')}; or {_OF_LAYERS}",
@@ -104,7 +106,7 @@ _OF_CHANCE = {
 
 
 def taint(kind: Kind, name: str) -> Taint:
-    """Return a taint with what to write against it."""
+    """Return a taint with advice on how to avoid it."""
     fix = _FIX[kind].format(name=_short(kind, name))
     if kind == "random" and name in _OF_CHANCE:
         fix = f"{_OF_CHANCE[name]}; or {fix}"
@@ -112,7 +114,9 @@ def taint(kind: Kind, name: str) -> Taint:
 
 
 def _short(kind: Kind, name: str) -> str:
-    """Return the last name of a file or of something in a module, by which it is declared."""
+    """Return the last part of the name of a file or of a value in a module, with which it is
+    declared.
+    """
     if kind == "memory":
         return name.rpartition(".")[2]
     return Path(name).name if kind in _OF_PATHS else name
@@ -120,18 +124,18 @@ def _short(kind: Kind, name: str) -> str:
 
 # --- judgement ------------------------------------------------------------------------------------
 
-# Which of the things that a step reached are not covered by its key?
+# Which accesses of a step are not covered by its key?
 
 
 _ACCESS = os.O_RDONLY | os.O_WRONLY | os.O_RDWR
 _PATH = getattr(os, "O_PATH", 0)
 _TMPFILE = getattr(os, "O_TMPFILE", 0)
 _GRND_NONBLOCK, _GRND_INSECURE = 1, 4
-_NO_FILE = "<unknown>"  #: of code that `ast.parse` was given as a text
+_NO_FILE = "<unknown>"  #: file name of code that was parsed from a text
 
 
 class Judgement:
-    """The taints of one call, from its records in their order."""
+    """The taints of one call, derived from its records in their order."""
 
     def __init__(
         self,
@@ -140,18 +144,21 @@ class Judgement:
         quiet: Set[str] = frozenset(),
         temporary: Set[str] = frozenset(),
     ) -> None:
-        """Judge by what the key covers, and by what the process knows: see `python_watch.Watch`."""
+        """Judge by what the key covers, and by what the process knows (see
+        `python_watch.Watch`).
+        """
         self._covered, self._bodies = covered, bodies
         self._quiet, self._temporary = quiet, temporary
         self._files = {str(path) for path in covered.files}
         self._made: set[str] = set()  #: files and folders that the call itself made
         self._caches = set(caches())
         self._folders = _with_all_parents((*self._files, *program(), *self._caches, *looked_at()))
-        self._looks: dict[str, None] = {}  #: paths that were looked at and are not covered
+        #: paths that were checked for existence or status and are not covered
+        self._looks: dict[str, None] = {}
         self._taints: dict[Taint, None] = {}
 
     def judge(self, records: Iterable[Record]) -> None:
-        """Add the taints of records."""
+        """Add the taints that follow from some records."""
         for record in records:
             getattr(self, f"_{record.does}")(record)
 
@@ -160,15 +167,15 @@ class Judgement:
         self._taints[taint(kind, name)] = None
 
     def judge_modules(self) -> None:
-        """Add a taint for each module of the user that was executed and that the key does not
-        follow.
-        """
+        """Add a taint for each module of the user that ran and that the key does not cover."""
         for name in self._bodies:
             if not self._covered.modules(name):
                 self.add("import", name)
 
     def taints(self) -> tuple[Taint, ...]:
-        """Return the taints, each once; a look at a folder on the way to another one is none."""
+        """Return the taints, each once. A check of a folder on the way to another path is no
+        taint.
+        """
         kinds = ("file", "folder", "write")
         reached_paths = [
             reached_item.what for reached_item in self._taints if reached_item.kind in kinds
@@ -185,23 +192,23 @@ class Judgement:
     # --- what was done ----------------------------------------------------------------------------
 
     def _open(self, record: Record) -> None:
-        """Judge a file that was opened: whoever does not empty it may learn its length, or that
-        it was there.
+        """Judge a file that was opened. Unless the call empties the file, the step may learn its
+        length or that it existed.
         """
         flags = record.flags
         # the flag has several bits
         if _TMPFILE and flags & _TMPFILE == _TMPFILE:
             return  # a new file without a name
-        # made by the call, if it was not there
+        # the call makes the file if it does not exist
         if _creates(record):
             self._make(record)
-        # emptied: its old content is not read
+        # the file is emptied: its old content is not read
         elif flags & os.O_TRUNC and flags & _ACCESS != os.O_RDONLY:
             self._add_made(record.path)
-        # a look at it
+        # opened only to check the path, or a folder
         elif flags & _PATH or os.path.isdir(record.path):
             self._check(record)
-        # written without a look at its content
+        # written without reading its content
         elif flags & _ACCESS == os.O_WRONLY:
             self._meet(record)
         else:
@@ -209,20 +216,18 @@ class Judgement:
             self._read_source(record.path)
 
     def _make(self, record: Record) -> None:
-        """Judge what is made if it is not there: that it could be made says that it was not
-        there before.
-        """
-        if record.there or os.path.lexists(record.path):  # the next run finds it
+        """Judge a path that a call makes: success shows that the path did not exist before."""
+        if record.there or os.path.lexists(record.path):  # the next run will find this path
             self._meet(record)
         if not record.there:
             self._add_made(record.path)
 
     def _remove(self, record: Record) -> None:
-        """Judge what is removed: that it could be removed says that it was there."""
+        """Judge a path that is removed: success shows that it existed."""
         self._meet(record)
 
     def _meet(self, record: Record) -> None:
-        """Judge a path where the success of a call depends on what was there before."""
+        """Judge a path if the success of a call depends on what existed before."""
         path = record.path
         named_by_chance = not self._temporary.isdisjoint(_with_parents(path))
         needs_no_taint = record.trusted or named_by_chance or path in self._folders
@@ -230,32 +235,32 @@ class Judgement:
             self.add("write", path)
 
     def _move(self, record: Record) -> None:
-        """Follow a file of the step to its new name; any other file is read there, perhaps in a
-        folder of the step.
+        """Follow a file that the step made to its new name. Any other file counts as read, since it
+        may be moved into a folder of the step.
         """
-        if os.path.isdir(record.second):  # one that is there stops a move
+        if os.path.isdir(record.second):  # an existing folder at the target stops a move
             self._meet(record._replace(path=record.second))
-        # its own file has another name now
+        # a file that the step made has another name now
         if self._is_made(record.path):
             self._add_made(record.second)
         elif record.there or not record.trusted:
             self._read(record.path)
 
     def _link(self, record: Record) -> None:
-        """Judge a link like a move: the file has the new name too."""
+        """Judge a link like a move: the file also has the new name."""
         if os.path.lexists(record.second):
             self._meet(record._replace(path=record.second))
         self._move(record)
 
     def _xattr(self, record: Record) -> None:
-        """Judge marks beside a file: no key has them, also of a file that is covered."""
+        """Judge extended attributes of a file: no key covers them, even if it covers the file."""
         if record.path not in self._quiet and not (
             self._is_made(record.path) or self._is_of_machine(record.path)
         ):
             self.add("attribute", record.path)
 
     def _check(self, record: Record) -> None:
-        """Judge a look at a path; whether it counts is known at the end."""
+        """Judge a check of a path; whether it counts is decided at the end."""
         if not (
             record.path in self._folders
             or self._is_covered(record.path)
@@ -264,29 +269,31 @@ class Judgement:
             self._looks[record.path] = None
 
     def _list(self, record: Record) -> None:
-        """Judge a folder whose names are read."""
+        """Judge a folder whose entries are listed."""
         if not self._is_covered(record.path):
             self.add("folder", record.path)
 
     def _input(self, record: Record) -> None:
-        """Judge what is read from an open file, such as the terminal."""
+        """Judge a read from an open file, such as the terminal."""
         self._read(record.path)
 
     def _exec(self, record: Record) -> None:
-        """Judge a program that is started; a look for one that is not there is none."""
+        """Judge the start of a program; a search for a missing program is no taint."""
         if record.there:
             self.add("process", record.path)
 
     def _fork(self, record: Record) -> None:
-        """Judge a fork, whose calls may be those of the step."""
+        """Judge a fork of this process, whose later calls may be part of the step."""
         self.add("process", "a fork of this process")
 
     def _connect(self, record: Record) -> None:
-        """Judge an address that is asked; a socket of the step or of the system is none."""
+        """Judge an address that is contacted; a local socket made by the step or of the system is
+        no taint.
+        """
         is_own_socket = record.second == "unix" and (
             self._is_made(record.path) or is_of_system(record.path)
         )
-        # an empty family reaches nothing
+        # an empty family connects to nothing
         if record.second and not is_own_socket:
             self.add("network", record.path)
 
@@ -298,14 +305,16 @@ class Judgement:
             self._connect(record)
 
     def _entropy(self, record: Record) -> None:
-        """Judge a call for chance; a small one that does not wait seeds tables and names."""
+        """Judge a call for random bytes; a short call that does not wait only seeds hash tables and
+        names.
+        """
         if record.flags & _GRND_INSECURE:
             return  # seeds of the hash tables of Rust, as in safetensors
         if not record.flags & _GRND_NONBLOCK or record.there:
             self.add("random", record.path)
 
     def _unseen(self, record: Record) -> None:
-        """Judge a call that nobody can follow."""
+        """Judge a call that cannot be followed."""
         self.add("unknown", record.path)
 
     # --- what is covered --------------------------------------------------------------------------
@@ -319,8 +328,8 @@ class Judgement:
             self.add(kind, path)
 
     def _read_source(self, path: str) -> None:
-        """Judge source of a module that the key follows, which has neither its comments nor its
-        lines.
+        """Judge the source of a module of the user, of which the key covers neither comments nor
+        line numbers.
         """
         if (
             path not in self._quiet
@@ -330,16 +339,16 @@ class Judgement:
             self.add("file", path)
 
     def _is_covered(self, path: str) -> bool:
-        """Return True for a path that the key covers, source of followed modules included."""
-        # a text of several lines, of which a library asks whether it is the name of a file, or the
-        # name that Python gives to code without a file, whose source a traceback looks for
+        """Return True for a path that the key covers, including the source of followed modules."""
+        # a library may check whether a text of several lines is a path, and a traceback looks for
+        # the source of code without a file, under the name that Python gives it
         no_name = "\n" in path or os.path.basename(path) == _NO_FILE
         if no_name and not os.path.lexists(path):
             return True
         return self._is_covered_as_a_whole(path) or self._is_source(path)
 
     def _is_covered_as_a_whole(self, path: str) -> bool:
-        """Return True for a path of which every byte is covered: made by the call, declared, or
+        """Return True for a path whose every byte is covered: made by the call, declared, or part
         of the machine.
         """
         if self._is_made(path) or not self._files.isdisjoint(_with_parents(path)):
@@ -347,7 +356,7 @@ class Judgement:
         return self._is_of_machine(path)
 
     def _is_of_machine(self, path: str) -> bool:
-        """Return True for a path of installed packages, the system or a cache."""
+        """Return True for a path of an installed package, of the system or of a cache."""
         return is_installed(path) or is_of_system(path) or self._is_cache(path)
 
     def _is_cache(self, path: str) -> bool:
@@ -355,9 +364,7 @@ class Judgement:
         return not self._caches.isdisjoint(_with_parents(path))
 
     def _is_source(self, path: str) -> bool:
-        """Return True for source or byte code of a module that the key follows; a traceback
-        reads the source again.
-        """
+        """Return True for the source or byte code of a module that the key follows."""
         folder, name = os.path.split(path)
         if os.path.basename(folder) == "__pycache__":
             # "__pycache__/node.cpython-311.pyc" is byte code of "node.py"
@@ -366,10 +373,10 @@ class Judgement:
         return any(self._covered.modules(module) for module in self._modules_of(source))
 
     def _modules_of(self, source: str) -> Iterator[str]:
-        """Yield the modules that were made from a file."""
+        """Yield the modules that were loaded from a file."""
         yield from (module for module, file in self._bodies.items() if file == source)
         for module, loaded in sys.modules.copy().items():
-            # to ask a lazy module would import it
+            # `getattr` on a lazy module itself would import it
             file = getattr(loaded, "__dict__", {}).get("__file__")
             if (
                 isinstance(file, str)
@@ -379,8 +386,10 @@ class Judgement:
                 yield module
 
     def _is_made(self, path: str) -> bool:
-        """Return True for a path that the call made, or that is in a folder which it made."""
-        if not os.path.isabs(path):  # below an open folder that nobody named
+        """Return True for a path that the call made, or that lies in a folder that the call
+        made.
+        """
+        if not os.path.isabs(path):  # below an open folder whose path is unknown
             return any(made_path.endswith(f"/{path}") for made_path in self._made)
         return not self._made.isdisjoint(_with_parents(path))
 
@@ -391,14 +400,14 @@ class Judgement:
 
 
 def _creates(record: Record) -> bool:
-    """Return True for a call that makes a file, or that one which is there stops."""
+    """Return True for a call that makes a file, or that fails if the file exists."""
     if not record.flags & os.O_CREAT:
         return False
     return bool(record.flags & os.O_EXCL) or not (record.there or record.flags & os.O_TRUNC)
 
 
 def _with_parents(path: str) -> list[str]:
-    """Return a path and the folders that it is in, the innermost first."""
+    """Return a path and all folders above it, the innermost first."""
     paths = [path]
     while path not in ("/", "") and (parent_folder := os.path.dirname(path)) != path:
         path = parent_folder
@@ -407,7 +416,7 @@ def _with_parents(path: str) -> list[str]:
 
 
 def _with_all_parents(paths: Iterable[str]) -> set[str]:
-    """Return paths with the folders that they are in: to look at one says only that the way to
-    the end exists.
+    """Return paths with all folders above them: a check of such a folder shows only that the way to
+    the path exists.
     """
     return set(chain.from_iterable(map(_with_parents, paths)))

@@ -1,4 +1,4 @@
-"""Schedule of tasks on devices by the heuristic HEFT, with memory as a hard limit."""
+"""Schedule of tasks on devices by the heuristic HEFT, with memory as a hard constraint."""
 
 from __future__ import annotations
 
@@ -49,9 +49,10 @@ class MemoryProfile:
     def __init__(self, limit: float) -> None:
         self.limit = limit
         self.times = [-math.inf]
-        # bytes in use from each of the times on; longer than the list of times
+        # memory in use (bytes) from each of the times on; the array may be longer than the list of
+        # times
         self.level = np.zeros(64)
-        self.kept = 0.0  # bytes that are reserved without end
+        self.kept = 0.0  # memory (bytes) that is reserved without end
 
     def add(self, start: float, end: float, size: float) -> None:
         """Reserve ``size`` bytes of memory from ``start`` until ``end``; a negative ``size``
@@ -59,7 +60,8 @@ class MemoryProfile:
         """
         if size and start < end:
             first_interval = self._cut(start)
-            # one entry for each interval between two times; the last one has no end
+            # each entry is the memory of an interval between two times; the last interval has no
+            # end
             self.level[first_interval : self._cut(end) if end < math.inf else len(self.times)] += (
                 size
             )
@@ -112,12 +114,12 @@ class MemoryProfile:
         index, count = bisect_left(self.times, time), len(self.times)
         if index < count and self.times[index] == time:
             return index
-        # twice the room, as for any growing list
+        # double the length of the array if it is full
         if count == len(self.level):
             self.level = np.concatenate([self.level, np.zeros(count)])
         self.times.insert(index, time)
         self.level[index + 1 : count + 1] = self.level[index:count].copy()
-        # the new interval begins with the level of the one that it is cut from
+        # the new interval has the level of the interval that was split
         self.level[index] = self.level[index - 1]
         return index
 
@@ -160,11 +162,14 @@ def without(
 
 
 Copy = tuple[float, float, float]  #: departure from the source, arrival, last use
-Of = tuple[int, float, int]  #: task of the result, bytes of the result, device
+#: number of the task, size of its result (bytes), number of the receiving device
+Of = tuple[int, float, int]
 
 
 def _most_memory(graph: Graph) -> float:
-    """Return an upper bound of the bytes that a schedule holds on a device at any time."""
+    """Return an upper bound on the memory (bytes) that any schedule uses on a device at any
+    time.
+    """
     task_numbers = range(len(graph.tasks))
     bytes_on_device = sum(graph.own) + max((graph.work(i, 1) for i in task_numbers), default=0.0)
     parts_sent = (graph.sizes[i] for i in task_numbers if graph.tasks[i].takes)
@@ -180,31 +185,33 @@ class PartialSchedule:
 
     def __init__(self, graph: Graph, bounded: bool = True) -> None:
         self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
-        # by task: its device (-1: not placed), its number of parts, its times
+        # for each task, its device (-1: not placed), its number of parts, its start and its end
         self.where, self.parts = [-1] * count, [1] * count
         self.start, self.end = [0.0] * count, [0.0] * count
         # time at which the last reader placed so far has its input
         self.free_at: list[float] = [0.0] * count
         self.left = [len(readers) for readers in graph.readers]  # readers that are not placed yet
-        # by device: the starts and the ends of its idle times
+        # for each device, the starts and the ends of its idle intervals
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
-        # a device with that much memory needs no profile
+        # a device with at least this memory needs no profile
         largest_need = _most_memory(graph) if bounded else -math.inf
         self.rooms = [MemoryProfile(d.memory) if d.memory < largest_need else None for d in devices]
-        # no delay to itself
+        # links between all pairs of devices; a device has no delay to itself
         self.links: list[list[Link]] = []
         for sender in devices:
             self.links.append(
                 [graph.cluster.link(sender.name, receiver.name) for receiver in devices]
             )
-        # bytes that a task needs at least: its result, and its work in as many parts as it allows
+        # least memory (bytes) of a task: its result, and its working memory in the largest allowed
+        # number of parts
         self.least = [
             result_bytes + graph.work(i, graph.tasks[i].parts)
             for i, result_bytes in enumerate(graph.own)
         ]
-        self.copies: dict[Of, list[Copy]] = {}  # of results on other devices
+        self.copies: dict[Of, list[Copy]] = {}  # copies of results on other devices
         self.placed: list[int] = []  # tasks in the order of their placement
-        self.refused: list[tuple[int, int, float]] = []  # task, device, bytes needed there
+        # tasks that did not fit: task, device, memory (bytes) needed there
+        self.refused: list[tuple[int, int, float]] = []
 
     # --- where and when ---------------------------------------------------------------------------
 
@@ -215,13 +222,13 @@ class PartialSchedule:
         earliest_end, best_device, best_start = math.inf, -1, 0.0
         for d in among:
             memory = self.rooms[d]
-            # the memory never suffices, whatever ends before
+            # the memory cannot suffice, even after all earlier tasks have ended
             if memory is not None and (
                 memory.free() < self.least[i] or self._needs(i, d) > memory.limit
             ):
                 continue
             ready, seconds = self._ready(i, d), self.graph.seconds[i][d]
-            # even without a wait for the device it would end later
+            # the task would end later here, even without waiting for the device
             if ready + seconds >= earliest_end:
                 continue
             start = self._slot(i, d, ready, seconds, earliest_end)
@@ -232,24 +239,26 @@ class PartialSchedule:
         return best_device >= 0
 
     def gave_back(self, i: int) -> bool:
-        """Return True if the placement of task ``i`` freed memory that waiting tasks may use."""
+        """Return True if the placement of task ``i`` freed memory for which other tasks may be
+        waiting.
+        """
         return any(not self.left[j] for j in self.graph.sources[i]) or bool(self.refused)
 
     def force(self, i: int) -> None:
-        """Place task ``i`` as if a device had enough memory for this task, and record the bytes
-        that the task needs.
+        """Place task ``i`` as if a device had enough memory for it, and record the memory that the
+        task needs.
         """
         bytes_needed = {
             d: self._needs(i, d) for d in self.graph.able[i] if self.rooms[d] is not None
         }
-        # the device that lacks least
+        # the device that lacks the least memory
         d = min(
             bytes_needed, key=lambda d: (bytes_needed[d] - self.graph.cluster.devices[d].memory, d)
         )
         room = self.rooms[d]
         assert room is not None
         self.refused.append((i, d, bytes_needed[d]))
-        # as if the device had the memory; the error names it
+        # raise the limit to the needed memory, which the error reports
         room.limit = bytes_needed[d]
         self.place(i, [d])
 
@@ -275,7 +284,7 @@ class PartialSchedule:
         before ``best``.
         """
         starts, ends = self.gaps[d]
-        # idle times that end late enough
+        # idle intervals that end late enough
         for gap in range(bisect_left(ends, ready + seconds), len(ends)):
             start = max(starts[gap], ready)
             if start + seconds >= best:
@@ -285,7 +294,7 @@ class PartialSchedule:
             start = self._fitting(i, d, start, seconds, ends[gap])
             if start + seconds <= ends[gap] and start < math.inf:
                 return start
-            # the wait for memory holds for later gaps too
+            # later intervals need the same wait for memory
             ready = max(ready, start)
         return math.inf
 
@@ -302,7 +311,7 @@ class PartialSchedule:
             delay = memory.wait(self._holds(i, d, start, start + seconds, most_parts))
             if not delay:
                 return start
-            # at least one step of the numbers, or a tiny delay would be lost in rounding
+            # at least the next larger number, since a tiny delay could be lost to rounding
             start = max(start + delay, math.nextafter(start, math.inf))
         return start
 
@@ -316,7 +325,7 @@ class PartialSchedule:
             (start, end, graph.work(i, parts)),
         ]
         for copy_of, departure in self._arriving(i, d, start):
-            # copies of an earlier reader on the device serve this one too
+            # a copy for an earlier reader on the device can be used by this task too
             new_spans = without(
                 departure,
                 end,
@@ -347,14 +356,14 @@ class PartialSchedule:
         room = self.rooms[d]
         assert room is not None
         copies = sum(math.ceil(size) for j, size in self._inputs(i) if self.where[j] != d)
-        # what stays reserved without end, and this task with its copies
+        # memory that stays reserved without end, plus this task with its copies
         return room.limit - room.free() + self.least[i] + copies
 
     # --- records of a placement -------------------------------------------------------------------
 
     def _commit(self, i: int, d: int, start: float, end: float) -> None:
-        """Place a task on a device at its times: reserve its memory and the time, and free
-        results that it is the last to read.
+        """Place a task: reserve its memory and the time of the device, and free the results that no
+        other task still reads.
         """
         graph, memory = self.graph, self.rooms[d]
         if memory is not None:
@@ -362,12 +371,12 @@ class PartialSchedule:
             for hold in self._holds(i, d, start, end, self.parts[i]):
                 memory.add(*hold)
         self.put(i, d, start, end)
-        # the time of the device
+        # reserve the time of the device
         self._fill(d, start, end)
         for copy_of, departure in self._arriving(i, d, start):
             self.copies[copy_of] = _joined([*self.copies.get(copy_of, ()), (departure, start, end)])
         for j in graph.sources[i]:
-            # on another device the copy is needed, and the result itself no longer
+            # for a reader on another device, only the copy is needed from its start on
             self.free_at[j] = max(self.free_at[j], end if self.where[j] == d else start)
             self.left[j] -= 1
             memory_of_source = self.rooms[self.where[j]]
@@ -379,8 +388,8 @@ class PartialSchedule:
         self.placed.append(i)
 
     def _fewest(self, i: int, d: int, start: float, end: float, room: MemoryProfile) -> int:
-        """Return the smallest number of band slices with which task ``i`` fits into the memory of
-        device ``d``.
+        """Return the smallest number of parts (groups of bands) with which task ``i`` fits into the
+        memory of device ``d``.
 
         The largest allowed number always fits.
         """
@@ -388,7 +397,7 @@ class PartialSchedule:
         def fits(parts: int) -> bool:
             return not room.wait(self._holds(i, d, start, end, parts))
 
-        # the fewest that fit, by bisection: more parts need less memory
+        # bisection works, because more parts need less memory
         return 1 + bisect_left(range(1, self.graph.tasks[i].parts), True, key=fits)
 
     def _fill(self, d: int, start: float, end: float) -> None:
@@ -421,7 +430,7 @@ class PartialSchedule:
     def schedule(self) -> Schedule:
         """Return the finished schedule; all tasks must have been placed before."""
         devices = self.graph.cluster.devices
-        # first, because it joins transfers
+        # called first, because it merges transfers
         self._bridge()
         moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
         slots = sorted(self._slots(), key=lambda slot: (slot.start, slot.end))
@@ -471,7 +480,7 @@ class PartialSchedule:
         """Return the memory reservations of the finished schedule, as one list for each device."""
         graph, holds_by_device = self.graph, list[list[Hold]]([] for _ in self.rooms)
         free_times, end_of_all = list(self.end), max(self.end, default=0.0)
-        # copies: from their departure to their last use
+        # a copy uses memory from its departure to its last use
         for (j, size, d), copies in self.copies.items():
             holds_by_device[d] += [
                 (departure, last_use, float(math.ceil(size))) for departure, _, last_use in copies
@@ -482,7 +491,7 @@ class PartialSchedule:
             for j in sources:
                 if self.where[j] == self.where[i]:
                     free_times[j] = max(free_times[j], self.end[i])
-        # the result, and the working memory while the task runs
+        # memory of the result, and working memory while the task runs
         for i, d in enumerate(self.where):
             holds_by_device[d].append(
                 (self.start[i], end_of_all if i in graph.kept else free_times[i], graph.own[i])
@@ -505,19 +514,19 @@ class PartialSchedule:
             task_ending_at[self.end[i]] = i
 
     def _waited(self, i: int, before: int, other: int) -> int:
-        """Return the task that delayed task ``i``: an input, the previous task, or a task that
-        freed memory.
+        """Return the task that delayed task ``i``: an input, the previous task on the device, or a
+        task that freed memory.
         """
         start, d = self.start[i], self.where[i]
         for j, size in self._inputs(i):
-            # it started the moment that its input arrived
+            # the task started when this input arrived
             if self.end[j] + self.links[self.where[j]][d].seconds(size) == start:
                 return j
-        # it started at once, or the moment that the device was free
+        # the task started at time 0, or when the device became free
         if start == 0.0 or (before >= 0 and self.end[before] == start):
             return before
         candidates = [j for j in (before, *self.graph.sources[i]) if j >= 0]
-        # a task that ended at this moment freed memory
+        # otherwise a task that ended at this time freed memory
         return other if other >= 0 else max(candidates, key=self.end.__getitem__, default=-1)
 
 
@@ -565,12 +574,12 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
     graph = Graph(tasks, cluster, keep)
     if len(cluster.devices) == 1:
         return _alone(graph, _able(graph))
-    # by rank, as given, and with little memory
+    # three orders: by rank, as given, and with low memory
     orders = [ranked(graph, upward(graph)), graph.by(range(len(graph.tasks))), frugal(graph)]
     try:
         schedule = _best(graph, orders)
     except TooLarge as error:
-        # reports the memory for one device, if this is less
+        # the error reports the memory of a single device if that is less
         return _alone(graph, _able(graph), error)
     seconds = {
         d: sum(seconds_of_task[d] for seconds_of_task in graph.seconds) for d in _able(graph)
@@ -595,7 +604,7 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
     schedule that fits.
     """
     memory = {device.name: device.memory for device in graph.cluster.devices}
-    # without memory limits first, which is fast and mostly suffices
+    # try without memory limits first: this is fast and usually fits
     schedule = _placed(PartialSchedule(graph, bounded=False), orders[0]).schedule()
     if all(peak <= memory[name] for name, peak in schedule.peak.items()):
         return schedule
@@ -603,8 +612,8 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
 
 
 def _shortest(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
-    """Return the shortest schedule within the memory, or raise the least error of the task
-    orders.
+    """Return the shortest schedule within the memory; if none fits, raise the error with the
+    smallest lack of memory.
     """
     shortest, errors = None, list[TooLarge]()
     for order in orders:
@@ -649,21 +658,21 @@ def _placed(
 
 
 class _Turns:
-    """Places in an order of tasks: of those that may be placed now, the first one first, and of
-    those that wait until memory is free.
+    """Positions in an order of tasks: those of tasks that may be placed now, smallest first, and
+    those of tasks that wait for free memory.
     """
 
     def __init__(self, graph: Graph, order: Sequence[int]) -> None:
         self._readers = graph.readers
-        # inputs that are not placed yet
+        # number of inputs of each task that are not placed yet
         self._missing = [len(sources) for sources in graph.sources]
-        self._turn = {i: n for n, i in enumerate(order)}  # place of each task in the order
+        self._turn = {i: n for n, i in enumerate(order)}  # position of each task in the order
         self.ready = [n for n, i in enumerate(order) if not self._missing[i]]
         self.waiting: list[int] = []
 
     def take(self) -> tuple[int, bool]:
-        """Return the next place, and whether it was only waiting: a task that does not fit must
-        then be placed all the same.
+        """Return the next position, and True if only waiting tasks are left, so that this task must
+        be placed although it does not fit.
         """
         if self.ready:
             return heapq.heappop(self.ready), False
@@ -671,14 +680,14 @@ class _Turns:
         return first_waiting, True
 
     def release(self, i: int) -> None:
-        """Let those tasks be placed that waited only for the result of task ``i``."""
+        """Make those tasks ready that waited only for the result of task ``i``."""
         for reader in self._readers[i]:
             self._missing[reader] -= 1
             if not self._missing[reader]:
                 heapq.heappush(self.ready, self._turn[reader])
 
     def try_again(self) -> None:
-        """Let all waiting tasks be placed."""
+        """Make all waiting tasks ready."""
         self.ready, self.waiting = [*self.ready, *self.waiting], []
         heapq.heapify(self.ready)
 
@@ -720,10 +729,10 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
     needed, largest_task = 0.0, 0
     for i in order:
         held_bytes += graph.own[i]
-        # in as few parts as the memory allows
+        # use the fewest parts that the memory allows
         partial.parts[i] = _fewest(graph, i, device.memory - held_bytes)
         peak_bytes = max(peak_bytes, held_bytes + graph.work(i, partial.parts[i]))
-        # in as many parts as the task allows
+        # least memory: with the largest number of parts that the task allows
         least_need = held_bytes + graph.work(i, graph.tasks[i].parts)
         needed, largest_task = (least_need, i) if least_need > needed else (needed, largest_task)
         start, end = end, end + graph.seconds[i][d]
@@ -743,11 +752,12 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
-    """Return the smallest number of band slices with which task ``i`` fits into ``room`` bytes of
-    memory.
+    """Return the smallest number of parts (groups of bands) with which task ``i`` fits into
+    ``room`` bytes of memory.
 
     If no allowed number suffices, return the largest allowed number.
     """
     limit = graph.tasks[i].parts
-    # by bisection: more parts need less memory; the largest number if none suffices
+    # bisection works, because more parts need less memory; it gives the largest number if none
+    # suffices
     return 1 + bisect_left(range(1, limit), True, key=lambda parts: graph.work(i, parts) <= room)

@@ -7,7 +7,7 @@
       cuda-cuda: {bandwidth: 300 GB/s, latency: 5 us}
     network: {bandwidth: 25 GB/s, latency: 5 us}
 
-``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family
+``speed`` is relative to the machine on which the costs were measured, for all nodes or by family
 of nodes. ``node: [a, b]`` puts a group of devices on each of the machines ``a`` and ``b``; the
 network links the machines.
 """
@@ -47,7 +47,7 @@ class Machines:
 
     title: str
     cluster: Cluster
-    #: by device, then by family of nodes or ``default``
+    #: relative speed, by device and then by family of nodes or ``default``
     speeds: Mapping[str, Mapping[str, float]] = field(repr=False)
 
     @property
@@ -66,7 +66,7 @@ def read_machines(path: Path | str) -> Machines:
     """
     document = read(_path(path), str(path))
     diagnostics: list[Diagnostic] = []
-    # mistakes are collected, and raised together
+    # all mistakes are collected and raised together
     root = _fields(
         document.root,
         {"devices": _groups, "links": _links, "network": _link},
@@ -85,7 +85,7 @@ def read_machines(path: Path | str) -> Machines:
         message = f"must be {_MOST_DEVICES} devices or fewer, not {len(devices)}"
         raise RecipeError([_problem(document.root.items["devices"], message)])
     speeds = {device.name: group["speed"] for device, group in devices.items()}
-    # by default that of `Cluster`
+    # the default is that of `Cluster`
     network = root.get("network") or Cluster.network
     return Machines(document.title, Cluster(tuple(devices), links, BUS, network), speeds)
 
@@ -123,7 +123,7 @@ def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
     devices = {}
     for machine, group in rows:
         machine_and_kind = (machine, group["kind"])
-        # a single CPU of a machine has no number
+        # the name of a machine's only CPU has no number
         name = (
             "cpu"
             if machine_and_kind[1] == "cpu" and group_sizes[machine_and_kind] == 1
@@ -156,7 +156,7 @@ def _groups(value: Value, diagnostics: list[Diagnostic]) -> list[dict[str, Any]]
         "speed": _speed,
         "node": _names,
     }
-    # one device as fast as the measured one, on a machine without a name
+    # defaults: one device with the speed of the measured one, on a machine without a name
     defaults: dict[str, Any] = {"count": 1, "speed": {"default": 1.0}, "node": [""]}
     return [
         defaults | _fields(group, readers, ("kind", "memory"), diagnostics)
@@ -225,7 +225,7 @@ def _fields(
 
 
 def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
-    """Return the kind of a group of devices; note one that is not known."""
+    """Return the kind of a group of devices; report an unknown kind."""
     if value.data not in _KINDS:
         diagnostics.append(
             _problem(value, f"unknown kind of device; {nearest(str(value.data), _KINDS)}")
@@ -234,7 +234,7 @@ def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
 
 
 def _count(value: Value, diagnostics: list[Diagnostic]) -> int:
-    """Return the number of devices of a group; note one that is no number of devices."""
+    """Return the number of devices of a group; report an invalid number."""
     if (
         isinstance(value.data, bool)
         or not isinstance(value.data, int)
@@ -248,7 +248,7 @@ def _count(value: Value, diagnostics: list[Diagnostic]) -> int:
 
 
 def _names(value: Value, diagnostics: list[Diagnostic]) -> list[str]:
-    """Return the machines of a group of devices, a single one as a list."""
+    """Return the names of the machines of a group of devices as a list; report invalid names."""
     names = value.data if isinstance(value.data, list) else [value]
     for name in names:
         if not isinstance(name.data, str) or not re.fullmatch(r"[\w.-]+", name.data):
@@ -262,7 +262,9 @@ def _names(value: Value, diagnostics: list[Diagnostic]) -> list[str]:
 
 
 def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
-    """Return the speed of a group of devices by family of nodes, or one for all of them."""
+    """Return the relative speed of a group of devices by family of nodes, or a single one for all
+    families.
+    """
     if not isinstance(value.data, dict):
         return {"default": _factor(value, diagnostics)}
     spec = find_spec("neusee.nodes")  # lists the families of nodes without importing a node
@@ -272,7 +274,7 @@ def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
 
 
 def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
-    """Return a speed relative to the measured one; note one that is no positive number."""
+    """Return a speed relative to the measured one; report a value that is not a positive number."""
     is_number = isinstance(value.data, int | float) and not isinstance(value.data, bool)
     if not is_number or not 0 < value.data < math.inf:
         diagnostics.append(
@@ -285,8 +287,8 @@ def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
 def _quantity(
     value: Value, diagnostics: list[Diagnostic], units: Mapping[str, float], such: str
 ) -> float:
-    """Convert a quantity such as ``80 GB`` to SI units; report a wrong unit, or a value that is
-    out of range.
+    """Convert a quantity such as ``80 GB`` to SI units; report a wrong unit or a value out of
+    range.
     """
     match = _QUANTITY.fullmatch(str(value.data).strip())
     if isinstance(value.data, bool) or match is None:
@@ -323,5 +325,5 @@ def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
 
 
 def _problem(value: Value, message: str, mark: Location | None = None) -> Diagnostic:
-    """Return the mistake of a value, at its place in the file."""
+    """Return the diagnostic for a value, with its location in the file."""
     return Diagnostic(mark or value.mark, value.name, message)

@@ -55,10 +55,10 @@ class Cluster:
     """The devices of one or more machines, with the links between the devices."""
 
     devices: tuple[Device, ...]
-    #: by kinds in either order, within one machine
+    #: links within one machine, by the two kinds of devices in either order
     links: Mapping[tuple[str, str], Link] = field(default_factory=dict)
-    bus: Link = BUS  #: for kinds of one machine that ``links`` does not name
-    network: Link = Link(12.5e9, 10e-6)  #: between machines
+    bus: Link = BUS  #: link within one machine for kinds that ``links`` does not contain
+    network: Link = Link(12.5e9, 10e-6)  #: link between machines
 
     def __post_init__(self) -> None:
         if not self.devices or len(self._by_name) < len(self.devices):
@@ -89,11 +89,11 @@ class Task:
     name: str
     sources: tuple[str, ...]
     seconds: Mapping[str, float]  #: by device name; a device without an entry cannot run the task
-    bytes: float = 0.0  #: size of the result
+    bytes: float = 0.0  #: size of the result (bytes)
     #: memory during the run beside inputs and result, in bytes; 0 for a task of 0 s
     work: float = 0.0
     parts: int = 1  #: upper bound on the number of band slices, among which ``work`` is divided
-    #: bytes that a source sends, if not its whole result
+    #: bytes that the task needs from a source, if not the whole result
     takes: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -133,7 +133,7 @@ class Schedule:
 
     slots: tuple[Slot, ...]
     makespan: float
-    peak: Mapping[str, float]  #: bytes by device, every device of the cluster
+    peak: Mapping[str, float]  #: peak memory (bytes) of every device of the cluster, by name
     transferred: float  #: bytes
     moves: tuple[Move, ...] = ()
 
@@ -158,14 +158,14 @@ class Schedule:
         path = []
         while slot_on_path is not None:
             path.append(slot_on_path)
-            # the task that delayed this one; none for the first
+            # the task that delayed this one; None for the first
             slot_on_path = slot_of_task.get(slot_on_path.after)
         return tuple(path[::-1])
 
 
 class TooLarge(ValueError):
-    """Error for a task that fits on no device, with the bytes that the task needs and the bytes
-    that a device has.
+    """Error for a task that fits on no device, with the memory that the task needs and the memory
+    of the device.
     """
 
     def __init__(
@@ -185,8 +185,8 @@ class TooLarge(ValueError):
         )
 
     def with_program(self, held: float) -> TooLarge:
-        """Return the error with the memory that the program itself holds on the device, as part
-        of need and limit.
+        """Return the error with the memory of the program itself added to the need and to the
+        limit.
         """
         error = TooLarge(self.task, self.device, self.needed, self.memory, self.parts)
         in_parts = f" in {self.parts} parts" if self.parts > 1 else ""
@@ -215,8 +215,7 @@ def _size(count: float) -> str:
 
 # --- task priorities ------------------------------------------------------------------------------
 
-# Priorities of tasks: orders in which a scheduler places tasks, by rank or for the least use of
-# memory.
+# Priorities of tasks: orders in which a scheduler places tasks, by rank or for low memory.
 
 
 class Graph:
@@ -229,18 +228,18 @@ class Graph:
         index = _numbers_of_names(self.tasks, keep)
         self.sources = [_sources_of(task, index) for task in self.tasks]
         self.readers = _readers_of(self.sources)
-        self.kept = set(map(index.__getitem__, keep))  # results that stay to the end
-        # bytes that a task takes of each of its sources
+        self.kept = set(map(index.__getitem__, keep))  # tasks whose results are kept to the end
+        # bytes that each task needs from each of its sources
         self.sizes = list(map(self._sent, self.tasks, self.sources))
-        # whole bytes add up without round-off
+        # whole numbers of bytes, so that sums have no rounding errors
         self.own = [float(math.ceil(task.bytes)) for task in self.tasks]
-        # by task: the devices that can run it
+        # for each task, the devices that can run it
         self.able = [_able_devices(task, cluster) for task in self.tasks]
         self.seconds = [_seconds_by_device(task, cluster) for task in self.tasks]
         self._check()
 
     def _sent(self, task: Task, sources: list[int]) -> list[float]:
-        """Return the bytes that a task takes of the result of each of its sources."""
+        """Return the bytes that a task needs from the result of each of its sources."""
         results = [self.tasks[j] for j in sources]
         return [task.takes.get(result.name, result.bytes) for result in results]
 
@@ -254,8 +253,8 @@ class Graph:
         return float(math.ceil(self.tasks[i].work / parts))
 
     def by(self, keys: Sequence[Any]) -> list[int]:
-        """Return the tasks in order, each after its inputs; the ready task with the smallest key
-        comes next.
+        """Return the tasks in an order in which each follows its inputs; among ready tasks, the one
+        with the smallest key comes next.
         """
         missing_inputs = [len(sources) for sources in self.sources]
         ready = [(keys[i], i) for i, count in enumerate(missing_inputs) if not count]
@@ -292,12 +291,12 @@ class Graph:
 
 
 def _numbers_of_names(tasks: Sequence[Task], keep: Collection[str]) -> dict[str, int]:
-    """Return the number of each task by its name; raise ValueError for a name that two tasks have,
-    and for one that a task reads, or the run keeps, and that none has.
+    """Return the number of each task by its name. Raise ValueError for a name of two tasks, and for
+    an unknown name among sources or kept results.
     """
     number_of_task = {task.name: i for i, task in enumerate(tasks)}
     if len(number_of_task) < len(tasks):
-        # the later of two tasks has the number that the name leads to
+        # the dict holds the number of the later of two tasks with the same name
         repeated_name = next(
             task.name for i, task in enumerate(tasks) if number_of_task[task.name] != i
         )
@@ -329,13 +328,13 @@ def _able_devices(task: Task, cluster: Cluster) -> list[int]:
 
 
 def _seconds_by_device(task: Task, cluster: Cluster) -> list[float]:
-    """Return the time of a task on each device; infinity where it cannot run."""
+    """Return the time (s) of a task on each device; infinity for a device that cannot run it."""
     return [task.seconds.get(device.name, math.inf) for device in cluster.devices]
 
 
 def ranked(graph: Graph, ranks: Sequence[float]) -> list[int]:
-    """Return the tasks in order of decreasing rank; ranks that differ only by round-off count as
-    equal.
+    """Return the tasks in order of decreasing rank; ranks that differ only by rounding errors count
+    as equal.
     """
     return graph.by([(-float(f"{rank:.9g}"), graph.tasks[i].name) for i, rank in enumerate(ranks)])
 
@@ -370,12 +369,12 @@ def frugal(graph: Graph) -> list[int]:
     249).
     """
     peak_up_to, input_order = _needs(graph)
-    # by final task: what stays after it
+    # for each final task, the memory that stays in use after it
     bytes_after = {
         i: graph.own[i] if i in graph.kept else 0.0 for i, r in enumerate(graph.readers) if not r
     }
     position: dict[int, int] = {}
-    # a stack: the last one comes first, that which frees most of its peak
+    # a stack: the last task comes first, which is the one that frees most of its peak
     stack = sorted(bytes_after, key=lambda i: (bytes_after[i] - peak_up_to[i], i), reverse=True)
     while stack:
         i = stack[-1]
@@ -393,7 +392,7 @@ def _needs(graph: Graph) -> tuple[list[float], list[list[int]]]:
     """
     peak_up_to, input_order = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
     for i in graph.by(range(len(graph.tasks))):
-        # the input that frees most of its peak first
+        # the input that frees most of its peak comes first
         input_order[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - peak_up_to[j], j))
         held_bytes = 0.0
         for j in input_order[i]:

@@ -35,7 +35,7 @@ def parse_size(text: str) -> int:
     match = _SIZE.fullmatch(text)
     if not match:
         raise ValueError(f"{text!r} is not a size: write a number of bytes, such as 20 GB")
-    # "20 G", "20 GB" and "20 gb" are the same
+    # "20 G", "20 GB" and "20 gb" mean the same
     unit = match[2].lower().removesuffix("b") + "b"
     return int(float(match[1]) * _ANY_CASE[unit])
 
@@ -78,8 +78,8 @@ def default_root() -> Path:
 
 
 def _is_checkout(folder: Path) -> bool:
-    """Return True for a checkout of neusee; with ``--no-code``, a stranger's folder that looks
-    like one is none.
+    """Return True for a checkout of neusee. With ``--no-code``, a folder that looks like a checkout
+    counts only if it contains the running program.
     """
     project = folder / "pyproject.toml"
     if not project.is_file() or 'name = "neusee"' not in project.read_text("utf-8"):

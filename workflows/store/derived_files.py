@@ -1,5 +1,5 @@
-"""Files derived from results, such as pictures, stored by key so that a second run reuses the
-files.
+"""Files derived from results, such as pictures, stored by key so that a second run can use them
+again.
 
 The files are in the folder ``files/`` of the store; their checksums are results of the store.
 """
@@ -28,7 +28,7 @@ from neusee.workflows.store.shared_folder import open_now
 if TYPE_CHECKING:
     from torch import Tensor
 
-_SHA256 = 32  #: bytes of this digest
+_SHA256 = 32  #: length (bytes) of a SHA-256 digest
 _FAST = xxhash.xxh3_128
 
 
@@ -40,17 +40,17 @@ class DerivedFiles:
     def __init__(self, store: Store) -> None:
         self.store = store
         self.folder = store.root / "files"
-        self._spare = ""  # a temporary folder, which goes with this object
-        self._failing = threading.Lock()  # two threads make files
-        # what the system said of each file when it was right
+        self._spare = ""  # a temporary folder, which is deleted with this object
+        self._failing = threading.Lock()  # lock, because two threads make files
+        # inode, size and time stamp of each file when its checksum was right
         self._fresh: dict[Path, tuple[int, ...]] = {}
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """Return the path of the derived file ``key``, or None if it is missing, or has a wrong
-        name or checksum.
+        """Return the path of the derived file ``key``, or None if the file is missing, or has a
+        wrong name or checksum.
 
-        A file that this object has written or compared is not compared again while it is the same
-        to the system.
+        A file that this object has written or compared is not compared again while inode, size and
+        time stamp stay the same.
         """
         from torch import Tensor
 
@@ -67,14 +67,14 @@ class DerivedFiles:
         return None
 
     def keep(self, key: str, suffix: str, step: str, write: Callable[[Path], None]) -> Path:
-        """Let ``write`` write a file beside its final path, rename the file, and store its
+        """Let ``write`` write a file under a temporary name, rename the file, and store its
         checksum; return its path.
 
-        The file is read-only. If the folder cannot be written, or the file not be read again, it is
-        written into a temporary folder.
+        The file is read-only. If the folder cannot be written, or the file cannot be read back, it
+        is written into a temporary folder.
         """
         try:
-            # once more below where the folder of the store fails
+            # tried again below, in a temporary folder, if the folder of the store fails
             path, digest = self._compared(key, suffix, write)
         except OSError as error:
             self.store.report_failure(error)
@@ -101,15 +101,13 @@ class DerivedFiles:
     def _compared(
         self, key: str, suffix: str, write: Callable[[Path], None]
     ) -> tuple[Path, Tensor]:
-        """Return the path of a file that is written now, and the digest of what the device gives
-        back of it.
-        """
+        """Write a file; return its path, and the digest of the bytes that are read back from it."""
         path = self._written(key, suffix, write)
         return path, _digest(path, "sha256" if secrets() else _FAST)
 
     def _written(self, key: str, suffix: str, write: Callable[[Path], None]) -> Path:
-        """Let ``write`` write a read-only file, which gets its name when it is complete; return
-        its path.
+        """Let ``write`` write a read-only file, which gets its final name when it is complete;
+        return its path.
         """
         path = self._path(key, suffix)
         make_folders(str(path.parent), str(self.store.root))
@@ -124,20 +122,20 @@ class DerivedFiles:
 
 
 def _remove(folder: str, process: int) -> None:
-    """Remove a folder in the process that made it, and not in a fork of it."""
+    """Remove a folder if this process made it; a forked process does nothing."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    """Return what the system says of a file, which differs after each change of it."""
+    """Return inode, size and time stamp of a file, which differ after each change."""
     file_status = path.stat()
     return file_status.st_ino, file_status.st_size, file_status.st_mtime_ns
 
 
 def _is_right(path: Path, stored_digest: Tensor) -> bool:
-    """Return True if a file has the digest that was stored: SHA-256, or the faster xxh3 where
-    nothing is signed.
+    """Return True if a file has the stored digest: SHA-256, or the faster xxh3 if no secret is
+    set.
     """
     import torch
 

@@ -18,17 +18,17 @@ from neusee.workflows.store.shared_folder import OLD, Disk, below, entries, read
 
 # --- budget eviction ------------------------------------------------------------------------------
 
-# Removal of values from a store beyond its size budget; values that save the least time per byte go
-# first.
+# Removal of values from a store that exceeds its size budget; values that save the least time per
+# byte are removed first.
 #
 # The weight of a value halves for every week between its last use and the newest use in the store;
 # today's date does not matter. Pinned values stay. The metadata of an evicted value stay as its
-# receipt, so that origin and cost remain known. A process that reads the value at that moment keeps
-# its memory map.
+# receipt, so that origin and cost remain known. A process that is reading the value keeps its
+# memory map.
 
 
 LOW = 0.9  #: fraction of the budget that remains after an eviction
-_HALF = 7 * 86400.0  #: s in which the weight of an unused value halves
+_HALF = 7 * 86400.0  #: time (s) in which the weight of an unused value halves
 _FULL_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -51,7 +51,8 @@ def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
     # the least valuable first
     evictable.sort(
         key=lambda c: (
-            # s saved for each byte, halved for each week without use; then age and key decide
+            # time saved per byte (s), halved for each week without use; equal values are sorted by
+            # age and key
             max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF),
             c.used,
             c.key,
@@ -63,7 +64,7 @@ def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
             break
         to_evict.append(candidate)
         freed += candidate.size
-    # the last values may be large enough to make earlier ones needless
+    # the last values may free so much that earlier ones need not be removed
     for candidate in to_evict[::-1]:
         if freed - candidate.size >= excess:
             to_evict.remove(candidate)
@@ -94,9 +95,7 @@ def evict(
 
 
 class CacheBudget:
-    """Comparison of the size of a store with its size budget, without a count of all bytes at
-    each write.
-    """
+    """Check of the size of a store against its budget, without counting all bytes at each write."""
 
     def __init__(self, disk: Disk, budget: int) -> None:
         self._disk, self.budget = disk, budget
@@ -113,9 +112,9 @@ class CacheBudget:
         stored = total(self._disk)
         self._spare = self.budget / 20
         if stored > self.budget:
-            # more than the excess, so that the next writes fit without another eviction
+            # evict more than the excess, so that the next writes fit without another eviction
             return stored - LOW * self.budget
-        # not beyond the budget
+        # count again before the budget can be exceeded
         self._spare = min(self._spare, self.budget - stored)
         return 0.0
 
@@ -131,10 +130,10 @@ def candidates(
     """Yield every stored value that may be evicted, with the number of bytes that its eviction
     frees.
 
-    A result that this program does not read saves no time.
+    A result in a format that this program cannot read counts as saving no time.
     """
     sizes, changes = dict[str, int](), dict[str, float]()
-    # by name without the folder, because the names of keys are unique
+    # by file name without the folder, because keys are unique
     for path, size, changed in files(disk):
         sizes[os.path.basename(path)], changes[os.path.basename(path)] = size, changed
     for key in metadata.names(disk):
@@ -146,16 +145,16 @@ def candidates(
 
 @dataclass(frozen=True, slots=True)
 class _StoredValue:
-    """What is known of a stored value."""
+    """Size and saved time of a stored value."""
 
-    size: int  #: bytes of its own files
+    size: int  #: bytes of its files
     seconds: float  #: time in s for computing the value, minus the time for loading the value
 
 
 def _stored_value(
     disk: Disk, key: str, sizes: Mapping[str, int], read_seconds: Callable[[float], float]
 ) -> _StoredValue | None:
-    """Return what is known of a stored value, or None if its metadata are unreadable or a
+    """Return size and saved time of a stored value, or None if its metadata are unreadable or a
     receipt.
     """
     payload_bytes = sizes.get(f"{key}.safetensors", 0)
@@ -177,16 +176,16 @@ def _stored_value(
 def drop(disk: Disk, key: str) -> bool:
     """Delete a stored value but keep its metadata; return False if the value cannot be deleted."""
     try:
-        # so that nobody stores the value anew in between
+        # locked, so that no process stores the value again in between
         with disk.lock():
             try:
                 entry = metadata.read(disk, key)
             except NotRead:
-                # of another format: only its file of tensors is known
+                # a record in another format: only the file of its tensors is known
                 entry = {"payload": True}
                 disk.unlink(disk.path(key, "json"))
             if metadata.is_kept(entry):
-                # metadata that were read; others are deleted above
+                # only metadata that could be read; others were deleted above
                 if "key" in entry:
                     _write_receipt(disk, key, entry)
                 _delete_files(disk, key, entry)
@@ -239,7 +238,7 @@ def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
 
 
 Find = Callable[[Disk], Iterator[os.DirEntry[str]]]
-#: no text in JSON contains a quotation mark without a backslash
+#: cannot occur inside a JSON text, where a quotation mark has a backslash
 _HAS_PAYLOAD = b'"payload":{'
 _WEEK = 7 * 86400.0  #: s for which a damaged entry is kept for inspection
 
@@ -276,7 +275,7 @@ def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
 
 
 def _not_read(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield old metadata of another format version, or without the signature that is asked for."""
+    """Yield old metadata of another format version, or without the required signature."""
     for entry in below(disk.folder):
         key, _, suffix = entry.name.partition(".")
         if suffix == "json":
@@ -325,7 +324,7 @@ def _bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
 def _raw(disk: Disk, key: str) -> bytes:
     """Return the metadata of a result as they are stored, without a check.
 
-    Whether a field is in them decides about most files, and takes a third of the time of a check.
+    A search for a field in them decides about most files, in a third of the time of a check.
     """
     return read_file(disk.path(key, "json"))
 

@@ -26,11 +26,11 @@ from neusee.workflows.store.shared_folder import Disk, append, read_file
 Row = dict[str, Any]
 _FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "size", "date")
 _CHECKED = [(name, FIELDS[name]) for name in (*_FIELDS, "kept")]
-_START, NO_VALUE = b'{"key":"', b'"kept":false'  #: bytes that no text in JSON contains
+_START, NO_VALUE = b'{"key":"', b'"kept":false'  #: bytes that cannot occur inside a JSON text
 _KEY = slice(len(_START), len(_START) + 32)
 _NAMES = {"key", "node", "kept", *_FIELDS}
 _HEAD = re.compile(rb'\{"journal":"[0-9a-f]{16}","format":%d\}' % FORMAT)
-_SPARE = 20_000  #: superseded lines from which the file is rewritten
+_SPARE = 20_000  #: number of lines above which a file of mostly superseded lines is rewritten
 _LATEST = 1 << 20  #: bytes at the end of the file that `Journal.latest` reads, about 3000 lines
 _TOTALS = re.compile(rb'^%s([^"]+)".*?,"bytes":(\d*).*?,"kept":(true|false)' % _START, re.M)
 
@@ -56,7 +56,7 @@ class Journal:
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._rows: list[Row] = []
-        # True where the file cannot be written: the rows are in memory alone
+        # True if the file cannot be written, so that the rows are in memory only
         self._fileless = False
         self._forget()
 
@@ -125,7 +125,7 @@ class Journal:
         """Rewrite the journal with the newest line of each existing result, and mark the evicted
         values.
 
-        Lines are copied as they are, so that a long journal needs little memory.
+        Lines are copied unchanged, so that a long journal needs little memory.
         """
         with self._guard:
             newest_lines = self._newest_lines()
@@ -153,17 +153,17 @@ class Journal:
         """Return the newest undamaged line of each key, the newest last."""
         line_of_key = dict[str, bytes]()
         with suppress(OSError), open(self._path, "rb", opener=_opened) as file:
-            # without the first line, which is the head
+            # skip the first line, which is the head
             for line in itertools.islice(file, 1, None):
                 key = line[_KEY].decode(errors="replace")
                 if line.startswith(_START) and any(_parsed(line := line.rstrip(b"\n"))):
-                    # so that the key moves to the end
+                    # removed first, so that the key moves to the end
                     line_of_key.pop(key, None)
                     line_of_key[key] = line
         return line_of_key
 
     def _line(self, key: str, line: bytes | None, has_value: bool) -> tuple[str, bytes]:
-        """Return the date and the line of a result, which is ``line`` if that is right."""
+        """Return the date and the line of a result; ``line`` is used again if it is correct."""
         if line is not None and has_value == (NO_VALUE not in line):
             # lines with a position need no date
             return "", line
@@ -175,14 +175,16 @@ class Journal:
         return str(row["date"]), seal_record("journal", {**row, "kept": has_value})
 
     def _forget(self) -> None:
-        """Forget what was read, so that the next call reads the file from its beginning."""
+        """Forget the lines that were read, so that the next call reads the file from its
+        beginning.
+        """
         self._rows = []
-        # first line, bytes read so far, no file, all lines were read
+        # first line; bytes read so far; whether there is no file; whether all lines were read
         self._head, self._offset, self._fileless, self._whole = b"", 0, False, True
 
     def _read(self, all_lines: bool = True) -> None:
-        """Read the lines that are new in the file; all of it where only its end was read before
-        and ``all_lines`` are asked for.
+        """Read the new lines of the file. If only its end was read before and ``all_lines`` are
+        needed, read the whole file.
         """
         with self._guard:
             if all_lines and not self._whole:
@@ -194,12 +196,12 @@ class Journal:
         """Read the lines added to the journal file since the last call; rebuild a missing or
         damaged file.
 
-        If ``all_lines`` is False, the first call reads the end of the file alone.
+        If ``all_lines`` is False, the first call reads only the end of the file.
         """
         try:
             with open(self._path, "rb", opener=_opened) as file:
                 head = file.readline(100).strip()
-                # another process has written the file anew
+                # another process has rewritten the file
                 if head != self._head or os.fstat(file.fileno()).st_size < self._offset:
                     self._forget()
                 start = self._offset or self._first_byte(file, len(head), all_lines)
@@ -218,21 +220,23 @@ class Journal:
         return None
 
     def _drop_old_rows(self) -> None:
-        """Write the journal anew with the newest row of each key, if most rows are older ones."""
+        """Rewrite the journal with the newest row of each key, if more than half of the rows are
+        superseded.
+        """
         newest = {row["key"]: row for row in self._rows}
         if len(self._rows) > 2 * len(newest):
             self._replace(list(newest.values()))
 
     def _first_byte(self, file: BinaryIO, head: int, all_lines: bool) -> int:
-        """Return where the first read begins: after the first line, or at the start of a line
-        near the end.
+        """Return the offset at which the first read begins: after the first line, or at the start
+        of a line near the end.
         """
         size = os.fstat(file.fileno()).st_size
         if all_lines or size - head <= _LATEST:
             return head
         self._whole = False
         file.seek(size - _LATEST)
-        # the rest of a line that began before
+        # skip the rest of a line that began before this offset
         file.readline(_LATEST)
         return file.tell()
 
@@ -240,7 +244,7 @@ class Journal:
         return itertools.chain(metadata.each(self._disk), self._others())
 
     def _rebuild(self) -> None:
-        """Write the journal anew from the metadata of all results, in the order of their dates."""
+        """Rewrite the journal from the metadata of all results, in the order of their dates."""
         rows = [row_of(key, entry) for key, entry in self._each()]
         self._replace(sorted(rows, key=lambda row: str(row["date"])))
 
@@ -253,8 +257,8 @@ class Journal:
         self._rows = rows
 
     def _replace_lines(self, lines: list[bytes]) -> None:
-        """Write the file of the journal from lines, with a new head that tells other processes;
-        where it cannot be written, the rows stay in memory alone.
+        """Rewrite the journal file from ``lines``, with a new head from which other processes see
+        the change. If that fails, the rows stay in memory only.
         """
         self._head = f'{{"journal":"{os.urandom(8).hex()}","format":{FORMAT}}}'.encode()
         content = b"\n".join([self._head, *lines])
@@ -294,7 +298,7 @@ def _opened(path: str, flags: int) -> int:
     """Open the journal, which is a regular file, without following a symbolic link; never wait for
     a pipe.
 
-    Raises `OSError` for anything else, such as a device that never ends.
+    Raises `OSError` for anything but a regular file, such as an endless device.
     """
     file = os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW)
     if not stat.S_ISREG(os.fstat(file).st_mode):

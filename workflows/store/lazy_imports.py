@@ -1,5 +1,5 @@
-"""Modules of the store that reach torch, imported when a value is first read or written: metadata,
-leases and the list of a cache need none of them, and torch takes a second.
+"""Modules of the store that import torch, loaded when a value is first read or written: metadata,
+leases and the list of a cache do not need them, and the import of torch takes a second.
 
     from neusee.workflows.store import lazy_imports as lazy
     lazy.serialization.pack(value)

@@ -33,7 +33,7 @@ class Lease:
     """The right of one process to compute the result of a cache key, until the process calls
     `release`.
 
-    The argument ``path`` is the file of the lease, or None if no file can be written.
+    ``path`` is the file of the lease, or None if no file can be written.
     """
 
     __slots__ = ("_inode", "_path")
@@ -67,7 +67,7 @@ class Leases:
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
-        #: by path: content, and the time of its first observation
+        #: for each path: the state of the lease file, and the time of its first observation
         self._seen: dict[str, tuple[object, float]] = {}
 
     def claim(self, key: str) -> Lease | None:
@@ -118,7 +118,7 @@ class Leases:
         temporary = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
         with self._disk.lock():
             state_now = _state_of_lease(path)
-            # another content or inode: somebody else took it since the look
+            # another content or inode: another process took the lease since it was observed
             if state_now is not None and (look is None or state_now[:2] != look[:2]):
                 raise FileExistsError(path)
             with _guard:
@@ -186,7 +186,7 @@ def _badge(disk: Disk) -> str:
     if disk.folder not in _badges:
         disk.prepare()
         path = f"{disk.folder}/tmp/badge.{me()}"
-        # of an earlier process with this number
+        # a badge of an earlier process with the same number
         with suppress(FileNotFoundError):
             os.unlink(path)
         with open(path, "xb") as file:
@@ -215,7 +215,8 @@ def _beat() -> None:
             badges = list(_badges.values())
         for path in badges:
             with suppress(OSError):
-                append(path, b".")  # a change that other processes see whatever their clocks say
+                # other processes see this change of the file independently of their clocks
+                append(path, b".")
 
 
 def retire() -> None:

@@ -21,13 +21,13 @@ from neusee.workflows.store.shared_folder import Disk, entries, read_file
 
 # --- layout check ---------------------------------------------------------------------------------
 
-# Check of the layout of a stored value, which is data that anybody may have written.
+# Check of the layout of a stored value. Stored data may come from anybody.
 #
 # A layout is a tree of small dicts, each with one kind: ``tensor``, ``bytes``, ``class``,
 # ``tuple``, ``list``, ``dict`` or ``value``. The check knows no class and makes no value.
 
 
-DEEPEST = 50  #: levels of a layout
+DEEPEST = 50  #: greatest depth of a layout
 _DIGITS = re.compile(r"[0-9a-f]{32}")
 _KINDS = ("tensor", "bytes", "class", "tuple", "list", "dict", "value")
 
@@ -44,7 +44,7 @@ def check_layout(layout: Any) -> None:
         if not isinstance(item, dict) or depth > DEEPEST:
             raise ValueError("the layout of the value is not a tree of mappings, or is too deep")
         kinds = [kind for kind in _KINDS if kind in item]
-        # a class has its items beside its name, any other kind nothing
+        # a class has the entry ``items`` beside its name; any other kind has a single entry
         if len(kinds) != 1 or len(item) != 1 + ("class" in item):
             raise OtherFormat(
                 f"its layout has a kind that is not known: {', '.join(map(str, item))[:80]}"
@@ -53,7 +53,7 @@ def check_layout(layout: Any) -> None:
 
 
 def _inner(kind: str, item: dict[str, Any]) -> Iterable[Any]:
-    """Check one level of a layout, and return the layouts in it."""
+    """Check one level of a layout, and return the layouts inside it."""
     content = item[kind]
     if kind in ("tensor", "bytes"):
         _expect(is_count(content), kind)
@@ -93,8 +93,8 @@ def _expect(condition: bool, kind: str) -> None:
 
 # --- metadata fields ------------------------------------------------------------------------------
 
-# Check of the metadata of a result, which are data that anybody may have written: types and ranges
-# of the fields.
+# Check of the metadata of a result: types and ranges of the fields. Stored data may come from
+# anybody.
 
 
 LONGEST = 1e9  #: s; no step takes longer
@@ -123,8 +123,8 @@ def is_number(value: Any) -> bool:
 
 
 def _is_payload(value: Any) -> bool:
-    """Return True for what the metadata say of a file of tensors: size and digests, and the
-    stamp of the file.
+    """Return True for a valid description of a file of tensors: its size, its digests and its
+    stamp.
     """
     is_payload = (
         isinstance(value, dict) and is_count(value.get("size")) and is_checksum(value.get("xxh3"))
@@ -140,7 +140,7 @@ def _is_inline(value: Any) -> bool:
 
 
 def _is_tensor(value: Any) -> bool:
-    """Return True for a tensor in the metadata: type, shape, whether it is complex, and its
+    """Return True for a valid tensor in the metadata: type, shape, whether it is complex, and its
     bytes as text.
     """
     if not isinstance(value, list) or len(value) != 4:
@@ -186,7 +186,7 @@ def _is_step_size(value: Any) -> bool:
     )
 
 
-#: what each field must be, unless it is missing or null
+#: the check of each field, applied unless the field is missing or null
 FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "step": is_text,
     "recipe": is_text,
@@ -213,7 +213,7 @@ def checked_fields(about: dict[str, Any], key: str) -> dict[str, Any]:
     """Return the metadata of the result ``key`` after a check of their fields.
 
     Raises `OtherFormat` for a layout of an unknown kind, and `ValueError` for any other field that
-    cannot be right.
+    is invalid.
     """
     if (stated_key := about.get("key")) != key:
         raise ValueError(
@@ -225,7 +225,7 @@ def checked_fields(about: dict[str, Any], key: str) -> dict[str, Any]:
             raise ValueError(
                 f"the field {name} of the metadata is not what was written: {str(value)[:60]!r}"
             )
-    # a value: its layout must be known, and its file of tensors named
+    # metadata of a stored value: the layout must be known, and the file of tensors stated
     if about.get("kept", True):
         check_layout(about.get("layout"))
         if "payload" not in about:
@@ -261,8 +261,8 @@ def read(disk: Disk, key: str) -> Metadata:
     """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` if the file is
     missing or damaged.
 
-    Raises `NotRead` for the metadata of another format version, or without the signature that is
-    asked for.
+    Raises `NotRead` for metadata of another format version, or without the required
+    signature.
     """
     return unseal_of("result", key, read_file(disk.path(key, "json")))
 
@@ -282,7 +282,7 @@ def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
     with disk.temporary(key) as (temporary, file):
         file.write(seal_record("result", about))
         file.flush()  # without a sync to disk, because torn metadata fail their checksum
-        # fails where the file exists
+        # False if the file exists
         is_new = disk.link(temporary, path)
         if over and not is_new:
             disk.rename(temporary, path)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # Conversion of values to metadata and tensors for the store, and loading of stored values.
 
 
-#: fraction of the loads that mode ``sampled`` verifies although the file has not been touched
+#: fraction of the loads that the mode ``sampled`` verifies although the file has not changed
 _SAMPLED = 1 / 20
 # a separate generator, so that loads do not change the random numbers of a user
 _draw = random.Random()
@@ -97,7 +97,7 @@ def _tensors_of_file(
             f"the file of tensors has {file_stamp[1]} bytes instead of {payload['size']} bytes"
         )
     is_compared = check or (verify == "sampled" and file_stamp != payload.get("stamp"))
-    # whatever ``verify`` says: the checksum has no key
+    # checked in every mode: unlike the checksum, the signed digest cannot be forged
     sha256 = payload.get("sha256", "") if secrets() else None
     tensors = lazy.serialization.read(path, payload["xxh3"] if is_compared else None, sha256)
     return tensors, payload["size"] if is_compared else 0
@@ -113,7 +113,7 @@ def stamp_of(path: str) -> list[int]:
     """Return the inode, size and times (ns) of a file; any write to the file changes one of these
     numbers.
 
-    Raises `ValueError` for what is no file, such as a pipe.
+    Raises `ValueError` for anything but a regular file, such as a pipe.
     """
     file_status = os.stat(path)
     if not stat.S_ISREG(file_status.st_mode):
@@ -136,7 +136,7 @@ def stamp_of(path: str) -> list[int]:
 # look-up of a key that is not known reads the lines added since the last look-up.
 
 
-MOST_BYTES = 64 << 20  #: bytes of the file above which the older half is dropped
+MOST_BYTES = 64 << 20  #: size (bytes) of the file above which the older half is dropped
 _LINE_START = b'{"key":"'
 _KEY_OF_LINE = slice(len(_LINE_START), len(_LINE_START) + 32)
 
@@ -219,10 +219,10 @@ class SmallResults:
             raise OSError(f"{self._path}: the disk has no space left to record a result")
 
     def _add(self, line: bytes) -> None:
-        """Keep a line of the file, as the newest of its key, unless it is no line of a result."""
+        """Keep a line of the file as the newest of its key; ignore a line that is no result."""
         if line.startswith(_LINE_START):
             key = line[_KEY_OF_LINE].decode(errors="replace")
-            if key.isalnum():  # it may be a part of a path
+            if key.isalnum():  # checked, because a key may become part of a path
                 self._lines.pop(key, None)
                 self._lines[key] = line
 
@@ -239,7 +239,7 @@ class SmallResults:
         if not S_ISREG(stat.st_mode):
             return
         with self._guard, suppress(OSError), open(self._path, "rb", opener=open_now) as file:
-            # the file was written anew
+            # the file was rewritten
             if stat.st_ino != self._file or stat.st_size < self._offset:
                 self._lines, self._offset = {}, 0
             file.seek(self._offset)

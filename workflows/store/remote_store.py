@@ -46,11 +46,11 @@ from neusee.workflows.store.result_store import Store
 
 # --- folder at url --------------------------------------------------------------------------------
 
-# A shared folder that is named by a URL (``file:///shared/neusee``), with the care that a folder of
-# others needs.
+# A shared folder with a URL (``file:///shared/neusee``), treated with the care that a folder of
+# other users needs.
 #
-# What is no regular file is never waited for or read, and what one user of a group makes the others
-# may use. A folder that this user may only read is never written to.
+# Only regular files are read, so that nothing blocks the program. Files that one user of a group
+# writes are usable by the others. Nothing is written to a folder that this user may only read.
 
 
 class FolderAtUrl:
@@ -68,7 +68,7 @@ class FolderAtUrl:
         return os.path.isdir(self._root) and not os.access(self._root, os.W_OK)
 
     def exists(self, path: str) -> bool:
-        """Return True if something has this name, also a link that leads nowhere."""
+        """Return True if a file, a folder or a link has this name, even a broken link."""
         return os.path.lexists(path)
 
     def ls(self, path: str, detail: bool = False) -> list[Any]:
@@ -93,20 +93,24 @@ class FolderAtUrl:
             shutil.copyfileobj(file, copy)
 
     def put_file(self, path: str, to: str) -> None:
-        """Copy a regular file into the folder, where the users of the folder may read it."""
+        """Copy a regular file into the folder, with permission to read for all users of the
+        folder.
+        """
         with opened(path) as file, open(to, "wb") as copy:
             shutil.copyfileobj(file, copy)
         inherit(to, self._root, 0o444)
 
     def pipe_file(self, to: str, raw: bytes, **_: Any) -> None:
-        """Write bytes to a file in the folder, where the users of the folder may read it."""
+        """Write bytes to a file in the folder, with permission to read for all users of the
+        folder.
+        """
         with open(to, "wb") as file:
             file.write(raw)
         inherit(to, self._root, 0o444)
 
     def mv(self, path: str, to: str) -> None:
-        """Rename a file to a name that something else may have; raise `IsADirectoryError` for a
-        folder.
+        """Rename a file and replace an existing file of the new name; raise `IsADirectoryError` for
+        a folder.
         """
         try:
             os.replace(path, to)
@@ -120,8 +124,8 @@ class FolderAtUrl:
         os.unlink(path)
 
     def makedirs(self, path: str, exist_ok: bool = True) -> None:
-        """Make a folder with the group and the permissions of the root, and the missing ones
-        above it.
+        """Make a folder and the missing folders above it, with the group and the permissions of the
+        root.
         """
         make_folders(self._root, self._root)
         make_folders(path, self._root)
@@ -139,21 +143,21 @@ class FolderAtUrl:
 T = TypeVar("T")
 Direction = Literal["down", "up"]
 _DIRECTIONS: tuple[Direction, ...] = ("down", "up")
-_LISTING_VALID_SECONDS = 20.0  #: s for which a listing counts as valid
+_LISTING_VALID_SECONDS = 20.0  #: time (s) for which a listing counts as valid
 _MOST_FOLDERS_ONE_BY_ONE = (
-    3  #: number of folders that are listed one by one; the next request lists all folders
+    3  #: number of folders that are listed one by one; the next query lists all folders
 )
 _PAUSE_AFTER_FAILURE = (
-    60.0  #: s for which a URL is not used after a failure; doubled at each failure
+    60.0  #: time (s) for which a URL is not used after a failure; doubled at each failure
 )
-#: bytes from which a transfer updates the rate; a smaller transfer updates the latency
+#: size (bytes) from which a transfer updates the rate; a smaller transfer updates the latency
 _RATE_BYTES = 1_000_000
-_ABANDONED_SECONDS = 86400.0  #: s after which a half-written file counts as abandoned
+_ABANDONED_SECONDS = 86400.0  #: time (s) after which a half-written file counts as abandoned
 _FOLDERS = tuple(f"{i:02x}" for i in range(256))
-#: show half-written files, but can rename files
+#: protocols that show half-written files, but can rename files
 _RENAMING_PROTOCOLS = frozenset({"file", "local", "sftp", "ssh"})
 _LOCAL_PROTOCOLS = frozenset({"file", "local", "memory"})
-#: what is there is a link in a circle or a folder
+#: errors for a circular link, a special file or a folder in place of a file
 _NOT_A_FILE_ERRORS = (errno.ELOOP, errno.ENXIO, errno.EISDIR, errno.ENOTDIR)
 
 
@@ -170,15 +174,15 @@ class RemoteFiles:
             bool(protocols & _RENAMING_PROTOCOLS),
             bool(protocols & _LOCAL_PROTOCOLS),
         )
-        # s for each transfer, and bytes / s: guesses until transfers are measured
+        # latency (s) of each transfer, and rate (bytes / s): guesses until transfers are measured
         self._latency = dict.fromkeys(_DIRECTIONS, 5e-4 if is_near else 0.05)
         self._rate = dict.fromkeys(_DIRECTIONS, 4e8 if is_near else 5e7)
         # time before which the URL is not used in a direction
         self._resume = dict.fromkeys(_DIRECTIONS, 0.0)
-        # s of the next pause after a failure
+        # length (s) of the next pause after a failure
         self._pause = dict.fromkeys(_DIRECTIONS, _PAUSE_AFTER_FAILURE)
         self._warned = False
-        # by folder: time of the listing (s), and names
+        # for each folder, the time of its listing (s) and the names in it
         self._listed: dict[str, tuple[float, set[str]]] = {}
         self._made: set[str] = set()  # folders that exist at the URL
         self._lock = threading.Lock()
@@ -195,7 +199,7 @@ class RemoteFiles:
         """
         with self._lock:
             if not self._fresh(name[:2]):
-                # with few fresh listings, one folder; then all at once, in parallel
+                # with few fresh listings, list one folder; after that list all folders, in parallel
                 lists_one = sum(map(self._fresh, self._listed)) < _MOST_FOLDERS_ONE_BY_ONE
                 self._list_folders([name[:2]] if lists_one else _FOLDERS)
             return name in self._listed[name[:2]][1]
@@ -253,7 +257,7 @@ class RemoteFiles:
                 self._fs.pipe_file(to, raw)
             return len(raw)
 
-        # where files are renamed, the file system itself would replace an existing one
+        # if files are renamed, the file system would replace an existing file
         must_look = not over and self._renames
         exists = must_look and self._attempt("down", lambda: self._fs.exists(self._path(name)))
         return bool(exists) or self._write(name, pipe)
@@ -302,7 +306,7 @@ class RemoteFiles:
             temporary = f"{self._root}/tmp/{uuid.uuid4().hex}"
             self._folder(f"{self._root}/tmp")
             self._folder(f"{self._root}/{name[:2]}")
-            # below zero: there was nothing to send
+            # a negative size means that there was nothing to send
             size = put(temporary)
             if size >= 0:
                 self._fs.mv(temporary, self._path(name))
@@ -337,8 +341,8 @@ class RemoteFiles:
     def _attempt(
         self, direction: Direction, do: Callable[[], T], size: Callable[[T], int] | None = None
     ) -> T | None:
-        """Return the result of the function ``do``, or None if ``do`` fails or the URL is
-        disabled after a failure.
+        """Return the result of the function ``do``, or None if it fails or if the URL is disabled
+        after a failure.
         """
         if time.monotonic() < self._resume[direction] or (
             direction == "up" and self._is_read_only()
@@ -360,16 +364,14 @@ class RemoteFiles:
         return result
 
     def _is_read_only(self) -> bool:
-        """Return True for a folder that this user may only read, in which case nobody expects
-        results there.
-        """
+        """Return True for a folder that this user may only read; no results are expected there."""
         return hasattr(self._fs, "is_read_only") and bool(self._fs.is_read_only())
 
     def _failed(self, direction: Direction, error: Exception) -> None:
         """Stop using the URL for a while, each time twice as long, and warn once."""
         if direction == "up" and isinstance(error, IsADirectoryError):
-            return  # a folder in the place of one file
-        # a file that cannot be written may be readable
+            return  # a folder in place of one file does not disable the URL
+        # reading may work where writing fails, and vice versa
         is_one_way = isinstance(error, PermissionError | FileNotFoundError)
         for paused_direction in (direction,) if is_one_way else _DIRECTIONS:
             self._resume[paused_direction] = time.monotonic() + self._pause[paused_direction]
@@ -385,7 +387,7 @@ class RemoteFiles:
         the measured value.
         """
         if size < _RATE_BYTES:
-            # a small transfer takes little but the latency
+            # the time of a small transfer is mostly latency
             self._latency[direction] += (seconds - self._latency[direction]) / 3
         else:
             rate = size / max(seconds - self._latency[direction], 1e-6)
@@ -393,7 +395,7 @@ class RemoteFiles:
 
 
 def _counts_as_missing(error: Exception) -> bool:
-    """Return True for the error of one name at a URL, which says nothing of the others."""
+    """Return True for an error that concerns only one name at a URL."""
     if isinstance(error, FileNotFoundError | NotRegular):
         return True
     return isinstance(error, OSError) and error.errno in _NOT_A_FILE_ERRORS
@@ -414,14 +416,14 @@ def _file_system(url: str) -> tuple[Any, str]:
         raise ModuleNotFoundError(f"a store at {url} needs one more package: {error}") from error
     except ValueError as error:
         known_schemes, scheme = fsspec.available_protocols(), url.partition("://")[0]
-        # the rest of the URL is wrong
+        # the scheme is known, so the rest of the URL is wrong
         if scheme in known_schemes:
             raise
         raise ValueError(
             f"no file system has the scheme {scheme}:// of {url}; {nearest(scheme, known_schemes)}"
         ) from error
     path = str(path).rstrip("/")
-    # a folder, with the care that one of others needs
+    # a folder of this file system, treated like a folder of other users
     if file_system.protocol in ("file", "local", ("file", "local")):
         file_system = FolderAtUrl(path)
     return file_system, path
@@ -595,7 +597,7 @@ class RemoteStore(Store):
         """Copy the value of a key from the URL into the local folder; after a failure, do not
         fetch this key again.
         """
-        # asks for the file also where no listing shows it: it may be new
+        # requests the file even if no listing shows it, since it may be new
         metadata = self._remote_metadata(key, look=True)
         try:
             if is_kept(metadata) and not self._value_fetched(key, metadata):
@@ -647,7 +649,7 @@ class RemoteStore(Store):
             xxh3, size = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest(), file.tell()
             os.fsync(file.fileno())
             file.seek(0)
-            # without a secret nothing is signed
+            # without a secret, no signature is checked
             is_signed = not secrets() or hashlib.file_digest(
                 file, "sha256"
             ).hexdigest() == payload.get("sha256")
@@ -661,7 +663,7 @@ class RemoteStore(Store):
         """Copy a local value to the URL, the large files before the metadata; copy nothing for
         an evicted value.
         """
-        # a copy that cannot be used is replaced
+        # an unusable copy is replaced
         name, replaces = f"{key}.json", key in self._broken
         if not replaces and self._remote.exists(name):
             return
@@ -680,12 +682,12 @@ class RemoteStore(Store):
             self._broken.discard(key)
 
     def _give_up(self, key: Key) -> None:
-        """Use the copy of a key at the URL no more."""
+        """Stop using the copy of a key at the URL."""
         self._seen.pop(key, None)
         self._broken.add(key)
 
     def _distrust(self, key: Key, error: Exception) -> None:
-        """Use a damaged copy at the URL no more, and warn of it."""
+        """Stop using a damaged copy at the URL, and warn of it."""
         self._give_up(key)
         warnings.warn(
             f"the result {key} at {self.url} is damaged ({error}) and is not used", stacklevel=4

@@ -36,13 +36,11 @@ if TYPE_CHECKING:
 
 Direction = Literal["read", "write"]
 _SPEEDS_FILE = "speeds.json"
-LARGE = 1_000_000  #: bytes from which a transfer updates the speed
+LARGE = 1_000_000  #: size (bytes) from which a transfer updates the speed
 _USUAL: dict[Direction, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
-#: s for each transfer, whatever its size; to write is to make a file, which takes 0.5 to 2 ms
+#: time (s) of each transfer regardless of its size; writing creates a file, which takes 0.5 to 2 ms
 _SETUP_SECONDS: dict[Direction, float] = {"read": 5e-5, "write": 1e-3}
-_SYNC_SECONDS = (
-    3e-3  #: s until the disk has a file, for each result that is written to a file of its own
-)
+_SYNC_SECONDS = 3e-3  #: time (s) until a file is on the disk, for each result with a separate file
 _NEWEST_WEIGHT = 0.3  #: weight of the newest transfer
 _SAVED_CHANGE = (
     1.25  #: factor by which a speed must differ from the stored speed to be written to the file
@@ -54,8 +52,8 @@ class Speeds:
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
-        self._now: dict[Direction, float] = {}  # bytes / s, as learned so far
-        self._written: dict[Direction, float] = {}  # bytes / s, as in the file
+        self._now: dict[Direction, float] = {}  # present estimates (bytes / s)
+        self._written: dict[Direction, float] = {}  # values in the file (bytes / s)
 
     def seconds(self, way: Direction, size: float) -> float:
         """Return the predicted time in seconds for reading or writing ``size`` bytes in the
@@ -82,8 +80,8 @@ class Speeds:
                 )
 
     def _speed(self, way: Direction) -> float:
-        """Return the speed of reading or writing in bytes / s, at first as the file says or as
-        is usual.
+        """Return the speed of reading or writing in bytes / s; at first the value in the file, or
+        the usual value.
         """
         if not self._now:
             self._written = self._stored()
@@ -91,10 +89,10 @@ class Speeds:
         return self._now[way]
 
     def _stored(self) -> dict[Direction, float]:
-        """Return the speeds that the file of the store says; none if it is missing or wrong."""
+        """Return the speeds in the file of the store; an empty dict if it is missing or invalid."""
         try:
             speeds = unseal_record("speeds", read_file(f"{self._disk.folder}/{_SPEEDS_FILE}"))
-            # bytes / s that a disk may have
+            # range of plausible speeds (bytes / s)
             return {
                 direction: float(speeds[direction])
                 for direction in _USUAL
@@ -105,14 +103,14 @@ class Speeds:
 
 
 def _setup(way: Direction, size: float) -> float:
-    """Return the time (s) that a transfer takes beside that of its bytes."""
+    """Return the time (s) of a transfer that does not depend on its size."""
     return _SETUP_SECONDS[way] + (_SYNC_SECONDS if way == "write" and size > INLINE else 0.0)
 
 
 # --- store warnings -------------------------------------------------------------------------------
 
-# Warnings of a store, each issued once: a folder that cannot be used, and results that are not
-# read.
+# Warnings of a store, each issued once: about a folder that cannot be used, and about results that
+# are not read.
 
 
 _CONSEQUENCE = (
@@ -138,16 +136,16 @@ class Warned:
             warnings.warn(self.failure, stacklevel=5)
 
     def pass_on(self, failure: str) -> None:
-        """Keep for reports the warning ``failure``, which this store or that of a worker process
-        has issued.
+        """Keep the warning ``failure`` for reports; this store, or that of a worker process, has
+        issued it.
         """
         if not self.failure:
             self.failure = failure
             self.failures.append(failure)
 
     def leave(self, error: NotRead) -> None:
-        """Issue one warning for all results that are left alone, because they are of another
-        format or unsigned.
+        """Issue one warning for all results that are ignored because they have another format or no
+        signature.
         """
         if not self._has_warned:
             reason = (
@@ -208,7 +206,7 @@ class Store(Warned, Maintained):
         self._known: dict[str, Metadata] = {}  # metadata that were read or written
         self._lost: set[str] = set()  # damaged results that the user may have no permission to move
         self._used: set[str] = set()  # keys of values that were loaded
-        self._missed: set[str] = set()  # keys that were asked for in vain
+        self._missed: set[str] = set()  # keys that were looked up but not found
 
     # another process receives the path and opens the store
     def __reduce__(self) -> tuple[Any, ...]:
@@ -225,7 +223,7 @@ class Store(Warned, Maintained):
         entry = self._known.get(key)
         if is_kept(entry):
             return entry
-        # damaged: it counts as missing
+        # a damaged result counts as missing
         if key in self._lost:
             return None
         entry = self.brief.find(key)
@@ -244,8 +242,8 @@ class Store(Warned, Maintained):
         return entry
 
     def asked(self) -> dict[str, Metadata | None]:
-        """Return the metadata of each result that this process asked for so far; None for one
-        that is missing.
+        """Return the metadata of each result that this process has looked up so far; None for a
+        missing result.
         """
         return {**dict.fromkeys(self._missed | self._lost), **self._known}
 
@@ -292,7 +290,7 @@ class Store(Warned, Maintained):
         return self._try(self._write_small, key, value, about)
 
     def entries(self) -> Iterator[tuple[str, Metadata]]:
-        """Yield key and metadata of every result in the order of the keys, also of results
+        """Yield key and metadata of every result in the order of the keys, including results
         without a stored value.
         """
         small_keys, key_before = self.brief.keys(), ""
@@ -304,10 +302,10 @@ class Store(Warned, Maintained):
                 yield key, entry
 
     def _listed(self, key: str, small: bool) -> Metadata | None:
-        """Return the metadata of a result as `about`, but remember nothing, so that a list of any
-        length takes no room.
+        """Return the metadata of a result like `about`, but keep nothing in memory, so that a list
+        may have any length.
 
-        ``small`` tells whether the common file of small results has a line of the result.
+        ``small``: True if the common file of small results has a line for the result.
         """
         if key in self._known or key in self._lost:
             return self.about(key)
@@ -316,7 +314,7 @@ class Store(Warned, Maintained):
         try:
             return metadata.read(self.disk, key)
         except UNREADABLE:
-            return self.about(key)  # missing meanwhile, damaged or not read
+            return self.about(key)  # removed meanwhile, damaged, or in another format
 
     def claim(self, key: str) -> Lease | None:
         """Return the lease of ``key``, the right to compute its result, or None while a running
@@ -340,7 +338,7 @@ class Store(Warned, Maintained):
         """Read the metadata of a result again; return None if the metadata were removed or
         cannot be read.
         """
-        # so that the file is read
+        # removed, so that the file is read
         self._known.pop(key, None)
         with suppress(*UNREADABLE):
             return metadata.read(self.disk, key)
@@ -384,8 +382,8 @@ class Store(Warned, Maintained):
             return False
 
     def _write(self, key: str, value: Any, about: Metadata) -> bool:
-        """Write a value with its metadata; only the metadata, and False, for a value larger than
-        the budget.
+        """Write a value with its metadata. If it is larger than the budget allows, write only the
+        metadata and return False.
         """
         began = time.perf_counter()
         metadata_entry, tensors = payload.described(key, value, about)
@@ -404,11 +402,11 @@ class Store(Warned, Maintained):
         return True
 
     def _write_small(self, key: str, value: Any, about: Metadata) -> bool:
-        """Write a value into the file of small results; only its metadata, and False, if it is
-        too large for a line.
+        """Write a value into the file of small results. If it is too large for a line, write only
+        its metadata and return False.
         """
         entry, tensors = payload.described(key, value, about)
-        # they do not fit into the metadata
+        # the tensors do not fit into the metadata
         if tensors:
             entry = metadata.receipt(entry)
         self.brief.append(entry)
@@ -425,7 +423,7 @@ class Store(Warned, Maintained):
             entry["payload"] = payload.written(file, tensors)
             with self.disk.lock():
                 if key not in self._lost and metadata.has_value(self.disk, key):
-                    # the value that is stored stays
+                    # keep the value that is already stored
                     return
                 path = self.disk.path(key, "safetensors")
                 # the file has its name before the metadata that name it
@@ -434,7 +432,7 @@ class Store(Warned, Maintained):
                 self._write_about(key, entry)
 
     def _write_about(self, key: str, entry: Metadata) -> None:
-        """Write metadata over those that are there, and remember them."""
+        """Write metadata in place of existing ones, and keep them in memory."""
         metadata.write(self.disk, key, entry, over=True)
         self._known[key] = entry
 
@@ -459,7 +457,7 @@ class Store(Warned, Maintained):
         if isinstance(error, OSError) and not isinstance(
             error, FileNotFoundError | PermissionError
         ):
-            # the device fails, of which one warning is enough
+            # the device fails: one warning is enough
             return self.report_failure(error, "read")
         warnings.warn(
             f"the stored result {key} is damaged ({error}) and counts as missing", stacklevel=5
@@ -481,7 +479,7 @@ class Store(Warned, Maintained):
             # a later line replaces the damaged one
             if is_kept(small_result):
                 self.brief.append(metadata.receipt(small_result))
-            # the damaged file is away, so that the key may be written again
+            # the damaged file is gone, so that the key may be written again
             if not os.path.lexists(self.disk.path(key, "json")):
                 self._lost.discard(key)
 

@@ -26,20 +26,19 @@ from neusee.workflows.store.shared_folder import open_now
 
 # --- stored types ---------------------------------------------------------------------------------
 
-# Registry of the named tuples that a stored value may contain, by the name that a stored value
-# gives.
+# Registry of the named tuples that a stored value may contain, by their names in stored values.
 #
-# The registry has the named tuples of `neusee.nodes.values`, and those in the annotations of the
-# inputs and the result of each node that this process has defined or imported. A name that a stored
-# value gives is only looked up here, so that no content of a store imports a module or chooses a
-# function. A recipe imports its nodes, hence also the types of the values that it makes and reads.
+# The registry contains the named tuples of `neusee.nodes.values`, and those in the annotations of
+# the inputs and the result of each node that this process has defined or imported. A name in a
+# stored value is only looked up here, so that no content of a store can import a module or choose a
+# function. A recipe imports its nodes, and so also the types of their values.
 
 
 NamedTupleType = type[tuple[Any, ...]]
 
 _types: dict[str, NamedTupleType] = {}
 _looked_at: dict[str, Node] = {}
-_all_nodes: list[tuple[Node, ...]] = [()]  #: those of the last look
+_all_nodes: list[tuple[Node, ...]] = [()]  #: the registered nodes at the last update
 
 
 class UnknownType(ValueError):
@@ -72,7 +71,8 @@ def is_registered(kind: type) -> bool:
 
 
 def made(kind: NamedTupleType, items: list[Any]) -> Any:
-    """Return a named tuple with the fields ``items``, without a call of its class.
+    """Return a named tuple of the class ``kind`` with the fields ``items``, without running code of
+    the class.
 
     Raises `ValueError` for a wrong number of fields, or for a field that does not fit its
     annotation.
@@ -87,12 +87,12 @@ def made(kind: NamedTupleType, items: list[Any]) -> Any:
     return tuple.__new__(kind, items)
 
 
-_PLAIN = (Tensor, bool, str, bytes, list, dict)  #: types of stored values without a rule of theirs
+_PLAIN = (Tensor, bool, str, bytes, list, dict)  #: types that are checked with `isinstance`
 
 
 def fits(value: Any, kind: Any) -> bool:
-    """Return True if a value has the annotated type ``kind``; a type that no stored value has
-    allows every value.
+    """Return True if a value has the annotated type ``kind``; True also for a type that stored
+    values cannot have.
     """
     origin, type_arguments = get_origin(kind), get_args(kind)
     if origin is typing.Annotated:
@@ -102,17 +102,17 @@ def fits(value: Any, kind: Any) -> bool:
         return any(fits(value, union_member) for union_member in type_arguments)
     if origin in (list, dict) or (origin is tuple and not hasattr(value, "_fields")):
         return isinstance(value, origin) and _items_fit(value, origin, type_arguments)
-    # any other type with parameters is no type of a stored value
+    # stored values have no other types with parameters
     return origin is not None or _fits_plain(value, kind)
 
 
 def _fits_plain(value: Any, kind: Any) -> bool:
-    """Return True if a value has a type without parameters, or if no stored value has that
-    type.
+    """Return True if a value has the type ``kind`` without parameters; True also for a type that
+    stored values cannot have.
     """
     if kind is None or kind is types.NoneType:
         return value is None
-    # a truth value is an int to Python, and no number here
+    # bool is a subclass of int in Python, but does not count as a number here
     if kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     if kind is int:
@@ -150,7 +150,7 @@ def _update() -> None:
         return
     _all_nodes[0] = known_nodes
     for node in known_nodes:
-        # not looked at yet, or defined anew
+        # a new node, or one that was defined again
         if _looked_at.get(name := f"{node.fn.__module__}:{node.fn.__name__}") is not node:
             _looked_at[name] = node
             for kind in _annotated(node):
@@ -199,7 +199,7 @@ def _hints(kind: type) -> dict[str, Any]:
 # value.
 
 
-_PIECE = 1 << 18  #: bytes of a file that are read at once
+_PIECE = 1 << 18  #: number of bytes of a file that are read at once
 _ALIGN = 64
 #: first letter of the names of padding entries, which fill up to the next multiple of `_ALIGN`
 _FILLER = "_"
@@ -258,11 +258,11 @@ def tensors_in(value: Any) -> list[Tensor]:
 
 
 def settle(value: Any) -> Any:
-    """Return ``value`` as if read from the store: contiguous tensors that hold no memory beyond
-    their own elements.
+    """Return ``value`` as if it were read from the store: with contiguous tensors that use no
+    memory beyond their own elements.
 
-    They have no attributes and no class of a user, and want a gradient only where gradients are
-    recorded.
+    They have no added attributes and no user-defined class, and require a gradient only if
+    gradients are being recorded.
     """
     return each_tensor(_settled, value)
 
@@ -280,19 +280,21 @@ def _settled(x: Tensor) -> Tensor:
 
 
 def forget_attributes(x: Tensor) -> None:
-    """Take from a tensor what was attached to it: a step that reads it from the store does not
-    see that either.
+    """Delete the attributes that code has attached to a tensor: a step that reads it from the store
+    would not see them either.
     """
     if type(x) is Tensor and vars(x):
         vars(x).clear()
 
 
 def _bare(x: Tensor) -> Tensor:
-    """Return a tensor without what the store does not keep."""
+    """Return a tensor without the properties that the store does not keep: gradient, attributes and
+    user-defined class.
+    """
     if x.requires_grad and not torch.is_grad_enabled():
         x = x.detach()
     kind = type(x)
-    # a plain tensor has attributes that somebody added; another class may be one of torch
+    # a plain tensor may have added attributes; a class outside of torch is user-defined
     if vars(x) if kind is Tensor else kind.__module__.partition(".")[0] != "torch":
         with torch._C.DisableTorchFunctionSubclass():
             return x.as_subclass(Tensor)
@@ -345,7 +347,9 @@ def _cannot_be_stored(item: Any) -> TypeError:
 
 
 def _tensor_of_bytes(text: bytes) -> Tensor:
-    """Return bytes as a tensor; torch makes none from an empty buffer."""
+    """Return bytes as a tensor; separately for no bytes, since torch cannot read an empty
+    buffer.
+    """
     return torch.frombuffer(bytearray(text), dtype=torch.uint8) if text else torch.empty(0)
 
 
@@ -393,7 +397,7 @@ def _unpacked(layout: dict[str, Any], tensors: list[Tensor], typed: bool) -> Any
 
 
 def _stored_tensor(kind: str, number: int, tensors: list[Tensor]) -> Tensor | bytes:
-    """Return the tensor with a number in the file, or the bytes that it holds."""
+    """Return the tensor with a given number in the file, or the bytes that it contains."""
     if number >= len(tensors):
         raise ValueError(f"the value needs tensor {number}, but only {len(tensors)} are stored")
     return tensors[number] if kind == "tensor" else _bytes(tensors[number])
@@ -401,7 +405,7 @@ def _stored_tensor(kind: str, number: int, tensors: list[Tensor]) -> Tensor | by
 
 def bytes_of(x: Tensor) -> memoryview:
     """Return the bytes of a tensor, without a copy if the tensor is contiguous and on the CPU."""
-    # torch may only note that a tensor is conjugated or negative
+    # torch may conjugate or negate a tensor by a flag alone, without new elements
     flat = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
     # a single element is contiguous whatever its stride, but cannot be viewed as bytes
     if flat.stride() != (1,):
@@ -410,7 +414,7 @@ def bytes_of(x: Tensor) -> memoryview:
 
 
 def _bytes(x: Tensor) -> bytes:
-    """Return the bytes that a tensor holds; see `_tensor_of_bytes`."""
+    """Return the bytes that a tensor stores; see `_tensor_of_bytes`."""
     if x.dtype != torch.uint8 and x.numel():
         raise ValueError(f"bytes cannot be stored as a tensor of {x.dtype}")
     return x.numpy().tobytes()
@@ -482,7 +486,7 @@ def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
             }
             offset += padding
     header_text = json.dumps(header, separators=(",", ":")).encode()
-    # spaces, so that the first tensor is aligned too; 8 bytes are the length
+    # padded with spaces, so that the first tensor is aligned too; 8 bytes are the length
     header_text += b" " * (-(8 + len(header_text)) % _ALIGN)
     yield len(header_text).to_bytes(8, "little")
     yield header_text
@@ -520,8 +524,8 @@ def _mapped(file: IO[bytes], digests: Sequence[Any]) -> mmap.mmap:
         for digest in digests:
             digest.update(data)
         return data
-    # read and not mapped: where a device fails, a read raises an error, and a look into a map ends
-    # the process
+    # digests are computed by reading: if a device fails, a read raises an error, but access to a
+    # memory map ends the process
     digests_of(file, *digests)
     return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
 
@@ -537,7 +541,7 @@ def _tensors_in(data: mmap.mmap) -> list[Tensor]:
         complex_or_real := header.get("__metadata__"), dict
     ):
         raise ValueError("the header of the file of tensors is missing or cut short")
-    # padding entries have no number as their name
+    # names of tensors are numbers; names of padding entries are not
     numbers = sorted(int(name) for name in header if name.isdecimal())
     return [
         _entry(data, first_byte, header.get(str(i)), complex_or_real.get(str(i))) for i in numbers
@@ -563,8 +567,8 @@ def digests_of(file: IO[bytes], *digests: Any) -> list[str]:
 
 
 def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:
-    """Return the tensor that one entry of the header describes; ``start`` is the first byte
-    behind the header, ``kind`` real or complex.
+    """Return the tensor that one entry of the header describes; ``start`` is the first byte after
+    the header, ``kind`` is real or complex.
     """
     offsets = entry.get("data_offsets") if isinstance(entry, dict) else None
     if not is_shape(offsets) or len(offsets) != 2 or kind not in ("real", "complex"):
@@ -588,8 +592,8 @@ def _kind(x: Tensor) -> tuple[str, list[int], bool]:
 
 
 def tensor_kind(x: Tensor) -> str:
-    """Return the name that safetensors gives to the type of a tensor; raise ValueError for a
-    type without a name.
+    """Return the name of a tensor's type in safetensors; raise ValueError for a type without a
+    name.
     """
     name = "C64" if x.dtype == torch.complex64 else _DTYPES.get(x.dtype)
     if name is None:
@@ -598,8 +602,8 @@ def tensor_kind(x: Tensor) -> str:
 
 
 def _type_and_count(kind: Any, shape: Any) -> tuple[torch.dtype, int]:
-    """Return the type and the number of elements of a stored tensor; raise `ValueError` if they
-    cannot be right.
+    """Return the type and the number of elements of a stored tensor; raise `ValueError` if type or
+    shape is invalid.
     """
     dtype = _NAMES.get(kind) if isinstance(kind, str) else None
     count = math.prod(shape) if is_shape(shape) else None
@@ -611,8 +615,8 @@ def _type_and_count(kind: Any, shape: Any) -> tuple[torch.dtype, int]:
 
 
 def _tensor(data: Any, offset: int, kind: Any, shape: Any, is_complex: bool) -> Tensor:
-    """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size
-    cannot be right.
+    """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size is
+    invalid.
     """
     dtype, count = _type_and_count(kind, shape)
     # pairs of floating-point numbers of at least 16 bits

@@ -1,4 +1,4 @@
-"""A folder to which many processes and users write, with the owners of their files."""
+"""A folder to which many processes and users write, with the owner processes of its files."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class Owner:
         """
         if self.host != host():
             return "foreign"
-        # of an earlier process with this number
+        # this number: the owner is this process, or an earlier one with the same number
         if self.pid == os.getpid():
             return "alive" if self.began == me().began else "dead"
         try:
             status, start_time = _process(self.pid)
         except FileNotFoundError:
-            # without /proc, ask by a signal
+            # on a system without /proc, test by a signal
             return "dead" if os.path.exists("/proc/self/stat") else _signalled(self.pid)
         except (OSError, ValueError):
             return "dead"
@@ -69,7 +69,7 @@ def owner_of(text: str) -> Owner | None:
     pid, _, start_time = number_and_time.partition("-")
     return (
         Owner(host_digest, int(pid), start_time)
-        # 6 bytes as hexadecimal digits
+        # the digest is 6 bytes, 12 hexadecimal digits
         if len(host_digest) == 12 and pid.isdecimal() and len(pid) < 12
         else None
     )
@@ -95,7 +95,7 @@ def host() -> str:
     different digests.
     """
     machine_texts = [os.uname().nodename]
-    with suppress(OSError):  # a system without these files
+    with suppress(OSError):  # some systems do not have these files
         with open("/proc/sys/kernel/random/boot_id") as file:
             machine_texts.append(file.read())
         machine_texts.append(str(os.stat("/proc/self/ns/pid").st_ino))
@@ -105,8 +105,8 @@ def host() -> str:
 def _process(pid: int) -> tuple[str, str]:
     """Return the state and the start time of a process from ``/proc``."""
     with open(f"/proc/{pid}/stat", "rb") as file:
-        # behind the name, which may hold any character
-        # "number (name) state ...": the fields behind the name begin with the state
+        # "number (name) state ...": the name may contain any character; the fields after it begin
+        # with the state
         fields = file.read().rpartition(b")")[2].split()
     if len(fields) < 20:
         raise ValueError(f"the file /proc/{pid}/stat is incomplete")
@@ -115,9 +115,11 @@ def _process(pid: int) -> tuple[str, str]:
 
 
 def _signalled(pid: int) -> State:
-    """Return whether a process of this machine runs, by a signal that does nothing."""
+    """Return whether a process of this machine runs, determined by signal 0, which has no
+    effect.
+    """
     try:
-        with suppress(PermissionError):  # a process of another user
+        with suppress(PermissionError):  # the process exists but belongs to another user
             os.kill(pid, 0)
     except ProcessLookupError:
         return "dead"
@@ -133,9 +135,10 @@ def _signalled(pid: int) -> State:
 # Folders, and the few files to which all processes write, copy the permissions of the root.
 
 
-MOST_READ = 64 << 20  #: bytes of metadata that are read at once
-OLD = 3600.0  #: s after which a temporary file of another machine counts as abandoned
-#: s to wait for the lock; its owner may be stopped, and a run without the lock may only repeat work
+MOST_READ = 64 << 20  #: greatest size (bytes) of a file of metadata
+OLD = 3600.0  #: time (s) after which a temporary file of another machine counts as abandoned
+#: time (s) to wait for the lock; its owner may be stopped, and a run without the lock can at worst
+#: repeat work
 _LOCK_PATIENCE = 10.0
 #: errors of a file system without hard links
 _LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
@@ -178,7 +181,7 @@ class Disk:
         path = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
             with open(path, "xb") as file:
-                # readable for those who may read the store, and never changed later
+                # readable for all who may read the store; never changed later
                 self.share(path, 0o444)
                 yield path, file
         finally:
@@ -196,8 +199,8 @@ class Disk:
             self.rename(path, f"{self.folder}/{name}")
 
     def rename(self, temporary: str, path: str) -> None:
-        """Rename a complete file to its final name, and replace what has that name; a folder is
-        put aside.
+        """Rename a complete file to its final name, and replace an existing file; an existing
+        folder is put aside.
         """
         try:
             os.replace(temporary, path)
@@ -256,7 +259,7 @@ class Disk:
             os.close(lock_file)
 
     def _lock_file(self) -> int:
-        """Open the file of the lock without waiting; what is no file is removed first, if this
+        """Open the lock file without waiting; anything but a regular file is removed first, if this
         user may.
         """
         path, safe_flags = f"{self.folder}/tmp/.lock", os.O_NOFOLLOW | os.O_NONBLOCK
@@ -270,7 +273,7 @@ class Disk:
             self.share(path)
             return file
         except (PermissionError, IsADirectoryError):
-            # a lock needs no right to write
+            # a lock works without permission to write
             return os.open(path, os.O_RDONLY | safe_flags)
 
     def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
@@ -310,11 +313,11 @@ class Disk:
     def _opened_folder(self, path: str) -> Iterator[tuple[int, str]]:
         """Yield the opened folder of a file below the root, and the name of the file.
 
-        Each folder is opened in the one above it, so that no symbolic link leads out of the root,
-        however late it is put there. Raises `OSError` for a symbolic link.
+        Each folder is opened relative to the one above it, so that no symbolic link leads out of
+        the root, even one that is created meanwhile. Raises `OSError` for a symbolic link.
         """
         *folders, name = path.removeprefix(f"{self.folder}/").split("/")
-        # a path with any of these may lead out of the root
+        # a path with one of these parts may lead out of the root
         if {"", ".", ".."} & {*folders, name}:
             raise OSError(errno.EPERM, f"{path} is not below {self.folder}")
         open_folders = [os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)]
@@ -355,10 +358,10 @@ def append(path: str, raw: bytes, flags: int = 0) -> int:
 
 
 def read_file(path: str, limit: int = MOST_READ) -> bytes:
-    """Return the bytes of a file; raise `ValueError` for what is no file or has more than ``limit``
-    bytes.
+    """Return the bytes of a file; raise `ValueError` for anything but a regular file, or for more
+    than ``limit`` bytes.
 
-    A pipe or a device in place of the file never makes the caller wait.
+    A pipe or a device in place of the file never blocks the caller.
     """
     file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -379,7 +382,7 @@ def read_file(path: str, limit: int = MOST_READ) -> bytes:
 
 
 def open_now(path: str, flags: int) -> int:
-    """Open a file, as `open` asks its ``opener`` to do, without waiting for a pipe in its place."""
+    """Open a file as an ``opener`` of `open`, without waiting for a pipe in its place."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
@@ -406,13 +409,13 @@ def below(base: str) -> Iterator[os.DirEntry[str]]:
 
 
 def _locked(file: int) -> bool:
-    """Return True if the lock of a file was taken; False while another process holds it."""
+    """Try to take the lock of a file; return False while another process holds it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:
-        pass  # a file system without locks
+        pass  # the file system has no locks
     return True
 
 

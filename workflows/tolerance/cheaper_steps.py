@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from neusee.nodes import Node
 
 ESTIMATED = 0.22  #: share of the tolerance for the estimated error of PSFs of few bands
-#: share of the tolerance for the channels of an image beside such an estimate, in place of
+#: share of the tolerance for the channels of an image if there is such an estimate, instead of
 #: `CHANNELS`
 BESIDE = 0.08
-#: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
+#: tolerance below which no error bound of sums over bands can be proved, because rounding alone
+#: contributes 1.4e-6
 _SMALLEST_TOLERANCE = 2e-5
-#: tolerance scale after a failure, or one that is expected, relative to the largest that would
-#: suffice
+#: factor of safety of the tolerance scale, relative to the largest scale that would suffice
 _SAFE = 0.8
-_EXPECTED_SHARE = 0.5  #: share of its limit that the error of a cheaper step is expected to be
-_MOST_PLANS = 4  #: plans with ever smaller limits
+_EXPECTED_SHARE = 0.5  #: expected ratio of the error of a cheaper step to its limit
+_MOST_PLANS = 4  #: greatest number of plans, each with smaller limits
 #: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom
 #: changes
 _MIXTURE = 0.1
@@ -63,7 +63,7 @@ def with_substitutions(
         _substituted(recipe, outputs, pinned),
         any(substitution.within for substitution in recipe.substitutions),
     )
-    # a recipe that has cheaper steps already stays as it is
+    # a recipe that already has cheaper steps is not changed
     for _ in range(0 if has_substitutions else _MOST_PLANS):
         if not any(substitution.within for substitution in plan.substitutions):
             break
@@ -77,11 +77,11 @@ def with_substitutions(
 
 
 def stricter_scale(recipe: Recipe, over: float) -> float:
-    """Return the tolerance scale of a second attempt, after an error of ``recipe`` that was
-    ``over`` times too large.
+    """Return the tolerance scale for a second attempt, after a run of ``recipe`` whose error was
+    ``over`` times the tolerance.
 
     The limits of low-rank cubes are powers of ten. The scale is so small that these limits become
-    smaller too, because a cube that stays the same may be what was too coarse.
+    smaller too, because the cube may have caused the error.
     """
     image_names = [
         substitution.step
@@ -91,9 +91,9 @@ def stricter_scale(recipe: Recipe, over: float) -> float:
     cube_limits = [
         recipe.allowed(name) * _MIXTURE for name in image_names if recipe.allowed(name) > 0
     ]
-    # the factor to the power of ten below each limit
+    # smallest ratio of the next lower power of ten to a limit
     next_power = min((_power_of_ten(limit) / limit for limit in cube_limits), default=1.0)
-    # 0.99: just below the power, so that the limit drops to the next one
+    # 0.99 gives a value just below the power of ten, so that the limit drops to the next power
     return recipe.tolerance_scale * min(_SAFE / over, 0.99 * next_power)
 
 
@@ -104,7 +104,9 @@ def _power_of_ten(limit: float) -> float:
 
 
 def _substituted(recipe: Recipe, outputs: frozenset[str], pinned: Collection[str]) -> Recipe:
-    """Return ``recipe`` with cheaper steps that err by at most what `Recipe.allowed` says."""
+    """Return ``recipe`` with cheaper steps whose errors are within the limits of
+    `Recipe.allowed`.
+    """
     if recipe.exact:
         return recipe
     recipe = without_nothing(recipe, needed(recipe, sorted(outputs)))
@@ -123,7 +125,7 @@ def _substituted(recipe: Recipe, outputs: frozenset[str], pinned: Collection[str
         if image.name not in pinned and image.wires.get("radiance") not in pinned_and_later:
             cheaper.collapse(image)
     recipe = cheaper.finished()
-    # the cheaper steps may change which steps have no bound
+    # cheaper steps may change which steps have no error bound
     return _limited(recipe, needed(recipe, sorted(outputs)))
 
 
@@ -157,12 +159,13 @@ def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
 
 @dataclass
 class _Draft:
-    """A recipe in which some steps are being replaced by cheaper steps."""
+    """A recipe in which cheaper steps are replacing some steps."""
 
     recipe: Recipe
     wanted: frozenset[str]
     readers: Mapping[str, list[str]]
-    dependent: frozenset[str] = frozenset()  #: steps that change while a value is optimised
+    #: steps whose results change while a value is optimised
+    dependent: frozenset[str] = frozenset()
     added: dict[str, Step] = field(default_factory=dict)
     rewired: dict[str, Step] = field(default_factory=dict)
     substitutions: list[Substitution] = field(default_factory=list)
@@ -181,14 +184,14 @@ class _Draft:
             return
         name, error_limit = f"{image.name}.channels", self.recipe.allowed(image.name)
         cube_step, rows_step = self._mixture(radiance, image), self._rows(*weights, readers, image)
-        # the level of the scene follows the brightest pixel
+        # True if a later step scales the scene by its brightest pixel
         largest = any(reader.node.hooks.band_invariant is not None for reader in readers)
         wires = {
             "radiance": cube_step,
             "rows": rows_step,
             **self._few_bands(image, cube_step, rows_step, largest),
         }
-        # beside an estimate of few bands the channels get a smaller share
+        # with an estimate for few bands, the channels get a smaller share
         error_limit *= BESIDE if "few" in wires else CHANNELS
         self._add(
             name, node, wires, {**image.params, "within": error_limit, "largest": largest}, image
@@ -204,7 +207,8 @@ class _Draft:
         )
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
-        """Return the steps that give all ``readers`` the wavelength bands and the camera responses.
+        """Return the steps that provide the wavelength bands and the camera responses for all
+        ``readers``.
 
         Return None if a step in ``readers`` needs single bands, or if the steps read different
         bands or responses.
@@ -248,14 +252,14 @@ class _Draft:
             band_invariant and not band_invariant(reader.params)
         ):
             return False
-        # such an input must be equal in all bands
+        # these inputs must be equal in all bands
         return all(
             self._even(reader.wires.get(input_name)) for input_name in node.needs_band_invariant
         )
 
     def _even(self, wire: Wire) -> bool:
-        """Return True if an input is unconnected, or if the connected node states that all bands
-        are equal.
+        """Return True if an input is unconnected, or if the connected node states that its result
+        is equal in all bands.
         """
         if not isinstance(wire, str):
             return wire is None
@@ -265,8 +269,8 @@ class _Draft:
         )
 
     def _few_bands(self, image: Step, cube: str, rows: str, largest: bool) -> dict[str, Wire]:
-        """Add steps that compute the PSF of an image for few bands, if nothing else reads it;
-        return the wires.
+        """Add steps that compute the PSF of an image at only a few bands, provided that no other
+        step reads this PSF; return the connections of the image's inputs.
         """
         name = image.wires.get("psf")
         step = self.recipe.steps[name] if isinstance(name, str) else None
@@ -284,7 +288,7 @@ class _Draft:
             "within": error_limit,
             "largest": largest,
         }
-        # which bands are enough
+        # choose the bands that suffice
         choice_step = self._add(f"{name}.choice", optics.few_bands, inputs, params, step)
         pupil_step = self._add(
             f"{name}.pupil",
@@ -293,9 +297,9 @@ class _Draft:
             {},
             step,
         )
-        # the PSF of these bands
+        # compute the PSF at these bands
         few_psf = self._add(f"{name}.few", step.node, {"pupil": pupil_step}, step.params, step)
-        # their error is estimated, and the run sees it
+        # estimate the error of these PSFs in the run
         check_inputs = {"few": choice_step, "psf": few_psf, **inputs}
         checked_name = self._add(
             f"{name}.checked", optics.few_bands_checked, check_inputs, lens_params, step
@@ -308,8 +312,8 @@ class _Draft:
         return {"psf": few_psf, "few": checked_name}
 
     def _only(self, psf: str, image: str) -> bool:
-        """Return True if no step but ``image`` reads a PSF on the axis, and an estimate of its
-        error is allowed.
+        """Return True if only ``image`` reads a PSF, the PSF is on the axis, and estimates of its
+        error are allowed.
         """
         if not self.recipe.estimates or psf in self.wanted or psf in self.dependent:
             return False
@@ -335,7 +339,8 @@ class _Draft:
         The conversion to low rank comes as early as the nodes allow.
         """
         step, new_name = self.recipe.steps[name], f"{name}.mixture"
-        # an input of which the node takes the low-rank form: the conversion comes before it
+        # an input that the node accepts in low-rank form: then the conversion comes before this
+        # node
         low_rank_input = next(
             (
                 input_name
@@ -373,8 +378,8 @@ class _Draft:
 
 
 def _well(readers: Iterable[Step]) -> bool:
-    """Return True if a step reads bands but no responses, as a step that computes the electrons
-    of a pixel does.
+    """Return True if a step reads bands but no responses, like a step that computes the electrons
+    in a pixel.
     """
     return any(
         "bands" in reader.node.inputs and "responses" not in reader.node.inputs
@@ -383,7 +388,7 @@ def _well(readers: Iterable[Step]) -> bool:
 
 
 def _exchanged(wire: Wire, old: str, new: str) -> Wire:
-    """Return a wire with the step ``new`` in place of ``old``."""
+    """Return the connection of an input with the step ``new`` in place of ``old``."""
     if isinstance(wire, tuple):
         return tuple(new if name == old else name for name in wire)
     return new if wire == old else wire

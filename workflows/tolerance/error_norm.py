@@ -1,4 +1,4 @@
-"""Error norm: the measure of the error of a result for all tolerances and studies.
+"""Error norm: the measure of the error of a result that all tolerances and studies use.
 
 The norm is the root mean square of the difference between result and reference, divided by the
 largest element of the reference; 1e-3 is a peak signal-to-noise ratio of 60 dB. Every error bound
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_PART = 1 << 22  #: elements that are compared at once in float64
+_PART = 1 << 22  #: number of elements that are compared at once in float64
 
 
 def error_of(value: Any, reference: Any) -> float:
@@ -74,28 +74,28 @@ def _tensor_errors(a: Tensor, b: Tensor) -> tuple[float, float]:
     for actual_part, expected_part in zip(_parts(a), _parts(b), strict=True):
         x, y = actual_part.to(double_type).cpu(), expected_part.to(double_type).cpu()
         is_same = (x == y) | (x.isnan() & y.isnan())
-        # the same infinity on both sides is no difference
+        # equal infinities count as no difference
         difference = (x - y).abs().where(~is_same, 0.0)
         if not bool(difference.isfinite().all()):
             return math.inf, math.inf
         largest_expected = max(largest_expected, float(y.abs().where(y.isfinite(), 0.0).max()))
         sum_of_squares += float(difference.square().sum())
         largest = max(largest, float(difference.max()))
-    # of an expected 0 the absolute error counts
+    # if the reference is 0 everywhere, the absolute error counts
     scale = largest_expected if largest_expected > 0 else 1.0
     return math.sqrt(sum_of_squares / a.numel()) / scale, largest / scale
 
 
 def _kind(x: Any) -> str:
-    """Return what a value is, for an error message."""
+    """Return a description of a value for an error message."""
     return (
         f"a tensor of shape {tuple(x.shape)}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
     )
 
 
 def _parts(x: Tensor) -> tuple[Tensor, ...]:
-    """Return the elements of a tensor in parts of at most `_PART`, so that little is in float64
-    at once.
+    """Return the elements of a tensor in parts of at most `_PART` elements, to limit the memory in
+    float64.
     """
     parts: tuple[Tensor, ...] = torch.split(x.detach().reshape(-1), _PART)
     return parts

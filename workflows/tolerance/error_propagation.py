@@ -26,7 +26,8 @@ from neusee.workflows.tolerance.skip_decision import UNKNOWN, ErrorBudget, Facts
 _Input = ErrorBound | list[ErrorBound] | None
 _EXACT = ErrorBound(0.0)
 Kind = Literal["exact", "proved", "estimated", "unknown"]
-#: share of the estimated errors that are at least as large as the error, over random recipes
+#: fraction of the estimated errors, over random recipes, that are at least as large as the true
+#: error
 COVERAGE = 0.95
 
 
@@ -34,15 +35,14 @@ COVERAGE = 0.95
 class ErrorBounds:
     """Upper bounds on the errors of results, each relative to the largest element of the result."""
 
-    #: by step; infinite where a node gives no bound
+    #: error bound by step; infinite if a node gives no bound
     shares: Mapping[str, float] = field(default_factory=dict)
-    #: of outputs, and of the inputs of nodes without bounds
+    #: error bounds that must meet the tolerance: of outputs, and of inputs of nodes without bounds
     held: Mapping[str, float] = field(default_factory=dict)
-    #: the errors that a run states for these results: with what one draw of the noise adds, and an
-    #: estimate of what rounding to digital numbers adds; the tolerance does not limit these
-    #: additions
+    #: errors that a run states for these results. They include the effect of a single draw of the
+    #: noise and an estimate of the rounding to digital numbers, which the tolerance does not limit
     stated: Mapping[str, float] = field(default_factory=dict)
-    estimated: frozenset[str] = frozenset()  #: steps whose stated error counts an estimate
+    estimated: frozenset[str] = frozenset()  #: steps whose stated error includes an estimate
 
     def of(self, step: str) -> float | None:
         """Return the error bound of a step's result, or None if no bound is known."""
@@ -108,7 +108,7 @@ def tolerance_frontier(recipe: Recipe, order: Iterable[str], outputs: Iterable[s
     for name in order:
         step = recipe.steps[name]
         inexact_sources = [source for source in step.sources if source in inexact]
-        # no bound behind it: the errors of its inputs must meet the tolerance
+        # this step gives no bound: the errors of its inputs must meet the tolerance
         if inexact_sources and not _bounds_its_error(step, recipe):
             frontier |= dict.fromkeys(inexact_sources)
         elif inexact_sources or _may_err(step):
@@ -117,9 +117,9 @@ def tolerance_frontier(recipe: Recipe, order: Iterable[str], outputs: Iterable[s
 
 
 def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
-    """Return the steps whose errors reach a node that gives no bound on the error of its result."""
+    """Return the steps whose errors reach a node that gives no error bound for its result."""
     unbounded = set[str]()
-    # from the outputs upstream
+    # go upstream from the outputs
     for name in reversed(order):
         if name in unbounded or not _bounds_its_error(recipe.steps[name], recipe):
             unbounded.update(recipe.steps[name].sources)
@@ -127,20 +127,20 @@ def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
 
 
 def _may_err(step: Step) -> bool:
-    """Return True if the result of a step may be approximate, or left out, where its inputs are
-    exact.
+    """Return True if a step may be left out, or if its result may be approximate even for exact
+    inputs.
     """
     return step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None
 
 
 def _bounds_its_error(step: Step, recipe: Recipe) -> bool:
-    """Return True if a step has an error bound whatever errors its inputs have."""
+    """Return True if a step gives an error bound for any errors of its inputs."""
     return _propagates(step, recipe) or step.node.hooks.approximation_error is not None
 
 
 def _propagates(step: Step, recipe: Recipe) -> bool:
-    """Return True if the node of a step tells how errors pass through it, by a bound or by an
-    estimate in use.
+    """Return True if the node of a step states how errors pass through it, by a bound, or by an
+    estimate if the recipe allows estimates.
     """
     hooks = step.node.hooks
     return hooks.propagate_error is not None and (recipe.estimates or not hooks.estimated)
@@ -161,7 +161,7 @@ def proof(
     for name in order:
         step = recipe.steps[name]
         if not _may_err(step) and bounds.keys().isdisjoint(step.sources):
-            continue  # exact, like almost every step
+            continue  # the result is exact, as for almost every step
         bound = _bound(step, bounds, done(name), facts_of, recipe)
         if bound is None:
             continue
@@ -169,7 +169,7 @@ def proof(
             held_shares |= _finite_shares(bounds, step.sources)
         bounds[name] = bound
     held_shares |= _finite_shares(bounds, outputs)
-    # what the run states: with one draw of the noise and rounding
+    # the stated errors include a single draw of the noise, and rounding
     bounds_of_one_picture = bounds | _of_one_picture(recipe, bounds, done, facts_of)
     return ErrorBounds(
         {name: bound.share for name, bound in bounds.items()},
@@ -180,7 +180,7 @@ def proof(
 
 
 def _finite_shares(bounds: Mapping[str, ErrorBound], names: Iterable[str]) -> dict[str, float]:
-    """Return the share of each error among ``names`` that has a bound."""
+    """Return the relative error bound of each step in ``names`` that has a finite bound."""
     shares = {name: bounds[name].share for name in names if name in bounds}
     return {name: share for name, share in shares.items() if math.isfinite(share)}
 
@@ -196,8 +196,8 @@ def _bound(
     """Return the error bound of a step's result from the bounds of its inputs in ``bounds``, or
     None if it is exact.
 
-    The bound is the root mean square over all draws of the noise, or with ``one_draw`` that of a
-    single draw.
+    The bound is the root mean square over all draws of the noise, or with ``one_draw`` the error of
+    a single draw.
     """
     own_error = _own(step, done, facts_of, one_draw)
     sources = [bounds[source] for source in step.sources if source in bounds]
@@ -211,8 +211,8 @@ def _bound(
 
 
 def _propagation(step: Step, one_draw: bool) -> Callable[..., float | ErrorBound] | None:
-    """Return the hook of a node that bounds how errors pass, with ``one_draw`` that for a single
-    draw of the noise if there is one.
+    """Return the hook of a node that bounds how errors pass through it; with ``one_draw``, the hook
+    for a single draw of the noise if there is one.
     """
     hooks = step.node.hooks
     if one_draw and hooks.propagate_error is not None:
@@ -221,8 +221,8 @@ def _propagation(step: Step, one_draw: bool) -> Callable[..., float | ErrorBound
 
 
 def _together(carried: ErrorBound, own: ErrorBound | None, facts: TensorStats | None) -> ErrorBound:
-    """Return the sum of the error that a step takes from its inputs and of the error that it
-    adds.
+    """Return the sum of two errors: the error caused by the inputs of a step, and the error that
+    the step itself adds.
     """
     if own is None:
         return replace(carried, stats=facts)
@@ -232,7 +232,7 @@ def _together(carried: ErrorBound, own: ErrorBound | None, facts: TensorStats | 
     return ErrorBound(
         carried.rms + own.rms,
         stats=facts,
-        # without an error of the inputs, the own largest error is all
+        # without an error of the inputs, only the step's own largest error counts
         peak=own.peak if carried.rms == 0.0 else largest_error,
         estimated=carried.estimated or own.estimated,
         scattered=carried.scattered + own.scattered,
@@ -245,8 +245,8 @@ def _of_one_picture(
     done: Callable[[str], StepRecord],
     facts_of: FactsOf,
 ) -> dict[str, ErrorBound]:
-    """Return the bounds of ``bounds`` that are larger for one draw of the noise, and by rounding
-    to digital numbers.
+    """Return those bounds that are larger for a single draw of the noise, or because of rounding to
+    digital numbers.
     """
     larger_bounds: dict[str, ErrorBound] = {}
     for name, bound_of_draws in bounds.items():
@@ -255,7 +255,7 @@ def _of_one_picture(
         draw_hook = hooks.skip_draw if is_omitted else hooks.propagate_draw or hooks.rounding_error
         if draw_hook is None and larger_bounds.keys().isdisjoint(step.sources):
             continue
-        # larger bounds of earlier steps replace theirs
+        # larger bounds of earlier steps replace the usual ones
         bound = (
             _bound(step, {**bounds, **larger_bounds}, record, facts_of, recipe, one_draw=True)
             or bound_of_draws
@@ -267,14 +267,14 @@ def _of_one_picture(
 
 
 def _with_rounding(step: Step, bound: ErrorBound) -> ErrorBound:
-    """Return the error bound of digital numbers with an estimate of what their rounding adds."""
+    """Return the error bound of digital numbers, including an estimate of their rounding."""
     rounding = step.node.hooks.rounding_error
     if rounding is None or bound.stats is None or not 0.0 < bound.rms < math.inf:
         return bound
     total_rms = float(rounding(bound.rms, result=bound.stats, **step.params))
     # independent errors add in squares: total^2 = before^2 + added^2
     added_rms = math.sqrt(max(total_rms**2 - bound.rms**2, 0.0))
-    # the sum, as for any two errors: a bound, not the most likely value
+    # added linearly, as any two errors: a bound, not the most likely value
     return replace(
         bound, rms=bound.rms + added_rms, scattered=bound.scattered + added_rms, estimated=True
     )
@@ -292,13 +292,15 @@ def _own(
         return None
     if is_omitted:
         return _of_omission(step, share, facts, one_draw)
-    # `share` is of the exact result, of which only the approximate one is known
+    # `share` is relative to the exact result, but only the approximate result is known
     rms = _of_full_result(share, max(abs(facts.min), abs(facts.max)))
     return ErrorBound(rms, peak=done.error[1] if done.error else None, estimated=hooks.estimated)
 
 
 def _of_omission(step: Step, share: float, facts: TensorStats, one_draw: bool) -> ErrorBound:
-    """Return the error of leaving out a step, which is at most ``share`` of its full result."""
+    """Return the error caused by leaving out a step, which is at most ``share`` of the step's full
+    result.
+    """
     hooks = step.node.hooks
     largest_element = max(abs(facts.min), abs(facts.max))
     if hooks.skip_scale is not None:
@@ -312,10 +314,11 @@ def _of_omission(step: Step, share: float, facts: TensorStats, one_draw: bool) -
 
 
 def _of_full_result(share: float, largest: float) -> float:
-    """Return a ``share`` of the full result as an error, where the largest element of the result
-    that there is has at least the share 1 - ``share`` of it.
+    """Return an upper bound on ``share`` times the largest element of the exact result, computed
+    from the ``largest`` element of the present result.
     """
-    # full <= largest / (1 - share), because the result that there is has 1 - share of it
+    # full <= largest / (1 - share), because the largest element of the present result is at least 1
+    # - share of the full one
     return share * largest / (1.0 - share) if share < 1.0 and largest > 0 else math.inf
 
 
@@ -325,17 +328,17 @@ def _carried(
     result: TensorStats | None,
     hook: Callable[..., float | ErrorBound] | None,
 ) -> ErrorBound:
-    """Return the error of a step's result that errors of its inputs cause; infinite where no
+    """Return the error of a step's result that the errors of its inputs cause; infinite if no
     ``hook`` bounds it.
 
-    The approximation of a step may count cheaper forms of its inputs, but never what was left out
-    of the inputs: the step cannot know of it.
+    The approximation error of a step may include cheaper forms of its inputs, but never steps left
+    out upstream, which the step cannot know.
     """
     errors = [error for error in _flat(inputs) if error.rms]
     if not errors:
         return _EXACT
     estimated = step.node.hooks.estimated or any(error.estimated for error in errors)
-    # without statistics no hook can bound it
+    # without statistics of the result no hook can bound the error
     if hook is None or result is None or any(math.isinf(error.rms) for error in errors):
         return ErrorBound(math.inf, estimated=estimated)
     return _passed_apart(step, inputs, result, hook, estimated)
@@ -348,8 +351,8 @@ def _passed_apart(
     hook: Callable[..., float | ErrorBound],
     estimated: bool,
 ) -> ErrorBound:
-    """Return the error that a step makes of the errors of its inputs: of those like noise apart
-    from all others.
+    """Return the error of a step's result, with errors like noise passed separately from all other
+    errors of the inputs.
     """
     hooks = step.node.hooks
     other_error = _passed(step, hook, _parts(inputs, scattered=False), result)
@@ -358,7 +361,7 @@ def _passed_apart(
     )
     return ErrorBound(
         other_error.rms + noise_error.rms,
-        # noise has no largest value
+        # an error like noise has no largest value
         peak=other_error.peak if noise_error.rms == 0.0 else None,
         estimated=estimated,
         scattered=other_error.scattered + noise_error.rms,
@@ -368,7 +371,7 @@ def _passed_apart(
 def _passed(
     step: Step, hook: Callable[..., float | ErrorBound], inputs: list[_Input], result: TensorStats
 ) -> ErrorBound:
-    """Return the error that a hook of a node finds for the errors of the inputs; exact for exact
+    """Return the error that a hook of a node computes from the errors of the inputs; zero for exact
     inputs.
     """
     if not any(error.rms for error in _flat(inputs)):
@@ -380,13 +383,15 @@ def _passed(
     return (
         error
         if isinstance(error, ErrorBound)
-        # a number is a root mean square; its largest value is not known
+        # a plain number is a root mean square; the largest error is unknown
         else ErrorBound(float(error), peak=0.0 if error == 0 else None)
     )
 
 
 def _parts(inputs: list[_Input], *, scattered: bool) -> list[_Input]:
-    """Return the errors of inputs that are like noise, or all other errors of inputs."""
+    """Return the errors of the inputs that are like noise (``scattered``), or all other errors of
+    the inputs.
+    """
 
     def part(error: ErrorBound) -> ErrorBound:
         rms = error.scattered if scattered else max(error.rms - error.scattered, 0.0)
@@ -400,14 +405,16 @@ def _parts(inputs: list[_Input], *, scattered: bool) -> list[_Input]:
 
 
 def _gathered(wire: Wire, bounds: Mapping[str, ErrorBound]) -> _Input:
-    """Return the error of the result behind a wire, a list of them, or None for no wire."""
+    """Return the error of the result that an input is connected to, a list of errors for a list of
+    steps, or None for an input without a connection.
+    """
     if wire is None or isinstance(wire, str):
         return None if wire is None else bounds.get(wire, _EXACT)
     return [bounds.get(name, _EXACT) for name in wire]
 
 
 def _flat(inputs: Iterable[_Input]) -> Iterator[ErrorBound]:
-    """Yield each error, also those in lists."""
+    """Yield each error, including those inside lists."""
     for error in inputs:
         if isinstance(error, list):
             yield from error
@@ -417,22 +424,22 @@ def _flat(inputs: Iterable[_Input]) -> Iterator[ErrorBound]:
 
 # --- expected errors ------------------------------------------------------------------------------
 
-# Errors that the cheaper steps of a plan are expected to leave in the outputs, found before
+# Errors that the cheaper steps of a plan are expected to cause in the outputs, computed before
 # anything runs.
 #
-# A tolerance is relative to the largest digital number. Where the full well or the converter cuts
-# off most of the light, an error that is small beside the brightest pixel of the image is large
-# beside that number. Nodes tell the range of their result from their parameters
-# (`Node.expected_range`), and the errors of the plan are carried through these ranges as `proof`
-# carries the errors of a run through its results. A run still proves its errors from what it
-# computed.
+# A tolerance is relative to the largest digital number. If the full well or the converter cuts off
+# most of the light, an error that is small relative to the brightest pixel of the image is large
+# relative to that number. Nodes predict the range of their result from their parameters
+# (`Node.expected_range`). The errors of the plan are propagated through these ranges, as `proof`
+# propagates the errors of a run through its results. A run still proves its errors from the
+# computed results.
 
 
 def expected_excess(recipe: Recipe, outputs: Iterable[str], share: float = 1.0) -> float:
     """Return the expected ratio of the largest error of ``outputs`` to its limit; 0 if
     nothing is known.
 
-    Each cheaper step of ``recipe`` is expected to err by this ``share`` of what it may err by.
+    The error of each cheaper step of ``recipe`` is expected to be ``share`` times its limit.
     """
     outputs = tuple(outputs)
     order = needed(recipe, outputs)
@@ -446,39 +453,37 @@ def expected_excess(recipe: Recipe, outputs: Iterable[str], share: float = 1.0) 
     records = {name: _record(recipe.steps[name], expected_errors, ranges) for name in order}
     try:
         return proof(recipe, order, outputs, records.__getitem__, ranges.known.get).over(recipe)
-    except RunError:  # a rule that needs more than a range
+    except RunError:  # a rule needs more than a range
         return 0.0
 
 
 def _record(step: Step, within: Mapping[str, float], ranges: _Ranges) -> StepRecord:
-    """Return the record that a step is expected to have: left out, or with the error of a
-    cheaper step.
-    """
+    """Return the expected record of a step: left out, or with the error of a cheaper step."""
     bound = ranges.left_out.get(step.name)
     if bound is not None:
         return StepRecord(step.name, "left out", "", 0.0, "", bound=bound)
-    # a cheaper step itself, and the cheaper form that it reads
+    # the error of the cheaper step itself, and of the cheaper forms that it reads
     error = within.get(step.name, 0.0) + sum(within.get(source, 0.0) for source in step.sources)
     states_error = error and step.node.hooks.approximation_error is not None
     return StepRecord(step.name, "run", "", 0.0, "", error=(error, error) if states_error else None)
 
 
 class _Ranges:
-    """Expected statistics of the results of a recipe, as far as the nodes tell them, and the
-    steps to leave out.
+    """Expected statistics of the results of a recipe, as far as the nodes predict them, and the
+    steps that will be left out.
     """
 
     def __init__(self, recipe: Recipe, order: Iterable[str]) -> None:
         self.known: dict[str, TensorStats] = {}
-        self.left_out: dict[str, float] = {}  #: error bound, by step
+        self.left_out: dict[str, float] = {}  #: error bound of each step that will be left out
         order = list(order)
         self._forms, self._budget = forms_of(recipe, order), ErrorBudget(recipe)
         for name in order:
             self._add(recipe.steps[name])
 
     def _add(self, step: Step) -> None:
-        """Add the expected range of the result of a step, if its node tells one, and whether the
-        step is left out.
+        """Add the expected range of the result of a step if its node predicts one, and whether the
+        step will be left out.
         """
         hooks = step.node.hooks
         if hooks.expected_range is None:
@@ -499,14 +504,14 @@ class _Ranges:
             return
         tensors = tensors_of(self._forms[step.name])
         result_shape = tuple(tensors[0].shape) if tensors else ()
-        # the sum and the number of elements that are not zero are not known
+        # the sum (NaN) and the number of nonzero elements (0) are unknown
         self.known[step.name] = TensorStats(
             result_shape, "float32", smallest, largest, math.nan, 0, True
         )
 
     def _of(self, wire: Wire) -> Any:
-        """Return the statistics of the result behind a wire, or a list of them; an unknown one
-        raises `LookupError` where it is read.
+        """Return the statistics of the result that an input is connected to, or a list of them;
+        unknown statistics raise `LookupError` when they are read.
         """
         if wire is None:
             return None

@@ -1,4 +1,4 @@
-"""Decision whether a step is left out, and the part of the tolerance that this uses up."""
+"""Decision whether a step is left out, and the part of the tolerance that omitted steps use up."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution, Wire
 # window.
 #
 # Such steps are found from parameters alone, before the run: a step whose node bounds its result by
-# 0 (`Node.zero_bound`) is removed from the inputs to which it would add nothing.
+# 0 (`Node.zero_bound`) is removed from the inputs that would only add 0.
 
 
 #: statistics of a result that is 0 everywhere
@@ -37,14 +37,14 @@ UNKNOWN = _Unknown()
 
 
 def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
-    """Disconnect steps whose result must be 0 and return the recipe; ``order`` lists each step
-    after its inputs.
+    """Return the recipe with those steps disconnected whose result must be 0; ``order`` lists each
+    step after its inputs.
     """
     zero_steps: dict[str, None] = {}
     rewired_steps: dict[str, Step] = {}
     for name in order:
         step = recipe.steps[name]
-        # its result is 0, since its parameters say so or its inputs are
+        # the result is 0 because of the step's parameters, or because its inputs are 0
         if _nothing(step, zero_steps):
             zero_steps[name] = None
         elif step.node.additive_inputs and not zero_steps.keys().isdisjoint(step.sources):
@@ -53,7 +53,7 @@ def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
         return recipe
     removed_before = {substitution.step for substitution in recipe.substitutions}
     reason = "its parameters make its result 0"
-    # a step in whose place stands nothing, with an error of 0
+    # substitutions of a step by nothing, with an error of 0
     new_substitutions = tuple(
         Substitution(name, "", 0.0, reason) for name in zero_steps if name not in removed_before
     )
@@ -75,13 +75,13 @@ def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
     input_stats = [_known(step.wires.get(name), dark) for name in step.node.inputs]
     try:
         return float(step.node.hooks.zero_bound(*input_stats, **step.params)) == 0.0
-    # the bound needs statistics that only a run gives
+    # the bound needs statistics that only a run provides
     except LookupError:
         return False
 
 
 def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
-    """Return statistics of 0 for a step in ``dark``, and unknown ones for any other step."""
+    """Return statistics of 0 for a step in ``dark``, and unknown statistics for any other step."""
     if wire is None:
         return None
     if isinstance(wire, str):
@@ -98,7 +98,7 @@ def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
     for group in step.node.additive_inputs:
         wire = wires.get(group[0])
         if isinstance(wire, str) and wire in dark:
-            # the whole group has no wire
+            # disconnect the whole group of inputs
             wires |= dict.fromkeys(group)
         elif isinstance(wire, tuple):
             remaining = [i for i, name in enumerate(wire) if name not in dark]
@@ -135,9 +135,7 @@ class SkipDecision:
 
 
 class _Later:
-    """Statistics of a result, obtained only when the calculation of an error bound reads one of
-    these statistics.
-    """
+    """Statistics of a result, obtained only when an error bound reads one of them."""
 
     __slots__ = ("_find", "_seen")
 
@@ -174,7 +172,7 @@ def judge(
         raise
     except Exception as error:
         raise RunError(step, [], error) from error
-    # only what the bound has read counts
+    # only statistics that the bound has read count
     if not all(stats.finite for stats in stats_read):
         return SkipDecision(
             _NO_BOUND, False, "its input is not finite, so its effect has no bound", first_wire
@@ -189,8 +187,8 @@ def judge(
 
 
 def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, asked: list[TensorStats]) -> Any:
-    """Return the statistics behind a wire, found when they are read and noted in ``asked``; a
-    list for a list of wires.
+    """Return the statistics of the result that an input is connected to, obtained when they are
+    read, and then noted in ``asked``; a list for a list of steps.
     """
     if wire is None:
         return None
@@ -200,7 +198,7 @@ def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, asked: list[Te
 
 
 def _number(value: Any) -> Any:
-    """Return the number in a tensor of one element, and any other value as it is."""
+    """Return the number in a tensor of one element; return any other value unchanged."""
     return value.item() if isinstance(value, Tensor) and value.numel() == 1 else value
 
 
@@ -235,7 +233,8 @@ class ErrorBudget:
     def __init__(self, recipe: Recipe) -> None:
         # the share of the tolerance that omitted steps may use
         self._recipe, self._share = recipe, skip_share(recipe)
-        # by step: bound by omitted step; equal dicts are one object
+        # for each step, the error bound of each omitted step upstream; equal dicts are the same
+        # object
         self._spent: dict[str, dict[str, float]] = {}
 
     def copy(self) -> ErrorBudget:
@@ -264,7 +263,9 @@ class ErrorBudget:
     def _without_estimate(
         self, step: Step, params: Mapping[str, Any], facts_of: FactsOf
     ) -> SkipDecision:
-        """Decide whether a step changes nothing; any other effect of the step is only estimated."""
+        """Decide whether a step certainly changes nothing; other effects are only estimated, and
+        estimates are not allowed.
+        """
         decision = judge(step, params, facts_of, 0.0)
         return (
             decision
@@ -285,7 +286,7 @@ class ErrorBudget:
         if not bounds_of_sources:
             return {}
         joined_bounds, *other_bounds = bounds_of_sources
-        # equal dicts are one object, so that most steps share one
+        # equal dicts are the same object, to save memory
         if any(bounds_of_other is not joined_bounds for bounds_of_other in other_bounds):
             joined_bounds = {}
             for bounds in bounds_of_sources:
