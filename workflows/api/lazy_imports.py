@@ -1,4 +1,5 @@
-"""Modules of single verbs, imported when a verb is first used: each takes 0.1 s beside torch.
+"""Modules of single verbs, imported when a verb is first used: each takes 0.1 s in addition to
+torch.
 
 from neusee.workflows.api import lazy_imports as lazy
 lazy.run_training.train(recipe, store, ...)

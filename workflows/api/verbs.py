@@ -56,12 +56,11 @@ def run(
     """Run a recipe and return the results of the steps ``outputs``; None means the outputs that the
     recipe names.
 
-    Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch:
-            gets every `Event`.
-    executor: computes the steps instead of this process. memory: largest number of bytes to use on
-    each device.
+    ``device`` names one or several devices, such as ``cuda:0,cuda:1,cpu``, the preferred one first.
+    ``watch`` receives every `Event`. ``executor`` computes the steps in place of this process.
+    ``memory`` is the largest number of bytes to use on each device.
     Raises: `RecipeError` before anything runs, `RunError` if a step fails, ValueError for an
-            unknown output.
+    unknown output.
     """
     names = (outputs,) if isinstance(outputs, str) else outputs
     return run_recipe(
@@ -82,12 +81,11 @@ def sweep(
     """Run a recipe at every combination of the parameter values in ``axes``, and return the results
     of all runs.
 
-    Args: axes: from a parameter or group to a list of values, or to a text such as ``"linspace(450
-            nm, 650 nm, 5)"``.
-    zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` lists a
-    failed point as a row.
+    ``axes`` maps a parameter or a group to a list of values, or to a text such as
+    ``"linspace(450 nm, 650 nm, 5)"``. ``zip`` pairs the values of the axes instead of combining
+    them. With ``on_error="continue"`` a failed point becomes a row.
     Raises: `RecipeError` with all mistakes of all points before anything runs, or the error of the
-            first failed point.
+    first failed point.
     """
     return run_sweep(
         _name(recipe, "sweep"),
@@ -114,13 +112,11 @@ def train(
     """Train the mask and the networks of a recipe, or continue a stopped training, and return the
     folder of results.
 
-    Args: stages: 1 trains mask and network, 2 the network alone, 0 designs the mask without
-            pictures; None means all
-    stages of the recipe. watch: is called with the stage (0 for a lift), its finished iterations
-    and the losses. mesh: the processes of `torchrun`.
+    In ``stages``, 1 trains mask and network, 2 the network alone, and 0 designs the mask without
+    pictures; None means all stages of the recipe. ``watch`` is called with the stage (0 for a
+    lift), its finished iterations and the losses. ``mesh`` has the processes of `torchrun`.
     Raises: ValueError, or its subclass `DesignError` or `MeshError`, for a recipe that cannot be
-            trained; `NotFinite`
-    if a loss is NaN or infinite.
+    trained; `NotFinite` if a loss is NaN or infinite.
     """
     recipe, folder, store = _read(recipe, changes), writable_folder(out), store or open_store()
     session = lazy.resumable_loop.TrainingSession(
@@ -154,16 +150,16 @@ def evaluate(
     """Compare masks and restorers on the same scenes and laser strengths, and return the folder of
     results.
 
-    What is None is that of the recipe's block ``evaluate``, such as all photographs in
-    ``paper_protocol``.
+    An argument that is None has the value of the recipe's block ``evaluate``, such as all
+    photographs in ``paper_protocol``.
 
-    Args: pipelines: a mask and a restorer each, ``"flat+none, five_half_rings+wiener"``. data: a
-            folder of photographs;
-    None means the recipe's own scene. scenes: number of scenes, else 20. strengths: of the laser,
-    in multiples of saturation; None means the strengths in the paper. small: the shorter side in
-    pixels of reduced pictures, which are compared too. reference: the pipeline with which all
-    others are compared. equal_protection: the peak of a laser as a share of that of the plain lens,
-    to which filters and stops bring every pipeline; by: ``best``, ``filter`` or ``stop``.
+    ``pipelines`` names a mask and a restorer each, such as ``"flat+none, five_half_rings+wiener"``.
+    ``data`` is a folder of photographs; None means the recipe's own scene. ``scenes`` is the number
+    of scenes, else 20. ``strengths`` are those of the laser in multiples of saturation; None means
+    the strengths in the paper. ``small`` is the shorter side in pixels of reduced pictures, which
+    are compared too. ``reference`` is the pipeline with which all others are compared.
+    ``equal_protection`` is the peak of a laser relative to that of the plain lens, to which filters
+    and stops bring every pipeline; ``by`` is ``best``, ``filter`` or ``stop``.
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     run_evaluation = lazy.run_evaluation
@@ -195,12 +191,10 @@ def calibrate(
     """Estimate the posterior of a recipe's sensor, or continue a stopped calibration, and return
     the folder of results.
 
-    Args: walkers: number of walkers in each of the four ensembles. move: the move of the walkers,
-            ``"de"`` or
-    ``"stretch"``. draws: least number of independent draws.
+    ``walkers`` is the number of walkers in each of the four ensembles, ``move`` the move of the
+    walkers, ``"de"`` or ``"stretch"``, and ``draws`` the least number of independent draws.
     Raises: `CalibrationRefused` if the levels constrain the sensor too little, ValueError for a
-            recipe without a
-    likelihood.
+    recipe without a likelihood.
     """
     recipe, store = _read(recipe, changes), store or open_store()
     options = lazy.run_calibration.CalibrationOptions(walkers, move, draws)
@@ -223,9 +217,9 @@ def study(
     """Study how accurate the numbers of a recipe are, or continue a stopped study, and return the
     folder of results.
 
-    Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"``,
-            ``"uncertainty"`` or
-    ``"protection"``. options: the options of this kind, as ``neusee study KIND --help`` lists them.
+    ``kind`` is ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"``,
+    ``"uncertainty"`` or ``"protection"``. ``options`` are the options of this kind, as ``neusee
+    study KIND --help`` lists them.
     Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` if a step fails.
     """
     if kind not in run_study.KINDS:

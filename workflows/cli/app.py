@@ -38,16 +38,16 @@ if TYPE_CHECKING:
 # processor time of one and take as much longer.
 
 
-#: variables that say how a thread waits
+#: environment variables that set how a thread of OpenMP waits
 _WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 _NUMBER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
-_DRAWN = ("run",)  #: commands beside whose short steps a process draws pictures
-_TIMED = ("study",)  #: commands whose stored times belong to a number of threads
+_DRAWN = ("run",)  #: commands during whose steps another process draws pictures
+_TIMED = ("study",)  #: commands whose stored times depend on the number of threads
 
 
 def settle_threads(command: str, environ: MutableMapping[str, str] = os.environ) -> None:
-    """Let waiting threads sleep, and leave the processors that are busy to other work; keep what
-    the user has set.
+    """Let waiting threads sleep, and use no more threads than there are free processors; keep the
+    user's settings.
 
     Steps beside which pictures are drawn leave one processor to these: on two processors `neusee
     run first_light` took 10.0 s with two threads and 8.1 s with one. Nothing changes where torch is
@@ -91,7 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
     traceback.
     """
     interrupts = Interrupts()
-    if arguments is None:  # else a caller inside Python, whose signals and garbage are its own
+    if arguments is None:  # a Python caller handles signals and garbage itself
         interrupts.watch()
         # a search for garbage among imported modules takes a tenth of the start-up time
         gc.disable()

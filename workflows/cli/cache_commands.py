@@ -113,9 +113,9 @@ def ls_lines(store: Store, every: bool = False) -> Iterator[str]:
     """Yield a line for each cached result with its date, bytes, seconds, step, recipe and key, the
     newest last.
 
-    Without ``every``, these are the newest 50. In a long journal their number and bytes are those
-    that it tells, so that the time does not grow with each result. Of each result, one short text
-    is held in memory.
+    Without ``every``, these are the newest 50. For a long journal, the number and bytes of the
+    results are taken from the journal, so that the time does not grow with each result. Only one
+    short text for each result is held in memory.
     """
     pins = store.pinned()
     if every or not store.journal.is_long():
@@ -223,9 +223,9 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
     limit = None if budget is None else parse_size(budget)
     swept = store.gc(limit, dry)
     is_full = limit is not None and _is_beyond(store, swept.left, limit)
-    # answers of commands go too where the values alone cannot keep to the budget
+    # stored answers are removed too if removing values alone does not reach the budget
     old_answers = stored_answer.sweep(store.disk, dry, everything=is_full)
-    # the receipts of what went
+    # the metadata of the removed values
     removed_metadata = ((key, store.about(key)) for key in swept.evicted)
     # bytes, seconds and step of the removed value, and the first digits of its key
     rows = [

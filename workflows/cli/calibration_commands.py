@@ -155,7 +155,9 @@ def _loaded(words: list[str] | None, store: Store, quiet: bool) -> tuple[Recipe,
 
 
 def _is_recipe(name: str) -> bool:
-    """Return True for the name of a recipe, which counts before a folder of the same name."""
+    """Return True for the name of a recipe, which takes precedence over a folder of the
+    same name.
+    """
     return name in {recipe.name for recipe in lazy.loading.recipes()}
 
 
@@ -178,7 +180,7 @@ def _write_sensor(
 
 def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
     """Return a line for each parameter in the document of a calibration."""
-    # what the frames do not tell is not in the file
+    # NaN for what the frames do not determine, which the file does not contain
     unknown = dict.fromkeys(("mean", "sd", "low", "high"), math.nan)
     row_type = lazy.calibration_page.ParameterEstimate
     rows = [row_type(**{**unknown, **row}) for row in parameters.values()]  # type: ignore[arg-type]
@@ -191,7 +193,7 @@ def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
 
 
 class StandardRelease(StrEnum):
-    """Release of EMVA 1288 whose variance in time is taken."""
+    """Release of EMVA 1288 whose temporal variance is used."""
 
     four = "4"
     three = "3"

@@ -169,7 +169,9 @@ def node_lines(name: str, own: Own = MappingProxyType({})) -> list[str]:
 
 
 def _reading_lines() -> list[str]:
-    """Return each interpretation of the paper, and then what the paper settles."""
+    """Return each contradiction in the paper that a recipe key resolves, and then those that need
+    no key.
+    """
     lines: list[str] = []
     for reading in READINGS:
         lines += [*_reading(reading.path), ""]

@@ -1,4 +1,4 @@
-"""What all commands share: read a recipe, print lines, report errors, stop and go on; and the
+"""Functions of all commands: reading of a recipe, printing, errors and interruption; and the
 options of several commands, with functions that check their values.
 """
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 DEFAULT = "first_light"
 _MOST_ERROR_LINES = 100  #: lines of an error that are printed
-#: containers that are new, after which Python searches for garbage; 700 at first
+#: number of new containers after which Python collects garbage; its default is 700
 _NEW_OBJECTS = 10_000
 
 
@@ -82,8 +82,8 @@ def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
 
 
 def _fix(words: list[str], number: int) -> str:
-    """Return how to write the word at ``number``, which is not a change and often the rest of a
-    value with a space.
+    """Return the correction of the word at ``number``, which is not a change and often the rest of
+    a value with a space.
     """
     if number == 0:
         return "write key=value, +key=value or ~key"
@@ -97,11 +97,11 @@ def _is_change(word: str) -> bool:
 
 
 def search_for_garbage() -> None:
-    """Let Python search for garbage from here on, but not among what was imported; the program
-    begins without.
+    """Switch on Python's garbage collection, which the program begins without, for objects that are
+    created from here on.
 
-    The searches are rare, because packages that are imported later make many objects and hardly any
-    garbage.
+    The collections are rare, because packages that are imported later make many objects and hardly
+    any garbage.
     """
     gc.freeze()
     gc.set_threshold(_NEW_OBJECTS)
@@ -161,7 +161,7 @@ def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iter
 
 
 class _ForResult:
-    """In place of stdout while it is kept for the result: a stream that writes to stderr."""
+    """Replacement of stdout while it is reserved for the result: a stream that writes to stderr."""
 
     def __init__(self, result: TextIO) -> None:
         self.result = result
@@ -171,8 +171,8 @@ class _ForResult:
 
 
 def keep_for_result(context: typer.Context) -> None:
-    """Keep stdout for what `say` prints: what own code prints goes to stderr until the command
-    ends.
+    """Reserve stdout for the output of `say`: output of the user's own code goes to stderr until
+    the command ends.
     """
     if not isinstance(sys.stdout, _ForResult):
         context.with_resource(redirect_stdout(cast(TextIO, _ForResult(sys.stdout))))
@@ -307,7 +307,7 @@ OneDevice = Annotated[str, typer.Option("--device", help="Where to compute: cpu 
 
 
 def _result_alone(context: typer.Context, value: bool) -> bool:
-    """Print nothing but the result to stdout."""
+    """Reserve stdout for the result if the option is set; return its value."""
     if value:
         keep_for_result(context)
     return value
@@ -374,7 +374,7 @@ class ProgressLines:
             return ""
         task, done_count, total = count["what"], int(count["done"]), int(count["all"])
         # a stopped study may begin with any count
-        # the rate is that since the first count of a kind of line
+        # the rate is taken from the first count of a kind of line
         if task not in self._began or done_count <= self._last[task]:
             # a count of 1 began at the line before it
             self._began[task] = (
@@ -389,7 +389,7 @@ class ProgressLines:
 
 
 class FewLines(ProgressLines):
-    """A printer of lines of progress that keeps lines with a count few.
+    """A printer of lines of progress that prints few of the lines with a count.
 
     On a terminal a line with a count takes the place of the one before. Elsewhere, as in a file, it
     is printed after half a minute, and then each time when the command has run twice as long.
@@ -452,8 +452,8 @@ def memory_limit(text: str) -> int | None:
 
 @contextmanager
 def within_memory(text: str) -> Iterator[int | None]:
-    """Yield the value of ``--memory`` in bytes, as `memory_limit`, and hold the readers of input
-    files to it.
+    """Yield the value of ``--memory`` in bytes, as `memory_limit` does, and limit the readers of
+    input files to it.
     """
     limit = memory_limit(text)
     if limit is None:
@@ -474,7 +474,8 @@ def executor_of(
     """Yield None for ``local``, or an executor on the cluster ``place``, and close it after the
     ``with`` block.
 
-    ``job`` are the options of jobs of SLURM. ``say`` is told what is waited for.
+    ``job`` has the options of jobs of SLURM. ``say`` receives a line on what the executor waits
+    for.
     """
     if place == "local":
         yield None

@@ -39,13 +39,16 @@ def handbook(
     The first build takes minutes, because it runs the commands of the pages; a later one takes
     their results from the cache. Needs `pip install "neusee[docs]"`.
     """
+    # mistakes of the call, found before any work
     with failing(site_build.HandbookError, before="neusee handbook: "):
         site_build.check_modules()
         site_build.check_folder(out)
 
+    # errors of the build itself
     with failing(
         site_build.HandbookError, NoPicture, OSError, code=FAILED, before="neusee handbook: "
     ):
+        # the guide is a folder of the packaged recipes
         reference = lazy.handbook_reference.reference_pages(site_build.GUIDE.parent)
         page = site_build.build_handbook(out, reference, pictures, progress_lines(quiet))
     say([str(page)])

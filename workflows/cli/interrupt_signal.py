@@ -26,14 +26,14 @@ _ONE_PRESS = 1.0
 
 
 def say_stopped(sentence: str = STOPPED) -> None:
-    """Print why a command ends before its end, unless this was printed before."""
+    """Print why a command ends early, unless this was printed before."""
     if not printed_sentences:
         printed_sentences.append(sentence)
         print(sentence, file=sys.stderr, flush=True)
 
 
 class Interrupts:
-    """The interrupts of one command: whether there was one, and what a further one does."""
+    """Handler of the interrupts (Ctrl-C) of one command."""
 
     def __init__(self) -> None:
         self._first = 0.0  # time of the first interrupt; 0 before
@@ -45,8 +45,8 @@ class Interrupts:
         return self._first > 0
 
     def watch(self) -> None:
-        """Take the signal, unless it is ignored, as in a script that runs the program in the
-        background.
+        """Install the handler, unless the signal is ignored, as in a script that runs the program
+        in the background.
         """
         if threading.current_thread() is not threading.main_thread():
             return
@@ -55,7 +55,7 @@ class Interrupts:
             sys.unraisablehook = self._swallowed
 
     def end(self) -> None:
-        """Let an interrupt from here on end the process, while Python closes what is open."""
+        """Let a later interrupt end the process at once, while Python closes open files."""
         if signal.getsignal(signal.SIGINT) == self._interrupt:
             signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
 

@@ -35,8 +35,8 @@ T = TypeVar("T")
 # The command ``neusee init``: make a folder for a project of the user's own.
 
 
-#: for each file of a project: the start from which it is written, and the name that stands for NAME
-#: in the start
+#: for each file of a project: the template (start) from which it is written, and the name in place
+#: of NAME in the template
 FILES: dict[str, tuple[str, str]] = {
     "README.md": ("project/README.md.txt", ""),
     ".gitignore": ("project/gitignore.txt", ""),
@@ -92,12 +92,12 @@ def _refuse_inside_file(folder: Path) -> None:
 
 
 def _is_taken(path: Path) -> bool:
-    """Return True if there is a file, also if it is a link to nothing."""
+    """Return True if there is a file, also if it is a broken link."""
     return path.exists() or path.is_symlink()
 
 
 def _write_start(path: Path, start: str, name: str) -> None:
-    """Write a start with a name in place of NAME; without a name, as it is."""
+    """Write a file from a template, with ``name`` in place of NAME, or unchanged without a name."""
     text = (files("neusee.workflows.cli") / "starts" / start).read_text(encoding="utf-8")
     if name:
         text = text.replace("NAME", name)
@@ -117,7 +117,7 @@ def _say_written(paths: Iterable[Path], folder: Path, commands: Iterable[str]) -
 # The command ``neusee new``: write a small start that works, with its test.
 
 
-#: for each kind: the files that it writes, from the name of a start, and the commands to try next
+#: for each kind: the files that it writes, each with its template, and the commands to try next
 KINDS: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
     "node": (
         {"NAME.py": "node.py.txt", "test_NAME.py": "test_node.py.txt"},
@@ -191,8 +191,8 @@ def _refuse_no_name(name: str) -> None:
 
 
 def _taken(name: str) -> str:
-    """Return what has the name of a new module already: a family of neusee or a module
-    elsewhere; no text if none.
+    """Return a description of the family or module that already has the name of a new module; empty
+    if none has it.
     """
     if (files("neusee") / "nodes" / name).is_dir():
         return f"the family {name} of neusee"
@@ -208,7 +208,7 @@ def _taken(name: str) -> str:
 
 # --- check command --------------------------------------------------------------------------------
 
-# The command ``neusee check``: does a node keep what nodes promise?
+# The command ``neusee check``: does a node keep the rules for nodes?
 
 
 _MARKS = {True: "ok", False: "FAIL", None: "-"}

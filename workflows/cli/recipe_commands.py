@@ -170,7 +170,7 @@ def _speaker(silent: bool) -> Callable[[str], None]:
 
 
 def _opening(recipe: Recipe, command: Sequence[str], silent: bool) -> list[str]:
-    """Say what is run, unless silent, and return what was said."""
+    """Print the lines before a run, unless silent, and return them."""
     if silent:
         return []
     lines = lazy.console.opening(recipe, shlex.join(command[1:]))
@@ -179,7 +179,7 @@ def _opening(recipe: Recipe, command: Sequence[str], silent: bool) -> list[str]:
 
 
 def _check_rerun(recipe: Recipe, names: Sequence[str]) -> None:
-    """End the command for a name in ``--rerun`` that is of no step."""
+    """End the command for a name in ``--rerun`` that no step has."""
     try:
         lazy.recipe_graph.copies_of(recipe, names)
     except ValueError as error:
@@ -189,7 +189,8 @@ def _check_rerun(recipe: Recipe, names: Sequence[str]) -> None:
 def _text(
     before: Sequence[str], done: Simulation, hints: Sequence[str]
 ) -> Callable[[str, str], str]:
-    """Return a function from the folder and the seconds of a run to all that the run has printed.
+    """Return a function that returns all that a run has printed, for the folder and the seconds of
+    the run.
 
     Without ``hints`` that is the path of the page alone.
     """
@@ -453,7 +454,7 @@ def sweep(
     # the comparison tells the type checker that the text is one of the two
     error_policy: OnError = "continue" if on_error == "continue" else "stop"
     with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
-        # many points make garbage, which the program otherwise never searches
+        # many points create garbage, which the program otherwise never collects
         search_for_garbage()
         options = lazy.sweep_screen.SweepCommandOptions(
             zip=paired,
@@ -472,8 +473,7 @@ def sweep(
 
 # --- restore command ------------------------------------------------------------------------------
 
-# The command ``neusee restore``: the scene from a frame that somebody took, and what is not known
-# of it.
+# The command ``neusee restore``: the scene from a frame of a real camera, and its uncertainty.
 
 
 Frames = Annotated[

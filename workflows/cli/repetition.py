@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
 
-_COMPUTED = {"-h", "--help", "--debug"}  #: words of a command that no stored answer answers
+_COMPUTED = {"-h", "--help", "--debug"}  #: options with which no stored answer is used
 
 
 def say_stored_answer(words: Sequence[str]) -> bool:
@@ -43,11 +43,11 @@ def say_stored_answer(words: Sequence[str]) -> bool:
 def say_and_keep(
     text: str, recipe: Recipe, store: Store | None = None, memory: float = 0.0
 ) -> None:
-    """Print the text of a command that writes nothing, and keep this text as the answer of the
+    """Print the text of a command that writes no folder, and store this text as the answer of the
     command.
 
-    ``store``: the store on which the answer rests. ``memory``: bytes that must be free, without
-    which it would differ.
+    ``store`` is the store whose results the answer uses. ``memory`` is the number of bytes that
+    must be free; with less memory the answer would differ.
     """
     lazy.command_frame.say_line(text)
     for command in repeated_command.running:
@@ -63,7 +63,7 @@ def keep_answer(
     report: StudyReport,
     recipe: Recipe,
 ) -> None:
-    """Keep what a command has printed and written, if the command is one whose answer is kept.
+    """Store the printed text and the folder of a command, if its answers are stored.
 
     ``text`` returns the text of the command for the path of its page.
     """
@@ -79,7 +79,7 @@ def keep_run(
     recipe: Recipe,
     store: Store,
 ) -> None:
-    """Keep what a run has printed and written, if all its results came from the cache.
+    """Store the printed text and the folder of a run, if all its results came from the cache.
 
     ``text`` returns the text of the command for the path of the folder of the run and the seconds
     that it took.

@@ -67,8 +67,8 @@ class Points(StrEnum):
 
 
 class Light(StrEnum):
-    """The choices of ``--light``: what of a laser harms the sensor, and so must be equal behind
-    all rivals.
+    """The choices of ``--light``: the kind of laser light, which decides what must be equal behind
+    all compared protections.
     """
 
     PULSE = "pulse"
@@ -272,7 +272,7 @@ def protection(
 
 
 def _refuse_unknown_until(recipe: Recipe, options: dict[str, Any]) -> None:
-    """End the command for a name in ``--until`` that is of no output."""
+    """End the command for a name in ``--until`` that no output has."""
     for name in options["until"]:
         outputs = {output.partition("[")[0] for output in recipe.outputs}
         if name.partition("[")[0].partition(".")[0] not in outputs:

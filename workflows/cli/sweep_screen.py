@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 _NUMBERS = 4  #: results in the row of a point
 _LAST = 25  #: points in a live table
-#: options that the command of a sweep does not name
+#: default values of options, which the command line of a sweep omits
 _USUAL = {"on-error": "stop", "device": "cpu", "out": Path("runs")}
 
 
@@ -57,8 +57,8 @@ class SweepCommandOptions:
     as_json: bool = False  #: print the result as one JSON object, and nothing else
 
     def words(self) -> list[str]:
-        """Return the words of the options that are not as usual, for a command that repeats the
-        sweep.
+        """Return the words of the options that differ from the defaults, for a command that repeats
+        the sweep.
         """
         values = {
             "zip": self.zip,

@@ -119,13 +119,13 @@ def train(
 
 
 def _refuse_stage(recipe: Recipe, stage: Stages) -> None:
-    """End the command for an option that the training of a lift does not have."""
+    """End the command for ``--stage`` with the training of a lift, which has no stages."""
     if stage is not Stages.BOTH:
         fail(f"{recipe.name} learns a lift, which has no stages: leave --stage out")
 
 
 def _lengths(recipe: Recipe, stages: Iterable[int]) -> dict[int, int]:
-    """Return the iterations of each stage, but for the design of a mask."""
+    """Return the number of iterations of each stage, except the design of a mask."""
     if not recipe.training:
         return {}
     return {stage: recipe.training.stages[stage].iterations for stage in stages if stage}

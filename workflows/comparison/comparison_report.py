@@ -197,7 +197,7 @@ def _files(comparison: RunComparison) -> Section:
 
 
 def _text_of_code(comparison: RunComparison) -> str:
-    """Return what the comparison of the code says, in a sentence."""
+    """Return the result of the comparison of the code, in a sentence."""
     if comparison.code is None:
         return (
             "The folder of a run of an earlier version records no digests of code, so that the"
@@ -382,7 +382,7 @@ _MOST_ROWS = 12  #: rows of each table
 
 
 def lines(comparison: RunComparison) -> list[str]:
-    """Return lines with the tables of a comparison; the page has what is cut here."""
+    """Return lines with the tables of a comparison; the page has the complete tables."""
     printed = [f"left   {comparison.left.folder}", f"right  {comparison.right.folder}"]
     printed += summary(comparison)
     files = [file for file in (*comparison.figures, *comparison.data) if file.state != "same"]

@@ -220,7 +220,7 @@ def steps(left: RunRecord, right: RunRecord) -> list[str]:
 
 
 def _release(package: Mapping[str, str]) -> str:
-    """Return the version of a package, with the digest of its files where this digest counts."""
+    """Return the version of a package, with the digest of its files if it was recorded."""
     content = package.get("content")
     return f"{package['version']} (files {content[:8]})" if content else package["version"]
 
@@ -245,7 +245,9 @@ def _definitions(
 def _changes(
     left: Mapping[str, Mapping[str, str]], right: Mapping[str, Mapping[str, str]], module: str
 ) -> Iterator[str]:
-    """Yield what differs in a module, or in the values that it holds, that both runs use."""
+    """Yield the differences in a module that both runs use, or in the values that the
+    module holds.
+    """
     left_definitions, right_definitions = left[module], right[module]
     if module.startswith(_STATE):
         name = module.removeprefix(_STATE)
@@ -486,8 +488,8 @@ def _viewed(image: Any, names: list[str]) -> Any:
 
 
 def _tensors(name: str, left: Path, right: Path) -> Iterator[FileDifference]:
-    """Yield the difference of each tensor with several elements; the numbers of a run have the
-    others.
+    """Yield the difference of each tensor with several elements; single numbers are compared with
+    the numbers of the run.
     """
     left_tensors, right_tensors = _loaded(left), _loaded(right)
     for key in dict.fromkeys([*left_tensors, *right_tensors]):
@@ -552,8 +554,8 @@ def _numbers(name: str, left: Any, right: Any) -> FileDifference:
 
 @drawn
 def drawing(left: Any, right: Any, change: Any, title: str) -> Any:
-    """Draw two pictures side by side, or one above the other if they are wide, and their
-    difference behind them.
+    """Draw two pictures side by side, or one above the other if they are wide, and then their
+    difference.
     """
     height, width = left.shape[:2]
     panels = 2 if change is None else 3

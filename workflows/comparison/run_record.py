@@ -39,7 +39,7 @@ class NotComparable(ValueError):
 
 
 class StepRow(BaseModel):
-    """What the document of a run says of one step."""
+    """Entry of one step in the document of a run."""
 
     step: str
     node: str

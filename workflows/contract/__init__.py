@@ -1,4 +1,4 @@
-"""Does a node keep what a node promises: documents, types, reference, gradient, bounds, key and
+"""Does a node obey the rules for nodes: documents, types, reference, gradient, bounds, key and
 surroundings?
 
 The nodes of neusee pass the same rules in the tests.

@@ -1,4 +1,4 @@
-"""Rule on surroundings: the same call in processes of which everything else is changed."""
+"""Rule on surroundings: a call must give the same result in processes with other surroundings."""
 
 from __future__ import annotations
 
@@ -51,20 +51,21 @@ from neusee.workflows.keys.code_digest import Code
 
 # --- elsewhere process ----------------------------------------------------------------------------
 
-# What runs in a process with other surroundings: its forks import the modules of the calls, and
-# send the outcomes.
+# Code that runs in a process with other surroundings: its forked processes import the modules of
+# the calls, and send the outcomes.
 
 
-#: s of a call after which its process ends: the one that asked, which waits less, has died
+#: s of a call, after which the forked process ends: the process that asked waits for less, so that
+#: it must have ended
 _LONGEST_TRIAL = 600
 _SIDE = 64  #: of the matrices of unrelated work
-_errors: list[object] = [None]  #: what NumPy does at an error, as this process has set it last
+_errors: list[object] = [None]  #: NumPy's reaction to errors, as this process has set it last
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """The calls that a process makes, each pickled as a function without arguments, with the
-    module of its code.
+    """Request to a process: the calls to make, each pickled as a function without arguments, with
+    the module of its code.
     """
 
     settings: Settings
@@ -73,10 +74,11 @@ class Asked:
 
 
 def serve(pipe: int) -> None:
-    """Answer what is asked through a pipe, given by its number, until its other end is closed.
+    """Answer the requests that come through the pipe with the file descriptor ``pipe``, until its
+    other end is closed.
 
-    Each answer comes from a fork, which has imported no code of the user before, and ends with its
-    exit code.
+    Each answer comes from a new forked process, which has imported no code of the user before. The
+    answer ends with the exit code of this process.
     """
     fork = multiprocessing.get_context("fork")
     with Connection(pipe) as connection:
@@ -87,14 +89,14 @@ def serve(pipe: int) -> None:
                 process = fork.Process(target=_answer, args=(connection, asked))
                 process.start()
                 process.join()
-                # an exit code instead of an outcome: the fork has ended
+                # the exit code in place of an outcome: the forked process has ended
                 connection.send_bytes(pickle.dumps(process.exitcode))
         except (EOFError, OSError):
             return
 
 
 def _answer(connection: Connection, asked: Asked) -> None:
-    """Send the outcome of each call, in the order that was asked for."""
+    """Send the outcome of each call, in the order of the request."""
     _settle(asked.settings)
     for module, pickled in asked.calls:
         faulthandler.dump_traceback_later(_LONGEST_TRIAL, exit=True)
@@ -103,8 +105,8 @@ def _answer(connection: Connection, asked: Asked) -> None:
 
 
 def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
-    """Return the outcome of one call, after a change of what other code changes between two
-    calls.
+    """Return the outcome of one call, made after changes of the state that other code may change
+    between two calls.
     """
     _disturb(asked.settings)
     try:
@@ -120,8 +122,8 @@ def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
 
 
 def _settle(settings: Settings) -> None:
-    """Change what is set once: the folder, variables, the zone, the locale, the threads of
-    torch.
+    """Change the surroundings that are set once: working folder, environment variables, time zone,
+    locale, and number of threads of torch.
     """
     for name, value in settings.variables.items():
         if value is None:
@@ -139,8 +141,8 @@ def _settle(settings: Settings) -> None:
 
 
 def _disturb(settings: Settings) -> None:
-    """Change what other code changes between two calls: other work, states of generators, errors
-    of NumPy.
+    """Change the state that other code may change between two calls: earlier work, random
+    generators, NumPy's reaction to errors.
     """
     if settings.has_other_work:
         _work()
@@ -148,7 +150,7 @@ def _disturb(settings: Settings) -> None:
         torch.manual_seed(4711)
         np.random.seed(4711)
         random.seed(4711)
-    # so that a second time does not change it back
+    # only once, so that a second call does not change it back
     if settings.has_other_errors and np.geterr() != _errors[0]:
         np.seterr(
             **{
@@ -160,8 +162,8 @@ def _disturb(settings: Settings) -> None:
 
 
 def _work() -> None:
-    """Do what other steps may have done before: numbers, and settings of libraries that code of
-    others changes.
+    """Do work as other steps may have done before: computations, and changes of the settings of
+    libraries.
     """
     matrix = torch.full((_SIDE, _SIDE), 3.0)
     torch.fft.fft2(matrix @ matrix).abs().sort()
@@ -173,12 +175,11 @@ def _work() -> None:
 
 # --- elsewhere rule -------------------------------------------------------------------------------
 
-# Rule on surroundings: the same call in other processes, of which everything around the call is
-# changed.
+# Rule on surroundings: the same call in other processes, with everything around the call changed.
 
 
 RULE = "elsewhere"
-#: hash seeds that are tried where two gave the same order: a set of two words has only two orders
+#: further hash seeds that are tried, because a set of two words has only two orders
 _MORE_SEEDS = 3
 _UNSTEADY = (
     "two processes in the same surroundings differ, so draw from the argument rng and read no"
@@ -191,7 +192,7 @@ Outcomes = dict[str, Outcome]  #: by the name of the call
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """One call that is tried elsewhere: of a node, or of a network."""
+    """Call of a node or of a network that is made again in other processes."""
 
     name: str
     module: str  #: of its code
@@ -219,19 +220,19 @@ class Trial:
                 self.findings[call.name] = Finding(RULE, None, text)
         self._tried = {call.name: call for call in tried if call.name in self._pickled}
         self._outcomes_here: Outcomes = {}
-        self._processes = dict[Changes, Elsewhere]()  # by what only a new process can have
+        self._processes = dict[Changes, Elsewhere]()  # by the changes that need a new process
 
     def compare(self, first: Elsewhere) -> None:
-        """Find what differs in the process ``first``, in which all is changed, and then what
-        decides it.
+        """Find the results that differ in the process ``first``, in which all surroundings are
+        changed, and then the surroundings that cause this.
         """
         with ExitStack() as self._stack:
             self._compare(first)
 
     def _compare(self, first: Elsewhere) -> None:
-        """Find what differs, and then what decides it; see `compare`."""
+        """Find the results that differ, and then the causes; see `compare`."""
         outcomes_away = self._outcomes(first, frozenset(self.others.changed()))
-        # first, since a call that ends its process would end this one
+        # before the calls here, since a call that ends its process would end this one
         self._leave_out_ends([name for name, outcome in outcomes_away.items() if outcome.is_end])
         self._outcomes_here = {
             name: outcome_of(call.function, call.module) for name, call in self._tried.items()
@@ -248,8 +249,8 @@ class Trial:
         self._settle_others([name for name in differing_names if name not in self.findings])
 
     def ends(self, name: str) -> bool:
-        """Return True if a call ends its process also in the same surroundings, so that it is
-        not made here.
+        """Return True if a call ends its process also in unchanged surroundings, so that it is not
+        made here.
         """
         return name not in self._outcomes_here and name in self._pickled
 
@@ -258,8 +259,8 @@ class Trial:
     def _outcomes(
         self, process: Elsewhere, changes: Changes, others: OtherSurroundings | None = None
     ) -> Outcomes:
-        """Return the outcome of each call in a process, in the other order where other work is
-        changed.
+        """Return the outcome of each call in a process; the calls are made in reverse order if the
+        order of work is changed.
         """
         names = [*self._tried]
         if WORK in changes:
@@ -278,7 +279,7 @@ class Trial:
         """
         change_sets = [frozenset(change_set) for change_set in sets]
         for change_set in change_sets:
-            # processes that differ in nothing that only a new one can have are shared
+            # sets of changes with the same changes that need a new process share this process
             if change_set & OF_NEW_PROCESSES not in self._processes:
                 self._processes[change_set & OF_NEW_PROCESSES] = self._stack.enter_context(
                     closing(Elsewhere(self.others, change_set))
@@ -308,7 +309,9 @@ class Trial:
                 del self._tried[name]
 
     def _settle_rounding(self, names: list[str], away: Outcomes) -> None:
-        """Say which results differ by rounding alone, and with the number of threads alone."""
+        """Record the results that differ by rounding alone, and only with another number of
+        threads.
+        """
         rounding_errors = dict[str, float]()
         for name in names:
             deviation = self._difference(name, away[name], self._outcomes_here[name])
@@ -323,7 +326,7 @@ class Trial:
                 self._say_same(name, size)
 
     def _settle_others(self, names: list[str]) -> None:
-        """Say for each result which surroundings it depends on, one by one."""
+        """Record on which surroundings each result depends, with one of them changed at a time."""
         if not names:
             return
         changed = self.others.changed()
@@ -354,7 +357,9 @@ class Trial:
     def _settle_one(
         self, name: str, surrounding: Surrounding, outcomes: Outcomes, same: Outcomes
     ) -> None:
-        """Say if a result depends on one surrounding, by more than rounding if on the threads."""
+        """Record if a result depends on one surrounding; for the number of threads, by more than
+        rounding.
+        """
         deviation = self._difference(name, outcomes[name], same[name])
         if deviation and not (surrounding is THREADS and deviation.is_rounding):
             variables = self._deciding(name, same) if surrounding is VARIABLES else []
@@ -363,13 +368,13 @@ class Trial:
     def _differences(
         self, names: Iterable[str], actual: Outcomes, expected: Outcomes
     ) -> dict[str, Difference]:
-        """Return how the outcomes differ, by name, of those that do."""
+        """Return the differences of the outcomes that differ, by name."""
         pairs = ((name, self._difference(name, actual[name], expected[name])) for name in names)
         return {name: deviation for name, deviation in pairs if deviation}
 
     def _deciding(self, name: str, same: Outcomes) -> list[str]:
-        """Return the variables of the environment without any of which a result differs, by
-        halving.
+        """Return the environment variables each of which changes a result if it is left out, found
+        by bisection.
         """
         process = self._processes[frozenset()]
         sets_left, deciding = [self.others.variables], list[str]()
@@ -391,7 +396,7 @@ class Trial:
     def _settle_hidden(
         self, names: list[str], same: Outcomes, unsteady: Mapping[str, Difference]
     ) -> None:
-        """Say what decides where no surrounding that was changed alone does."""
+        """Record the cause of differences that no single change of the surroundings explains."""
         if not names:
             return
         # two seeds may give the same order of a small set
@@ -406,7 +411,7 @@ class Trial:
         for name in names:
             if name in self.findings:
                 continue
-            # the call after others here differs from that of a new process
+            # the call here, after other calls, differs from the call in a new process
             if name in unsteady:
                 text = f"in a process that has done nothing else, {unsteady[name].text}: {WORK.fix}"
                 self._fail(name, text, unsteady[name].place)
@@ -424,8 +429,8 @@ class Trial:
         return difference(outcome, expected, self._tried[name].rtol)
 
     def _say_same(self, name: str, rounding: float = 0.0) -> None:
-        """Note that a call gives the same in other surroundings; ``rounding`` is its error with
-        other threads.
+        """Record that a call gives the same in other surroundings; ``rounding`` is its relative
+        error with another number of threads.
         """
         count = len(self.others.changed()) - (rounding > 0)
         text = (
@@ -446,7 +451,7 @@ class Trial:
         deviation: Difference,
         variables: Sequence[str] = (),
     ) -> None:
-        """Note that a call depends on a surrounding, and on these variables of the environment."""
+        """Record that a call depends on a surrounding, and on these environment variables."""
         differs = self.others.differs(surrounding, variables)
         fix = surrounding.fix.replace("NAME", variables[0]) if variables else surrounding.fix
         self._fail(name, f"{differs} {deviation.text}: {fix}", deviation.place)
@@ -462,7 +467,7 @@ class Trial:
 def check_elsewhere(
     tried: Sequence[Tried], process: Callable[[], Elsewhere]
 ) -> tuple[dict[str, Finding], set[str]]:
-    """Return what was found on each call, by name, and the names of those that may not be called
+    """Return the finding on each call, by name, and the names of the calls that must not be made
     here.
 
     ``process`` returns a process in which all surroundings are changed.
@@ -480,8 +485,8 @@ def check_elsewhere(
 
 # --- tried calls ----------------------------------------------------------------------------------
 
-# Calls of nodes and networks as another process makes them: pickled, with full paths, and with what
-# keys cover.
+# Calls of nodes and networks as another process makes them: pickled, with full paths, and with the
+# environment variables that keys cover.
 
 
 _TRIED_SIDE = 32  #: pixels of a picture
@@ -522,7 +527,7 @@ def _tried(
 
 
 def _declarations(module: str) -> Iterator[str]:
-    """Yield what a module, and those that it imports, declare that they read."""
+    """Yield the dependences that a module, and the modules that it imports, declare."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             looks = Code(Path(folder) / "code.json").looks(module)
@@ -540,7 +545,7 @@ def _with_full_paths(value: Any) -> Any:
 
 
 def _on_a_picture(architecture: Architecture) -> torch.Tensor:
-    """Return the result of a network with its first weights, on a picture that a seed gives."""
+    """Return the result of a network with its first weights on a pseudo-random picture."""
     net = own_network(architecture, None, None).eval()
     picture = torch.rand(
         1,

@@ -1,4 +1,4 @@
-"""The contract of nodes and networks: every rule, and what each found."""
+"""The contract of nodes and networks: every rule, and its findings."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from neusee.workflows.observation.observed_call import WORDS, call_observed
 
 # --- node contract --------------------------------------------------------------------------------
 
-# The contract of a node: every rule, and what each found on one example of a call.
+# The contract of a node: every rule, and its findings on one example of a call.
 
 
 def check_reach(call: Call) -> Iterator[Finding]:
-    """Find whether a call of own code reaches more than its cache key covers."""
+    """Find whether a call of the user's code uses more than its cache key covers."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             own_code = own_code_of(call.node, call.params, [], Code(Path(folder) / "code.json"))
@@ -77,8 +77,8 @@ _OF_VALUES: tuple[Callable[[Call], Iterator[Finding]], ...] = (
 
 
 def check_node(node: Node, example: Mapping[str, Any] | None = None) -> list[Finding]:
-    """Return what each rule of the contract found; a rule that does not concern the node finds
-    nothing.
+    """Return the findings of each rule of the contract; a rule that does not concern the node has
+    none.
 
     ``example`` has the inputs and parameters of one call by name, parameters as a recipe writes
     them or in SI; by default it is what the node's hook ``example`` returns.
@@ -88,12 +88,12 @@ def check_node(node: Node, example: Mapping[str, Any] | None = None) -> list[Fin
 
 
 def check_words(node: Node) -> list[Finding]:
-    """Return what each rule found on what a node says of itself, and on its key."""
+    """Return the findings on the docstring, the signature, the hooks and the key of a node."""
     return [*check_docstring(node), *check_signature(node), *check_hooks(node), *_check_key(node)]
 
 
 def check_values(call: Call) -> list[Finding]:
-    """Return what each rule found on what a node computes in one call."""
+    """Return the findings of each rule on the values that a node computes in one call."""
     findings: list[Finding] = []
     for rule in _OF_VALUES:
         findings += _guarded(rule, call)
@@ -112,7 +112,7 @@ def _check_key(node: Node) -> Iterator[Finding]:
 
 
 def example_call(node: Node, example: Mapping[str, Any] | None = None) -> Call | Finding:
-    """Return the call of the example, or the finding that there is none or that it is wrong."""
+    """Return the call of the example, or a finding if there is no example or it is wrong."""
     if example is None and node.hooks.example is None:
         return _no_example(node)
     try:
@@ -163,14 +163,14 @@ def _no_example(node: Node) -> Finding:
 
 
 def _arguments(node: Node, example: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the arguments of an example, or of that of the node."""
+    """Return the arguments of ``example``, or else those of the node's own example."""
     if example is None and node.hooks.example:
         return dict(node.hooks.example())
     return dict(example or {})
 
 
 def _guarded(rule: Callable[[Call], Iterator[Finding]], call: Call) -> Iterator[Finding]:
-    """Yield what a rule finds, and the error of the node or of a hook as a finding."""
+    """Yield the findings of a rule; an error of the node or of a hook becomes a finding."""
     try:
         yield from rule(call)
     except Exception as error:
@@ -180,10 +180,10 @@ def _guarded(rule: Callable[[Call], Iterator[Finding]], call: Call) -> Iterator[
 
 # --- network contract -----------------------------------------------------------------------------
 
-# The contract of a network class of a user, and what each rule found on small pictures.
+# The contract of a network class of a user, and the findings of each rule on small pictures.
 
 
-Make = Callable[[int], OwnNetwork]  #: returns a network with initial weights of a seed
+Make = Callable[[int], OwnNetwork]  #: returns a network with initial weights from a seed
 _SIDE = 32  #: pixels of a picture, at least
 
 
@@ -205,7 +205,9 @@ def whole_networks(module: ModuleType) -> dict[str, type[nn.Module]]:
 
 
 def check_network(name: str, network: type[nn.Module]) -> list[Finding]:
-    """Return what each rule found on a network class, built with the defaults of its arguments."""
+    """Return the findings of each rule on a network class, built with the defaults of its
+    arguments.
+    """
     findings = [*_check_docstring(network), *_check_network_key(network)]
     make: Make = partial(own_network, Architecture(name, network), None, None)
     try:
@@ -222,7 +224,7 @@ def check_network(name: str, network: type[nn.Module]) -> list[Finding]:
 
 
 def _guarded_network(rule: Callable[[Make], Iterator[Finding]], make: Make) -> Iterator[Finding]:
-    """Yield what a rule finds on a network, and an error of the network as a finding."""
+    """Yield the findings of a rule on a network; an error of the network becomes a finding."""
     try:
         yield from rule(make)
     except (ParameterError, RuntimeError, TypeError, ValueError) as error:
@@ -251,8 +253,8 @@ def _check_network_key(network: type[nn.Module]) -> Iterator[Finding]:
 
 
 def _check_picture(make: Make) -> Iterator[Finding]:
-    """Find whether a picture gives one of the same sizes, finite, the same twice, and the input
-    is left alone.
+    """Find whether the network returns a finite picture of the same size, the same twice, and
+    leaves its input unchanged.
     """
     net = make(0)
     trial = try_network(net)
@@ -271,8 +273,8 @@ def _check_double(make: Make) -> Iterator[Finding]:
 
 
 def _check_weights(make: Make) -> Iterator[Finding]:
-    """Find whether the weights of one network make another one, built with other random numbers,
-    equal to it.
+    """Find whether a second network, built with other random numbers, equals the first after it has
+    loaded the weights of the first.
     """
     network, other_network = make(1).eval(), make(2).eval()
     other_network.inner.load_state_dict(network.inner.state_dict())
@@ -320,7 +322,7 @@ def _has_finite_gradient(parameter: nn.Parameter) -> bool:
 
 
 def _picture() -> torch.Tensor:
-    """Return a small picture that a seed gives, with odd sides."""
+    """Return a small pseudo-random picture with odd sides."""
     random = torch.Generator().manual_seed(3)
     return torch.rand(1, 3, _SIDE + 1, _SIDE + 3, generator=random)
 
@@ -335,7 +337,7 @@ def check_all(
     networks: Mapping[str, type[nn.Module]],
     process: Callable[[], Elsewhere],
 ) -> dict[str, list[Finding]]:
-    """Return what each rule found on each node and network, by name.
+    """Return the findings of each rule on each node and network, by name.
 
     ``process`` returns a process in which all surroundings are changed. A call that ends this
     process would end the check, so each is made there first.
@@ -355,8 +357,8 @@ def check_all(
 
 
 def _on_values(call: Call | Finding, ends: bool) -> list[Finding]:
-    """Return what each rule found on the values of a call, unless there is none or it ends its
-    process.
+    """Return the findings on the values of a call, the finding on a missing example, or none for a
+    call that ends its process.
     """
     if isinstance(call, Finding):
         return [call]

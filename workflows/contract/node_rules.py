@@ -1,4 +1,4 @@
-"""Rules on what a node says of itself and what it computes, and the outcome of a call."""
+"""Rules on the description of a node and on its results, and the outcome of a call."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from neusee.workflows.store.serialization import each_tensor, fits, tensors_in
 
 # --- finding --------------------------------------------------------------------------------------
 
-# What one rule found about one node.
+# The finding of one rule on one node.
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Finding:
     """
 
     rule: str
-    ok: bool | None  #: None if the node leaves out what would be good to have
+    ok: bool | None  #: None if an optional part is missing, or the rule was not tried
     text: str
 
     @classmethod
@@ -50,7 +50,7 @@ class Finding:
 
 # --- document rules -------------------------------------------------------------------------------
 
-# Rules on what a node says of itself: docstring, annotations, arguments of its hooks.
+# Rules on the description of a node: docstring, annotations, arguments of its hooks.
 
 
 _LINES = ("Shapes:", "Units:", "Error:", "Source:")
@@ -80,7 +80,7 @@ def check_docstring(node: Node) -> Iterator[Finding]:
 
 
 def _has_line(lines: Sequence[str], word: str) -> bool:
-    """Return True if one line alone begins with a word, and says something."""
+    """Return True if exactly one line begins with ``word``, and a text follows."""
     lines_with_word = [line for line in lines if line.startswith(word)]
     return len(lines_with_word) == 1 and len(lines_with_word[0].removeprefix(word).strip()) >= 2
 
@@ -137,7 +137,7 @@ def _raises(node: Node) -> bool:
 
 # --- value rules ----------------------------------------------------------------------------------
 
-# Rules on what a node computes, checked on one example of a call.
+# Rules on the results of a node, checked on one example of a call.
 
 
 _SEED = 2026
@@ -165,8 +165,8 @@ class Call:
 
 
 def check_result(call: Call) -> Iterator[Finding]:
-    """Find whether the result is finite, of the annotated type, the same twice, and the inputs
-    are left alone.
+    """Find whether the result is finite, of the annotated type and the same twice, and whether the
+    inputs are unchanged.
     """
     inputs_before = [x.clone() for x in tensors_in(list(call.inputs))]
     result, second_result = call.result(), call.result()
@@ -214,7 +214,7 @@ def check_reference(call: Call) -> Iterator[Finding]:
         )
         return
     if node.hooks.approximation_error is not None:
-        return  # factors of a cheaper form, of which many have the same product
+        return  # a cheaper form returns factors, and many sets of factors have the same product
     rng = {"rng": torch.Generator().manual_seed(_SEED)} if node.random else {}
     results = tensors_in(call.result())
     reference_results = tensors_in(node.hooks.reference(*call.inputs, **call.params, **rng))
@@ -230,13 +230,13 @@ def check_reference(call: Call) -> Iterator[Finding]:
 
 
 def check_gradient(call: Call) -> Iterator[Finding]:
-    """Find whether each gradient is that of finite differences in float64."""
+    """Find whether each gradient agrees with finite differences in float64."""
     lines = (inspect.getdoc(call.node.fn) or "").splitlines()
     gradient_lines = [line for line in lines if line.startswith("Gradient:")]
     if gradient_lines:
         yield Finding("gradient", None, f"not compared: {gradient_lines[0]}")
         return
-    # inputs with a slope
+    # inputs with a gradient
     names_followed = []
     for name, function, zero in _followed(call):
         if fault := _slope_fault(function, zero):
@@ -254,8 +254,8 @@ def check_gradient(call: Call) -> Iterator[Finding]:
 def _followed(
     call: Call,
 ) -> Iterator[tuple[str, Callable[[Tensor], tuple[Tensor, ...]], Tensor]]:
-    """Yield the name of the input of each tensor on which the result depends with a slope, the
-    result as a function of a change of the tensor, and no change.
+    """Yield, for each input tensor with a gradient, the name of the input, the result as a function
+    of a change of the tensor, and a change of zero.
     """
     inputs = [_double(value) for value in call.inputs]
     # each result is compared relative to its largest value
@@ -267,7 +267,7 @@ def _followed(
             result_of_change = partial(_scaled, call, inputs, i, j, largest_values)
             zero = torch.zeros_like(x, requires_grad=True)
             with warnings.catch_warnings():
-                # a node may read a number of a tensor without a slope
+                # a node may read a number from a tensor, which has no gradient
                 warnings.simplefilter("ignore")
                 has_slope = any(y.requires_grad for y in result_of_change(zero))
             if has_slope:
@@ -275,12 +275,12 @@ def _followed(
 
 
 def _slope_fault(function: Callable[[Tensor], tuple[Tensor, ...]], zero: Tensor) -> str:
-    """Return what is wrong with the slopes of a function at ``zero``; no text if they are those
-    of differences.
+    """Return what is wrong with the gradient of a function at ``zero``; empty if it agrees with
+    finite differences.
     """
     slopes = [y.requires_grad for y in function(zero)]
 
-    # gradcheck pairs results wrongly where one of them has no slope
+    # gradcheck pairs results wrongly if one of them has no gradient
     def followed(x: Tensor) -> tuple[Tensor, ...]:
         return tuple(y for y, has_slope in zip(function(x), slopes, strict=True) if has_slope)
 
@@ -293,7 +293,7 @@ def _slope_fault(function: Callable[[Tensor], tuple[Tensor, ...]], zero: Tensor)
             " a logarithm or a quotient is 0"
         )
     try:
-        # fast mode: along one drawn direction in place of each element
+        # fast mode: along one random direction in place of each element
         gradcheck(followed, (zero,), eps=_STEP, atol=_ATOL, rtol=_RTOL, fast_mode=True)
     except GradcheckError as error:
         slope_texts = _SLOPES.search(str(error))
@@ -307,8 +307,8 @@ def _slope_fault(function: Callable[[Tensor], tuple[Tensor, ...]], zero: Tensor)
 
 
 def check_bands(call: Call) -> Iterator[Finding]:
-    """Find whether one band alone has the bits that it has in the stack, if the node declares
-    that.
+    """Find whether a band that is computed alone has the same bits as in the stack of bands, if the
+    node declares that.
     """
     axes = call.node.bands
     if not axes:
@@ -343,8 +343,7 @@ def check_skip_bound(call: Call) -> Iterator[Finding]:
     if (skip_scale := call.node.hooks.skip_scale) is not None:
         scale = min(scale, float(skip_scale(input_stats[0], **call.params)))
     change = _size(result - replacement, call.node.random) / (scale or 1.0)
-    # five standard deviations
-    # of a root mean square over few numbers
+    # five standard deviations of a root mean square over few numbers
     margin = 5 / math.sqrt(result.numel()) if call.node.random else 1e-9
     is_within = change <= bound * (1 + margin) + 1e-12
     yield Finding(
@@ -355,14 +354,14 @@ def check_skip_bound(call: Call) -> Iterator[Finding]:
 
 
 def _size(change: Tensor, is_random: bool) -> float:
-    """Return the largest element of a change, or the root mean square of a random one."""
+    """Return the largest absolute element of a change, or its root mean square if it is random."""
     double = change.double()
     size = double.square().mean().sqrt() if is_random else double.abs().max()
     return float(size)
 
 
 def check_shape(call: Call) -> Iterator[Finding]:
-    """Find whether the rule for the shape tells the shape that comes."""
+    """Find whether the node's rule for shapes predicts the shape of the result."""
     hook = call.node.hooks.shape
     if hook is None:
         return
@@ -377,8 +376,8 @@ def check_shape(call: Call) -> Iterator[Finding]:
 
 
 def _every_tensor(value: Any) -> list[Tensor]:
-    """Return the tensors in ``value``, one that stands at two places twice: a shape that is told
-    may be shared.
+    """Return the tensors in ``value``; a tensor at two places is returned twice, because predicted
+    tensors may be shared.
     """
     if isinstance(value, Tensor):
         return [value]
@@ -430,9 +429,7 @@ def _double(value: Any) -> Any:
 
 
 def _first_band(value: Any, axis: int) -> Any:
-    """Return a value with its first band alone; of a named tuple, the fields that have bands are
-    cut.
-    """
+    """Return a value with its first band alone; in a named tuple, the fields with bands are cut."""
     if isinstance(value, Tensor):
         return value.narrow(axis, 0, 1)
     fields = {name: getattr(value, name) for name in band_names(value)}
@@ -441,7 +438,7 @@ def _first_band(value: Any, axis: int) -> Any:
 
 
 def off_by(actual: Tensor, expected: Tensor) -> float:
-    """Return the largest difference of two tensors relative to the largest wanted value."""
+    """Return the largest difference of two tensors relative to the largest expected value."""
     if actual.numel() == 0:
         return 0.0
     double_type = torch.complex128 if expected.is_complex() else torch.float64
@@ -456,22 +453,24 @@ def _shapes(tensors: Sequence[Tensor]) -> str:
 
 # --- outcomes -------------------------------------------------------------------------------------
 
-# What a call gave, in a form that another process can compare: its parts, an error, or an end
-# without either.
+# Outcome of a call in a form that another process can compare: the parts of the result, an error,
+# or an end without either.
 
 
 _PLAIN = (bool, int, float, complex, str, bytes, type(None))
-_EPS = 16  #: smallest steps of a type of numbers that a sum in another order is off by
+_EPS = 16  #: error of a sum in another order, in units of the machine epsilon
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The parts of a result, each with its place in the result, or why there is none."""
+    """The parts of a result, each with its place in the result, or the reason why there is no
+    result.
+    """
 
     parts: tuple[tuple[str, Any], ...] = ()
     failure: str = ""  #: such as "raises ValueError: ..."
     place: str = ""  #: file and line of the failure in the code of the user
-    is_end: bool = False  #: True if the call ended its process, or had no end
+    is_end: bool = False  #: True if the call ended its process, or did not return
 
     def names(self) -> list[str]:
         """Return the places of the parts in the result."""
@@ -484,12 +483,12 @@ class Difference:
 
     text: str
     place: str = ""
-    size: float = float("inf")  #: relative to the largest value; infinite if no numbers say it
+    size: float = float("inf")  #: relative to the largest value; infinite if not a size of numbers
     is_rounding: bool = False  #: True if a sum in another order explains it
 
 
 def outcome_of(function: Callable[[], Any], module: str) -> Outcome:
-    """Return the outcome of a call of code of a module."""
+    """Call a function of a module and return the outcome."""
     try:
         return Outcome(tuple(_parts("", function())))
     except (Exception, SystemExit) as error:
@@ -520,7 +519,7 @@ def difference(actual: Outcome, expected: Outcome, rtol: float) -> Difference | 
 
 
 def _of_failures(actual: Outcome, expected: Outcome) -> Difference | None:
-    """Return how an outcome differs, where one of both is a failure."""
+    """Return how an outcome differs from another one, if one of the two is a failure."""
     if actual.failure == expected.failure:
         return None
     text = f"it {actual.failure}" if actual.failure else "it gives a result"
@@ -561,7 +560,7 @@ def _same_value(actual: Any, expected: Any) -> bool:
 
 
 def _last_digit(x: Tensor) -> float:
-    """Return the step of the numbers of a tensor beside 1; 0 for whole numbers."""
+    """Return the machine epsilon of the type of a tensor; 0 for whole numbers."""
     return torch.finfo(x.dtype).eps if x.is_floating_point() or x.is_complex() else 0.0
 
 
@@ -585,8 +584,8 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _items(value: Any) -> list[tuple[str, Any]] | None:
-    """Return what a value holds, each with its place in it; None for a value that holds nothing
-    that is known.
+    """Return the elements of a value with their places in it, or None for a value of an unknown
+    kind.
     """
     if isinstance(value, dict):
         return [(f"[{key!r}]", item) for key, item in value.items()]

@@ -1,4 +1,4 @@
-"""The surroundings that a result must not depend on, and a process that has others."""
+"""The surroundings on which a result must not depend, and a process with other surroundings."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 
 # --- surroundings ---------------------------------------------------------------------------------
 
-# The surroundings of a call that a result must not depend on, and how a new process gets others.
+# The surroundings of a call on which a result must not depend, and how a new process gets others.
 #
-# Nothing here imports torch: a process with other surroundings starts before it does.
+# Nothing here imports torch: a process gets other surroundings before it imports torch.
 
 
 @dataclass(frozen=True, slots=True)
 class Surrounding:
-    """One thing around a call that can be changed."""
+    """One property of the surroundings of a call that can be changed."""
 
     name: str
     differs: str  #: where the result differs, such as "in another time zone"
-    fix: str  #: what its author writes
+    fix: str  #: advice to the author of the code
 
 
 FOLDER = Surrounding(
@@ -95,13 +95,13 @@ MEMORY = Surrounding(
     "where new memory has other bits",
     "fill all that torch.empty or np.empty gives, or write zeros",
 )
-#: those of a new process of Python; the others change in a fork of one, before it imports code of
-#: the user
+#: surroundings that only a new process of Python can change; a forked process changes the others,
+#: before it imports code of the user
 OF_NEW_PROCESSES = frozenset({LOCALE, HASH, THREADS, MEMORY})
 ALL = (FOLDER, LOCALE, HASH, THREADS, ZONE, RANDOM, WORK, ERRORS, HOME, VARIABLES, MEMORY)
 
-ZONE_ELSEWHERE = "NSC-13:45"  #: a zone that needs no table: UTC and 13 h 45 min
-#: languages that write 1,5; Turkish first, whose i is another letter
+ZONE_ELSEWHERE = "NSC-13:45"  #: a zone that needs no table: 13 h 45 min ahead of UTC
+#: languages with a decimal comma; Turkish first, whose i is another letter
 _LANGUAGES = (
     "tr_",
     "de_",
@@ -123,7 +123,7 @@ _LANGUAGES = (
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What a fork of a process changes before it makes the calls."""
+    """Changes that a forked process makes before the calls."""
 
     folder: str  #: the working folder; empty if it stays
     variables: dict[str, str | None]  #: of the environment; None for one that is left out
@@ -136,7 +136,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class OtherSurroundings:
-    """What a process gets in place of the surroundings of this one."""
+    """Surroundings of another process, in place of those of this one."""
 
     hash_seed: int
     threads: int
@@ -145,12 +145,12 @@ class OtherSurroundings:
     variables: tuple[str, ...]  #: that are left out
 
     def changed(self) -> tuple[Surrounding, ...]:
-        """Return the surroundings that can be changed here."""
+        """Return the surroundings that can be changed on this machine."""
         return tuple(surrounding for surrounding in ALL if self._can_change(surrounding))
 
     def differs(self, surrounding: Surrounding, variables: Sequence[str] = ()) -> str:
-        """Return in which surrounding a result differs; ``variables`` of the environment decide
-        it.
+        """Return in which surroundings a result differs, as text; environment ``variables`` are
+        named if they are the cause.
         """
         names = "variables"
         if variables:
@@ -167,7 +167,7 @@ class OtherSurroundings:
         return f"{self.threads} thread{'s' * (self.threads > 1)}"
 
     def described(self, without_threads: bool = False) -> str:
-        """Return all that is changed, and what is not, as one text."""
+        """Return the changed surroundings, and a note if the locale is not changed, as one text."""
         words = {
             LOCALE: f"locale ({self.locale})",
             THREADS: self.in_threads(),
@@ -187,12 +187,12 @@ class OtherSurroundings:
     def environment(
         self, changes: frozenset[Surrounding], environ: Mapping[str, str]
     ) -> dict[str, str]:
-        """Return the environment of a new process of Python with those of ``changes`` that only
-        a new one can have.
+        """Return the environment variables of a new process of Python, with those of ``changes``
+        that need a new process.
         """
         hash_seed = self.hash_seed + 1 if HASH in changes else self.hash_seed
         variables = {**environ, "PYTHONHASHSEED": str(hash_seed)}
-        # of compiled programs
+        # folder of compiled programs
         variables.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))
         if LOCALE in changes:
             variables = {
@@ -202,14 +202,14 @@ class OtherSurroundings:
         if THREADS in changes:
             variables |= dict.fromkeys(OF_THREADS, str(self.threads))
         if MEMORY in changes:
-            variables["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
+            variables["MALLOC_PERTURB_"] = "165"  # the C library fills allocated and freed memory
         return variables
 
     def settings(
         self, changes: frozenset[Surrounding], folder: Path, declared: Mapping[str, str]
     ) -> Settings:
-        """Return what a fork changes; ``folder`` is empty, and variables that are ``declared``
-        stay.
+        """Return the changes that a forked process makes; ``folder`` is an empty folder, and
+        environment variables in ``declared`` are kept.
         """
         variables = dict[str, str | None]()
         if VARIABLES in changes:
@@ -235,8 +235,8 @@ class OtherSurroundings:
         )
 
     def _can_change(self, surrounding: Surrounding) -> bool:
-        """Return True if this machine has another locale, or this process variables, so that the
-        surrounding can be changed.
+        """Return True if a surrounding can be changed: another locale must be installed, and this
+        process must have variables to leave out.
         """
         if surrounding is LOCALE:
             return bool(self.locale)
@@ -264,7 +264,7 @@ def other_surroundings(environ: Mapping[str, str]) -> OtherSurroundings:
 
 
 def installed_locales(environ: Mapping[str, str]) -> list[str]:
-    """Return the names of the locales of this machine; none where it cannot say them."""
+    """Return the names of the locales of this machine; none if they cannot be listed."""
     try:
         finished = subprocess.run(
             ["locale", "-a"], capture_output=True, text=True, check=False, errors="replace"
@@ -280,8 +280,8 @@ def installed_locales(environ: Mapping[str, str]) -> list[str]:
 
 
 def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> str:
-    """Return a locale that is not ``now``: one with a decimal comma and other letters than UTF-8 if
-    there is one.
+    """Return a locale that is not ``now``, if possible one with a decimal comma and another
+    encoding than UTF-8.
 
     The locale C, in which a text is ASCII, is the last choice. No text if there is no other.
     """
@@ -291,7 +291,7 @@ def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> 
             (number for number, prefix in enumerate(_LANGUAGES) if name.startswith(prefix)),
             len(_LANGUAGES),
         )
-        # False before True: other letters than UTF-8 first
+        # False before True: another encoding than UTF-8 first
         return language_rank, _is_utf8(name), name
 
     plain_locales = ("C", "POSIX")
@@ -316,7 +316,9 @@ def _processors() -> int:
 
 
 def _same(name: str) -> str:
-    """Return the name of a locale in the form in which equal names are equal."""
+    """Return the name of a locale in small letters and without hyphens, so that its spellings are
+    equal.
+    """
     return name.lower().replace("-", "")
 
 
@@ -341,7 +343,7 @@ serve(pipe)
 
 
 class NotStartedError(RuntimeError):
-    """Error for a process that ends before it is asked anything."""
+    """Error for a process that ends before the first request."""
 
 
 class Elsewhere:
@@ -350,7 +352,7 @@ class Elsewhere:
     """
 
     def __init__(self, others: OtherSurroundings, changes: frozenset[Surrounding]) -> None:
-        # what only a new process can have; forks change the others
+        # the changes that need a new process; forked processes make the others
         self.others, self._process_changes = others, changes & OF_NEW_PROCESSES
         self.folder = tempfile.TemporaryDirectory(prefix="neusee-check-")
         try:
@@ -360,10 +362,11 @@ class Elsewhere:
             raise NotStartedError(f"a process of Python does not start: {error}") from None
 
     def outcomes(self, asked: Asked) -> list[Outcome]:
-        """Return the outcome of each call, made in a fork of the process; raise `NotStartedError`.
+        """Return the outcome of each call, made in a forked process; raise `NotStartedError` if the
+        process has ended.
 
-        After a call that ends its fork, or that does not end, the other calls are made in another
-        one.
+        After a call that ends its forked process, or that does not return, the other calls are made
+        in another one.
         """
         outcomes: list[Outcome] = []
         while len(outcomes) < len(asked.calls):
@@ -376,7 +379,7 @@ class Elsewhere:
         self.folder.cleanup()
 
     def _start(self) -> None:
-        """Start the process in a group of its own, with which its forks end."""
+        """Start the process in a group of its own, so that its forked processes end with it."""
         self._pipe, other_end = Pipe()
         self._is_ready = False
         search_path = [os.path.abspath(entry) for entry in sys.path]
@@ -402,17 +405,19 @@ class Elsewhere:
             )
 
     def _end(self) -> None:
-        """End the process and its forks, if they run still."""
+        """End the process and its forked processes, if they still run."""
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self._pipe.close()
 
     def _up_to_an_end(self, asked: Asked) -> list[Outcome]:
-        """Return the outcomes of the calls up to the first that ends its process or has no end."""
+        """Return the outcomes of the calls up to the first that ends its process or does not
+        return.
+        """
         try:
             if not self._is_ready:
-                # the word with which the process says that it has imported all
+                # the message with which the process says that its imports are done
                 self._pipe.recv_bytes()
                 self._is_ready = True
             self._pipe.send_bytes(pickle.dumps(asked))  # `send` would share the memory of a tensor
@@ -445,8 +450,8 @@ class Elsewhere:
 
 @contextmanager
 def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
-    """Give a function that returns a process in which all surroundings are changed, and end the
-    process at last.
+    """Yield a function that returns a process in which all surroundings are changed; end the
+    process afterwards.
 
     The process starts with the ``with`` block if ``early``, so that it imports torch beside this
     process.
@@ -461,7 +466,7 @@ def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
 
     try:
         if early:
-            with suppress(NotStartedError):  # said where it is needed
+            with suppress(NotStartedError):  # reported where the process is needed
                 process()
         yield process
     finally:

@@ -46,7 +46,7 @@ def descriptors_in(folder: Path) -> list[Path]:
 
 
 def _text(file: Path) -> str:
-    """Return the text of a file, or nothing of what is no text file, such as a pipe."""
+    """Return the text of a file, or an empty text if it is not a text file, such as a pipe."""
     try:
         return text_of(file, "utf-8-sig", "replace")
     except ValueError:
@@ -54,7 +54,7 @@ def _text(file: Path) -> str:
 
 
 def descriptor_of(path: Path) -> Path:
-    """Return the descriptor file that a path is, or the only one in the folder that a path is.
+    """Return the descriptor file at a path, or the only one in the folder at this path.
 
     Raises: ValueError for a folder without a descriptor, or with several.
     """
@@ -148,7 +148,7 @@ _RELATIVE = """traceability:
 
 @dataclass(frozen=True)
 class _Corrections:
-    """What the frames of a folder need before they are reduced."""
+    """Corrections of the frames of a folder before they are reduced to moments."""
 
     divisor: int  #: 1 for numbers that are not shifted
     hot: tuple[Path, ...]  #: dark frames that show hot pixels; none without hot pixels
@@ -164,12 +164,12 @@ def recipe_of_folder(
     """Return the recipe of a calibration of the frames in a folder; the frames are read, and
     reduced to moments.
 
-    ``progress`` receives what was read as exposure before any frame is reduced, and what is divided
-    or left out. With ``every_pixel`` hot pixels count too, as EMVA 1288 demands of a sheet.
+    ``progress`` receives lines on the exposures before any frame is reduced, on the divisor of the
+    numbers, and on pixels that are left out. With ``every_pixel`` hot pixels count too, as EMVA
+    1288 demands of a sheet.
 
-    Raises: `FolderRefused` with all reasons why the frames are no measurement, `RecipeError` with
-            all mistakes of
-    ``changes``.
+    Raises: `FolderRefused` with all reasons why the frames are no measurement, `RecipeError`
+    with all mistakes of ``changes``.
     """
     name = (
         "".join(character if character.isalnum() else "_" for character in folder.absolute().name)
@@ -194,7 +194,9 @@ def recipe_of_folder(
 
 
 def _corrections(levels: FolderLevels, progress: Progress, every_pixel: bool) -> _Corrections:
-    """Return which numbers are divided and which pixels are left out, and tell both."""
+    """Return the divisor of the numbers and the dark frames that show hot pixels, and
+    report both.
+    """
     divisor = _shift(levels)
     if divisor > 1:
         progress(
@@ -227,7 +229,7 @@ def _shift(levels: FolderLevels) -> int:
         divisor = int(np.gcd(divisor, frame_divisor(level.files[0])))
         if divisor == 1:
             return 1
-    # 16 bits less those of the converter: by so many a number is shifted
+    # the numbers of a converter of b bits are shifted by 16 - b bits
     return divisor if divisor in [2 ** (16 - bits) for bits in _BITS] else 1
 
 
@@ -249,7 +251,7 @@ def _described(file: Path, name: str, store: Store, changes: Sequence[str]) -> R
 
 
 def _fit(recipe: Recipe, store: Store) -> LeastSquares:
-    """Return the standard's fit of the levels of a recipe.
+    """Return the standard's least-squares fit of the levels of a recipe.
 
     Raise `FolderRefused` where it is impossible.
     """
@@ -314,8 +316,8 @@ def _level(level: FolderLevel, scale: float) -> str:
 
 
 def _estimate_steps(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> str:
-    """Return the steps after the levels, with first estimates; ``times`` is the number of
-    exposures of darks.
+    """Return the steps after the levels, with first estimates; ``times`` is the number of different
+    exposures of the dark frames.
     """
     gain, noise = float(fit.gain), max(float(fit.temporal_dark_noise), 0.1)
     dark = float(fit.dark_current)

@@ -26,7 +26,7 @@ _NUMBER = r"(\d+(?:[.,p]\d+)?(?:e[-+]?\d+)?)"  #: 10p5 is 10.5, as in names with
 _UNIT = r"(ns|us|µs|μs|ms|s)"
 _WORD = r"(?:exposure|exptime|texp|exp|t)"
 _SPACE = r"[ =_-]?"
-#: 1/200 of a second: a file name has no stroke; after a hyphen, and between lone numbers, it may be
+#: 1/200 of a second: a file name has no slash; after a hyphen, and between lone numbers, it may be
 #: something else
 _FRACTION = re.compile(
     rf"(?<![a-z0-9.,-]){_WORD}?{_SPACE}(?<![\d.,-])1(?:[-⁄]|over|div)([1-9][\d.]*)"
@@ -36,6 +36,7 @@ _DOUBTFUL = re.compile(r"(?<![\d.,])(?:(?<=[a-z-])1-|1[_/ ])([1-9]\d*) ?s(?:ec)?
 _EXPOSURE = re.compile(rf"(?<![a-z0-9.,]){_WORD}?{_SPACE}{_NUMBER}[ _-]?{_UNIT}(?:ec)?(?![a-z0-9])")
 _UNIT_FIRST = re.compile(rf"(?<![a-z0-9]){_WORD}{_SPACE}{_UNIT}{_SPACE}{_NUMBER}(?![a-z.,0-9])")
 _SHORT_UNIT_FIRST = re.compile(rf"(?<![a-z0-9])(ns|us|µs|μs|ms){_SPACE}{_NUMBER}(?![a-z.,0-9])")
+#: number of photons with the unit after it, such as 1200ph, or before it, such as ph_1200
 _AFTER = re.compile(rf"(?<![a-z0-9.,]){_NUMBER}[ _-]?(?:photons?|ph)(?![a-z])")
 _BEFORE = re.compile(rf"(?<![a-z])(?:photons?|ph)[ =_-]?{_NUMBER}(?![a-z.,0-9])")
 _DARK = re.compile(r"(?<![a-z])(?:darks?(?:frames?)?|bias|closed|nolight)(?![a-z])")
@@ -44,7 +45,9 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e
 
 
 class NamedFrame(NamedTuple):
-    """What the name of a file says of its frames; None for what it does not say."""
+    """Properties of frames according to the name of their file; None for those that it does not
+    state.
+    """
 
     level: str  #: the name without exposure, light and the number of the frame
     dark: bool
@@ -60,7 +63,8 @@ class _Exposure(NamedTuple):
 
 
 def read_name(file: Path, folder: Path) -> NamedFrame:
-    """Return what the path of a file below ``folder`` says, such as ``flat_10ms_1200ph_2.tif``.
+    """Return the properties that the path of a file below ``folder`` states:
+    ``flat_10ms_1200ph_2.tif``.
 
     Folders count as parts of the name: ``dark/10ms/1.png``. An exposure is a number and its unit in
     either order: ``10ms``, ``10p5ms``, ``exp_ms_10``, or a fraction of a second such as ``1-200s``.
@@ -74,7 +78,7 @@ def read_name(file: Path, folder: Path) -> NamedFrame:
         photons = 0.0
     elif light_match is not None:
         photons = _float(light_match[1])
-    # the name without exposure, light and number of the frame tells its level
+    # the name without exposure, light and number of the frame identifies its level
     remaining_text = text.replace(exposure_match.written, "") if exposure_match else text
     remaining_text = remaining_text.replace(light_match[0], "") if light_match else remaining_text
     level = _INDEX.sub("", remaining_text).strip(" /._-")
@@ -89,8 +93,8 @@ def read_name(file: Path, folder: Path) -> NamedFrame:
 
 
 def _exposure(text: str) -> _Exposure | None:
-    """Return the last exposure of a name; a fraction counts before a number, and a number before
-    a unit.
+    """Return the last exposure of a name: a fraction, or else a number before its unit, or else a
+    number after its unit.
     """
     if fraction := _last(_FRACTION, text):
         return _Exposure(1 / _float(fraction[1]), fraction[0])
@@ -129,9 +133,7 @@ _COLUMNS = "file, exposure (such as 10 ms) or exposure_ms, and photons or light"
 
 
 class TableRow(NamedTuple):
-    """A line of a table: a file and what is told of it; None for an empty cell or a column that
-    is missing.
-    """
+    """A line of a table: a file and its properties; None for an empty cell or a missing column."""
 
     line: int
     file: Path
@@ -247,7 +249,7 @@ def _light(row: Mapping[str, str], column: str) -> float | None:
 # Frames whose mean does not fit their level, as where a file has the wrong name.
 
 
-#: most difference of two frames: of their signal, and of the brightest signal
+#: largest difference of two frames, relative to their signal, and to the brightest signal
 _OFF, _FLOOR = 0.1, 0.01
 
 _CHANCE_ERRORS = 6.0  #: standard errors of a mean, added to the difference
@@ -264,8 +266,8 @@ def _means(files: Sequence[Path]) -> list[tuple[Path, float, float]]:
 
 
 def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
-    """Yield a sentence for each level whose frames differ too much in their means, or one if
-    darks are not dark.
+    """Yield a sentence for each level whose frames differ too much in their means, or one sentence
+    if the dark frames are not dark.
     """
     frame_means_of_levels = [_means(files) for _, _, files in levels]
     level_medians = [
@@ -314,7 +316,9 @@ def _spread(frames: Sequence[tuple[Path, float]]) -> float:
 def _misfit_of_level(
     frames: Sequence[tuple[Path, float]], middle: float, room: float, folder: Path
 ) -> str:
-    """Return which frame of a level does not fit the others, or both of a pair."""
+    """Return a sentence that names the frame that does not fit its level, or both frames
+    of a pair.
+    """
     values = [mean for _, mean in frames]
     if len(values) == 2:
         (first_file, first_mean), (second_file, second_mean) = frames
@@ -342,7 +346,7 @@ def _name(file: Path, folder: Path) -> str:
 
 
 SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr", ".fits", ".fit", ".fts")
-#: suffixes of pictures that hold no raw grey numbers, or that nothing here reads
+#: suffixes of pictures that hold no raw grey numbers, or that this program does not read
 NOT_READ = (
     ".jpg",
     ".jpeg",
@@ -367,7 +371,7 @@ NOT_READ = (
 )
 _LOSSY = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp")
 _FILES_SHOWN = 3  #: files that a message names
-#: lit levels: a gain, a bend, a twist and the lamp are told from fewer only by their priors
+#: least number of lit levels: from fewer, only the priors determine gain, bend, twist and lamp
 _LIT = 4
 _HOW_TO_NAME = """name files such as dark_10ms_1.png and lit_10ms_5000ph_1.png (exposure, photons
 of a pixel, number of the frame), or write a table frames.csv with the columns file, exposure and
@@ -384,7 +388,7 @@ class FolderRefused(ValueError):
 
 @dataclass(frozen=True)
 class Frame:
-    """A file of frames with what its name, its header or a table tells."""
+    """A file of frames with the properties that its name, its header or a table states."""
 
     file: Path
     header: FrameHeader
@@ -393,11 +397,11 @@ class Frame:
     exposure: float | None  #: s
     photons: float | None  #: per pixel and exposure
     light: float | None = None  #: relative
-    told: str = ""  #: what said the exposure, such as ``1-200s`` of a name
+    told: str = ""  #: source of the exposure, such as ``1-200s`` of a name
 
 
 class FolderLevel(NamedTuple):
-    """Frames of one illumination."""
+    """Frames with the same illumination."""
 
     name: str
     files: tuple[Path, ...]
@@ -411,7 +415,7 @@ class FolderLevels(NamedTuple):
 
     levels: tuple[FolderLevel, ...]
     light: Light
-    source: str  #: what told exposure and light, in words
+    source: str  #: source of exposure and light, in words
 
 
 def find_levels(folder: Path, progress: Progress = silent) -> FolderLevels:
@@ -461,8 +465,8 @@ def _no_frames(folder: Path, unread: Sequence[Path]) -> str:
 
 
 def _exposures(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
-    """Yield a line for each exposure with what said it, so that a wrong one is seen before the
-    work.
+    """Yield a line for each exposure with its source, so that the user sees a wrong one before the
+    computation.
     """
     by_source: dict[tuple[bool, float, str], list[Path]] = defaultdict(list)
     for frame in frames:
@@ -493,7 +497,9 @@ def _unread_line(unread: Sequence[Path], folder: Path) -> Iterator[str]:
 
 
 def _read_folder(folder: Path) -> tuple[list[Frame], str, list[str]]:
-    """Return the frames of a folder, what told of them, and the problems of single files."""
+    """Return the frames of a folder, the source of their properties in words, and the problems of
+    single files.
+    """
     try:
         table = find_table(folder)
         rows = read_table(table) if table else []
@@ -518,7 +524,7 @@ def _read_folder(folder: Path) -> tuple[list[Frame], str, list[str]]:
 
 
 def _sources(table: Path | None) -> str:
-    """Return what says light and exposure of the frames of a folder."""
+    """Return the source of light and exposure of the frames of a folder, in words."""
     return f"the table {table.name}" if table else "names and headers of the files"
 
 
@@ -530,10 +536,12 @@ def _frame_files(folder: Path) -> list[Path]:
 def _frame(
     file: Path, name: NamedFrame, row: TableRow | None, header: FrameHeader, table: Path | None
 ) -> Frame:
-    """Return a frame with what a table says of it, else its name, else its header."""
+    """Return a frame with the properties that a table states, or else its name, or else
+    its header.
+    """
     photons, exposure = (row.photons, row.exposure) if row else (name.photons, name.exposure)
     light = row.light if row else None
-    # a light above 0 in the table counts before the word dark in a name
+    # a light above 0 in the table overrides the word dark in a name
     dark = 0.0 in (photons, light, header.photons) or (name.dark and not photons and not light)
     table_of_row = table if row else None
     source = _source(exposure, name, table_of_row)
@@ -554,7 +562,7 @@ def _frame(
 
 
 def _source(exposure: float | None, name: NamedFrame, table: Path | None) -> str:
-    """Return what says the exposure of a frame."""
+    """Return the source of the exposure of a frame, in words."""
     if exposure is None:
         return "the header"
     return table.name if table else f"{name.written} of the name"
@@ -563,7 +571,7 @@ def _source(exposure: float | None, name: NamedFrame, table: Path | None) -> str
 def _contradiction(
     frame: Frame, name: NamedFrame, row: TableRow | None, table: Path | None, folder: Path
 ) -> Iterator[str]:
-    """Yield a problem where a name or a table says another exposure than the header."""
+    """Yield a problem if a name or a table states another exposure than the header."""
     stated_exposure, header_exposure = row.exposure if row else name.exposure, frame.header.exposure
     # 1 %, because names have rounded times
     if (
@@ -580,8 +588,8 @@ def _contradiction(
 
 
 def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) -> Iterator[str]:
-    """Yield a problem for a name such as ``dark_1_200s``, unless a frame 2 shows that the 1 is a
-    number of frames.
+    """Yield a problem for a name such as ``dark_1_200s``, unless a frame 2 shows that the 1 is the
+    number of a frame.
     """
     if not name.doubtful or frame.header.exposure is not None:
         return
@@ -635,7 +643,9 @@ def _sizes(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
 
 
 def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
-    """Yield what is not known of the frames: exposures, darks, or the light of some."""
+    """Yield a problem for unknown exposures, for missing darks, and for lit frames of which only
+    some have a known light.
+    """
     if without_exposure := [frame.file for frame in frames if frame.exposure is None]:
         yield f"{_some(without_exposure, folder)}: the exposure is unknown: {_HOW_TO_NAME}"
     lit_frames = [frame for frame in frames if not frame.dark]
@@ -649,7 +659,7 @@ def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
 
 
 def _partly_known(name: str, lit: Sequence[Frame], folder: Path) -> Iterator[str]:
-    """Yield that some lit frames lack a light that others have, if so."""
+    """Yield a problem if some lit frames lack a light that others have."""
     missing = [frame.file for frame in lit if getattr(frame, name) is None]
     if 0 < len(missing) < len(lit):
         yield (
@@ -673,8 +683,8 @@ _Key = tuple[bool, float, float, str]
 
 
 def _groups(frames: Sequence[Frame], light: Light) -> dict[_Key, list[Frame]]:
-    """Return the frames of each level, in rising order of light and exposure, by what they have in
-    common.
+    """Return the frames of each level by their common properties, in rising order of light and
+    exposure.
 
     Where only exposures tell the light, frames of one exposure are one level if their names agree
     too.
@@ -734,7 +744,9 @@ def _count(frames: Sequence[Frame]) -> int:
 
 
 def _light_problems(levels: Sequence[FolderLevel], light: Light) -> Iterator[str]:
-    """Yield a problem if only exposures tell the light, and two levels have the same one."""
+    """Yield a problem if the light is known by exposures alone, and two levels have the same
+    exposure.
+    """
     if light != "exposure":
         return
     lit_exposures = [level.exposure for level in levels if not level.dark]

@@ -43,7 +43,7 @@ _NOTES = {
 
 
 class SensorFrames(NamedTuple):
-    """What the frames say of the sensor beside the posterior."""
+    """Properties of the sensor that are read from its frames and are not in the posterior."""
 
     shape: tuple[int, int]  #: (y, x)
     bits: int  #: of a digital number
@@ -54,7 +54,7 @@ class SensorFrames(NamedTuple):
 def sensor_target(name: str, folder: Path) -> Path:
     """Return the file of a sensor group in a folder.
 
-    Raises: ValueError for a name that is no word, and for a file that somebody else wrote.
+    Raises: ValueError for a name that is no word, and for a file that no calibration wrote.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(f"--sensor {name}: write a word of a-z, 0-9 and _, such as mine")
@@ -68,9 +68,9 @@ def sensor_target(name: str, folder: Path) -> Path:
 
 
 def frames_of_sensor(recipe: Recipe, store: Store) -> SensorFrames:
-    """Return what the frames of a calibration of a folder say of the sensor.
+    """Return the properties of the sensor that the frames of a calibration of a folder show.
 
-    A level is full where its variance has fallen.
+    A level is saturated if its variance has dropped.
     """
     files: list[Path] = []
     for step in recipe.steps.values():
@@ -127,7 +127,8 @@ def _values(
     budget: Mapping[str, Any], draws: Mapping[str, NDArray[np.float64]], frames: SensorFrames
 ) -> dict[str, _Value]:
     """Return each value of a sensor that the budget has, by its name in the group."""
-    # draws with the values and uncertainties of the budget, which has more sources than they
+    # draws with the values and uncertainties of the budget, which includes more sources than the
+    # draws
     scaled_draws = {name: _moved(draws[name], row) for name, row in budget.items() if name in draws}
     values = {
         group_name: _Value(budget[name]["value"], unit, scaled_draws[name])
@@ -174,13 +175,13 @@ def _moved(draws: NDArray[np.float64], row: Mapping[str, Any]) -> NDArray[np.flo
 def _written(values: Mapping[str, _Value], frames: SensorFrames, source: str) -> str:
     """Return the text of the file.
 
-    It has what the frames say, the values, and their joint distribution.
+    It has the properties that the frames show, the values, and their joint distribution.
     """
     return "\n".join([*_head(frames, source), *_sensor(values, frames), *_posterior(values), ""])
 
 
 def _head(frames: SensorFrames, source: str) -> list[str]:
-    """Return the lines of what does not follow from the calibration."""
+    """Return the lines of the values that do not follow from the calibration."""
     return [
         f"{FIRST}: {source}.",
         "# What the frames do not tell is that of the packaged sensor: check pixel_pitch.",

@@ -18,18 +18,20 @@ UNREAD = "unread"  #: code of a value to which no step refers
 _BEFORE_NAMES = "there are: "  #: text before a list of known names
 
 
-#: characters that no reader sees and a terminal obeys: they move the cursor, clear the screen, or
-#: turn text around
+#: invisible characters that act on a terminal: they move the cursor, clear the screen, or reverse
+#: the text
 CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 
 
 def visible(text: str) -> str:
-    """Return a text with escapes such as ``\\x1b`` in place of characters that a terminal obeys."""
+    """Return a text with escapes such as ``\\x1b`` in place of characters that act on
+    a terminal.
+    """
     return CONTROL.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 def shortened(text: str, characters: int) -> str:
-    """Return a text of at most a number of characters; an ellipsis stands for what is left out."""
+    """Return a text cut to a number of characters; an ellipsis stands for the rest."""
     return text if len(text) <= characters else f"{text[: characters - 1]}…"
 
 
@@ -73,7 +75,7 @@ class RecipeError(ValueError):
 
 
 def _of_values_once(diagnostics: set[Diagnostic]) -> Iterator[Diagnostic]:
-    """Yield mistakes, without that of a setting where a step says the same of its value: `a`
+    """Yield the mistakes, without that of a setting whose value has the same mistake in a step: `a`
     beside `a = -1 m`.
     """
     mistakes_of_steps = {

@@ -62,7 +62,7 @@ class Config:
 
 
 def changes(base: Config, other: Config, ignored_block: str) -> list[str]:
-    """Return the overrides that turn the values of one recipe into those of another, but for the
+    """Return the overrides that turn the values of one recipe into those of another, except the
     block ``ignored_block``.
     """
     new_values, old_values = _given_values(other, ignored_block), _given_values(base, ignored_block)
@@ -76,8 +76,8 @@ def changes(base: Config, other: Config, ignored_block: str) -> list[str]:
 
 
 def _given_values(config: Config, ignored_block: str) -> dict[str, Any]:
-    """Return the values of a recipe that are no defaults, but for those of the
-    block ``ignored_block``.
+    """Return the values of a recipe that are not defaults, except those of the block
+    ``ignored_block``.
     """
     settings_given = {path: s for path, s in config.settings.items() if not s.default}
     return {
@@ -128,7 +128,7 @@ def _scalar(value: Any) -> str:
 
 
 def _escaped(char: str) -> str:
-    """Return a character as it stands in a text in quotes."""
+    """Return a character as it is written in a quoted text."""
     if char in '"\\':
         return "\\" + char
     return char if char.isprintable() else f"\\U{ord(char):08X}"

@@ -88,7 +88,7 @@ Wire = str | tuple[str, ...] | None
 
 
 def names_in(wire: Wire) -> tuple[str, ...]:
-    """Return the names of the steps that a wire reads."""
+    """Return the names of the steps to which an input is connected."""
     return (wire,) if isinstance(wire, str) else wire or ()
 
 
@@ -173,7 +173,7 @@ class Recipe:
     uncertain: Uncertain | None = field(default=None, compare=False)
     #: settings of the training of a network
     training: Training | None = field(default=None, compare=False)
-    #: of `train.cameras`, one recipe each
+    #: one recipe for each camera of `train.cameras`
     cameras: tuple[Recipe, ...] = field(default=(), compare=False)
     #: settings of the training of a lift
     lifting: LiftTraining | None = field(default=None, compare=False)
@@ -209,7 +209,7 @@ class Recipe:
 def copies_of(recipe: Recipe, names: Iterable[str]) -> set[str]:
     """Return the steps ``names``; a name without items, such as ``psf``, stands for all copies.
 
-    Raises `ValueError` for a name of no step.
+    Raises `ValueError` for a name that no step has.
     """
     copies = set[str]()
     for name in names:
@@ -238,8 +238,8 @@ def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
 
 
 def ordered(sources: Mapping[str, tuple[str, ...]], names: Iterable[str]) -> list[str]:
-    """Return what `in_order` returns; the order of a graph is found once, because points of a sweep
-    share few graphs.
+    """Return the steps ``names`` and their sources in topological order, as `in_order` does;
+    cached, because the points of a sweep share few graphs.
 
     ``sources`` has the steps that each step reads.
     """
@@ -250,7 +250,7 @@ def ordered(sources: Mapping[str, tuple[str, ...]], names: Iterable[str]) -> lis
 def _ordered(
     steps: tuple[str, ...], sources: tuple[tuple[str, ...], ...], names: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Return what `ordered` returns, for arguments that can be kept in a cache."""
+    """Return the result of `ordered`, for arguments that are hashable."""
     return tuple(in_order(dict(zip(steps, sources, strict=True)), names))
 
 
@@ -262,8 +262,8 @@ def nodes_of(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
 def dependents(
     recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None = None
 ) -> set[str]:
-    """Return the names of the steps ``roots`` and of all steps that depend on ``roots``, directly
-    or not.
+    """Return the names of the steps ``roots`` and of all steps that depend on them, directly or
+    indirectly.
 
     ``order`` lists the steps to consider, in topological order; by default, all steps of the
     recipe.
@@ -281,7 +281,7 @@ def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list
     """
     # as an ordered set
     order: dict[str, None] = {}
-    # by depth: a step, and its sources that were not looked at yet
+    # depth-first search: each step with its sources still to visit
     stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
         name, sources_left = stack[-1]
@@ -307,27 +307,27 @@ def unknown_step(name: str, steps: Collection[str]) -> str:
 
 # --- told copies ----------------------------------------------------------------------------------
 
-# Copies of the steps from which a restorer knows optics and laser, so that a camera may differ from
-# what is believed.
+# Copies of the steps that describe optics and laser to a restorer, so that the camera may differ
+# from the assumptions of the restorer.
 #
 # The camera keeps its steps. The copies have the prefix ``told_``, and the restorer reads these in
 # place of the camera's.
 
 
 TOLD = "told_"  #: prefix of the copies
-#: inputs of a restorer that say what the optics and the laser are
+#: inputs of a restorer that describe the optics and the laser
 KNOWLEDGE = ("psf", "glare", "nearby")
-#: step of the frame behind the mask, before which the camera is and after which the user
+#: step of the frame behind the mask: the camera is before it, the processing of the user after it
 FRAME = "raw[mask]"
 
 
 def knowers(recipe: Recipe, steps: Iterable[str]) -> list[str]:
-    """Return those of the steps that read what optics or lasers are."""
+    """Return those of the steps with an input that describes optics or lasers."""
     return [name for name in steps if any(recipe.steps[name].wires.get(key) for key in KNOWLEDGE)]
 
 
 def known(recipe: Recipe, readers: Iterable[str]) -> list[str]:
-    """Return the steps whose results tell the steps ``readers`` what optics and lasers are."""
+    """Return the steps whose results describe optics and lasers to the steps ``readers``."""
     names: list[str] = []
     for reader in readers:
         wires = recipe.steps[reader].wires
@@ -339,8 +339,8 @@ def known(recipe: Recipe, readers: Iterable[str]) -> list[str]:
 def with_copies(
     recipe: Recipe, readers: Iterable[str], copied: Collection[str], change: Callable[[Step], Step]
 ) -> Recipe:
-    """Return the recipe with changed copies of the steps ``copied``, from which alone the
-    ``readers`` know.
+    """Return the recipe with changed copies of the steps ``copied``, which the ``readers`` read in
+    place of the originals.
     """
     steps = dict(recipe.steps)
     for name in copied:
@@ -358,7 +358,7 @@ def with_copies(
 
 
 def _told(wire: Wire, copied: Collection[str]) -> Wire:
-    """Return a wire that reads the copies of the steps that have one."""
+    """Return a connection to the copies of those steps that have one."""
     if isinstance(wire, str):
         return TOLD + wire if wire in copied else wire
     return None if wire is None else tuple(TOLD + name if name in copied else name for name in wire)

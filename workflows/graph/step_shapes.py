@@ -105,7 +105,7 @@ def without_values(value: Any) -> Form:
     return [without_values(item) for item in value] if isinstance(value, list) else value
 
 
-#: numbers of a tensor up to which the values may tell the work of a later node
+#: elements of a tensor up to which its values are kept, which may decide the work of a later node
 _MOST_NUMBERS = 4096
 
 
@@ -128,7 +128,7 @@ def tensors_of(form: Form) -> list[Tensor]:
 
 
 def alike(form: Form, other: Form) -> bool:
-    """Return True if two forms tell the same: equal shapes and types, and equal values as far as
+    """Return True if two forms are equivalent: equal shapes and types, and equal values as far as
     these are known.
     """
     from torch import Tensor, equal

@@ -81,6 +81,7 @@ def schema(own: Own = MappingProxyType({})) -> Schema:
         "properties": {
             name: {**value, "description": _MEANINGS[name]} for name, value in _keys().items()
         },
+        # any other key is a block of values, such as `sensor`
         "additionalProperties": True,
         "$defs": {
             "step": _step(nodes),

@@ -21,9 +21,7 @@ _CODE = re.compile(r"(``.+?``|`[^`]+`)", re.DOTALL)
 
 
 def escaped(text: str) -> str:
-    """Return a text in which signs that Markdown would read stand for themselves, outside of
-    code.
-    """
+    """Return a text with the special characters of Markdown escaped, except in code."""
     pieces = _CODE.split(text)
     return "".join(
         # the pattern has one group, so that every second piece is code
@@ -151,7 +149,6 @@ def _signature(value: Any) -> str:
             ]
         )
     )
-    # no address
     # a default that is a function or a class is shown by its name, without an address
     return re.sub(r"<(?:function|class) '?([\w.]*\.)?(\w+)'?(?: at 0x[0-9a-f]+)?>", r"\2", text)
 

@@ -117,7 +117,7 @@ def with_pictures(text: str, paths: Mapping[Picture, str]) -> str:
 
 # --- the pictures that the commands of the pages draw ---------------------------------------------
 
-_FINE = (0, 3)  #: exit codes after which the folder of results is whole
+_FINE = (0, 3)  #: exit codes after which the folder of results is complete
 
 
 class NoPicture(RuntimeError):
@@ -136,7 +136,7 @@ def draw_pictures(
     """Run each command once in the folder ``work``, copy the pictures to ``target`` and return
     their file names.
 
-    Commands run in their order, and `runs/latest` is what the one before wrote.
+    Commands run in order, and `runs/latest` is the folder that the previous command wrote.
     If a command fails, a ``strict`` build raises `NoPicture`; any other build says so and goes on
     without the picture.
     """
@@ -183,7 +183,7 @@ def _run(words: tuple[str, ...], work: Path, results: Path) -> Path:
 
 
 def _name_latest(results: Path, work: Path) -> None:
-    """Make a folder of results the `runs/latest` of the commands that follow, as it is for a
+    """Link `runs/latest` to a folder of results, so that later commands find it as they do for a
     reader who types them.
     """
     latest = work / "runs" / "latest"
@@ -305,7 +305,7 @@ def complete_nav(nav: Tree, pages: Mapping[str, str]) -> Tree:
 
 
 def _sections(nav: Tree, pages: Mapping[str, str]) -> Tree:
-    """Return each entry with its title, without entries of no page."""
+    """Return each entry with its title, without entries that have no page."""
     sections = []
     for entries in nav:
         for title, entry in entries.items():

@@ -43,7 +43,9 @@ def unaffected_expectations(recipe: Recipe, written: Recipe | None) -> Recipe:
 
 
 def _unchanged_steps(recipe: Recipe, written: Recipe) -> set[str]:
-    """Return the steps that are the same in two recipes, with all that they depend on."""
+    """Return the names of the steps that are the same in two recipes, with all steps on which they
+    depend.
+    """
     unchanged: set[str] = set()
     for name in needed(recipe, recipe.steps):
         if unchanged.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
@@ -69,7 +71,7 @@ def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
 
 
 KEY, ALL, NONE, HALF = "exports", "all", "none", "@half"
-#: files of the folder ``data`` of a run; `report.contents` says what each of them has
+#: files in the folder ``data`` of a run; `report.contents` describes each of them
 NAMES = (
     "radiance.exr",
     "psf_plain.exr",
@@ -101,7 +103,7 @@ def exports_of(root: Value, wiring: Wiring) -> dict[str, bool] | None:
 
 
 def _named(words: list[Value], wiring: Wiring) -> Iterator[tuple[str, bool]]:
-    """Yield each file name of the list with True for half floats; report names that no file has."""
+    """Yield each file name of the list with True for half floats; report unknown names."""
     for word in words:
         name = str(word.data).removesuffix(HALF)
         is_half = str(word.data) != name
@@ -181,7 +183,7 @@ def _requested(root: Value, wiring: Wiring) -> list[Value]:
     """Return the values in the recipe key ``outputs``; report a recipe that requests no output."""
     block = root.items.get("outputs")
     if block is None or block.data in (None, "", [], {}):
-        # else reported as unknown
+        # a misspelt key is reported as unknown instead
         if block is not None or not get_close_matches("outputs", map(str, root.items)):
             message = "no output is requested: write outputs: [STEP, …]"
             wiring.refuse(block or root, "outputs", message)

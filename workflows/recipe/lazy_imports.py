@@ -1,5 +1,5 @@
-"""Modules that are imported for the few recipes that need them: the blocks of settings, and what
-reaches torch, which takes a second.
+"""Modules that are imported only for a recipe that needs them: the blocks of settings, and modules
+that import torch, which takes a second.
 
     from neusee.workflows.recipe import lazy_imports as lazy
     lazy.train_block.read_training(composed, context)

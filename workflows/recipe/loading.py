@@ -1,4 +1,4 @@
-"""Loading of a recipe from its name or file and arguments; all mistakes are told at once."""
+"""Loading of a recipe from its name or file and arguments; all mistakes are reported together."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ _TRAIN, _CAMERAS = "train", "train.cameras"
 def with_cameras(
     recipe: Recipe, composed: Composed, made: Callable[[Sequence[Override]], Recipe]
 ) -> Recipe:
-    """Return a recipe with the recipes of `train.cameras`, which ``made`` loads with the overrides
-    of each.
+    """Return a recipe with one further recipe for each camera in `train.cameras`, which ``made``
+    loads with the overrides of the camera.
 
-    The final values state each camera by the values that differ, so that their text needs no groups
-    of options. Raises `RecipeError` with the location of an override, also for one that changes the
-    training.
+    The final values describe each camera by the values that differ, so that their text needs no
+    options of groups. Raises `RecipeError` with the location of an override, also for an override
+    that changes the training.
     """
     block = composed.root.items[_TRAIN].items["cameras"]
     cameras = tuple(
@@ -219,9 +219,10 @@ def load(
     of all its values.
 
         load("first_light", ["sensor.read_noise=20 e-"])
-        load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green":
-        {"strength": 1e4}}) load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red":
-        {"wavelength": "638 nm", …}})
+        load("first_light", doe="axicon", sensor={"read_noise": "20 e-"})
+        load("first_light", lasers={"green": {"strength": 1e4}})
+        load("first_light", **{"sensor.read_noise": "20 e-"})
+        load("first_light", **{"+lasers.red": {"wavelength": "638 nm", …}})
 
     ``values`` are overrides as Python values, which are applied after ``overrides``; a mapping
     changes only the values that it names. Paths are relative to ``folder`` (default: the working
@@ -238,7 +239,7 @@ def load(
             composed,
             lambda words: check(compose(name, [*changes, *words], base_folder, first)),
         )
-    # numbers of a recipe that was extended hold only where nothing was changed since
+    # expected numbers of an extended recipe hold only if the changes do not affect them
     for extended in composed.extended if recipe.expect else ():
         recipe = _without_changed_numbers(recipe, extended, base_folder)
     if recipe.expect and changes:
@@ -249,8 +250,9 @@ def load(
 
 
 def _without_changed_numbers(recipe: Recipe, extended: Path, folder: Path) -> Recipe:
-    """Return a recipe without those expected numbers of a recipe that it extends which its changes
-    affect. One that is no recipe by itself has no numbers of its own.
+    """Return a recipe without the expected numbers of an extended recipe that its changes affect.
+
+    A file that is not a valid recipe by itself has no expected numbers.
     """
     extended_recipe = _as_written(str(extended), folder)
     return recipe if extended_recipe is None else unaffected_expectations(recipe, extended_recipe)
@@ -283,8 +285,8 @@ def _settings_blocks(
 ) -> tuple[
     Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None
 ]:
-    """Return a recipe without its blocks of settings, and these; few recipes need the import of
-    their models.
+    """Return a recipe without its blocks of settings, and these blocks; their models are imported
+    only for a recipe with such a block.
     """
     if not blocks:
         return composed, None, None, None, None
@@ -374,7 +376,9 @@ def _declared(
     diagnostics: list[Diagnostic],
     own: OwnFamilies,
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
-    """Return the declared steps of a recipe and those that are null, which a cached graph has."""
+    """Return the declared steps of a recipe and its null steps, from the cached graph if there is
+    one.
+    """
     if graph is not None:
         return graph.steps, graph.absent
     return declare(root, references, diagnostics, own)
@@ -433,8 +437,8 @@ def _with_mismatch(
 def _safety(
     root: Value, references: References, diagnostics: list[Diagnostic], files: dict[Where, Any]
 ) -> Safety | None:
-    """Return the settings in the block ``safety`` of a recipe, or None; few recipes need the
-    import of these.
+    """Return the settings in the block ``safety`` of a recipe, or None; the module is imported only
+    for a recipe with this block.
     """
     if SAFETY not in root.items:
         return None
@@ -454,12 +458,12 @@ def _bind(
     """Yield every copy of every step with its parameters and inputs, and add each valid copy to
     ``checked``.
 
-    ``graph`` has the inputs of each copy, and the copies that were checked with the same values
-    before.
+    ``graph`` has the inputs of each copy, and the copies that an earlier check with the same values
+    found valid.
     """
     cached_wires, memory = (graph.wires, graph.memory) if graph else ({}, None)
     for step in wiring.steps.values():
-        # no copy is made, but what the step refers to counts as used
+        # no copy is made, but the values to which the step refers count as used
         if not step.items:
             for key in ("from", "with", "device", "cache"):
                 wiring.references.touch(step.entry(key), step.dims)
@@ -495,7 +499,9 @@ def _bound_copy(
     items: tuple[str, ...],
     known_wires: Mapping[str, Mapping[str, Wire]],
 ) -> _BoundCopy | None:
-    """Return one copy of a step with its parameters and inputs, or None without its node."""
+    """Return one copy of a step with its parameters and inputs, or None if its node does
+    not exist.
+    """
     name, scope = step.instance(items), step.scope(wiring.root, items)
     parameters = wiring.references.resolve(step.entry("with"), scope)
     wires = known_wires[name] if name in known_wires else wiring.wires(step, items)
@@ -528,7 +534,7 @@ def families_of(name: str, folder: Path | None = None) -> Own:
 
 
 def recipes() -> list[Titled]:
-    """Return names and titles of all recipes that a name finds: those of the user, and the
+    """Return names and titles of all recipes that can be found by name: those of the user, and the
     packaged recipes.
     """
     paths: dict[str, Path] = {}
@@ -552,7 +558,7 @@ def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
     }
 
 
-_TITLE = 4096  #: bytes of the first line of a recipe, at most
+_TITLE = 4096  #: largest number of bytes of a recipe that are read for its title
 
 
 def _titled(path: Path) -> Titled:

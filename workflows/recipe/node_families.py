@@ -81,8 +81,8 @@ def families(own: Own = _NO_OWN) -> list[str]:
 
 
 def nodes_of(family: str, own: Own = _NO_OWN) -> dict[str, Node]:
-    """Return the nodes of a family such as ``optics`` by name; raise `LookupError` for an
-    installed one that fails.
+    """Return the nodes of a family such as ``optics`` by name; raise `LookupError` for an installed
+    family that cannot be used.
     """
     if family in own:
         return own_nodes(family, own[family])
@@ -90,8 +90,8 @@ def nodes_of(family: str, own: Own = _NO_OWN) -> dict[str, Node]:
 
 
 def all_nodes(own: Own = _NO_OWN) -> Iterator[tuple[str, Node]]:
-    """Yield each node of all families that work with the name that recipes use, such as
-    ``sensor.digitize``.
+    """Yield the name, such as ``sensor.digitize``, and the node of each node in all families that
+    can be used.
     """
     for family in families(own):
         try:
@@ -135,9 +135,7 @@ def class_context(own: Own) -> dict[str, Any]:
 
 
 def installed_as(module: str) -> str | None:
-    """Return the family that an installed package makes of a module; None if no package makes
-    one.
-    """
+    """Return the family that an installed package makes of a module, or None if no package does."""
     return next(
         (family for family, points in _installed().items() if points[0].value == module), None
     )
@@ -217,8 +215,8 @@ def import_own(where: str, folder: Path) -> ModuleType:
 
 
 def _with_parameters(node: Node) -> Node:
-    """Return a node of a user; raise `LookupError` with the place of one whose parameters cannot
-    be validated.
+    """Return a node of a user; raise `LookupError` with its place if its parameters cannot be
+    validated.
     """
     code = inspect.unwrap(node.fn).__code__
     source_line, name = f"{Path(code.co_filename).name}:{code.co_firstlineno}", node.fn.__name__
@@ -256,14 +254,14 @@ def _failure(where: str, error: BaseException) -> str:
     )
     if isinstance(error, SyntaxError) and error.filename:
         source_line = f"{Path(error.filename).name}:{error.lineno}: "
-    # an ImportError of our own says all in its text
+    # an ImportError that neusee raises says everything in its text
     kind = "" if type(error) is ImportError and not user_frames else f"{type(error).__name__}: "
     text = error.msg if isinstance(error, SyntaxError) else str(error)
     return f"{where} cannot be imported: {source_line}{kind}{text}".rstrip()
 
 
 def _own_frames(error: BaseException) -> list[traceback.FrameSummary]:
-    """Return the lines of an error that are neither of the import nor of neusee."""
+    """Return the stack frames of an error that are neither in importlib nor in neusee."""
     package_folder = str(Path(neusee.nodes.__file__).parents[1])
     return [
         frame
@@ -292,8 +290,8 @@ def _ours(family: str) -> dict[str, Node]:
 
 @functools.cache
 def _installed() -> dict[str, tuple[EntryPoint, ...]]:
-    """Return the entry points of each family of an installed package; a name of a family of
-    neusee does not count.
+    """Return the entry points of each family of an installed package; a family with the name of a
+    family of neusee is ignored.
     """
     points = dict[str, tuple[EntryPoint, ...]]()
     for point in entry_points(group=GROUP):
@@ -400,7 +398,9 @@ def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies
 
 
 def _pair(entry: Value) -> tuple[str, Value] | None:
-    """Return the family, or an empty text, and the place of an entry, or None for another form."""
+    """Return the family (empty if not written) and the place of an entry, or None for an entry of
+    another form.
+    """
     if isinstance(entry.data, str):
         return "", entry
     items = list(entry.items.items()) if isinstance(entry.data, dict) else []

@@ -101,10 +101,10 @@ class Checker:
         parameters: Value,
         step: Value,
     ) -> Sequence[str] | None:
-        """Check a step with its node's own check, and return its notes, or None for a mistake.
+        """Run a node's own check of a step, and return its notes, or None for a mistake.
 
-        ``inputs`` has what is known of each input, and ``source`` returns the parameters of the
-        step that feeds one.
+        ``inputs`` has the known form of each input, and ``source`` returns the parameters of the
+        step that computes an input.
         """
         if bound.node.hooks.preflight is None:
             return ()
@@ -127,7 +127,7 @@ class Checker:
                 self.diagnostics.append(Diagnostic(value.mark, _value_text(value), str(error)))
         except ValueError as error:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
-        except OSError as error:  # a read that fails does not say of which file
+        except OSError as error:  # the error of a failed read does not name the file
             names = ", ".join(path.name for path in files_in(bound.params))
             self.diagnostics.append(
                 Diagnostic(step.key, step.name, f"{names} cannot be read ({error})")
@@ -156,14 +156,14 @@ class Checker:
 
 
 def _strange_files(params: Mapping[str, Any], values: Mapping[str, Value]) -> list[Diagnostic]:
-    """Return a diagnostic for each value that leads to a file which its recipe may not name."""
+    """Return a diagnostic for each parameter value with a file that the recipe may not read."""
     reasons = [(value, _strange(params[name], value)) for name, value in values.items()]
     return [Diagnostic(value.mark, _value_text(value), why) for value, why in reasons if why]
 
 
 def _strange(parameter: Any, value: Value) -> str:
-    """Return why a recipe of a stranger may not name the files that a value led to, or an empty
-    text.
+    """Return why an untrusted recipe may not read the files of a parameter value, or an
+    empty text.
     """
     values = parameter if isinstance(parameter, tuple | list) else [parameter]
     paths = [path for path in values if isinstance(path, Path)]
@@ -181,9 +181,7 @@ def _strange(parameter: Any, value: Value) -> str:
 
 
 def _checked(bound: Step, hook: Callable[[], Sequence[str]]) -> Sequence[str]:
-    """Return the notes of a node's own check, which is observed where the node is one of the
-    user.
-    """
+    """Run a node's own check and return its notes; the check of a user's node is observed."""
     if not is_own(bound.node.fn.__module__):
         return hook()
     return lazy.observed_call.call_hook(bound.node, hook, bound.params)
@@ -262,8 +260,8 @@ def _value_text(value: Value) -> str:
 
 # --- known before run -----------------------------------------------------------------------------
 
-# What is known of the results of a recipe before the run: shapes and small values, and the mistakes
-# that they show.
+# Facts about the results of a recipe before the run: shapes and small values, and the mistakes that
+# follow from them.
 
 
 _CHEAPER = ("channel_sum_form", "low_rank_form", "accepts_channel_sums", "accepts_low_rank")
@@ -282,7 +280,9 @@ class CheckedStep:
 
 
 class KnownForm(NamedTuple):
-    """What the check of a step with its inputs gave."""
+    """Outcome of an earlier check of a step: its inputs, its notes and the known form of its
+    result.
+    """
 
     checked: CheckedStep
     inputs: Sequence[Any]
@@ -291,7 +291,7 @@ class KnownForm(NamedTuple):
     form: Any
 
     def holds(self, checked: CheckedStep, inputs: Sequence[Any], computed: bool) -> bool:
-        """Return True if the step and what is known of its inputs are the same objects."""
+        """Return True if the step and the known forms of its inputs are the same objects."""
         return (
             checked is self.checked
             and computed == self.computed
@@ -309,8 +309,8 @@ def check_steps(
     and diagnostics.
 
     ``outputs`` are the steps whose results the recipe returns; None means a cycle of steps, so that
-    no shape is known. ``earlier_forms`` has what earlier checks of the same graph found, and is
-    brought up to date.
+    no shape is known. ``earlier_forms`` has the outcomes of earlier checks of the same graph, and
+    is updated.
     """
     by_name = {candidate.step.name: candidate for candidate in checked}
     sources = {name: _sources_among(by_name, candidate.step) for name, candidate in by_name.items()}
@@ -335,15 +335,13 @@ def _sources_among(names: Container[str], step: Step) -> tuple[str, ...]:
 
 @dataclass
 class _FormChecks:
-    """The checks of the steps of a recipe, one after another, with what is known of their
-    results.
-    """
+    """Checks of the steps of a recipe, one after another, with the known forms of their results."""
 
     by_name: Mapping[str, CheckedStep]
     checker: Checker
     computed: Collection[str]  #: steps that an output needs
     is_cycle: bool  #: whether the steps depend on each other in a cycle
-    earlier_forms: dict[str, KnownForm]  #: what earlier checks found, brought up to date
+    earlier_forms: dict[str, KnownForm]  #: outcomes of earlier checks, updated
     memory: float  #: of the machine, bytes
     results: dict[str, Any] = field(default_factory=dict)
 
@@ -382,7 +380,9 @@ class _FormChecks:
         return notes
 
     def _add_result(self, name: str) -> None:
-        """Add what is known of the result of a step, or a diagnostic if it cannot be."""
+        """Add the known form of the result of a step, or a diagnostic if the result
+        cannot exist.
+        """
         current_step, known_form = self.by_name[name], self.earlier_forms.get(name)
         try:
             self.results[name] = form = _form(current_step.step, self.results)
@@ -407,7 +407,7 @@ def _set_aside(step: Step, inputs: Mapping[str, Any], checker: Checker) -> list[
     """Return the last mistake as a note if it comes from the inputs of a step that no output of
     the recipe needs.
     """
-    # the mistake is of the parameters alone, so that it stays
+    # the mistake is in the parameters alone: it remains a mistake
     if all(inputs.get(name) is None for name in step.node.preflight_inputs):
         return []
     problem = checker.diagnostics.pop()
@@ -430,7 +430,7 @@ def refuse_indices(recipe: Recipe) -> Iterator[Diagnostic]:
 
 def machine_memory() -> float:
     """Return the bytes of memory of this machine, or infinity if the operating system does not
-    tell.
+    report it.
     """
     try:
         return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -445,8 +445,8 @@ def _params(by_name: Mapping[str, CheckedStep], wire: Wire) -> Mapping[Any, Valu
 
 
 def _form(step: Step, results: Mapping[str, Form]) -> Form:
-    """Return what is known of the result of a step; a step that is computed before the run tells
-    its own mistakes.
+    """Return the known form of the result of a step; a step with `before_run` is computed, and
+    raises for its own mistakes.
     """
     if step.node.before_run:
         return step.node(**step.params)
@@ -454,8 +454,8 @@ def _form(step: Step, results: Mapping[str, Form]) -> Form:
 
 
 def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float) -> str:
-    """Return a message if inputs and result of a step cannot be in this machine's memory at once,
-    else an empty text.
+    """Return a message if the result of a step and its largest input do not fit together into the
+    memory of this machine, else an empty text.
 
     A step that a cheaper form may replace is not judged, because its full result may never exist.
     """
@@ -464,7 +464,7 @@ def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float
     input_results: list[Any] = []
     for value in inputs.values():
         input_results += value if type(value) is list else [value]
-    # at least one input is there while the result is made
+    # at least one input is in memory while the result is computed
     needed_bytes = bytes_of(result) + max(map(bytes_of, input_results), default=0.0)
     if needed_bytes <= memory:
         return ""
@@ -543,8 +543,8 @@ class BoundStep:
     reads: Mapping[str | int, Mapping[Where, Value | None]]  #: by block of the recipe
     #: each of these blocks, which has not changed if it is the same object
     blocks: Mapping[str | int, Value | None]
-    used: frozenset[Where]
-    offered: frozenset[Where]
+    used: frozenset[Where]  #: paths of the values that the step reads
+    offered: frozenset[Where]  #: paths that the step looks up and that have no value
 
     @classmethod
     def of(
@@ -575,7 +575,7 @@ class BoundStep:
 
 @dataclass(eq=False)
 class GraphMemory:
-    """What earlier checks of one step graph found: steps, forms of results, and final values by
+    """Outcomes of earlier checks of one step graph: steps, forms of results, and final values by
     block.
     """
 
@@ -632,8 +632,8 @@ class Attempt:
 # Cache of the step graphs of recipes; a graph is valid while the steps, their copies and nodes are
 # unchanged.
 #
-# The node and the wires of a step depend on no other values, so that the points of a sweep share
-# one graph. Parameters are checked again where they have changed, and files for each point.
+# The node and the connections of a step depend on no other values, so that the points of a sweep
+# share one graph. Parameters are checked again where they have changed, and files for each point.
 
 
 #: name and items of each block; None for a block without items
@@ -649,7 +649,7 @@ class CachedGraph:
 
     steps: dict[str, Declared]
     absent: dict[str, Value]
-    #: by step, for the steps whose wires are not references
+    #: by step, for the steps whose connections are not references
     wires: Mapping[str, Mapping[str, Wire]]
     memory: GraphMemory = field(default_factory=GraphMemory)
 
@@ -713,14 +713,14 @@ def _items(block: dict[str | int, Value]) -> tuple[str, ...] | None:
 
 
 def _key(root: Value) -> tuple[Value | None, Value | None, Names]:
-    """Return what decides a graph: the steps, the user's own nodes, and the names of the items."""
+    """Return the key of a step graph: its steps, the user's own nodes, and the names of
+    the items.
+    """
     return root.items.get("steps"), root.items.get("nodes"), _names(root)
 
 
 def _is_current(step: Declared, families: Callable[[str], Mapping[str, Node]]) -> bool:
-    """Return True if the node of a cached step has not been replaced by another node of the same
-    name.
-    """
+    """Return True if the name of the node of a cached step still means the same node."""
     family, _, name = str(step.value.items["node"].data).partition(".")
     try:
         return families(family).get(name) is step.node

@@ -25,7 +25,7 @@ from neusee.workflows.recipe.text.yaml_values import Value, kind
 # its copies.
 
 
-_MOST_STEPS = 20_000  #: steps of a recipe, at most, with all copies
+_MOST_STEPS = 20_000  #: largest number of steps of a recipe, with all copies
 _KEYS = ("node", "each", "from", "with", "device", "cache")
 _DEVICE = re.compile(r"any|cpu|gpu|mps|cuda(:\d+)?")
 _NAME = re.compile(r"[^\W\d][\w-]*")
@@ -40,7 +40,7 @@ class Declared:
 
     name: str
     value: Value
-    node: Node | None  #: None if the node does not exist; the wires are checked nevertheless
+    node: Node | None  #: None if the node does not exist; the connections are checked nevertheless
     dims: tuple[str, ...]  #: names of the lists of items in ``each``
     items: tuple[tuple[str, ...], ...]  #: items of each copy; one empty tuple without ``each``
 
@@ -132,7 +132,9 @@ def _items_of(dims: tuple[str, ...] | None, root: Value) -> tuple[tuple[str, ...
 def _too_many(
     step: Value, dims: tuple[str, ...], root: Value, copies: int, total: int
 ) -> Diagnostic:
-    """Return the diagnostic for the step with which a recipe has more steps than the limit."""
+    """Return the diagnostic for the step with which a recipe exceeds the largest
+    number of steps.
+    """
     if copies <= _MOST_STEPS:
         message = (
             f"with this step the recipe has {total} steps, more than the limit of {_MOST_STEPS}:"
@@ -196,7 +198,7 @@ def _node(
     try:
         return find(str(name.plain))
     except LookupError as error:
-        # else a family may be one that failed
+        # otherwise the family may be one whose import failed, which is reported already
         if own.is_whole or is_known(str(name.plain).partition(".")[0]):
             diagnostics.append(Diagnostic(name.mark, f"{step.name}.node", str(error.args[0])))
         return None
@@ -304,7 +306,7 @@ def _is_item_list(block: Value) -> bool:
 # their types.
 
 
-_NAMED = 12  #: steps of a cycle that a message names
+_NAMED = 12  #: largest number of steps of a cycle that a message names
 _LISTS = (list, tuple, Sequence)  #: annotations of an input that takes a list of steps
 _WIRE = re.compile(r"\s*([^\[\]\s]+)\s*(?:\[([^\[\]]*)\])?\s*")
 
@@ -414,7 +416,7 @@ class Wiring:
         return names if is_many else names[0]
 
     def _named(self, value: Value) -> Declared:
-        """Return the step that a value names, which exists."""
+        """Return the step that a value names; the step must exist."""
         parsed = _parse(value)
         assert parsed is not None
         return self.steps[parsed[0]]
@@ -473,7 +475,7 @@ class Wiring:
         selected = {} if items is None else self._selected_items(producer, items, value, path)
         if selected is None:
             return None
-        # brackets count before the items of the reader; a list with neither gives all its items
+        # items in brackets override those of the reader; a list with neither gives all its items
         item_by_list = {**reader_items, **selected}
         items_by_list = [
             [item_by_list[dim]] if dim in item_by_list else self._items(dim)
@@ -617,7 +619,9 @@ def _options(hint: Any) -> list[Any]:
 
 
 def _kinds(hint: Any) -> list[type]:
-    """Return the classes in a type annotation; ``object`` says nothing and does not count."""
+    """Return the classes in a type annotation; ``object`` is left out, because it
+    excludes nothing.
+    """
     return [
         option for option in _options(hint) if isinstance(option, type) and option is not object
     ]
@@ -642,7 +646,7 @@ def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator
         if frozenset(names) in reported:
             continue
         reported.add(frozenset(names))
-        # the same cycle begins at its step that stands first in the file
+        # a cycle is written from the step that comes first in the file
         start = min(range(len(names)), key=lambda n: marks[names[n]])
         names = names[start:] + names[:start]
         shown_names = (

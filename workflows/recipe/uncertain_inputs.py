@@ -1,4 +1,4 @@
-"""Uncertain inputs of a recipe: the range that it allows, and random draws in it."""
+"""Uncertain inputs of a recipe: the allowed range of their values, and random draws from it."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from neusee.workflows.recipe.loading import recipe_at
 
 # --- allowed range --------------------------------------------------------------------------------
 
-# The part of a probability distribution that lies in the values that a recipe allows, as a read
-# noise from 0.
+# The part of a probability distribution inside the range that a recipe allows, such as a read noise
+# of 0 or more.
 #
 # A distribution with more than a negligible part outside is refused before anything runs. A
 # negligible part is cut off, with a statement: the draws then have the distribution under the
@@ -39,10 +39,10 @@ from neusee.workflows.recipe.loading import recipe_at
 
 #: probability that a study cuts off; it changes the sd of a normal distribution by at most 0.6 %
 NEGLIGIBLE = 1e-3
-RARE = 1e-6  #: probability that is cut off where nobody reads a statement, as in a training
+RARE = 1e-6  #: probability that is cut off if no user reads a statement, as in a training
 #: standard deviations up to which values are tried; 1e-9 of a distribution lies beyond each end
 _FAR = 6.0
-_HALVINGS = 48  #: of the interval that contains the end of the allowed values
+_HALVINGS = 48  #: bisections of the interval that contains the end of the allowed values
 _CLOSE = 1e-9  #: share of a standard deviation by which a bound may be rounded to a short number
 
 Reason = str  #: why a value is not allowed; empty for an allowed value
@@ -50,8 +50,8 @@ Reason = str  #: why a value is not allowed; empty for an allowed value
 
 @dataclass(frozen=True)
 class AllowedPart:
-    """Range of normal scores at which the values of a distribution are allowed, and what lies
-    outside.
+    """Range of normal scores at which the values of a distribution are allowed, and why values
+    outside are refused.
     """
 
     low: float  #: -inf if no value below is refused
@@ -65,8 +65,8 @@ class AllowedPart:
 
 
 def within_allowed(uncertain: Uncertain, negligible: float) -> tuple[Uncertain, dict[str, str]]:
-    """Return uncertain values whose distributions have allowed values only, and a statement for
-    each that was cut.
+    """Return uncertain values with distributions that are restricted to allowed values, and a
+    statement for each that was cut.
 
     Raises `RecipeError` for each distribution of which more than the share ``negligible`` is not
     allowed.
@@ -165,7 +165,7 @@ def _is_single(law: Law, low: float, high: float) -> bool:
 
 
 def _advice(law: Law, low: float, high: float) -> str:
-    """Return what to write in place of a distribution of which too much is not allowed."""
+    """Return the advice for a distribution with too much probability outside the allowed values."""
     if law.kind == "truncated":
         return "give it tighter bounds"
     if isinstance(law.shape, Discrete):
@@ -181,7 +181,9 @@ def _bound_text(bound: float, unit: str) -> str:
 def _refusal(
     uncertain: Uncertain, name: str, text: str, allowed: AllowedPart, advice: str
 ) -> Diagnostic:
-    """Return the diagnostic for a distribution of which too much is not allowed."""
+    """Return the diagnostic for a distribution with too much probability outside the allowed
+    values.
+    """
     share_text = f"{allowed.outside:.2g}" if allowed.outside < 1e-3 else f"{allowed.outside:.2%}"
     message = (
         f"{share_text} of this distribution lies outside the allowed values"
@@ -259,8 +261,8 @@ def _normal_value(mean: float, sd: float, score: float) -> float:
 
 
 def _rank(score: float, count: int) -> int:
-    """Return the index of the sample at a normal score among ``count`` sorted samples, with both
-    ends at 6.
+    """Return the index of the sample at a normal score among ``count`` sorted samples; scores of -6
+    and 6 or beyond give the first and the last one.
     """
     if abs(score) >= _FAR:
         return 0 if score < 0 else count - 1
@@ -322,7 +324,7 @@ Index = tuple[int | str, ...]  #: path of a number in a parameter; empty for the
 
 
 class NothingDrawn(ValueError):
-    """Error for a recipe of which no output depends on an uncertain value."""
+    """Error for a recipe whose outputs depend on no uncertain value."""
 
 
 @dataclass(frozen=True)
@@ -355,10 +357,9 @@ class Inputs:
 
         A part of a distribution outside the allowed values is cut off, with a note, if its
         probability is at most ``negligible``; None leaves all distributions as they are.
-        Raises: `NothingDrawn` for a recipe without uncertain values, and if no output depends on an
-                uncertain value.
-        `RecipeError` for a distribution of which more is outside. ValueError for a value that
-        cannot be sampled.
+        Raises `NothingDrawn` for a recipe without uncertain values, and if no output depends on an
+        uncertain value; `RecipeError` for a distribution with more probability outside than
+        ``negligible``; ValueError for a value that cannot be sampled.
         """
         outputs = recipe.outputs if outputs is None else outputs
         uncertain = recipe.uncertain
@@ -523,7 +524,7 @@ def _readers(
     in the parameter.
     """
     probe = _probe(uncertain, name)
-    # what changes with the value is what reads it
+    # the parameters that change with the value are those that read it
     changed_recipe = recipe_at(uncertain, {name: probe})
     if (
         changed_recipe.steps.keys() != recipe.steps.keys()
@@ -591,8 +592,8 @@ def _paired(before: Any, after: Any) -> dict[Any, tuple[Any, Any]] | None:
 
 
 def put_at(value: Any, index: Index, new: float) -> Any:
-    """Return a parameter with another number at an index; the index is empty for the parameter
-    itself.
+    """Return a parameter with ``new`` in place of the number at an index; the index is empty for
+    the parameter itself.
     """
     if not index:
         return new
@@ -605,10 +606,10 @@ def put_at(value: Any, index: Index, new: float) -> Any:
 
 
 def _label(uncertain: Uncertain, name: str) -> str:
-    """Return the label of an input: its name, or that it is drawn with others.
+    """Return the label of an input: its name, with a remark if it is correlated with other inputs.
 
-    Correlated values are drawn one after another, so that a later one is only the rest that the
-    earlier ones leave open.
+    Correlated values are drawn one after another, so that a later normal number describes only the
+    variation that the earlier ones leave open.
     """
     joint = uncertain.joint
     if joint is None or name not in joint.names:

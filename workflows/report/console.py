@@ -51,7 +51,7 @@ class LiveTable(Live):
         )
 
     def start(self, refresh: bool = False) -> None:
-        """Start to draw, in a thread with a name of this program."""
+        """Start to draw in a thread, which gets a name of this program."""
         super().start(refresh)
         if self._refresh_thread is not None:
             self._refresh_thread.name = "neusee table"
@@ -265,8 +265,8 @@ class RunTable(ProgressTable):
         mode: Mode,
         predicted: Mapping[str, float] | None = None,
     ) -> None:
-        """Make the table of the steps ``names``; ``predicted`` has the seconds of steps as
-        earlier runs took.
+        """Make the table of the steps ``names``; ``predicted`` has the seconds that steps took in
+        earlier runs.
         """
         super().__init__(mode)
         self._seconds_of_steps_left = dict(predicted or {})
@@ -308,8 +308,8 @@ class RunTable(ProgressTable):
             yield from family.done
 
     def caption(self) -> str:
-        """Return the time that is left, or how many steps were neither computed nor loaded in
-        the end.
+        """Return the remaining time, or at the end the number of steps that were neither computed
+        nor loaded.
         """
         if (seconds_left := sum(self._seconds_of_steps_left.values())) >= 1:
             return f"about {lasts(seconds_left)} left, as earlier runs took"
@@ -379,8 +379,8 @@ def opening(recipe: Recipe, command: str) -> list[str]:
 
 
 def forecast_line(seconds: float, steps: int, unknown: int) -> str:
-    """Return the time that ``steps`` steps will take, of which ``unknown`` never ran; empty for
-    less than a second.
+    """Return a line with the predicted time of ``steps`` steps, of which ``unknown`` never ran;
+    empty for less than a second.
     """
     if seconds < 1 or unknown == steps:
         return ""
@@ -416,7 +416,7 @@ def _error_lines(doc: Mapping[str, Any]) -> list[str]:
     """Return the lines on cheaper steps, steps left out, and the errors of outputs and of bands."""
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [left_out_line(doc)] if doc["left_out"] else []
-    # errors of outputs, where something was saved at their cost
+    # errors of the outputs, if cheaper or omitted steps can cause any
     lines += [said_of_errors(doc["spent"])] if lines else []
     lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
     return lines
@@ -432,7 +432,7 @@ def _table_lines(results: Mapping[str, Any]) -> list[str]:
 
 
 def story_lines(doc: Mapping[str, Any]) -> list[str]:
-    """Return the sentences on what the mask buys and costs, after an empty line and no wider
+    """Return the sentences on the benefit and cost of the mask, after an empty line and no wider
     than the terminal.
     """
     lines: list[str] = []

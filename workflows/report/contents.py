@@ -68,7 +68,7 @@ OUTPUTS = "outputs.safetensors"
 
 
 def files_of(recipe: Recipe) -> dict[str, tuple[str, Mapping[str, str]]]:
-    """Return format and needs of the data files that a recipe asks for, by name."""
+    """Return format and needs of the data files that a recipe requests, by name."""
     files = {**FILES, OUTPUTS: ("safetensors", {step: step for step in recipe.outputs})}
     return {
         name: file
@@ -87,7 +87,7 @@ Row = tuple[Any, ...]  #: property that is changed, new value, error, seconds
 
 
 def keep_variants(recipe: Recipe, step: str, rows: Sequence[Row], store: Store) -> None:
-    """Keep the errors and run times of the variants of a step, for recipes with this step, its
+    """Store the errors and run times of the variants of a step, for recipes with the same step,
     inputs and machine.
     """
     if rows:
@@ -98,8 +98,8 @@ def keep_variants(recipe: Recipe, step: str, rows: Sequence[Row], store: Store) 
 
 
 def variants_of(recipe: Recipe, family: str, store: Store, code: Code) -> list[Row]:
-    """Return the errors and run times of the variants of a step such as ``psf``, of any item;
-    none if not measured.
+    """Return the errors and run times of the variants of a step such as ``psf``, of the first copy
+    with stored ones; none if no copy was measured.
     """
     for name in recipe.steps:
         if name.partition("[")[0] == family:
@@ -177,7 +177,7 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code, store: 
     """Find the source of an argument of a drawing function in a recipe, from a text such as
     ``psf[mask]``.
 
-    The module `contents` lists all forms of this text. ``store`` has what studies measured.
+    The module `contents` lists all forms of this text. ``store`` has the measurements of studies.
     """
     if need.startswith(_MEASURED):
         return _variants(need.removeprefix(_MEASURED), recipe, code, store)

@@ -1,7 +1,7 @@
 """Data files of a run: spectral OpenEXR, RGB OpenEXR, PNG of 16 bits and safetensors.
 
-Each file is written once, straight to where it stays, piece by piece. Stacks of planes are not
-compressed, because they are noise and tails of PSFs, which do not compress.
+Each file is written once, piece by piece, directly at its final place. Stacks of planes are not
+compressed, because noise and the wings of PSFs hardly compress.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[
 
 
 def data_files(recipe: Recipe) -> Iterator[DerivedFile]:
-    """Yield the data files that a recipe asks for."""
+    """Yield the data files that a recipe requests."""
     for name, (file_format, needs) in contents.files_of(recipe).items():
         in_16_bits = recipe.exports is not None and recipe.exports[name]
         kind = ("file", file_format, _VERSION, *(["half"] if in_16_bits else []))
@@ -51,8 +51,8 @@ def data_files(recipe: Recipe) -> Iterator[DerivedFile]:
 
 
 def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = False) -> None:
-    """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021, with ``half``
-    in 16 bits a value.
+    """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021, with ``half`` in
+    16 bits per value.
     """
     values = cube.intensity if isinstance(cube, Psf) else cube
     write_spectral(path, values, bands.centres, half=half)
@@ -92,7 +92,7 @@ def exr(path: Path, /, *, image: Tensor, half: bool = False) -> None:
     """Write an RGB image (3, y, x) as an OpenEXR file, or a grey image (1, y, x) with the one
     channel Y.
 
-    Pixels are float32, or with ``half`` float16. Raises: ValueError for ``half`` and a value beyond
+    Pixels are float32, or float16 with ``half``. Raises ValueError for ``half`` and a value beyond
     float16.
     """
     import OpenEXR
@@ -152,9 +152,8 @@ def _compressed(image: Tensor) -> Iterator[bytes]:
     """Yield the compressed lines of a PNG of 16 bits, each as differences from the pixel at the
     left.
 
-    Of a picture with noise the differences take less room than the pixels, and runs and the lengths
-    of codes are all that is worth looking for: a third of the time of a full search, and no more
-    bytes.
+    For a picture with noise the differences compress better than the pixels. Run lengths and code
+    lengths alone take a third of the time of a full search for repetitions, and no more bytes.
     """
     import numpy as np
 
@@ -202,10 +201,10 @@ def marked(path: Path, /, *, marked: Tensor, source: Path, draws: int) -> None:
 
 
 def _named(png: bytes, source: Path, draws: int, coding: bytes = b"") -> bytes:
-    """Return a PNG with text chunks that name the frame, and the number of draws of the interval
+    """Return a PNG with text chunks that name the frame, and the number of draws for the interval
     beside it.
 
-    ``coding`` is a chunk that says how the numbers are encoded.
+    ``coding`` is a chunk that states how the numbers are encoded.
     """
     # signature, and the chunk IHDR: 12 bytes around its 13
     header_end = 8 + 12 + 13

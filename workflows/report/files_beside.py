@@ -1,4 +1,4 @@
-"""Pictures and data files of a run, made beside it while later steps compute."""
+"""Pictures and data files of a run, made in parallel while later steps compute."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ from neusee.workflows.store.serialization import pack, tensors_in, unpack
 
 # --- drawing process ------------------------------------------------------------------------------
 
-# A process beside that of the run, which draws pictures and encodes images while the steps of the
-# run compute.
+# A second process, forked from that of the run, which draws pictures and encodes images while the
+# steps of the run compute.
 #
 # matplotlib holds the lock of the interpreter, so that a thread that draws would stop the steps.
 # The process is a fork of the run at its start, with one thread, so that it imports nothing again;
@@ -54,7 +54,7 @@ from neusee.workflows.store.serialization import pack, tensors_in, unpack
 # another reason no process answers, the run draws its pictures itself.
 
 
-MOST_PIPE_BYTES = 1 << 27  #: bytes of the arguments of a picture that go through the pipe
+MOST_PIPE_BYTES = 1 << 27  #: bytes; largest size of the arguments of a picture in the pipe
 _PATIENCE = 120.0  #: s for one picture, after which the process counts as lost
 _WORDS = (str, int, float, Path, type(None))
 
@@ -72,15 +72,14 @@ class DrawingProcess:
     """A forked process that writes one picture at a time; `close` ends the process."""
 
     def __init__(self) -> None:
+        """Fork the process that draws; raise `OSError` if memory or permission is lacking."""
         # a second thread waits until the file of the first is written
-        """Fork the process that draws; raise `OSError` where no memory or no permission is left for
-        it.
-        """
         self._turn = threading.Lock()
-        self._next = threading.Lock()  # and is the next then, before the first thread asks again
+        # it is then the next, before the first thread asks again
+        self._next = threading.Lock()
         context = multiprocessing.get_context("fork")
         self._pipe, far_end = context.Pipe()
-        # Python 3.12 warns of every fork beside a thread
+        # Python 3.12 warns of each fork in a process with several threads
         with warnings.catch_warnings(), deaf_fork():
             warnings.simplefilter("ignore", DeprecationWarning)
             self._process = context.Process(
@@ -124,7 +123,9 @@ class DrawingProcess:
 
 
 def _sent(path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> bytes:
-    """Return a job as bytes; raise `NotDrawn` for arguments that are large or that are no data."""
+    """Return a job as bytes; raise `NotDrawn` for arguments that are too large or cannot be
+    pickled.
+    """
     if sum(tensor.nbytes for tensor in tensors_in(list(arguments.values()))) > MOST_PIPE_BYTES:
         raise NotDrawn("the arguments are large")
     try:
@@ -135,8 +136,8 @@ def _sent(path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -
 
 
 def _packed(value: Any) -> tuple[Any, list[Any], Any]:
-    """Return the layout and the arrays of a value, and None; or a value without tensors at the end,
-    as it is.
+    """Return (layout, arrays, None) for a value with tensors, or (empty layout, no arrays, value)
+    for a value without tensors.
 
     A function that applies the node of a step is such a value; the process that draws has all
     modules of the run.
@@ -153,14 +154,14 @@ def _packed(value: Any) -> tuple[Any, list[Any], Any]:
 
 
 def _serve(pipe: Connection, other_end: Connection) -> None:
-    """Make the files that the pipe asks for, until its other end closes."""
+    """Make the files that are requested through the pipe, until its other end closes."""
     other_end.close()  # else the pipe stays open when the run is killed
     # open files of the run would stay open as long as this process
     _close_all_but(pipe.fileno())
     gc.freeze()  # a search for garbage among the objects of the run would copy their memory
     ignore_interrupts()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    torch.set_num_threads(1)  # the threads of the run are not in a fork of it
+    torch.set_num_threads(1)  # a forked process does not have the threads of the run
     with suppress(Exception):  # the first picture meets the error again
         style.warm()
     with suppress(EOFError, OSError), torch.no_grad():
@@ -200,24 +201,23 @@ def _made(job: bytes) -> str:
 # Pictures and data files of a run, made while later steps compute.
 #
 # A file is made as soon as the last of its results is there. One thread writes data files, and
-# another leaves pictures to the process that draws, so that neither waits for the other. What is
-# made so is found by its key when the report is written, and the report makes what is missing; an
-# error is met there again. So nothing of the report depends on this module but its time.
+# another leaves pictures to the process that draws, so that neither waits for the other. Such a
+# file is found by its key when the report is written, and the report makes what is missing; there
+# an error occurs again. So this module changes only the time that the report takes.
 
 
-#: bytes; a larger result is held only for files that need nothing else any more
+#: bytes; a larger result is held only for files that need no further result
 LARGE_RESULT = 1 << 26
 _SMALL_RESULT = 1 << 22  #: bytes of a result that is held in any case
 ROOM = 1 << 27  #: bytes of smaller results that are held for files
 
 
 class FilesBeside:
-    """Files that are made beside a run; call the object with each result of the run.
+    """Files that are made in parallel with a run; call the object with each result of the run.
 
-    Args: files: the files of a recipe. limit: bytes of memory that the process may use; of these,
-            an eighth at most is
-    held for files, no more than `ROOM` beside one large result, and nothing once half of the limit
-    is in use. With 0 no file is made beside the run.
+    ``files`` returns the files of a recipe. ``limit`` is the memory in bytes that the process may
+    use: at most an eighth of it is held for files, no more than `ROOM` beside one large result, and
+    nothing once half of it is in use. With 0 no file is made beside the run.
     """
 
     def __init__(
@@ -266,18 +266,18 @@ class FilesBeside:
         self._let_go(names if is_full else ())
 
     def _submit_complete(self, recipe: Recipe, keys: Mapping[str, Key]) -> None:
-        """Begin the files of which all results are held."""
+        """Begin the files whose results are all held."""
         # job[1]: the steps that the file shows
         for file, steps in [job for job in self._open if job[1] <= self._held.keys()]:
             self._open.remove((file, steps))
             self._submit(file, recipe, {name: keys[name] for name in steps})
 
     def _shown(self) -> set[str]:
-        """Return the steps that files which are still to be made show."""
+        """Return the steps that are shown by files which are still to be made."""
         return set(itertools.chain.from_iterable(steps for _, steps in self._open))
 
     def _is_too_large(self, size: int) -> bool:
-        """Return True for a result of so many bytes that none of it may be held now."""
+        """Return True if a result of ``size`` bytes is too large to be held now."""
         if size > self._large and (self._busy or size > self._limit / 16):
             return True
         return size > _SMALL_RESULT and process_memory() > self._limit / 2
@@ -311,7 +311,7 @@ class FilesBeside:
         return wait
 
     def finish(self) -> None:
-        """Wait for the files that were begun, and hold no result any more.
+        """Wait for the files that were begun, and release all results.
 
         The last pictures are drawn here while the process that draws is busy with others.
         """
@@ -334,7 +334,7 @@ class FilesBeside:
         draws.
         """
         self._recipe, self._held, self._open = recipe, {}, []
-        # keys are not known yet, and only the steps are asked for
+        # the keys are not known yet; only the steps are needed here
         empty_keys = dict.fromkeys(needed(recipe, wanted(recipe)), "")
         for file in self._files(recipe):
             with suppress(Missing):
@@ -349,12 +349,14 @@ class FilesBeside:
                 self._drawer = DrawingProcess()
 
     def _let_go(self, names: Iterable[str]) -> None:
-        """Hold no result longer that no file needs, and none of the steps ``names``."""
+        """Release the results that no file needs any more, and those of the steps ``names``."""
         needed_later = self._shown() - set(names)
         self._held = {name: value for name, value in self._held.items() if name in needed_later}
 
     def _submit(self, file: DerivedFile, recipe: Recipe, keys: Mapping[str, Key]) -> None:
-        """Begin a file whose results are all held; one for the report if it cannot be made here."""
+        """Begin a file whose results are all held; leave to the report a picture that cannot be
+        drawn here.
+        """
         sources = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
         arguments = {name: source.make(self._held) for name, source in sources.items()}
         is_large = _bytes_of(list(arguments.values())) > MOST_PIPE_BYTES
@@ -412,8 +414,8 @@ class _Job:
 
 
 def _draws_at_once() -> bool:
-    """Return True if this process has imported what drawing needs; the import takes longer than
-    a picture.
+    """Return True if this process has imported the modules for drawing; their import takes longer
+    than a picture.
     """
     return "matplotlib.figure" in sys.modules
 
@@ -432,11 +434,10 @@ def _bytes_of(value: Any) -> int:
 
 
 class GraphAhead:
-    """A function of each result of a run, which begins the graph when the keys of all steps are
-    known.
+    """Callable that receives each result of a run, and begins the picture of the graph when the
+    keys of all steps are known.
 
-    Args: beside: draws the graph. done: the records of the steps that have finished, which the run
-            fills.
+    ``beside`` draws the graph. ``done`` has the records of the finished steps; the run fills it.
     """
 
     def __init__(self, beside: FilesBeside, store: Store, done: Mapping[str, StepRecord]) -> None:

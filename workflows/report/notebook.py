@@ -35,8 +35,8 @@ _MOST_CHARACTERS = 100  #: characters of a value in a table, at most
 
 
 def result_html(result: Result) -> str:
-    """Return an HTML page with pictures, result table and steps of a run, without values that
-    take over 2 s.
+    """Return an HTML page with pictures, result table and steps of a run; values that take more
+    than 2 s to compute are left out.
     """
     values = _at_hand(result, [*_of_table(result), *_of_overview().values()])
     return filled(
@@ -214,8 +214,8 @@ def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _shown_pictures(values: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return linear pictures of which the brightest has the value 1: of the overview, or four
-    others.
+    """Return linear pictures, each over its white level: those of the overview, or up to four other
+    images.
     """
     if all(need in values for need in FIGURES[0].needs.values() if not need.startswith("?")):
         step_of_picture = _of_overview()

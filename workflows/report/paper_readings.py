@@ -2,8 +2,7 @@
 and the reason.
 
 Source: Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. The groups ``reading``
-        and ``train`` make
-each choice.
+and ``train`` make each choice.
 """
 
 from __future__ import annotations

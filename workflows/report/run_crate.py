@@ -47,7 +47,7 @@ _LINK = re.compile(r"\[(?P<name>[^]]+)]\((?P<address>[^)]+)\)")
 
 
 def tools(document: Mapping[str, Any]) -> list[Entity]:
-    """Return neusee and the libraries that it computed with; neusee is the first."""
+    """Return the entities of neusee and of the libraries that it used; neusee is the first."""
     versions = dict(document.get("versions") or _of_facts(document.get("facts") or ()))
     libraries = [
         _library(*name_and_version)
@@ -119,7 +119,7 @@ def inputs(rows: Iterable[Any]) -> tuple[list[Entity], list[Entity]]:
 def _input_file(
     name: str, row: Mapping[str, str], users: Sequence[str], entry: Mapping[str, str] | None
 ) -> Entity:
-    """Return the entity of an input file, with what is known of it if neusee ships it."""
+    """Return the entity of an input file, with author and licence if neusee ships the file."""
     source = f": {entry['what']}; by {entry['author']}." if entry else "."
     return {
         "@id": name,
@@ -133,7 +133,9 @@ def _input_file(
 
 
 def _sample(file: str, digest: str) -> dict[str, str] | None:
-    """Return what is known of a file that neusee ships, or None for any other file."""
+    """Return the description, author and licence of a file that neusee ships, or None for any other
+    file.
+    """
     known_row = _samples().get(file)
     try:
         return (
@@ -258,8 +260,8 @@ def write_crate(
 ) -> None:
     """Write the crate of a complete folder of results; ``name`` is the final name of the folder.
 
-    ``said`` is what the folder says of its command, such as the content of ``provenance.json``. The
-    file appears by an atomic rename.
+    ``document`` describes the command of the folder, such as the content of ``provenance.json``.
+    The file appears by an atomic rename.
     """
     crate = {
         "@context": f"{_SPECIFICATION}/context",
@@ -307,7 +309,7 @@ def _write(folder: Path, crate: Mapping[str, Any]) -> None:
 def _graph(folder: Path, name: str, document: Mapping[str, Any], ended: datetime) -> list[Entity]:
     """Return the entities of a crate: the folder, its command, software, files and people.
 
-    ``said`` is what the folder says of its command, and ``ended`` when that ended.
+    ``document`` describes the command of the folder, and ``ended`` is the time at which it ended.
     """
     title_of_path = _titles(document)
     parts = [_file(path, size, title_of_path.get(path, "")) for path, size in _sizes(folder)]
@@ -332,12 +334,14 @@ def _graph(folder: Path, name: str, document: Mapping[str, Any], ended: datetime
     entities = [*about_the_crate, *software, *parts, *input_files, *licences]
     if creator:
         entities.append(creator)
-    # an address stands once: a licence of several inputs
+    # one entity for each address, also for a licence of several inputs
     return list({entity["@id"]: entity for entity in entities}.values())
 
 
 def _titles(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return the titles of files by path: those of figures, and of what each run writes."""
+    """Return the titles of files by path: of the figures, and of the files that every
+    run writes.
+    """
     figures = [row for row in document.get("figures") or () if isinstance(row, Mapping)]
     return {row["file"]: row["title"] for row in figures if "file" in row} | _FILES
 
@@ -438,7 +442,7 @@ def _sizes(folder: Path) -> list[tuple[str, int]]:
 
 
 def _file(path: str, size: int, text: str) -> Entity:
-    """Return the entity of a file; ``text`` says what it holds."""
+    """Return the entity of a file; ``text`` describes its content."""
     return {
         "@id": quoted(path),
         "@type": "File",
@@ -450,5 +454,5 @@ def _file(path: str, size: int, text: str) -> Entity:
 
 
 def _time(moment: datetime) -> str:
-    """Return a time as text in UTC, in ms."""
+    """Return a time as text in UTC, to the millisecond."""
     return moment.astimezone(UTC).isoformat(timespec="milliseconds")

@@ -141,7 +141,7 @@ def _folder(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
     An error removes it. ``latest`` points to it at the end.
     """
     root.mkdir(parents=True, exist_ok=True)
-    # what killed runs have left
+    # unfinished folders of killed runs
     _sweep(root)
     name = f"{date.today().isoformat()}_{recipe}_{key[:8]}"
     run_folder = RunFolder(root / f".{name}.{os.getpid()}.part")
@@ -241,8 +241,8 @@ def find_run(where: str, root: Path) -> Path:
 
 
 def _plain(cell: Any) -> Any:
-    """Return a cell with a number of Python in place of one of NumPy, whose text its print
-    options decide.
+    """Return a NumPy number as a number of Python, because NumPy's print options change its text;
+    return any other cell as it is.
     """
     return cell.item() if hasattr(cell, "dtype") and not cell.ndim else cell
 
@@ -289,9 +289,7 @@ _BREAK = re.compile(r"(?<=[_,/.])(?=[a-z])|(?=\[)")  #: where a long word may go
 
 
 def filled(template: str, **values: Any) -> str:
-    """Return the HTML that an HTML template of the folder ``templates`` gives for the given
-    ``values``.
-    """
+    """Return the HTML page that a template of the folder ``templates`` makes with ``values``."""
     return str(compiled(template).render(**values))
 
 

@@ -34,7 +34,7 @@ from neusee.workflows.store.cache_settings import format_size
 
 StepRow = Mapping[str, Any]  #: a step in the document of a run
 
-#: of the file ``timing.csv``, which has a line for each step
+#: columns of the file ``timing.csv``, which has a line for each step
 COLUMNS = (
     "step",
     "node",
@@ -99,7 +99,7 @@ def _total(steps: Iterable[StepRow], column: str) -> Any:
 
 
 def _span(ran: Sequence[StepRow]) -> Any:
-    """Return the time in s from the begin of the first step that ran to the end of the last."""
+    """Return the time in s from the start of the first step that ran to the end of the last."""
     if not ran:
         return 0.0
     last_end = max(step["began"] + step["seconds"] for step in ran)
@@ -245,7 +245,7 @@ def with_pictures(
     refused: Mapping[str, str],
     warnings: Iterable[str],
 ) -> dict[str, Any]:
-    """Return the document of a run with its pictures, its data files, what is missing of both, and
+    """Return the document of a run with its pictures and data files, the missing ones of both, and
     all warnings.
 
     ``missing`` and ``refused`` have the reason for each missing picture and data file; a picture
@@ -334,8 +334,8 @@ def shape_of(done: StepRecord) -> str:
 
 
 def _step(done: StepRecord, result: Result) -> dict[str, Any]:
-    """Return a step of the document of a run: what its record says, or that of its
-    stored result.
+    """Return the entry of one step in the document of a run, taken from the record of the step or,
+    failing that, from the record of its stored result.
     """
     node = result.recipe.steps[done.step].node
     stored_metadata = (

@@ -37,7 +37,7 @@ def in_turn(groups: Sequence[Sequence[str]], result: Result) -> Iterator[Mapping
     group. A value is deleted after the last group that needs it.
     """
     uses_left = Counter(itertools.chain.from_iterable(groups))
-    # what neither the run nor the store has: in one run
+    # values that neither the run nor the store has are computed in one run
     values = dict(_computed([step for step in uses_left if _is_lacking(step, result)], result))
     for group in groups:
         values |= _read([step for step in group if step not in values], result)
@@ -123,7 +123,7 @@ class DerivedFile:
     make: Callable[..., None]
     #: True for a file that is made only if an argument is a table of the user
     only_tables: bool = False
-    #: True for a file that holds results as they are: it is written as fast as sent elsewhere
+    #: True for a file of uncompressed results: sending them elsewhere takes as long as writing
     copied: bool = False
 
 
@@ -299,7 +299,7 @@ def steps_of(sources: Mapping[str, Source]) -> frozenset[str]:
 
 
 def key_of_file(file: DerivedFile, sources: Mapping[str, Source]) -> str:
-    """Return the key of a file: the digest of how it is made and of what it shows."""
+    """Return the key of a file: the digest of its kind and of the results that it shows."""
     return digest(*file.kind, [[name, source.identity] for name, source in sources.items()])
 
 

@@ -1,5 +1,5 @@
-"""The summary of a run: its numbers in tables, and sentences on what the mask buys and costs and on
-what a frame tells.
+"""The summary of a run: its numbers in tables, and sentences on the benefit and cost of the mask
+and on a restored frame.
 """
 
 from __future__ import annotations
@@ -187,16 +187,16 @@ def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[
 
 # --- mask story -----------------------------------------------------------------------------------
 
-# What a mask, filter or stop buys and costs in a run, in sentences with the numbers of the run, and
-# its rival.
+# Benefit and cost of a mask, filter or stop in a run, in sentences with the numbers of the run, and
+# its rival: a grey filter with the same laser suppression.
 
 
 SENTENCES = ("buys", "irradiance", "costs", "rival", "frame")
 PLAIN, MASK, RESTORED = "plain lens", "with mask", "restored"
 _PEAK, _QUALITY, _LOST = "peak/I_sat", "PSNR (dB)", "saturated px"
 _EQUAL = 0.01  #: relative difference of two peaks below which the mask changes nothing
-_UNSUPPRESSED_LSR = 0.9  #: LSR above which there is nothing to replace
-_TIMES = 2.0  #: ratio of two peaks below which their difference is told in percent
+_UNSUPPRESSED_LSR = 0.9  #: LSR above which no grey filter is suggested in place of the mask
+_TIMES = 2.0  #: ratio of two peaks below which their difference is stated in percent
 
 Arm = Mapping[str, float]
 _WHERE = {PLAIN: "behind the plain lens", MASK: "behind the mask"}  #: words of the two arms
@@ -204,8 +204,8 @@ _PREFIXES = {-9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 
 
 def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
-    """Return the sentences on what the mask of a run buys and costs, and their numbers; nothing
-    without a pair.
+    """Return the sentences on the benefit and cost of the mask of a run, and their numbers; nothing
+    unless the run has both plain lens and mask.
     """
     numbers = {name: _known(cells) for name, cells in arms(recipe, keys, value).items()}
     lsr = suppressed(recipe, keys, value)
@@ -213,7 +213,7 @@ def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
     has_damage = any(name.partition("[")[0] == "damage" for name in recipe.steps)
     # without a sentence on the mask no other one is said
     texts |= irradiance(_laser_peaks(keys, value), has_damage) if texts else {}
-    # a shade is a rival itself
+    # a filter or a stop is itself such a rival
     texts |= {} if shade_of(recipe) or not texts else rival(lsr, numbers)
     return {
         **texts,
@@ -223,8 +223,8 @@ def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
 
 
 def element(recipe: Recipe) -> str:
-    """Return what stands in the arm of the mask: a mask, a stop, a filter, several of these, or
-    a flat plate.
+    """Return the name of the element that the run compares with the plain lens: a mask, a stop, a
+    filter, several of these, or a flat plate.
     """
     height_step, shade_step = recipe.steps.get("height"), recipe.steps.get(shade_of(recipe) or "")
     elements = [] if height_step and height_step.node.path == "doe.flat" else ["mask"]
@@ -257,8 +257,8 @@ def sentences(
 
 
 def irradiance(peaks: Mapping[str, float], judged: bool) -> dict[str, str]:
-    """Return the sentence ``irradiance``: the W/cm2 of the lasers in the brightest pixel, which no
-    multiple replaces.
+    """Return the sentence ``irradiance``: the irradiance of the lasers in the brightest pixel in
+    W/cm2, which a multiple of saturation does not replace.
 
     ``peaks`` are in W/m2, by plain lens and mask. ``judged`` is True for a recipe that compares
     them with thresholds.
@@ -283,8 +283,8 @@ def irradiance(peaks: Mapping[str, float], judged: bool) -> dict[str, str]:
 
 
 def _laser_peaks(keys: Mapping[str, str], value: Value) -> dict[str, float]:
-    """Return the W/m2 of all lasers in the brightest pixel behind the plain lens and behind the
-    mask.
+    """Return the irradiance (W/m2) of all lasers in the brightest pixel, behind the plain lens and
+    behind the mask.
     """
     steps = {name: TABLE[name][_PEAK] for name in (PLAIN, MASK)}
     peaks = {name: value(step) for name, step in steps.items() if step in keys}
@@ -292,18 +292,18 @@ def _laser_peaks(keys: Mapping[str, str], value: Value) -> dict[str, float]:
 
 
 def _density(value: float) -> str:
-    """Return an irradiance in W/m2 as text in W/cm2 with a prefix."""
+    """Return an irradiance in W/m2 as text in W/cm2 with an SI prefix."""
     # the largest multiple of 3 below the logarithm of the W/cm2
     exponent = min(max(3 * math.floor(math.log10(value * 1e-4) / 3), -9), 9)
     return f"{value * 1e-4 / 10.0**exponent:.3g} {_PREFIXES[exponent]}W/cm2"
 
 
 def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str]:
-    """Return the sentence ``rival``: the grey filter that weakens each laser at least as much, if
-    the mask does at all.
+    """Return the sentence ``rival`` on the grey filter that weakens each laser at least as much as
+    the mask; nothing if the mask hardly weakens one of them.
 
-    The picture behind this filter has its numbers if the run computed them, and else the command
-    that computes them.
+    It states the picture quality behind this filter if the run computed it, or else the command
+    that computes it.
     """
     largest_lsr = max(lsr.values(), default=1.0)
     if largest_lsr >= _UNSUPPRESSED_LSR:
@@ -329,7 +329,9 @@ def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str
 
 
 def _known(cells: Arm) -> dict[str, float]:
-    """Return the numbers of an arm without NaN, which stands for an unknown one."""
+    """Return the numbers of plain lens, mask or restored picture without NaN, which stands for an
+    unknown number.
+    """
     return {name: number for name, number in cells.items() if not math.isnan(number)}
 
 
@@ -359,8 +361,8 @@ def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool, element:
 
 
 def _lowered(less: float, element: str) -> str:
-    """Return whether a mask lowers the peak on the sensor, for the peak of the plain lens over
-    that of the mask.
+    """Return a clause on whether a mask lowers the peak on the sensor; ``less`` is the peak behind
+    the plain lens over that behind the mask.
     """
     is_plural = _several(element)
     if abs(less - 1) < _EQUAL:
@@ -429,8 +431,8 @@ def _picture(plain: Arm, mask: Arm, restored: Arm, element: str) -> str:
 
 
 def _saturation(plain: Arm, mask: Arm, laser: bool, element: str) -> str:
-    """Return how many pixels saturate with the mask and with the plain lens, and that a laser
-    dazzles more of them.
+    """Return how many pixels saturate with the mask and with the plain lens, and whether a laser
+    dazzles a larger area with the mask.
     """
     if _LOST not in plain or _LOST not in mask:
         return ""
@@ -466,18 +468,18 @@ def _number(value: float) -> str:
 
 # --- frame story ----------------------------------------------------------------------------------
 
-# What is known of a restored frame, in sentences with the numbers of the run: invented pixels, and
+# Uncertainty of a restored frame, in sentences with the numbers of the run: invented pixels, and
 # the interval.
 
 
 _NEEDS = ("restored", "restored_spread", "raw[mask]", "clipped[mask]")
 _FRAME = "sensor.frame"
-_WIENER = ("restore.wiener", "restore.wiener_by_field")  #: filters of which the interval is
+_WIENER = ("restore.wiener", "restore.wiener_by_field")  #: filters that the interval describes
 _MEASURED = "restore.spread_by_field"
 
 
 def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, str]:
-    """Return what is known of a restored frame as the paragraph ``frame``; nothing for a run
+    """Return the paragraph ``frame`` on the uncertainty of a restored frame; nothing for a run
     without a frame.
     """
     if not keys.keys() >= set(_NEEDS) or recipe.steps["raw[mask]"].node.path != _FRAME:
@@ -498,7 +500,7 @@ def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict
 
 
 def _invented(name: str, invented: Tensor) -> str:
-    """Return how many pixels of a frame are saturated, so that they are invented."""
+    """Return a sentence on the number of saturated pixels of a frame, which are invented."""
     count, share = int(invented.sum()), float(invented.double().mean())
     if not count:
         return (
@@ -513,7 +515,9 @@ def _invented(name: str, invented: Tensor) -> str:
 
 
 def _interval(half: Tensor, invented: Tensor) -> str:
-    """Return how well the other pixels are known; empty if there are none."""
+    """Return a sentence on the half width of the interval in the other pixels; empty if there are
+    none.
+    """
     if bool(invented.all()):
         return ""
     mean_widths = half.mean(0)[~invented].flatten()
@@ -546,7 +550,7 @@ def _doubtful(restored: Tensor, half: Tensor, invented: Tensor) -> str:
 
 
 def _limits(recipe: Recipe) -> str:
-    """Return what the interval of a restored frame includes and what not."""
+    """Return what the interval of a restored frame includes and excludes."""
     restoring_step = recipe.steps.get("deconvolved")
     is_own_filter = (
         restoring_step is not None

@@ -186,7 +186,7 @@ def _holds_numbers(cells: Sequence[Any]) -> bool:
 
 
 def _paragraphs(text: str) -> list[str]:
-    """Return the paragraphs of a text, which blank lines part, each in one line."""
+    """Return the paragraphs of a text, which are separated by blank lines, each in one line."""
     return [" ".join(paragraph.split()) for paragraph in text.split("\n\n") if paragraph.strip()]
 
 
@@ -266,7 +266,7 @@ class StudyReport:
 
 @dataclass(frozen=True)
 class StudyOutcome:
-    """What a study has found, before its folder is written."""
+    """Result of a study before its folder is written: key, provenance and report."""
 
     key: str  #: of all that decides the results; the name of the folder ends with it
     content: Mapping[str, Any]  #: of ``provenance.json``, beside what each study states

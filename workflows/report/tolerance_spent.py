@@ -59,7 +59,7 @@ def spent(result: Result) -> dict[str, Any]:
 
 
 def _costs(result: Result) -> Costs:
-    """Return the costs of earlier runs, where this run left steps out or replaced them."""
+    """Return the costs of steps in earlier runs, if this run left steps out or replaced them."""
     recipe = result.recipe
     if recipe.substitutions or _left_out(result):
         return past_costs(result.store, sizes_of(recipe, needed(recipe, recipe.steps)))
@@ -127,8 +127,8 @@ def said_of_errors(account: Mapping[str, Any]) -> str:
 
 
 def _said_of_measured(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the largest error that was measured beside ``--exact``, and in which outputs, if
-    not in all.
+    """Return the largest error that was measured against a run with ``--exact``, and the outputs
+    without a measurement.
     """
     measured = [row for row in rows if row["measured"] is not None]
     if not measured:
@@ -197,11 +197,11 @@ def _economy(
 
 
 def _spent_on(result: Result, substitution: Substitution) -> float | None:
-    """Return the time in s of all steps that replace a step: the cheaper one, and those that choose
-    and check it.
+    """Return the time in s of all steps that replace a step: the cheaper step, and the steps that
+    choose and check it.
 
-    A stored result counts with the time in which it was computed; None if the store no longer knows
-    that.
+    A stored result counts with the time in which it was computed; None if the store has lost a
+    time.
     """
     seconds = [
         _made_in(result, done)
@@ -278,8 +278,8 @@ def _full_keys(result: Result) -> dict[str, str]:
 def spectral_error(
     recipe: Recipe, keys: Mapping[str, str], value: Callable[[str], Any]
 ) -> dict[str, Any]:
-    """Return the largest error by the number of bands, over channels, by what it is the error
-    of; empty if unknown.
+    """Return the largest error over the channels due to the finite number of bands, by affected
+    quantity; empty if unknown.
     """
     errors: dict[str, float] = {}
     for name in spectral_steps(recipe):
@@ -297,7 +297,7 @@ def spectral_error(
 
 
 def _said(errors: Mapping[str, float], tolerance: float, larger: bool) -> str:
-    """Return one sentence with the errors by the number of bands, and a warning if one exceeds
+    """Return one sentence with the errors due to the number of bands, and a warning if one exceeds
     the tolerance.
     """
     listed = ", ".join(f"{error:.1e} {cause}" for cause, error in errors.items())

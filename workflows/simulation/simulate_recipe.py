@@ -41,7 +41,9 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Where a run computes, what it computes anew, and who watches it."""
+    """Options of a run: devices, memory, steps to compute anew, and a function that receives its
+    events.
+    """
 
     #: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first
     device: str = "cpu"
@@ -89,7 +91,7 @@ def simulate(
             options.watch(event)
 
     picture_store = DerivedFiles(store)
-    # a run with a limit of its own keeps nothing for files beside it
+    # with an explicit limit of memory, no results are held for files beside the run
     memory_beside = memory_limit(None) if memory is None else 0.0
     with (
         warnings.catch_warnings(record=True) as caught_warnings,
@@ -143,7 +145,7 @@ def _watched() -> Iterator[None]:
 
 
 def _files(recipe: Recipe) -> Iterator[DerivedFile]:
-    """Yield the pictures and data files that are made beside a run while it goes on."""
+    """Yield the pictures and data files that are made in parallel with a run."""
     yield from figure_files()
     yield from data_files(recipe)
 
@@ -156,8 +158,8 @@ def _write(
     caught: Sequence[warnings.WarningMessage],
     beside: FilesBeside,
 ) -> dict[str, Any]:
-    """Write the folder of a run: all that shows no picture while the last pictures are drawn,
-    and then the page.
+    """Write the folder of a run: all files without pictures while the last pictures are drawn, and
+    then the page.
     """
     timeline_file, finish = (
         folder.path / "figures" / "timeline.png",

@@ -50,15 +50,15 @@ if TYPE_CHECKING:
 
 # --- sensor facts ---------------------------------------------------------------------------------
 
-# The sensor of an estimate of safety: its pixels, and what fills them.
+# The sensor of an estimate of safety: its pixels, and the electrons that saturate a pixel.
 
 
 Passing = Annotated[float, Field(gt=0, le=1)]
 
 
 class SensorFacts(SettingsBlock):
-    """What damage and dazzle need to know of the sensor; no quantum efficiency means that none
-    is known.
+    """Properties of the sensor on which damage and dazzle depend; None for the quantum efficiency
+    means that it is unknown.
     """
 
     pixel_pitch: PixelPitch
@@ -76,8 +76,8 @@ class SensorFacts(SettingsBlock):
 
     @property
     def fills(self) -> float:
-        """Return the electrons of light that fill a pixel, to its full well or to the end of the
-        converter.
+        """Return the number of photoelectrons that saturate a pixel, at its full well or at the end
+        of the range of the converter.
         """
         well = self.full_well or math.inf
         if self.gain is None or self.bits is None or self.full_well is None:
@@ -103,15 +103,15 @@ class SensorFacts(SettingsBlock):
 
 @dataclass(frozen=True)
 class LaserChannels:
-    """The responses of the colour channels to a laser, as steps that can be asked at another
-    wavelength too.
+    """Responses of the colour channels to a laser, with the steps that compute them, so that they
+    can be computed at another wavelength too.
     """
 
-    line: Step  #: of the bands of the laser
+    line: Step  #: step of the bands of the laser
     responses: Step
     #: response of the channel that responds most, relative to the quantum efficiency of the sensor
     largest: float
-    key: str  #: of the responses, for the key of an estimate
+    key: str  #: of the responses; part of the key of an estimate
 
 
 # --- safety block ---------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ class LaserChannels:
 
 
 KEY, LASERS = "safety", "lasers"  #: keys of the two blocks in a recipe
-#: facts of a sensor without which nothing saturates
+#: properties of a sensor that a computation of saturation needs
 SATURATION = ("quantum_efficiency", "full_well", "exposure")
 BEAM = (
     "wavelength",
@@ -134,7 +134,7 @@ BEAM = (
     "m_squared",
 )
 
-Above = Annotated[float, Field(gt=0, le=1e9)]
+Above = Annotated[float, Field(gt=0, le=1e9)]  #: a number above 0
 Exponent = Annotated[float, Field(ge=0, le=1)]
 Model = TypeVar("Model", bound=SettingsBlock)
 
@@ -159,8 +159,8 @@ class Laser(SettingsBlock):
     haze: Literal["kruse", "kim"] = "kim"
 
     def beam(self, values: Mapping[str, float] | None = None) -> Beam:
-        """Return the beam with ``values`` in place of its own; raise `ParameterError` for values
-        that disagree.
+        """Return the beam with ``values`` in place of the values of the laser; raise
+        `ParameterError` if the values contradict each other.
         """
         parameters = {name: getattr(self, name) for name in BEAM}
         parameters |= {name: value for name, value in (values or {}).items() if name in BEAM}
@@ -178,7 +178,7 @@ class Scatter(SettingsBlock):
     behind a mask too.
     """
 
-    #: of the light; without a value in the recipe it is assumed
+    #: scattered part of the light; an assumption unless the recipe states it
     share: Annotated[float, Field(gt=0, lt=1)] = 0.005
     l: Annotated[float, Field(gt=0, le=10)] = 0.01  #: width of the scatter, as a sine  # noqa: E741
     s: Annotated[float, Field(ge=-10, le=0)] = -1.5  #: slope far outside of the width
@@ -194,7 +194,7 @@ class Lens(SettingsBlock):
     diameter: Diameter
     transmittance: Passing = 1.0
     focus: Literal["infinity", "laser"] | Distance = "infinity"  #: distance, or always on the laser
-    defocus: Waves = 0.0  #: of the lens at its rim, beside that of the distance, at 550 nm
+    defocus: Waves = 0.0  #: of the lens at its rim, added to that of the distance, at 550 nm
     scatter: Scatter | None = Scatter()  #: None: a lens that scatters nothing
     stop: str | None = None  #: step that returns the stop; its grid may narrow the diameter
 
@@ -205,8 +205,8 @@ class Lens(SettingsBlock):
 
 
 class Spots(SettingsBlock):
-    """Steps for the plain lens and the mask, at the wavelength of the laser: PSFs, or pixels ranked
-    by their light.
+    """Names of the steps, for plain lens and mask, that compute PSFs or ranked pixels at the
+    wavelength of the laser.
 
     ``laser_psf`` means ``laser_psf[plain,pointer]`` and ``laser_psf[mask,pointer]`` for the laser
     ``pointer``.
@@ -217,8 +217,8 @@ class Spots(SettingsBlock):
 
 
 class Protection(SettingsBlock):
-    """Protections beside the plain lens: the mask of the recipe, a grey filter and a smaller
-    stop.
+    """Protections that are compared with the plain lens: the mask of the recipe, a grey filter and
+    a smaller stop.
     """
 
     #: step of the laser suppression ratio (LSR) at the wavelength of the laser, as in `Spots`
@@ -233,17 +233,19 @@ class Protection(SettingsBlock):
 
 
 class Damage(SettingsBlock):
-    """Which thresholds of damage hold, and for which exposure."""
+    """Thresholds of damage that apply, and the duration of the exposure."""
 
     device: str = "CMOS"  #: class of the sensor, as the table of thresholds names it
     dwell: Time = 1.0  #: s, for which the light stays on one place of the sensor
-    #: of published spot / spot, the bonus of a narrower spot; 0: none
+    #: of (published spot / spot), by which a smaller spot raises the threshold; 0: not at all
     small_spot_exponent: Exponent = 0.0
-    file: Path | None = None  #: table of thresholds of the user, which count where they hold
+    file: Path | None = None  #: table with thresholds of the user, used where they apply
 
 
 class Dazzle(SettingsBlock):
-    """How much of the picture may be lost, and when a feature counts as lost."""
+    """Largest part of the picture that may be lost, and the feature that decides whether a part is
+    lost.
+    """
 
     share: Passing = 0.1  #: of the picture
     contrast: Above = 0.5  #: Weber contrast of the feature
@@ -262,8 +264,8 @@ class Dazzle(SettingsBlock):
 
 
 class EyeDazzle(SettingsBlock):
-    """What a viewer has to see beside the laser: the light of the surroundings, the target, and
-    who looks.
+    """Conditions under which a viewer must see a target beside the laser: background luminance,
+    target and viewer.
     """
 
     angles: Annotated[tuple[PositiveAngle, ...], Field(min_length=1)] = tuple(
@@ -307,8 +309,8 @@ class EyeDazzle(SettingsBlock):
 
 
 class Eye(SettingsBlock):
-    """How long an eye looks into the laser, by which rule trains of pulses are judged, and what
-    the eye has to see.
+    """Exposure of an eye to the laser: its duration, the rule for pulse trains, and the conditions
+    of dazzle.
     """
 
     #: None: 0.25 s for visible light, until the eye turns away, and 10 s for other light
@@ -319,12 +321,14 @@ class Eye(SettingsBlock):
 
 
 class Unevenness(SettingsBlock):
-    """How much brighter than an even Gaussian beam a laser may be, in places or for moments."""
+    """Factors by which the irradiance of a laser exceeds that of an even Gaussian beam, in places
+    or for moments.
+    """
 
     #: factor on the irradiance; 1: not counted
     hot_spots: Annotated[float, Field(ge=1, le=1000)] = 1.0
     cn2: Above | None = None  #: m^(-2/3), of the turbulent air; None: not counted
-    #: share of the time in which turbulence is exceeded by none
+    #: part of the time in which the irradiance behind turbulent air is below the assumed one
     worst: Annotated[float, Field(gt=0, lt=1)] = 0.99
 
 
@@ -335,8 +339,8 @@ class SafetySettings(SettingsBlock):
     distances: tuple[Distance, Distance] = (1.0, 1e5)
     lens: Lens
     sensor: SensorFacts
-    damage: Damage | None = Damage()  #: None, written none or null: damage is not asked for
-    dazzle: Dazzle | None = None  #: None: dazzle is not asked for
+    damage: Damage | None = Damage()  #: None, written none or null: damage is not estimated
+    dazzle: Dazzle | None = None  #: None: dazzle is not estimated
     eye: Eye = Eye()
     beam: Unevenness = Unevenness()
     protection: Protection = Protection()
@@ -380,7 +384,7 @@ class Safety:
     values: Mapping[str, Value]
     #: thresholds of damage in the file of the user; empty without a file
     laws: tuple[DamageLaw, ...]
-    channels: LaserChannels | None = None  #: known where the settings name a step of responses
+    channels: LaserChannels | None = None  #: None unless the settings name a step of responses
 
 
 def read_safety(
@@ -459,8 +463,8 @@ def _validated(model: type[Model], block: Value, diagnostics: list[Diagnostic]) 
 
 
 def _located_in(value: Value, file: str) -> Value:
-    """Return a mapping with the place where a file writes into it, in place of that in an option
-    that came before.
+    """Return a mapping whose location is the place where ``file`` sets one of its values, in place
+    of its location in an earlier option.
     """
     if not isinstance(value.data, dict):
         return value
@@ -504,8 +508,8 @@ def _laser_of(
 
 
 def _laser(item: Value, diagnostics: list[Diagnostic]) -> Laser | None:
-    """Return the light of a laser, without the values that steps of the recipe read; report each
-    mistake.
+    """Return the validated settings of a laser, without the values that only steps of the recipe
+    read; report each mistake.
     """
     if not isinstance(item.data, dict):
         diagnostics.append(
@@ -534,8 +538,8 @@ def _laser(item: Value, diagnostics: list[Diagnostic]) -> Laser | None:
 
 
 def _leaves(value: Value, path: Where) -> Iterator[tuple[Where, Value]]:
-    """Yield each single value below a mapping with the path of its setting, which is not where a
-    reference leads.
+    """Yield each single value in a mapping with its path in the mapping; for a reference this is
+    not the path of its target.
     """
     for key, child in value.items.items():
         if isinstance(child.data, dict):

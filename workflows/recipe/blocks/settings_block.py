@@ -41,8 +41,9 @@ def read_block(
 ) -> tuple[Composed, Settings | None]:
     """Return a recipe without its block ``key``, and the validated settings from that block.
 
-    ``plain`` is the plain data of the block, and ``context`` has what the models of the settings
-    need to know of the recipe. Mistakes in the block add diagnostics, and the settings are None.
+    ``plain`` is the plain data of the block. ``context`` gives the models of the settings data of
+    the recipe, such as its families of nodes. For a mistake in the block, the returned recipe has a
+    further diagnostic and the settings are None.
     """
     block, without_block = composed.root.items[key], composed.without(key)
     try:
@@ -93,19 +94,21 @@ def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
     return list(model.model_fields)
 
 
-# --- the block `evaluate`: the errors in what the restorer is told --------------------------------
+# --- the block `evaluate`: errors of the parameters that the restorer assumes ---------------------
 
 KEY = "evaluate"  #: key of the block in a recipe
 
 
 class Mismatch(SettingsBlock):
-    """Errors in what a restorer is told, each tried by itself; 0 or false leaves an error out."""
+    """Errors of the parameters that a restorer assumes, each tested alone; 0 or false omits an
+    error.
+    """
 
-    pixels: Annotated[float, Field(ge=0, le=100)] = 0.5  #: of the place of the laser, along y and x
+    pixels: Annotated[float, Field(ge=0, le=100)] = 0.5  #: of the laser's position, along y and x
     wavelength: Annotated[Length, Field(ge=0, le=100e-9)] = 2e-9  #: of the laser
     defocus: Waves = 0.1  #: of the lens, for scene and laser, peak to valley at 550 nm
-    dirt: bool = True  #: whether the dirt of the window is not told
-    #: null: the largest of the evaluation
+    dirt: bool = True  #: whether the restorer does not know of the dirt on the window
+    #: of the laser; null: the largest strength of the evaluation
     strength: Annotated[float, Field(gt=0, le=1e18)] | None = None
     scenes: Number = 5  #: the first scenes with a laser
 
@@ -113,7 +116,7 @@ class Mismatch(SettingsBlock):
 class EvaluateSettings(SettingsBlock):
     """Settings of `neusee evaluate` in the recipe key ``evaluate``."""
 
-    mismatch: Mismatch | None = Mismatch()  #: null: the restorer is always told the truth
+    mismatch: Mismatch | None = Mismatch()  #: null: the restorer always assumes the true values
     #: drawn: the first laser of the recipe, its wavelength by its law
     lasers: Literal["in turn", "drawn"] = "in turn"
     scenes: Number | Literal["all"] = 20  #: all: every photograph of the folder once
@@ -122,7 +125,7 @@ class EvaluateSettings(SettingsBlock):
     #: peak of a laser behind each pipeline
     equal_protection: Annotated[float, Field(gt=0, lt=1)] | None = None
     by: Literal["best", "filter", "stop"] = "best"
-    #: true: the pipelines as they are are evaluated too, beside those of equal protection
+    #: true: the unchanged pipelines are evaluated too, beside those of equal protection
     beside: bool = False
     #: changes of the recipe for the figure with the lasers, such as sensor.c1=0.2
     figure: tuple[str, ...] = ()

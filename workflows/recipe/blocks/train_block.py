@@ -66,6 +66,7 @@ Kind = Literal[
     "unet",
     "five_half_rings",
 ]
+#: default learning rate of each kind of mask
 _RATE = {
     "pixelwise": 0.05,
     "recipe_mask": 4e-3,
@@ -112,7 +113,9 @@ class Weights(SettingsBlock):
 
     @property
     def protected(self) -> bool:
-        """Return True if a term of the loss is that of a picture behind a peak limit."""
+        """Return True if the loss has a term for the picture behind the filter that keeps the peak
+        at `limit`.
+        """
         return bool(self.filtered_error or self.information)
 
     @property
@@ -155,9 +158,9 @@ class MaskSettings(SettingsBlock):
     contrast_variance: ContrastVariance = 0.1  #: of the scene, relative
     #: standard deviation of the defocus, drawn at each iteration
     defocus_spread: Annotated[Waves, Field(ge=0)] = 0.0
-    #: the same of all wavelengths together
+    #: the same for a shift of all wavelengths together
     wavelength_spread: Annotated[Length, Field(ge=0, le=1e-6)] = 0.0
-    #: the same of the direction of the laser, on each axis
+    #: the same for the direction of the laser, on each axis
     direction_spread: Annotated[Angle, Field(ge=0)] = 0.0
     learn_stop: bool = False  #: the diameter of `doe.shade` is learnt with the mask
     bands: Count | None = 7  #: number of bands of the recipe in one iteration; None: all bands
@@ -274,7 +277,7 @@ def state_file(out: Path, recipe: str, key: str) -> Path:
 
 
 KEY = "train"  #: key of the block in a recipe
-#: kinds of networks that need what the Wiener filter knows of a picture
+#: kinds of networks whose input includes the quantities that the Wiener filter uses
 POSED = ("unrolled", "informed")
 _OF_CLASS = ("architecture", "parameters", "multiple")  #: settings of a network class of the user
 
@@ -290,7 +293,7 @@ class Network(SettingsBlock):
     #: a class of the user, in place of a kind and its options
     architecture: NetworkClass | None = None
     parameters: dict[str, Any] | None = None  #: arguments of this class
-    #: of this class: divisor of the sides of a picture
+    #: of this class: number by which the sides of a picture must be divisible
     multiple: Annotated[int, Field(ge=1, le=1024)] | None = None
 
     @property
@@ -348,16 +351,16 @@ class Rates(SettingsBlock):
 
 
 class Augment(SettingsBlock):
-    """Changes of the photographs of a training, which make more scenes of them; held-out
-    pictures are not changed.
+    """Augmentation of the photographs of a training by random changes; held-out pictures are not
+    changed.
     """
 
     #: mirror: half of the scenes left to right; all: quarter turns too
     symmetries: Literal["mirror", "all"] = "mirror"
-    #: stops by which a scene is darker, at most
+    #: largest darkening of a scene, in stops
     exposure: Annotated[float, Field(ge=0, le=10)] = 0.0
     colour: Share = 0.0  #: largest change of the saturation of colours
-    #: largest factor of size: what is enlarged is less sharp
+    #: largest magnification; an enlarged scene is less sharp
     enlarge: Annotated[float, Field(ge=1, le=8)] = 1.0
     #: turned_mask: turn pooled pictures, as behind a turned mask
     pooled: Literal["none", "turned_mask"] = "none"
@@ -399,9 +402,9 @@ class Training(SettingsBlock):
     pool: Number | None = None
     keep_pool: bool = True  #: keep the pictures of the pool in the cache, for later trainings
     augment: Augment = Augment()
-    #: overrides, each list for one more camera: pictures of each in turn
+    #: lists of overrides, one for each further camera; the cameras take pictures in turn
     cameras: tuple[tuple[str, ...], ...] = ()
-    #: by path, laws of how the camera differs from what its restorer is told
+    #: by path: distribution of the difference between the camera and what its restorer assumes
     mismatch: dict[str, Any] | None = None
     critics: Critics = Critics()
     betas: tuple[Beta, Beta] = (0.9, 0.999)
@@ -416,9 +419,9 @@ class Training(SettingsBlock):
     #: settings of the mask design without images, which replaces stage 1
     mask: MaskSettings = MaskSettings()
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
-    #: share of the photographs; None: none
+    #: part of the photographs that is kept for validation; None: no photographs
     held_out: Annotated[float, Field(gt=0, le=0.5)] | None = 0.1
-    held_out_pictures: Number = 16  #: held-out photographs that a validation restores, at most
+    held_out_pictures: Number = 16  #: largest number of held-out photographs in a validation
     validate_every: Number = 500  #: iterations
     #: validations without a better state after which stage 2 ends; None: no limit
     patience: Number | None = None
@@ -554,8 +557,8 @@ def _missing(block: Value, training: Training) -> Iterator[Diagnostic]:
 
 
 def _outside(path: Path, value: Value) -> Iterator[Diagnostic]:
-    """Yield a diagnostic for a file that is not the stranger's whose recipe names it, also for a
-    link in a folder.
+    """Yield a diagnostic for a path, or for a link in a folder, to a file that an untrusted recipe
+    may not read.
     """
     links = (
         (link for link in path.rglob("*") if link.is_symlink())
@@ -570,8 +573,8 @@ def _outside(path: Path, value: Value) -> Iterator[Diagnostic]:
 
 
 def _wrong_network(block: Value, training: Training) -> Iterator[Diagnostic]:
-    """Yield a diagnostic for each setting of the packaged networks, and for a class that fails
-    on a small picture.
+    """Yield a diagnostic for each misplaced setting of the packaged networks, and for a network
+    class of the user that fails on a small picture.
     """
     network = training.network
     if network.architecture is None:
@@ -591,7 +594,9 @@ def _wrong_network(block: Value, training: Training) -> Iterator[Diagnostic]:
 
 
 def _without_class(block: Value) -> Iterator[Diagnostic]:
-    """Yield a diagnostic for the first setting of a class of the user, where none is named."""
+    """Yield a diagnostic for the first setting that needs a network class of the user, if the
+    recipe names no class.
+    """
     for name in _OF_CLASS[1:]:
         value = block.child(name)
         if value and value.plain:
@@ -601,7 +606,9 @@ def _without_class(block: Value) -> Iterator[Diagnostic]:
 
 
 def _of_packaged_networks(block: Value) -> Iterator[Diagnostic]:
-    """Yield a diagnostic for each setting of the packaged networks beside a class of the user."""
+    """Yield a diagnostic for each setting of the packaged networks that is written beside a network
+    class of the user.
+    """
     for name, value in block.items.items():
         if name not in _OF_CLASS and not Path(value.mark.folder).is_relative_to(packaged()):
             text = (

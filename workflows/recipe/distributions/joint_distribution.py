@@ -34,7 +34,7 @@ from neusee.workflows.recipe.text.recipe_files import refuse_outside
 Line = tuple[int, list[str]]  #: number and cells of a line of a table
 
 _CELLS = 24.0  #: bytes in memory for each byte of a table: all cells as texts, and their numbers
-FEWEST = 30  #: smallest number of samples that stand for a distribution
+FEWEST = 30  #: smallest number of samples that can represent a distribution
 _HEADING = re.compile(r"\s*(.*?)\s*\[([^\[\]]*)\]\s*")  #: ``gain [DN/e-]``
 _SUFFIXES = (".csv", ".txt", ".npy", ".npz")
 
@@ -144,8 +144,9 @@ def with_units(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray]
     """Return the columns by name in SI units, and their units by name, from headings such as
     ``exposure [ms]``.
 
-    Values in ``e-/DN`` stay as they are, with this unit. A unit that no recipe has, such as that of
-    a dark current ``e- in 1 s``, stays as text. Raises ValueError for a name that stands twice.
+    Values in ``e-/DN`` stay as they are, with this unit. A unit that recipes do not use, such as
+    that of a dark current ``e- in 1 s``, stays as text. Raises ValueError for two columns of one
+    name.
     """
     values: dict[str, FloatArray] = {}
     units: dict[str, str] = {}
@@ -162,8 +163,8 @@ def with_units(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray]
 
 
 def si_unit(unit: str) -> tuple[float, str]:
-    """Return the factor from a unit to SI and the SI unit; ``e-/DN`` and unknown units stay,
-    with the factor 1.
+    """Return the factor from a unit to the SI unit, and the SI unit; ``e-/DN`` and unknown units
+    are kept, with the factor 1.
     """
     try:
         scale, si_text, reciprocal = read_written(f"1 {unit}".strip())
@@ -173,7 +174,7 @@ def si_unit(unit: str) -> tuple[float, str]:
 
 
 def require_samples(samples: FloatArray, name: str) -> None:
-    """Raise ValueError for samples that do not stand for a distribution: too few, not finite, or
+    """Raise ValueError for samples that cannot represent a distribution: too few, not finite, or
     all equal.
     """
     if not np.isfinite(samples).all():
@@ -200,7 +201,7 @@ BARE_GAIN = (
 )
 #: standard deviations around the mean that contain 90 % of a normal distribution
 Z_90 = 1.6448536269514722
-_LARGEST = 4_000_000  #: bytes of a posterior that is a document, as of a recipe
+_LARGEST = 4_000_000  #: bytes of a posterior in JSON or YAML, at most; the same as of a recipe
 _JITTER = 1e-10  #: added to the diagonal of a correlation so that its Cholesky factor exists
 _FILES = (
     "the folder of `neusee calibrate`, its posterior.json, draws in .npz or .csv, or a mean and sd"
@@ -334,7 +335,9 @@ def _scores(draws: FloatArray) -> FloatArray:
 
 
 def _factor(correlation: FloatArray) -> FloatArray:
-    """Return the lower Cholesky factor of a correlation, made firm against rounding."""
+    """Return the lower Cholesky factor of a correlation matrix; a small diagonal term guards
+    against rounding errors.
+    """
     return np.asarray(
         np.linalg.cholesky(correlation + _JITTER * np.eye(len(correlation))), np.float64
     )
@@ -351,7 +354,7 @@ class Posterior:
     kinds: Mapping[str, str] = field(default_factory=dict)
     #: as text, for the values whose unit the file gives
     units: Mapping[str, str] = field(default_factory=dict)
-    #: names that the file has without draws, because no frame tells them
+    #: parameters in the file without draws, because the frames do not determine them
     untold: tuple[str, ...] = ()
 
 
@@ -404,7 +407,9 @@ def _document(path: Path, mark: Location | None) -> Posterior:
 
 
 def _calibrated(doc: Mapping[str, Any], path: Path, mark: Location | None) -> Posterior:
-    """Return the posterior of a calibration, whose draws stand in a file beside it."""
+    """Return the posterior of a calibration, whose draws are in the file ``draws.npz``
+    beside it.
+    """
     _refuse_failed(doc)
     joint = read_posterior(path.with_name("draws.npz"), mark).joint
     assert joint.draws is not None
@@ -422,7 +427,7 @@ def _calibrated(doc: Mapping[str, Any], path: Path, mark: Location | None) -> Po
 
 
 def _refuse_failed(doc: Mapping[str, Any]) -> None:
-    """Raise ValueError for a calibration of which a check fails."""
+    """Raise ValueError for a calibration with a failed check."""
     if not doc.get("failed"):
         return
     failed = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
@@ -477,7 +482,7 @@ def _normal(moments: Mapping[str, Any]) -> Joint:
 
 
 def _of_covariance(names: list[str], mean: FloatArray, covariance: FloatArray) -> Joint:
-    """Return the normal distribution with a covariance.
+    """Return the normal distribution with means and a covariance matrix.
 
     Raise ValueError for one without variances.
     """
@@ -491,7 +496,9 @@ def _of_covariance(names: list[str], mean: FloatArray, covariance: FloatArray) -
 
 
 def _refuse_other_moments(moments: Mapping[str, Any]) -> None:
-    """Raise ValueError for a summary without means, or without one statement of their spread."""
+    """Raise ValueError for a summary without means, or without exactly one of standard deviations
+    and covariance.
+    """
     if strange := sorted(set(moments) - {"mean", "sd", "correlation", "covariance"}):
         raise ValueError(
             f"unknown key {strange[0]}: give mean, sd and perhaps correlation, or mean and"

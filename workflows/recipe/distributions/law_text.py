@@ -95,8 +95,8 @@ def read_law(text: str, folder: Path = Path(), mark: Location | None = None) -> 
     """Return the probability distribution in a text; raise ValueError with the correct form for an
     invalid text.
 
-    Args: folder: folder of the recipe, to which the path of a file of samples is relative. mark:
-            place of the text.
+    ``folder`` is the folder of the recipe, to which the path of a file of samples is relative.
+    ``mark`` is the place of the text.
     """
     text = text.strip()
     match = _CALL.fullmatch(text)
@@ -115,14 +115,14 @@ def read_law(text: str, folder: Path = Path(), mark: Location | None = None) -> 
 
 
 def _form(kind: str) -> str:
-    """Return the message that a distribution is not well written, with its correct form."""
+    """Return the error message for an incorrect distribution, with the correct form."""
     form, meaning = KINDS[kind]
     return f"the distribution {kind} needs {meaning}: write {form}"
 
 
 def _is_closed(text: str) -> bool:
-    """Return True if no parenthesis closes before it opens, as in ``normal(1, 2) + normal(3,
-    4)``.
+    """Return True if each parenthesis in a text has its partner; the text inside the outer
+    parentheses of ``normal(1, 2) + normal(3, 4)`` does not.
     """
     depth = 0
     for sign in text:
@@ -134,8 +134,8 @@ def _is_closed(text: str) -> bool:
 
 
 def _arguments(text: str) -> list[str]:
-    """Return the arguments between the outer commas of a text; a comma in quotes or parentheses
-    separates nothing.
+    """Return the arguments in a text, which is split at the commas outside quotes and
+    parentheses.
     """
     # a quote ends at the sign with which it began
     arguments, depth, quote = [""], 0, ""
@@ -151,7 +151,7 @@ def _arguments(text: str) -> list[str]:
 
 
 def _numbers(arguments: Sequence[str]) -> _Numbers:
-    """Return numbers of one unit."""
+    """Return arguments as numbers in SI; raise ValueError unless all have the same unit."""
     written_numbers = [read_written(argument) for argument in arguments]
     _, unit, reciprocal = written_numbers[0]
     for argument, (_, other_unit, other_reciprocal) in zip(arguments, written_numbers, strict=True):
@@ -251,7 +251,7 @@ def _discrete(kind: str, text: str, arguments: Sequence[str]) -> Law:
 
 
 def _weights(written: Sequence[str], count: int) -> list[float]:
-    """Return the weights of ``count`` values, equal if none is written."""
+    """Return the weights of ``count`` values; they are equal if none is written."""
     if not written:
         return [1.0 / count] * count
     if len(written) < count:
@@ -306,7 +306,7 @@ def _empirical(text: str, arguments: Sequence[str], folder: Path, mark: Location
             raise ValueError(f"{path.name} gives the unit {unit} of {name}: remove the unit here")
         scale, unit = _unit(options["unit"])
         samples = samples * scale
-    # a recipe has no e-/DN; any other unit that a recipe does not have raises
+    # e-/DN is allowed; for any other unit that recipes do not use, `_unit` raises
     reciprocal = unit == "e-/DN"
     if unit and not reciprocal:
         _unit(unit)
@@ -337,7 +337,7 @@ def _options_of(arguments: Sequence[str]) -> dict[str, str]:
 
 
 def _column(path: Path, names: Sequence[str], name: str | None) -> str:
-    """Return the column that is named, or the only one.
+    """Return the name of the column to read: the one that is written, or that of the only column.
 
     Raise ValueError if it is not clear which.
     """
@@ -374,22 +374,22 @@ _READERS: dict[str, Callable[[str, str, Sequence[str]], Law]] = {
 
 # --- mismatch laws --------------------------------------------------------------------------------
 
-# Laws of how a camera differs from what a recipe says of it: a training draws them, and the
-# restorer is not told.
+# Distributions of the difference between a camera and its recipe: a training draws the differences,
+# and the restorer does not know them.
 #
 # A ``lognormal`` or ``loguniform`` law multiplies the value of the recipe; any other law, or a
 # single value, is added to it.
 
 
-#: standard deviation of a true value that is certain, relative to the value of the recipe
+#: standard deviation in place of 0, relative to the value of the recipe
 _NARROW = 1e-3
-_NARROWEST = 1e-9  #: standard deviation in SI if the value of the recipe is 0
-ANGLE = "angle"  #: key of the direction of a laser, of which y and x differ independently
+_NARROWEST = 1e-9  #: standard deviation in place of 0, in SI, if the value of the recipe is 0
+ANGLE = "angle"  #: key of the direction of a laser, whose y and x differ independently
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The law of the difference of one value from that of the recipe."""
+    """Distribution of the difference between a value of the camera and that of the recipe."""
 
     law: Law
     own: float  #: value of the recipe, in SI
@@ -401,7 +401,9 @@ class Difference:
 
     @property
     def truth(self) -> Law:
-        """Return the distribution of the true value, which is nowhere a single value."""
+        """Return the distribution of the true value; a single value becomes a narrow normal
+        distribution.
+        """
         shape: Shape = self.law.shape
         if isinstance(shape, Normal) and not shape.sd:
             shape = Normal(shape.mean, abs(self.own) * _NARROW or _NARROWEST)
@@ -438,9 +440,10 @@ def _laws(block: Value, above: str = "") -> Iterator[tuple[str, Value]]:
 
 
 def _difference(path: str, leaf: Value, root: Value) -> Difference:
-    """Return the law of how the value at a path of the recipe differs in truth.
+    """Return the distribution of the difference between the true value and the recipe's value at a
+    path.
 
-    Lognormal and loguniform laws are factors, all others are added.
+    Lognormal and loguniform distributions are factors; all others are added.
     """
     value_in_recipe = root.below(path.split("."))
     if value_in_recipe is None:
@@ -470,7 +473,7 @@ def _difference(path: str, leaf: Value, root: Value) -> Difference:
 
 
 def _refuse_factor(law: Law, path: str, value: float) -> None:
-    """Raise ValueError for a factor with a unit, and for a value that no factor changes."""
+    """Raise ValueError for a factor with a unit, and for a value of 0, which no factor changes."""
     if law.unit:
         raise ValueError(f"{law.kind} multiplies {path}: write it without the unit {law.unit}")
     if not value:
@@ -491,6 +494,6 @@ def _own(path: str, own: Value) -> tuple[float, str]:
 
 
 def _single(leaf: Value) -> Law:
-    """Return a certain difference as a law: a normal distribution without width."""
+    """Return a difference that is a single value as a normal distribution without width."""
     value, unit = read_any(leaf.plain)
     return Law("normal", str(leaf.data), Normal(value, 0.0), unit)

@@ -1,5 +1,5 @@
-"""Nominal values of uncertain inputs, which a run uses in place of probability distributions and of
-a posterior.
+"""Nominal values of uncertain inputs: the single values that a run uses in place of probability
+distributions and of a posterior.
 
 A run uses the median of a distribution and the value that ``posterior`` chooses; the study of
 uncertainty draws values.
@@ -34,7 +34,7 @@ KEY = "posterior"  #: key of the block in a recipe
 _BLOCK = "sensor"  #: block of the values that a calibration names without their block
 _KEYS = ("file", "use", "values")
 _SUMMARY = ("mean", "sd", "correlation", "covariance")
-#: units whose numbers a table could mean in another scale
+#: units in which a number without a unit could mean another multiple, such as mm
 _MANY_SCALES = ("m", "s", "rad", "W", "J", "Hz")
 #: probability of each tail of a posterior in which a recipe's own value counts as far off
 _FAR = 0.005
@@ -76,7 +76,7 @@ class Uncertain:
     source: str = ""  #: of the posterior
     #: SI unit by path of the values in the joint distribution
     units: Mapping[str, str] = field(default_factory=dict)
-    #: by path, of the true values of a training
+    #: by path: difference between the true value in a training and the value of the recipe
     mismatch: Mapping[str, Difference] = field(default_factory=dict)
 
     @property
@@ -142,7 +142,7 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
     """Yield the path and the value of every distribution in a recipe; a value with YAML aliases
     has several paths.
     """
-    # `_laws_in` takes from the end of its stack: both together keep one order
+    # reversed, because `_laws_in` takes from the end of its stack: together they keep one order
     for key, block in reversed(root.items.items()):
         if key != KEY:
             yield from (((key, *path), value) for path, value in _laws_in(block))
@@ -150,8 +150,8 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
 
 @functools.lru_cache(maxsize=64)
 def _laws_in(block: Value) -> tuple[tuple[Where, Value], ...]:
-    """Return the distributions in a block, which the points of a sweep share where they have the
-    same block.
+    """Return the distributions in a block with their paths; cached, because the points of a sweep
+    share unchanged blocks.
     """
     laws: list[tuple[Where, Value]] = []
     stack: list[tuple[Where, Value]] = [((), block)]
@@ -247,8 +247,8 @@ class _Reader:
         raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){number}")
 
     def _pairs(self, setting: Value | None, posterior: Posterior) -> dict[str, str]:
-        """Return the name in the posterior for each value that the recipe takes from it, by the
-        value's recipe path.
+        """Return, by recipe path, the name in the posterior of each value that the recipe takes
+        from it.
         """
         names = posterior.joint.names
         pairs = self._own_pairs(names) if setting is None else _stated_pairs(setting, names)
@@ -272,8 +272,8 @@ class _Reader:
         return pairs
 
     def _own_pairs(self, names: Sequence[str]) -> dict[str, str]:
-        """Return the name in the posterior for each value of the recipe that has the same name; say
-        which names have no value.
+        """Return, by recipe path, the names in the posterior that values of the recipe have; note
+        the names without a value.
         """
         all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
         pairs = {path: name for path, name in all_pairs.items() if self._value(path) is not None}
@@ -322,7 +322,8 @@ class _Reader:
     def _apply(
         self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Location
     ) -> None:
-        """Put the values of the posterior into the recipe, and compare them with those that it has.
+        """Put the values of the posterior into the recipe, and compare them with the recipe's own
+        values.
 
         A value that an argument sets stays; a distribution in the recipe is a mistake.
         """
@@ -330,7 +331,7 @@ class _Reader:
         for path, name in pairs.items():
             value = self._value(path)
             assert value is not None
-            # an argument of the command has no line
+            # line 0: an argument of the command sets this value
             if path in self.laws or value.mark.line == 0:
                 if path in self.laws and value.mark.line:
                     self._fail(
@@ -399,8 +400,8 @@ class _Reader:
 
 
 def _unit_fault(name: str, unit: str, own: str) -> str:
-    """Return what is wrong with the unit of a value of the posterior, beside the unit of the
-    recipe's ``own`` value.
+    """Return what is wrong with the unit of a posterior's value, compared with the unit ``own`` of
+    the recipe's value; empty if nothing is wrong.
     """
     if not unit and own in _MANY_SCALES:
         return (
@@ -416,7 +417,7 @@ def _unit_fault(name: str, unit: str, own: str) -> str:
 
 
 def _stated_pairs(setting: Value, names: Sequence[str]) -> dict[str, str]:
-    """Return the name in the posterior for each value by its path, as a recipe states them."""
+    """Return, by recipe path, the names in the posterior that a recipe states."""
     if not isinstance(setting.data, dict):
         raise ValueError(
             "values must be a mapping: write values: {path in the recipe: name in the posterior}"

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-_REACH = 11.0  #: standard deviations that contain all of a normal distribution, also times z**20
+_REACH = 11.0  #: standard deviations beyond which a normal density is negligible, even times z**20
 _NODES = 4097  #: points of the measure of a continuous distribution
-_ROUNDING = 1e-12  #: probability by which a sum of weights may miss the probability of a step
+_ROUNDING = 1e-12  #: rounding error that is allowed in a cumulative sum of weights
 _SMALLEST_SHARE = 1e-9  #: smallest probability between the bounds of a truncated distribution
 
 
@@ -325,7 +325,7 @@ def share_between(low: float, high: float) -> float:
 
 
 def scores_between(z: FloatArray, low: float, high: float) -> FloatArray:
-    """Map standard normal numbers to those of the normal distribution truncated to ``low`` …
+    """Map standard normal numbers to numbers with the normal distribution truncated to ``low`` …
     ``high``.
 
     The map keeps the order, and both tails keep their accuracy.
@@ -351,8 +351,8 @@ def _score(probability: float) -> float:
 
 
 def _normal_measure() -> tuple[FloatArray, FloatArray]:
-    """Return standard normal numbers and their probabilities; the rule is exact to rounding for
-    smooth functions.
+    """Return nodes and weights of a quadrature rule for the standard normal distribution; for
+    smooth functions it is exact to rounding error.
     """
     z = np.linspace(-_REACH, _REACH, _NODES)
     weights = np.exp(-(z**2) / 2)
@@ -365,7 +365,7 @@ def _normal_measure() -> tuple[FloatArray, FloatArray]:
 # ``10.5 e-``.
 
 
-#: normal scores whose values are tried
+#: normal scores at which `Law.other_than` looks for another value
 _PROBES = (0.3, -0.3, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 6.0, -6.0)
 
 
@@ -397,16 +397,16 @@ class Law:
         return float(self.at(np.zeros(())))
 
     def other_than(self, value: float) -> float:
-        """Return a value of the distribution that differs from ``value``, unless all others are
-        rarer than 1e-9.
+        """Return a value of the distribution that differs from ``value``, or ``value`` itself if
+        all others are rarer than 1e-9.
         """
         values = self.at(np.array(_PROBES))
         return float(next((x for x in values if x != value), value))
 
     @property
     def multiplies(self) -> bool:
-        """Return True if a difference with this distribution is a factor, as that of a lognormal
-        distribution.
+        """Return True if a difference with this distribution is a factor (lognormal and
+        loguniform).
         """
         shape = self.shape.shape if isinstance(self.shape, Truncated) else self.shape
         return isinstance(shape, LogNormal | LogUniform)
@@ -429,8 +429,8 @@ class Law:
         return f"{self.text} {samples}".strip()
 
     def truncated(self, low: float, high: float) -> Law:
-        """Return the distribution of numbers as written between two bounds in SI; raise
-        ValueError if none is left.
+        """Return the distribution truncated to bounds in SI, which hold for the number as written;
+        raise ValueError if almost nothing is left.
         """
         return replace(self, shape=self.shape.truncated(low, high))
 
@@ -438,8 +438,8 @@ class Law:
 def draw_laws(
     laws: Mapping[str, Law], count: int, seed: Sequence[int], first: int = 0
 ) -> dict[str, list[float]]:
-    """Return ``count`` independent draws of each law in SI, from the number ``first`` on, by the
-    name of the law.
+    """Return ``count`` independent draws of each distribution in SI, from draw number ``first`` on,
+    by the name of the distribution.
     """
     z = np.random.default_rng(list(seed)).standard_normal((first + count, len(laws)))[first:]
     return {name: law.at(z[:, i]).tolist() for i, (name, law) in enumerate(laws.items())}

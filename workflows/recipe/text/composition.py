@@ -67,8 +67,8 @@ class Groups:
         return values
 
     def _file(self, option: Option, open_: tuple[Path, ...]) -> Path | None:
-        """Return the file of an option; one that extends its own name extends that of the next
-        folder.
+        """Return the file of an option; an option that extends its own name extends the option of
+        this name in the next folder.
 
         ``open_``: the files of options that are being read.
         """
@@ -119,8 +119,8 @@ class Groups:
         return self.merge(values, root.mark) if len(values) > 1 else root
 
     def _absent(self, option: Option, open_: tuple[Path, ...]) -> str:
-        """Return the message for an option without a file, or with the files of all folders in
-        use.
+        """Return the message for an option that no folder has, or whose files are all being read
+        already.
         """
         options = self.names()
         if option.group not in options:
@@ -156,7 +156,7 @@ class Groups:
 
 
 def _is_link(file: Path, folder: Path) -> str:
-    """Return the message for an option that is a link out of its folder."""
+    """Return the message for an option whose file is a link to another folder."""
     return (
         f"{shown(file, folder)} is a link to another folder, which {NO_CODE_VARIABLE} or --no-code"
         " refuses"
@@ -184,8 +184,8 @@ class Composed:
     #: ``scene=siemens``
     replaced: tuple[tuple[Where, str], ...] = ()
     notes: tuple[str, ...] = ()  #: on options that hide others of the same name
-    groups: tuple[str, ...] = ()  #: names of the groups of which it has an option
-    own_blocks: frozenset[str] = frozenset()  #: blocks that the recipes write, beside the options
+    groups: tuple[str, ...] = ()  #: names of the groups from which it takes an option
+    own_blocks: frozenset[str] = frozenset()  #: blocks that the files of the recipes write
     extended: tuple[Path, ...] = ()  #: files of the recipes that it extends, at any depth
 
     def without(self, key: str) -> Composed:
@@ -216,7 +216,7 @@ class Composer:
         document = read(self._path, shown(self._path, folder))
         self._written = Extension(folder).written(self._path, document)
         self._hides = hiding_notes(self._path, recipe)
-        # before the arguments that set single values
+        # by the chosen options, before the arguments that set single values
         self._known: dict[tuple[Choice, ...], Composed] = {}
 
     def compose(self, arguments: Sequence[str | Override], first: int = 1) -> Composed:
@@ -231,7 +231,8 @@ class Composer:
                 )
             except RecipeError as error:
                 diagnostics += error.diagnostics
-        if not self._written.is_complete:  # what lacks a recipe lacks what arguments change
+        # without an extended recipe, the values that arguments change may be missing
+        if not self._written.is_complete:
             overrides = []
         choices, values = _choose(self._written, overrides, self._groups(diagnostics))
         # points of a sweep with the same options share the composed recipe
@@ -343,8 +344,8 @@ def _names_options(override: Override) -> bool:
 def _replaced(
     written: Written, choices: Iterable[Choice], groups: Groups
 ) -> Iterator[tuple[Where, str]]:
-    """Yield the path of each value in an option that a recipe names and an argument, or a recipe
-    that extends it, replaces or removes.
+    """Yield the path of each value in the options of a recipe that an argument, or an extending
+    recipe, replaces or removes, with the text of the new choice.
     """
     final_choices = {entry.group: entry for entry in choices}
     silent_groups = replace(groups, diagnostics=[], notes=[])

@@ -1,5 +1,5 @@
-"""A recipe with those that it extends: the entries of its list ``defaults``, and the recipes as one
-list of layers, of which a later one wins.
+"""A recipe and the recipes that it extends: the entries of its list ``defaults``, and the values of
+all as one list of layers, in which a later layer overrides an earlier one.
 
 A layer has the options of a group, or the values that a file itself writes.
 """
@@ -52,12 +52,14 @@ class Option:
     name: str
     mark: Location
     shown: str  #: the choice as the user wrote it, for a message
-    is_optional: bool = False  #: whether a run goes on without it, if there is no such option
+    is_optional: bool = False  #: whether a missing option is no mistake
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Entry ``group: option``: the options of a group, of which a later one wins; none for null."""
+    """Entry ``group: option``: the options of a group, of which a later one overrides an earlier
+    one; none for null.
+    """
 
     group: str
     options: tuple[Option, ...]
@@ -80,7 +82,7 @@ class Extended:
 
 @dataclass(frozen=True, slots=True)
 class OwnValues:
-    """Entry ``_self_``: where the values of the file itself stand among the others."""
+    """Entry ``_self_``: the position of the file's own values among the entries."""
 
     mark: Location
 
@@ -104,7 +106,7 @@ def entries_of(root: Value, diagnostics: list[Diagnostic], group: str = "") -> l
 def choice(
     group: str, values: Sequence[Value], mark: Location, shown: str, is_optional: bool = False
 ) -> Choice:
-    """Return the choice of the options in ``values``, of which null is none."""
+    """Return the choice of the options in ``values``; null adds no option."""
     options = tuple(
         Option(group, str(value.data), value.mark, shown, is_optional)
         for value in values
@@ -138,7 +140,9 @@ def _listed(block: Value, diagnostics: list[Diagnostic], group: str) -> list[Ent
 
 
 def _identity(entry: Entry, group: str) -> tuple[str, tuple[str, str]]:
-    """Return the name of an entry for a message, and what no second entry of the list may have."""
+    """Return the name of an entry for a message, and the identity by which repeated entries are
+    found.
+    """
     if isinstance(entry, OwnValues):
         return SELF, (SELF, "")
     if isinstance(entry, Extended):
@@ -206,7 +210,7 @@ class Written:
     root: Value  #: of its own file
     title: str
     layers: tuple[Layer, ...]
-    replaced: tuple[Choice, ...]  #: choices of extended recipes in whose place is another one
+    replaced: tuple[Choice, ...]  #: choices of extended recipes that a later choice replaces
     extended: tuple[Path, ...]  #: files of the recipes that it extends, at any depth
     diagnostics: tuple[Diagnostic, ...]
     notes: tuple[str, ...]
@@ -231,8 +235,8 @@ class Written:
         return frozenset(keys - {"defaults"})
 
     def layers_with(self, choices: Iterable[Choice]) -> list[Layer]:
-        """Return the layers with other choices: each in the place of the former one of its group,
-        and a new one before the values of the recipe itself.
+        """Return the layers with other choices: each replaces the former choice of its group, and a
+        choice of a new group comes before the values of the recipe itself.
         """
         chosen_groups = {entry.group: entry for entry in choices}
         layers: list[Layer] = []
@@ -269,8 +273,8 @@ class Extension:
         )
 
     def _layers(self, root: Value, open_: tuple[Path, ...]) -> list[Layer]:
-        """Return the layers of the recipe in the last file of ``open_``, which extend each other in
-        this order.
+        """Return the layers of the recipe in the last file of ``open_``; each of these files
+        extends the next one.
         """
         layers: list[Layer] = []
         for entry in entries_of(root, self.diagnostics):
@@ -283,7 +287,9 @@ class Extension:
         return layers
 
     def _add_choice(self, entry: Choice, layers: list[Layer]) -> None:
-        """Add a choice to the layers, in the place of that which an extended recipe has."""
+        """Add a choice to the layers, in place of the choice of the same group in an extended
+        recipe.
+        """
         for position, layer in enumerate(layers):
             if isinstance(layer, Choice) and layer.group == entry.group:
                 if entry.is_optional:
@@ -337,10 +343,10 @@ class Extension:
         raise ValueError(f"no such file; {similar_file(entry.name, path, folder)}")
 
     def _file_of_name(self, entry: Extended, open_: tuple[Path, ...]) -> Path:
-        """Return the file of a recipe by its name: beside the file that names it, or where the
-        recipes of all are; raise ValueError if there is none.
+        """Return the file of a recipe by its name, in the folder of the file that names it or in a
+        shared folder; raise ValueError if there is none.
 
-        A recipe that extends its own name extends that of the next folder.
+        A recipe that extends its own name extends the recipe of this name in the next folder.
         """
         folders = tuple(dict.fromkeys((open_[-1].parent, *shared_folders())))
         later_folders = folders
@@ -389,7 +395,7 @@ def _absent(name: str, folders: tuple[Path, ...]) -> str:
 
 
 def _refuse_strange(file: Path, entry: Extended) -> None:
-    """Raise ValueError for a file outside of the folder of a stranger's recipe that extends it."""
+    """Raise ValueError for a file outside the folder of the untrusted recipe that extends it."""
     shared, folder = shared_folders(), Path(entry.mark.folder)
     is_own = file.parent in shared or any(
         folder.is_relative_to(shared_folder) for shared_folder in shared
@@ -402,8 +408,8 @@ def _refuse_strange(file: Path, entry: Extended) -> None:
 
 
 def _chosen_before(entry: Extended, layers: Sequence[Layer], before: Sequence[Layer]) -> str:
-    """Return what to do about groups of which an extended recipe has an option, and an earlier
-    entry too; or an empty text.
+    """Return the advice on groups from which both an extended recipe and an earlier entry choose an
+    option, or an empty text.
     """
     groups = {layer.group for layer in choices_in(layers)}
     earlier = [layer for layer in choices_in(before) if layer.group in groups]

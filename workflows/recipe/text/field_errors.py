@@ -1,5 +1,5 @@
-"""Sentences for values that a model of parameters or settings refuses: what to write, in the
-words of a recipe.
+"""Messages for invalid values of parameters and settings, which say in terms of a recipe what to
+write.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from neusee.workflows.recipe.text.yaml_values import Value
 _LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
 
-_LONG_NUMBER = 1e9  #: limit from which a number is told by its power of ten
+_LONG_NUMBER = 1e9  #: limit above which a message writes a number with a power of ten
 
 
 def message_of(error: ErrorDetails, value: Value) -> str:
-    """Return the sentence for an error of a model, so that the user knows what to write in place
-    of ``value``.
+    """Return the message for an error of a model, which says what to write in place of
+    ``value``.
     """
     if error["type"] == "missing" and isinstance(error["loc"][-1], str):
         return f"lacks {error['loc'][-1]}"
@@ -62,20 +62,21 @@ def _in_plain_words(text: str) -> str:
 
 
 def _limit_in_unit(error: ErrorDetails, value: Value) -> str:
-    """Return the sentence for a limit of a quantity in a unit that a reader would use, or "" for
-    any other error.
+    """Return the message for a value beyond its limit, with the limit in the unit that the user
+    wrote, or "" for any other error.
     """
     name = _limit_name(error)
     if name is None:
         return ""
     limit = error["ctx"][name]
+    # a number without a unit: the usual message would print a large limit with all its digits
     if not isinstance(value.data, str):
         return f"must be {_LIMITS[name]} {limit:g}" if abs(limit) > _LONG_NUMBER else ""
     try:
         _, unit, _ = read_written(value.data)
     except ValueError:
         return ""
-    # a tiny least value stands for a number above 0
+    # the sign is wrong, which matters more than a tiny least value
     if name == "ge" and limit > 0 and _is_at_most_zero(error["input"]):
         return "must be greater than 0"
     return f"must be {_LIMITS[name]} {in_words(limit, unit)}" if unit and limit else ""

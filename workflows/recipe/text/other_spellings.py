@@ -1,5 +1,5 @@
-"""Spellings of other programs and of neusee 0.1, with what a recipe of today has in their place: a
-habit of Hydra, and the former name of a key, a node or a parameter.
+"""Spellings of Hydra and of neusee 0.1 that a recipe does not have, with those to write instead:
+habits of Hydra, and former names of keys, nodes and parameters.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ _REMOVED: dict[str, str] = {
     ),
     **_TABLE["removed"],
 }
-#: present name by that of version 0.1, of a parameter
+#: present name of a parameter by its name in version 0.1
 POSTERIOR_NAMES: dict[str, str] = _TABLE["posterior"]
 
 

@@ -178,7 +178,9 @@ def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
 def _followed_similar(
     root: Value, path: tuple[str, ...], groups: Iterable[str]
 ) -> tuple[Value, list[str]]:
-    """Return the value at which a path of similar names ends, with these names."""
+    """Follow a path by the most similar names in a recipe; return the value at its end, and these
+    names.
+    """
     value, similar = root, list[str]()
     for name in path:
         names = set(map(str, value.items))
@@ -310,7 +312,7 @@ def _read(key: str, argument: Any, mark: Location) -> Iterator[Override]:
 
 
 def _named(key: str, argument: Any, mark: Location) -> Override:
-    """Return the override that the name of a keyword argument says, without its value."""
+    """Return the override, sign and path, in the name of a keyword argument, without its value."""
     if key.startswith("~") and argument is not None:
         raise RecipeError(
             [

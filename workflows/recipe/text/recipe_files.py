@@ -1,4 +1,6 @@
-"""Where the files of recipes and options lie, and which files a recipe of a stranger may name."""
+"""Locations of the files of recipes and options, and the files that an untrusted
+recipe may read.
+"""
 
 from __future__ import annotations
 
@@ -14,20 +16,20 @@ from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, nea
 
 # --- no code --------------------------------------------------------------------------------------
 
-# The switch ``--no-code``, with which a recipe is read as that of a stranger.
+# The switch ``--no-code``, with which every recipe counts as untrusted.
 
 
-#: any text but an empty one refuses recipes that name code, or files that are not in their folder
+#: any text but an empty one refuses recipes that name code, or files outside their folder
 NO_CODE_VARIABLE = "NEUSEE_NO_CODE"
 
 
 def is_strange() -> bool:
-    """Return True if recipes count as those of strangers."""
+    """Return True if recipes count as untrusted."""
     return bool(os.environ.get(NO_CODE_VARIABLE))
 
 
 def is_inside(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> bool:
-    """Return True if a path leads to something in a folder, whatever links are on the way."""
+    """Return True if a path is in a folder after all links are resolved."""
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
@@ -50,8 +52,8 @@ def packaged() -> Path:
 
 
 def user_folder() -> Path:
-    """Return the folder of the user for recipes and groups, as his system places the
-    configuration of programs.
+    """Return the user's folder for recipes and groups, at the place where the operating system
+    keeps the configuration of programs.
     """
     home = Path.home()
     if sys.platform == "win32":
@@ -76,8 +78,8 @@ def shared_folders() -> tuple[Path, ...]:
 
 
 def search_folders(recipe: Path, extended: Iterable[Path], folder: Path) -> tuple[Path, ...]:
-    """Return the folders in which the groups of a recipe are searched: beside it, beside the
-    recipes that it extends, and those of all recipes. Beside a packaged recipe is ``folder``.
+    """Return the folders in which the groups of a recipe are searched: its own folder (for a
+    packaged recipe: ``folder``), those of the recipes that it extends, and the shared folders.
     """
     first_folder = folder if recipe.parent == packaged() else recipe.parent
     extended_folders = [file.parent for file in extended if file.parent != packaged()]
@@ -173,13 +175,12 @@ def hiding_notes(path: Path, recipe: str | Path) -> list[str]:
 
 # --- named files ----------------------------------------------------------------------------------
 
-# Files that a recipe names: with ``--no-code`` those in its own folder alone, so that it shows none
-# of the reader.
+# Files that a recipe names: with ``--no-code`` only those in its own folder, so that a recipe
+# cannot show other files of the reader.
 
 
 def refuse_outside(path: Path, mark: Location) -> None:
-    """Raise ValueError for a file that a recipe of a stranger names outside the folder of the YAML
-    file.
+    """Raise ValueError for a file outside the folder of the YAML file, if the recipe is untrusted.
 
     ``mark`` is the place of the path. An argument of the reader, and a file in the reader's own
     folders of recipes, may name any file.
@@ -199,7 +200,7 @@ def refuse_outside(path: Path, mark: Location) -> None:
 
 
 def _is_argument(mark: Location) -> bool:
-    """Return True for a place on the command line; what a recipe passes on as one has the place
-    in the recipe.
+    """Return True for a place on the command line; an argument that a recipe itself states has its
+    place in the recipe.
     """
     return not mark.line and ":" not in mark.file

@@ -84,7 +84,7 @@ class References:
         self.open: list[Where] = []  #: values that are being resolved
         self.lacking: list[tuple[Where, Diagnostic]] = []  #: targets that do not exist
         self.spare: set[Where] = set()  #: unused values of packaged options
-        #: values to which an optional reference refers and that nobody gave
+        #: paths of missing values to which optional references refer
         self.offered: set[Where] = set()
         self.followed = 0  #: references followed since the last value of a step was begun
         #: number of values in each list or mapping, by identity
@@ -195,13 +195,15 @@ class References:
         elif any(child.data is BROKEN for child in value.items.values()):
             value = replace(value, data=BROKEN)
         if target.path[0] != "steps":
-            # each once: nested lists would grow it
+            # each path once, because nested lists would repeat them
             self.trace[first_trace:] = dict(self.trace[first_trace:]).items()
             self.known[target.path], self._traces[target.path] = value, self.trace[first_trace:]
         return value
 
     def _chain_fault(self, target: Value) -> str:
-        """Return what is wrong with one more reference behind those that are being resolved."""
+        """Return why a reference cannot be followed (a cycle, a long chain, too many values), or an
+        empty text.
+        """
         if target.path in self.open:
             cycle = [*self.open[self.open.index(target.path) :], target.path]
             return f"the value refers to itself: {' -> '.join(map(dotted, cycle))}"
@@ -221,7 +223,7 @@ class References:
             return 1
         if id(value.data) not in self.weights:
             weight = 1 + sum(map(self._weight, value.items.values()))
-            # kept alive, so that its identity stays its own
+            # the object is kept, so that no other object gets its identity
             self.weights[id(value.data)] = weight, value.data
         return self.weights[id(value.data)][0]
 
@@ -286,7 +288,7 @@ class References:
         self._report_lacking(misspelt)
 
     def _report_lacking(self, misspelt: Container[Where]) -> None:
-        """Report the references to values that do not exist, but for those in ``misspelt``."""
+        """Report the references to values that do not exist, except those in ``misspelt``."""
         lacking = [(path, problem) for path, problem in self.lacking if path not in misspelt]
         incomplete = dict(self._incomplete({path for path, _ in lacking}))
         self.diagnostics += incomplete.values()
@@ -295,8 +297,8 @@ class References:
         ]
 
     def _may_be_unused(self, leaf: Value) -> bool:
-        """Return True for a value of a packaged option, and for one of an option that an argument
-        replaces, which is noted.
+        """Return True for a value of a packaged option, and, with a note, for a value of an option
+        that an argument replaces.
         """
         if _is_packaged(leaf):
             return True
@@ -340,7 +342,7 @@ class References:
 
 def _lacking_message(block: Value, paths: Iterable[Where]) -> str:
     """Return the message for a block of the user that lacks the values at ``paths``, or an empty
-    text where each step says so itself.
+    text if each step reports this itself.
     """
     if not block.mark.line or not isinstance(block.data, dict):
         return ""
@@ -354,8 +356,8 @@ def _lacking_message(block: Value, paths: Iterable[Where]) -> str:
 
 
 def _unknown(leaf: Value, meant: Where, needed: Diagnostic | None) -> Diagnostic:
-    """Return the diagnostic for a value that no step uses; ``needed`` is the one of a missing value
-    that the user probably ``meant``.
+    """Return the diagnostic for a value that no step uses; ``needed`` is the diagnostic for a
+    missing value that the user probably ``meant``.
     """
     if advice := instead(leaf.name):
         return Diagnostic(leaf.key, leaf.name, advice)
@@ -368,8 +370,8 @@ def _unknown(leaf: Value, meant: Where, needed: Diagnostic | None) -> Diagnostic
 
 
 def _place(block: Value) -> Literal["packaged", "option", "recipe"]:
-    """Return where a block of a recipe is from: a packaged file, an option of a group of the
-    user, or his recipe.
+    """Return where a block of a recipe is from: a packaged file, an option of a user's group, or a
+    user's recipe.
     """
     folder = Path(block.mark.folder)
     if packaged() in (folder, folder.parent):

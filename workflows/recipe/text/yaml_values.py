@@ -147,7 +147,7 @@ def _missing_space(error: MarkedYAMLError, text: str) -> YamlMistake | None:
 
 
 def _unfinished_key(text: str, line: int, column: int) -> YamlMistake:
-    """Return the mistake of a key at a place that no colon with a space follows."""
+    """Return the mistake of a key that no colon with a space follows."""
     key_and_value = (text.splitlines() or [""])[line][column:].split(" #")[0].strip()
     key, colon, value = key_and_value.partition(":")
     advice = f"write `{key}: {value}`" if colon and value else "write `key: value`"
@@ -156,8 +156,7 @@ def _unfinished_key(text: str, line: int, column: int) -> YamlMistake:
 
 
 def _text_goes_on(error: MarkedYAMLError, text: str) -> YamlMistake | None:
-    """Return the mistake of a key that YAML reads as more of the text before it, which began on an
-    earlier line.
+    """Return the mistake of a key that YAML reads as a continuation of a text from an earlier line.
 
     The text before is a key without a space behind its colon, such as ``seed:7``, or a value, and
     then the indent of the later key is wrong.
@@ -235,9 +234,7 @@ def _advice_on_brackets(problem: str, here: str) -> str:
 
 
 def _wrong_indent(problem: str, here: str) -> str:
-    """Return the sentence for a line that belongs to no mapping or list that is open, because of
-    its indent.
-    """
+    """Return the message for a line whose indent fits no open mapping or list."""
     indent = len(here) - len(here.lstrip(" "))
     if problem.endswith(("'<scalar>'", "'<alias>'", "'<tag>'")):
         return "text after the end of a value: quote the whole value, or begin a new line"
@@ -531,8 +528,8 @@ class _Builder:
         return -1 if is_hidden else int(node.start_mark.column)
 
     def _fault(self, node: Node, tag: str) -> str:
-        """Return what is wrong with a value that the parser reads otherwise than YAML 1.2 has it,
-        or that would harm a reader; or an empty text.
+        """Return what is wrong with a value that the parser reads differently from YAML 1.2, or
+        that could harm a reader; or an empty text.
         """
         fault = _fault(str(node.value)) if isinstance(node, ScalarNode) else ""
         return fault or self._tag_fault(node, tag) or self._end_fault(node)
@@ -558,7 +555,7 @@ class _Builder:
         end_index = node.end_mark.index
         if self.text[end_index : end_index + 1] == "#":
             return "a comment needs a space before its #, after this value"
-        if self.column is None:  # the brackets around it have been looked at, with all their lines
+        if self.column is None:  # the check of the enclosing brackets covers all their lines
             return ""
         # many write a closing bracket, or a comment, under the key
         exempt_starts = "]}#" if isinstance(node, CollectionNode) else ""
@@ -691,7 +688,9 @@ def _scalar(node: ScalarNode) -> Any:
 
 
 def _fits(node: Node, tag: str) -> bool:
-    """Return True if a tag that a text writes says what the value is without it, or a text."""
+    """Return True if the explicit tag of a value is ``!!str`` or the type that the value has
+    without it.
+    """
     if isinstance(node, MappingNode):
         return tag == "!!map"
     if not isinstance(node, ScalarNode):
@@ -732,7 +731,7 @@ def _is_enclosed(node: Node) -> bool:
 
 
 def _lacks_space(key: str | int | None, value: Node) -> bool:
-    """Return True for a key such as ``seed:7``, behind which nothing is written."""
+    """Return True for a key such as ``seed:7`` without a value, in which a space is missing."""
     is_empty = isinstance(value, ScalarNode) and value.style is None and str(value.value) == ""
     return is_empty and isinstance(key, str) and _LACKS_SPACE.fullmatch(key) is not None
 

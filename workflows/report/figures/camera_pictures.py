@@ -93,8 +93,8 @@ def centre(image: Tensor, like: Tensor) -> Tensor:
 
 
 def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
-    """Draw a ring around the brightest pixel of each laser, unless this pixel is on the rim:
-    that laser is outside.
+    """Draw a ring around the brightest pixel of each laser, unless this pixel is at the rim,
+    because the laser is then outside the picture.
     """
     from matplotlib.patches import Circle
 
@@ -151,6 +151,7 @@ def _points(scene: Tensor) -> list[tuple[int, int]]:
     """Return (y, x) of the reddest, the greenest and the bluest pixel of the scene that is
     neither dark nor clipped.
     """
+    # means of 5 x 5 pixels, so that single noisy pixels are not chosen
     blurred = (
         torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0]
         if min(scene.shape[-2:]) >= 5
@@ -226,13 +227,13 @@ def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
 
 # --- frame and interval ---------------------------------------------------------------------------
 
-# A frame that somebody took, the restored picture, and what is not known of each of its pixels.
+# A frame of a real camera, the restored picture, and the uncertainty of each of its pixels.
 
 
-BRIGHT = 1.5  #: times white, which nothing that is lit by the light of the scene exceeds by much
+BRIGHT = 1.5  #: times white; what the light of the scene illuminates hardly exceeds it
 _LEVEL = 0.95  #: of the quantile of Student's t that ends an interval of 90 %
-#: degrees of freedom of a draw, whose errors are averaged over 7 x 7 pixels and alike in a few of
-#: them
+#: degrees of freedom of one draw: its errors are averaged over 7 x 7 pixels, and are correlated
+#: among a few of them
 _FREEDOM_OF_A_DRAW = 4
 
 
@@ -246,10 +247,10 @@ def half_width(spread: Tensor, draws: int) -> Tensor:
 
 
 def unexplained(restored: Tensor, half: Tensor, invented: Tensor) -> Tensor:
-    """Return True for pixels (y, x) that no scene explains: darker than black or brighter than
-    `BRIGHT` white.
+    """Return True for pixels (y, x) that no scene explains: darker than black, or brighter than
+    `BRIGHT` times white.
 
-    The half width of the interval is allowed for, and saturated pixels do not count.
+    Such a value is outside by more than the half width of the interval; saturated pixels are False.
     """
     outside = (restored < -half) | (restored > BRIGHT + half)
     return outside.any(0) & ~invented

@@ -134,7 +134,7 @@ def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
 
 
 def _mean(values: list[float], other: float) -> float:
-    """Return the mean of values, or ``other`` without any."""
+    """Return the mean of values, or ``other`` if there are none."""
     return sum(values) / len(values) if values else other
 
 
@@ -237,7 +237,7 @@ _STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3
 
 
 class _Chart(NamedTuple):
-    """What the bars of a Gantt chart show."""
+    """Times and colours of the bars of a Gantt chart."""
 
     plan: Spans
     ran: Spans
@@ -282,7 +282,7 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
 
 
 def _lanes_in_use(schedule: Schedule, plan: Spans, ran: Spans) -> list[str]:
-    """Return the lanes of planned and of actual steps, those of the schedule first."""
+    """Return the lanes (devices) of planned and of actual steps, those of the schedule first."""
     in_use = dict.fromkeys(lane for lane, _, _ in (*plan.values(), *ran.values()))
     return [
         *(lane for lane in schedule.peak if lane in in_use),
@@ -349,9 +349,7 @@ def _steps(ax: Any, steps: Sequence[str], chart: _Chart, critical: set[str]) -> 
 
 
 def _bar(ax: Any, y: float, start: float, width: float, height: float, **look: Any) -> None:
-    """Draw a bar whose row is in the limits of the axes, which are therefore not computed from
-    the bars.
-    """
+    """Draw a bar without adjusting the limits of the axes, which are set to contain all bars."""
     from matplotlib.patches import Rectangle
 
     ax.add_artist(Rectangle((start, y - height / 2), width, height, linewidth=0.9, **look))
@@ -395,7 +393,7 @@ def _rows(ax: Any, names: Sequence[str]) -> None:
 
 
 def _title(plan: Spans, ran: Spans) -> str:
-    """Return when the planned and the actual run end, as text."""
+    """Return the end times of the planned and of the actual run as text."""
     times_by_word = {
         word: _time(max(start + duration for _, start, duration in spans.values()))
         for word, spans in (("planned", plan), ("took", ran))
@@ -423,8 +421,8 @@ def _time(seconds: float) -> str:
 
 
 def _letter() -> Any:
-    """Return a letter as a marker, without dollar signs, for which matplotlib first makes a
-    parser of formulas.
+    """Return the letter a as a marker; a text in dollar signs would make matplotlib build a parser
+    of formulas first.
     """
     from matplotlib.textpath import TextPath
     from matplotlib.transforms import Affine2D

@@ -116,6 +116,7 @@ def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
 
 def _spot(ax: Any, psf: Psf, band: int, name: str, pitch: float, arm: str) -> Any:
     """Draw the logarithm of a PSF around its middle in one band, and return the image."""
+    # at most 257 pixels, an odd number with the optical axis in the middle
     size = min(257, *psf.intensity.shape[-2:])
     log_psf = _window(metrics.over_clear_peak(psf, band), size).double().clamp_min(1e-30).log10()
     image = picture(

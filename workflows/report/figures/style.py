@@ -122,8 +122,8 @@ def png_of(figure: Any) -> bytes:
 
 
 def warm() -> None:
-    """Import what figures need and find the font, so that the first picture takes no longer than
-    others.
+    """Import the modules that figures need and find the font, so that the first picture takes no
+    longer than others.
     """
     with styled():
         figure, axes = canvas(1.0, 1.0)
@@ -278,8 +278,8 @@ def _contains(outer: Any, box: Any) -> bool:
 
 
 def plain_ticks(axis: Any) -> None:
-    """Label a logarithmic axis with plain numbers such as 0.5 and 20, as many as stand apart
-    from each other.
+    """Label a logarithmic axis with plain numbers such as 0.5 and 20, as many as fit without
+    touching.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -303,7 +303,7 @@ def plain_ticks(axis: Any) -> None:
 
 
 def _length(axis: Any) -> float:
-    """Return the length of an axis in points before the layout is known, on the short side."""
+    """Return a low estimate of the length of an axis in points, before the layout is known."""
     box = axis.axes.get_window_extent()
     pixels = box.width if axis.axis_name == "x" else box.height
     return float(_AXIS_SHARE * pixels * 72 / axis.figure.dpi)

@@ -29,7 +29,7 @@ from neusee.workflows.report.figures.style import (
 # float32.
 
 
-_LEAST_ERROR = 1e-17  #: an error of zero has no place on a logarithmic axis
+_LEAST_ERROR = 1e-17  #: drawn in place of zero, which a logarithmic axis cannot show
 STRENGTHS = (0.0, 1.0, 1e3, 1e6)  #: peak of the laser divided by the white of the scene
 METHODS = ("shifted PSF, added", "scene and laser\nin one convolution")
 
@@ -108,21 +108,22 @@ def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
 
 
 def _verdict(error: float) -> tuple[str, str]:
-    """Return the word and the colour of an error."""
+    """Return the verdict on a relative error in one word, and its colour."""
     if error < 1e-5:
         return "sound", "#9AD6C1"
     return ("watch", "#F6D58A") if error < 1e-3 else ("wrong", "#F2B08A")
 
 
 def laser_trial(step: Callable[..., Any], psf: Psf, size: int = 192) -> Tensor:
-    """Return the float32 error of the image of a laser, for each way to add the laser and for
-    each laser strength.
+    """Return the largest float32 error of the image of a laser (method, strength), for each way to
+    add the laser and for each laser strength.
     """
     band, half_size = (
         psf.intensity.shape[0] // 2,
         min(64, *(side // 2 for side in psf.intensity.shape[-2:])),
     )
     first_row, first_column = (side // 2 - half_size for side in psf.intensity.shape[-2:])
+    # the middle of the PSF in the middle band, at most 128 x 128 pixels
     psf_core = psf.intensity[
         band : band + 1,
         first_row : first_row + 2 * half_size,
@@ -156,6 +157,7 @@ def _errors(
     rows_from_laser, columns_from_laser = (
         torch.arange(side) - position for side in scene.shape[-2:]
     )
+    # more than 16 pixels from the laser
     is_far = (
         torch.hypot(rows_from_laser[:, None].double(), columns_from_laser[None, :].double()) > 16
     )
