@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 # --- calibration figures --------------------------------------------------------------------------
 
-# The pictures of a calibration: photon-transfer curve, rings about a source, and traces of the
+# The pictures of a calibration: photon-transfer curve, rings around a source, and traces of the
 # chains.
 
 
-# the ends and the middle of a band of 90 %
+# lower end, median and upper end of the central 90 %
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
-_POINTS = 1500  #: most points of a chain in the picture
-_LEAST_DRAWN_VARIANCE = 0.1  #: DN², the variance at which a level without scatter is drawn
+_POINTS = 1500  #: largest number of drawn points of a chain
+_LEAST_DRAWN_VARIANCE = 0.1  #: DN², lowest drawn variance, for levels without scatter
 _CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none"}
 COUNTED = "clipped or coarse: numbers counted one by one; variance at most as drawn"
 
@@ -44,8 +44,8 @@ def transfer(
     other: str,
     means: FloatArray | None = None,
 ) -> Any:
-    """Draw the photon-transfer curve, and the deviation of each light level from the posterior's
-    prediction.
+    """Draw the photon-transfer curve, and the deviation of each light level from the prediction of
+    the posterior.
 
     ``measured`` (2, level) has mean and variance, and ``predicted`` (2, draw, level) mean and
     variance of a repeated measurement. ``unclipped`` (level,) is False for levels without a
@@ -97,7 +97,7 @@ def transfer(
     # a clipped level does not stretch the axis
     curve_panel.set_ylim(bottom=lowest_drawn_variance / 2)
     curve_panel.legend(loc="upper left")
-    # measured less the mean of all draws, over the spread of the draws
+    # (measured - mean of all draws) / standard deviation of the draws
     variance_distance = (measured[1, unclipped] - predicted[1].mean(0)[unclipped]) / predicted[
         1
     ].std(0)[unclipped]
@@ -109,9 +109,7 @@ def transfer(
 
 
 def _distances(ax: Any, places: FloatArray, distance: FloatArray, label: str) -> None:
-    """Draw distances from a prediction in standard deviations, over a band of two standard
-    deviations.
-    """
+    """Draw deviations from a prediction in standard deviations, over a band of ±2."""
     ax.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
     ax.axhline(0, color=BLUE, linewidth=1.0)
     ax.plot(places, distance, "o", color=BLACK, markersize=5)
@@ -128,11 +126,11 @@ def rings(
     predicted: FloatArray,
     variance: FloatArray,
 ) -> Any:
-    """Draw the signal of the rings about an overexposed source over the radius, and its deviation
-    from the prediction.
+    """Draw the signal of the rings around an overexposed source against the radius, and its
+    deviation from the prediction.
 
-    ``measured`` (ring,) and ``predicted`` and ``variance`` (draw, ring) are electrons of a pixel
-    and their squares; ``cut`` (cut,) are the radii of the rings that are cut off.
+    ``measured`` (ring,), ``predicted`` and ``variance`` (draw, ring) are in electrons per pixel,
+    the variance in their square; ``cut`` (cut,) are the radii of the clipped rings.
     """
     figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     signal_panel, distance_panel = axes[0, 0], axes[1, 0]
@@ -158,7 +156,7 @@ def rings(
         xscale="log", yscale="log", ylabel="signal (e- of a pixel)", title="Rings about the source"
     )
     signal_panel.legend(loc="lower left")
-    # spread of the draws and noise of each ring, added as variances
+    # variance of the draws plus noise variance of each ring
     total_sd = np.sqrt(predicted.var(0) + variance.mean(0))
     _distances(
         distance_panel,
@@ -174,8 +172,8 @@ def rings(
 
 @drawn
 def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
-    """Draw a trace plot of each coordinate: the median and the middle 90 % of the walkers of
-    each ensemble.
+    """Draw a trace plot of each coordinate: median and central 90 % of the walkers of each
+    ensemble.
     """
     count = len(labels)
     figure, axes = canvas(9.0, 1.35 * count + 0.5, count, 1, sharex=True)
@@ -204,12 +202,13 @@ def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
 # which takes three times as long for ten parameters.
 
 
-_PAGE = 11.4  #: inches, the width of the page at 100 pixels an inch
-_WIDEST = 13  #: characters of a line of a label
+_PAGE = 11.4  #: inches, width of the page at 100 pixels per inch
+_WIDEST = 13  #: largest number of characters in a line of a label
 #: quantiles, so that a single draw does not squeeze a panel of the corner plot
 _NEARLY_ALL = (0.005, 0.995)
-_BINS = 20  #: of each side of a panel
-#: shares of the draws inside the contours
+_BINS = 20  #: number of bins along each side of a panel
+#: shares of the draws inside the contours: 0.5, 1, 1.5 and 2 sigma of a two-dimensional normal
+#: distribution
 _LEVELS = 1 - np.exp(-0.5 * np.array([0.5, 1.0, 1.5, 2.0]) ** 2)
 #: inches of a panel, of the margin with the labels, and between panels
 _SIZE, _LEFT, _GAP = 1.75, 0.9, 0.06
@@ -217,7 +216,7 @@ _SIZE, _LEFT, _GAP = 1.75, 0.9, 0.06
 
 @drawn
 def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -> Any:
-    """Draw a corner plot of all pairs of parameters, with the recipe's own values in orange."""
+    """Draw a corner plot of all pairs of parameters, with the values of the recipe in orange."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -231,7 +230,7 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
     for row in range(count):
         for column in range(row + 1):
             panel_left, panel_bottom = _LEFT + _SIZE * column, _LEFT + _SIZE * (count - 1 - row)
-            # matplotlib counts from below, in shares of the figure
+            # matplotlib counts from the bottom, in fractions of the figure
             ax = figure.add_axes(
                 (
                     panel_left / figure_inches,
@@ -247,7 +246,7 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
                 (nominal[column], nominal[row]),
             )
             x_label = names[column] if row == count - 1 else ""
-            # no label beside the first row: it is a histogram, whose height has no unit
+            # no label next to the first row: it is a histogram
             y_label = names[row] if column == 0 < row else ""
             _labelled(ax, x_label, y_label, font_size)
     return figure
@@ -256,10 +255,11 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
 def _panel(
     ax: Any, pair: FloatArray, ends: Sequence[tuple[float, float]], own: tuple[float, float]
 ) -> None:
-    """Draw the histogram of one parameter, or of two with contours.
+    """Draw the histogram of one parameter, or the two-dimensional histogram of two with contours.
 
-    `pair` (draw, 2) are the draws of both, `ends` the range of each axis, and `own` the recipe's
-    value of each. On the diagonal of the corner plot both are the same parameter.
+    ``pair`` (draw, 2) are the draws of both parameters, ``ends`` the range of each axis, and
+    ``own`` the recipe's value of each. On the diagonal of the corner plot both parameters are the
+    same.
     """
     ax.grid(False)
     ax.set_xlim(ends[0])
@@ -288,12 +288,12 @@ def _panel(
 
 
 def _heights(counts: FloatArray) -> FloatArray:
-    """Return the contour levels of a histogram, in draws of a cell, rising and without repetition.
+    """Return the contour levels of a histogram, in draws per cell, rising and without repetition.
 
-    The cells above a level hold one of the shares `_LEVELS` of all draws.
+    The cells above a level contain one of the shares `_LEVELS` of all draws.
     """
     falling_counts = np.sort(counts.ravel())[::-1]
-    # the fullest cells first, until they hold each share of all draws
+    # fill up from the fullest cell until the cells contain each share of all draws
     last_cell = np.searchsorted(np.cumsum(falling_counts), _LEVELS * falling_counts.sum())
     # the count of the last cell that belongs to each share
     contour_levels = np.unique(falling_counts[last_cell.clip(max=len(falling_counts) - 1)])
@@ -306,7 +306,7 @@ def _heights(counts: FloatArray) -> FloatArray:
 def _labelled(ax: Any, below: str, left: str, text: float) -> None:
     """Label the axes of a panel.
 
-    An axis without a label has no ticks either, and `text` is the size of the font.
+    An axis without a label has no ticks; ``text`` is the font size.
     """
     from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
@@ -321,13 +321,13 @@ def _labelled(ax: Any, below: str, left: str, text: float) -> None:
 
 
 def _wrapped(label: str) -> str:
-    """Return a label with its lines broken between words, so that it is no wider than a panel."""
+    """Return a label with line breaks between words, so that it is no wider than a panel."""
     return "\n".join(textwrap.fill(line, _WIDEST) for line in label.splitlines())
 
 
 def _ranges(draws: FloatArray, nominal: Sequence[float]) -> list[tuple[float, float]]:
-    """Return the range of each parameter in the corner plot: nearly all draws, and the recipe's
-    value if among them.
+    """Return the axis range of each parameter in the corner plot: nearly all draws, extended to the
+    recipe's value if that lies among the draws.
     """
     quantiles = np.quantile(draws, _NEARLY_ALL, axis=0).T
     margin = 0.1 * (quantiles[:, 1] - quantiles[:, 0])
@@ -371,7 +371,9 @@ _CORNER = 20_000  #: draws for the picture of pairs
 
 
 def curve_section(result: CalibrationResult) -> Section:
-    """Return the section with the photon-transfer curve, or with the rings about a point source."""
+    """Return the section with the photon-transfer curve, or with the rings around a point
+    source.
+    """
     if isinstance(result.problem.levels, Rings):
         return _rings(result, result.problem.levels)
     levels: Any = result.problem.levels
@@ -397,11 +399,11 @@ def curve_section(result: CalibrationResult) -> Section:
 
 
 def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Return mean and variance (draw, level) of a repeated measurement, with what scatters beyond
-    chance.
+    """Return mean and variance (draw, level) of a simulated repeated measurement, including the
+    fitted scatter of the variances.
 
-    For a real camera also the distances (level,) of the means from those that the light gives, in
-    standard deviations.
+    For a real camera the third value has the distances (level,) of the means from the prediction by
+    the light, in standard deviations; else None.
     """
     rng = np.random.default_rng(1)
     all_draws = result.walked.flat
@@ -413,7 +415,7 @@ def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray, FloatA
     scatter = np.broadcast_to(np.asarray(values.get("scatter", 0.0)), len(some_draws))
     # a sample variance has the relative standard deviation sqrt(2 / degrees of freedom)
     relative_sd = np.sqrt(2 / degrees_of_freedom + scatter[:, None] ** 2)
-    # what a repeated measurement would find: the predicted variance and its chance
+    # a repeated measurement: the predicted variance with its random error
     variance = prediction.variance.numpy() * (
         1 + relative_sd * rng.standard_normal(relative_sd.shape)
     )
@@ -428,7 +430,7 @@ def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def _rings(result: CalibrationResult, levels: Rings) -> Section:
-    """Return the section with the rings about a point source: their signal over the radius."""
+    """Return the section on the rings around a point source: signal against radius."""
     rng, all_draws = np.random.default_rng(1), result.walked.flat
     prediction = result.problem.likelihood(all_draws[rng.integers(len(all_draws), size=_PREDICTED)])
     picture = rings(
@@ -444,8 +446,8 @@ def _rings(result: CalibrationResult, levels: Rings) -> Section:
 
 
 def ring_radii(rings: Rings) -> tuple[FloatArray, FloatArray]:
-    """Return the root mean square radius of each averaged ring, and of each ring that is cut
-    off, in pixels.
+    """Return the root mean square radius in pixels of each averaged ring, and of each
+    clipped ring.
     """
     ring, count = rings.ring.numpy(), rings.weight.numpy()
     mean_square_radius = np.bincount(ring, count * rings.square.numpy()) / np.bincount(ring, count)
@@ -453,8 +455,8 @@ def ring_radii(rings: Rings) -> tuple[FloatArray, FloatArray]:
 
 
 def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the variance of all digital numbers of each light level, including
-    histograms.
+    """Return mean and variance of all digital numbers of each light level, including levels with a
+    histogram.
     """
     if isinstance(levels, Levels):
         return levels.mean.numpy(), levels.variance.numpy()
@@ -464,7 +466,7 @@ def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
     # sums of the powers 0, 1 and 2 of the digital numbers of each histogram
     power_sums = [np.bincount(level, count * value**n, minlength=len(pixels)) for n in range(3)]
     all_pixels = pixels + power_sums[0]
-    # both kinds of levels have sums: of plain moments, and of counted numbers
+    # combine both kinds of data: plain moments, and counted digital numbers
     all_mean = (pixels * mean + power_sums[1]) / all_pixels
     # mean of squares = variance + mean²
     square_sum = pixels * (variance + mean**2) + power_sums[2]

@@ -1,4 +1,4 @@
-"""The page of a calibration: parameters, checks, and the least squares of EMVA 1288."""
+"""The page of a calibration: parameters, checks, and the least-squares fits of EMVA 1288."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ if TYPE_CHECKING:
 
 # --- standard fit ---------------------------------------------------------------------------------
 
-# The least squares of EMVA 1288 beside the posterior: a section of the page, and a check that both
-# agree.
+# The least-squares fit of EMVA 1288 next to the posterior: a section of the page, and a check that
+# both agree.
 
 
-#: parameter of the posterior: field of `LeastSquares`, and what the field is called in EMVA 1288
+#: for each parameter of the posterior: the field of `LeastSquares`, and its name in EMVA 1288
 QUANTITIES = {
     "gain": ("gain", "overall system gain K"),
     "quantum_efficiency": ("efficiency", "quantum efficiency \u03b7"),
     "read_noise": ("temporal_dark_noise", "temporal dark noise \u03c3_d"),
     "temporal_dark_noise": ("temporal_dark_noise", "temporal dark noise \u03c3_d"),
 }
-#: combined standard deviations between the posterior and its least squares, above which it is
-#: refused
+#: difference between the posterior's own fit and the measured one, in combined standard deviations,
+#: above which the posterior is refused
 _MOST_COMBINED_SD = 3.0
 _TEXT = """The fit of the standard, of lines through the origin up to 70 % of saturation, on the
     same frames. Its error is that of the noise alone. It knows neither a bent response nor the
@@ -66,14 +66,14 @@ _TEXT = """The fit of the standard, of lines through the origin up to 70 % of sa
 
 
 class Comparison(NamedTuple):
-    """A quantity by the standard's least squares, and by the same fit on the levels that the
-    posterior predicts.
+    """A quantity from the standard's least-squares fit to the frames, and from the same fit to the
+    levels that the posterior predicts.
     """
 
     name: str
     value: float
     error: float  #: standard error of `value` by noise alone
-    #: by the fit on the predicted levels; the value of the posterior where nothing predicts levels
+    #: from the fit to the predicted levels, or the posterior's mean if no levels are predicted
     predicted: float
     apart: float  #: difference over the combined standard deviation
 
@@ -81,8 +81,8 @@ class Comparison(NamedTuple):
 def comparisons(
     measured: Levels, estimates: Sequence[ParameterEstimate], camera: Mapping[str, Any] | None
 ) -> list[Comparison]:
-    """Return the comparison of each quantity that the frames determine; none where the standard's
-    fit is impossible.
+    """Return the comparison of each quantity that the frames determine; empty if the standard's fit
+    is impossible.
 
     ``measured`` are the statistics of the frames, ``estimates`` the rows of the posterior, and
     ``camera`` the parameters of `calibrate.camera`, or None for another likelihood.
@@ -97,8 +97,8 @@ def comparisons(
 
 
 def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
-    """Return if posterior and least squares agree, as a check that refuses the posterior; none
-    without a comparison.
+    """Return the check that the posterior agrees with the least-squares fit, as a list of one;
+    empty without a comparison.
     """
     if not comparisons:
         return []
@@ -125,11 +125,11 @@ def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
 def least_squares_section(
     measured: Levels, estimates: Sequence[ParameterEstimate], comparisons: Sequence[Comparison]
 ) -> Section:
-    """Return the comparison of the standard's least squares with the posterior, or the reason why
-    there is none.
+    """Return the section that compares the standard's least-squares fit with the posterior, or says
+    why it cannot.
 
-    A parameter of which the posterior is no estimate has no row: the standard's value would rest on
-    what the frames do not tell.
+    A parameter that the posterior does not estimate has no row: the standard's value would depend
+    on quantities that the frames do not determine.
     """
     heading = "Beside the least squares of EMVA 1288"
     rows = {row.name: row for row in estimates if row.name in QUANTITIES and row.kind == "estimate"}
@@ -156,9 +156,7 @@ def least_squares_section(
 
 
 def compared(comparisons: Sequence[Comparison]) -> Mapping[str, Mapping[str, float]]:
-    """Return value and standard error of the standard's fit for each parameter that the section
-    compares.
-    """
+    """Return value and standard error of the standard's fit for each compared parameter."""
     return {
         comparison.name: {"value": comparison.value, "error": comparison.error}
         for comparison in comparisons
@@ -168,7 +166,7 @@ def compared(comparisons: Sequence[Comparison]) -> Mapping[str, Mapping[str, flo
 def _own_fit(
     measured: Levels, estimates: Sequence[ParameterEstimate], camera: Mapping[str, Any] | None
 ) -> LeastSquares | None:
-    """Return the standard's fit on the levels that the posterior predicts.
+    """Return the standard's fit to the levels that the posterior predicts.
 
     It is None without a camera, and where the fit is impossible.
     """
@@ -185,8 +183,8 @@ def _own_fit(
 def _compared(row: ParameterEstimate, fit: LeastSquares, own: LeastSquares | None) -> Comparison:
     """Return one row of the comparison.
 
-    `fit` is the standard's fit on the frames, `own` that on the levels that the posterior predicts,
-    if it predicts levels.
+    ``fit`` is the standard's fit to the frames, ``own`` its fit to the levels that the posterior
+    predicts, or None.
     """
     value, error = _value(fit, row.name)
     predicted = row.mean if own is None else _value(own, row.name)[0]
@@ -198,7 +196,7 @@ def _compared(row: ParameterEstimate, fit: LeastSquares, own: LeastSquares | Non
 
 
 def _reason(measured: Levels) -> str:
-    """Return why the standard's fit of these levels is impossible, in words."""
+    """Return the reason why the standard's fit to these levels is impossible."""
     try:
         least_squares(measured)
     except ValueError as reason:
@@ -231,7 +229,7 @@ def _value(fit: LeastSquares, name: str) -> tuple[float, float]:
 # pictures.
 
 
-#: by kind of a result: the numbers that the frames do not give
+#: for each kind of result: the fields that the frames do not determine
 NOT_TOLD = {
     "estimate": (),
     "between": ("mean", "sd"),
@@ -239,14 +237,14 @@ NOT_TOLD = {
     "lower": ("mean", "sd", "high"),
     "none": ("mean", "sd", "low", "high"),
 }
-#: without a unit
+#: parameters without a unit
 _PURE = ("quantum_efficiency", "spread", "scatter", "lamp", "bend", "twist", "l", "s", "core")
 
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """The posterior of one parameter: mean, standard deviation and interval, compared with the
-    recipe's own value.
+    """The posterior of one parameter: mean, standard deviation and interval, next to the nominal
+    value of the recipe.
     """
 
     name: str
@@ -256,14 +254,14 @@ class ParameterEstimate:
     sd: float
     low: float  #: 5 %
     high: float  #: 95 %
-    nominal: float  #: the recipe's own value
-    share: float  #: of the draws that lie below ``nominal``
+    nominal: float  #: the value in the recipe
+    share: float  #: share of the draws below ``nominal``
     narrower: float  #: width of the posterior over that of the prior
 
     @property
     def text(self) -> str:
-        """Return the estimate or limit of a parameter as text with its unit, or say that the
-        frames give neither.
+        """Return the estimate or limit with its unit as text, or a statement that the frames give
+        neither.
         """
         if self.kind == "estimate":
             return f"{with_uncertainty(self.mean, self.sd)} {self.unit}".rstrip()
@@ -278,8 +276,8 @@ class ParameterEstimate:
         return f"{limit} {self.unit}".rstrip() + " (95 %, depends on the prior)"
 
     def end(self, which: Literal["low", "high"]) -> str:
-        """Return the 5 % or the 95 % end of the interval as text, or a dash where only the prior
-        gives it.
+        """Return the 5 % or the 95 % end of the interval as text; a dash if it comes only from the
+        prior.
         """
         return "–" if which in NOT_TOLD[self.kind] else f"{getattr(self, which):.6g}"
 
@@ -295,20 +293,22 @@ class CalibrationResult:
     identifiability: Identifiability
     chains: Chains
     checks: Sequence[Check]
-    models: Sequence[ModelSpread] = ()  #: of a camera of unknown response
+    models: Sequence[ModelSpread] = ()  #: models of a camera of unknown response
     frames: Sequence[FrameTest] = ()  #: the tests of the frames
-    #: the draws of the walkers, where `chains` also has what the frames may hide
+    #: draws of the walkers before `chains` was widened by errors that the frames may hide
     walk: Chains | None = None
     budgets: Sequence[Budget] = ()  #: the uncertainty budgets of the estimates
 
     @cached_property
     def budget_picture(self) -> bytes | None:
-        """Return the picture of the uncertainty budgets, or None where nothing has a value."""
+        """Return the PNG bytes of the uncertainty budgets, or None without a budget."""
         return budget_picture(self.budgets) if self.budgets else None
 
     @cached_property
     def beside(self) -> Sequence[Comparison]:
-        """Return the least squares of EMVA 1288 beside the posterior; none for a lens."""
+        """Return the comparison of the EMVA 1288 least squares with the posterior; empty for a
+        lens.
+        """
         if self.problem.measured is None:
             return []
         camera = self.params if is_camera(self.problem) else None
@@ -316,7 +316,9 @@ class CalibrationResult:
 
     @property
     def walked(self) -> Chains:
-        """Return the draws of the walkers themselves, which the levels alone determine."""
+        """Return the draws of the walkers before any widening, which follow from the levels and
+        priors alone.
+        """
         return self.walk or self.chains
 
     @cached_property
@@ -328,7 +330,9 @@ class CalibrationResult:
 
     @property
     def params(self) -> Mapping[str, Any]:
-        """Return the parameters that the recipe gives to the step that computes the likelihood."""
+        """Return the parameters of the step that computes the likelihood, as the recipe
+        gives them.
+        """
         return self.problem.recipe.steps[self.problem.step].params
 
     @property
@@ -344,7 +348,7 @@ class CalibrationResult:
     def _estimate(self, name: str, draws: FloatArray, narrower: float) -> ParameterEstimate:
         """Return the estimate of one parameter from its draws.
 
-        `narrower` is the width of its posterior over that of its prior.
+        ``narrower`` is the ratio of the posterior's width to the prior's.
         """
         interval_low, interval_high = np.quantile(draws, [0.05, 0.95]).tolist()
         nominal, kind = float(self.params[name]), self.identifiability.kinds[name]
@@ -356,7 +360,7 @@ class CalibrationResult:
 
 
 def unit_of(name: str, params: Mapping[str, Any]) -> str:
-    """Return the unit of a parameter of the likelihood: `calibrate.density`, `.camera` or
+    """Return the unit of a parameter of the nodes `calibrate.density`, `.camera` or
     `.stray_light`.
     """
     if name == "gain":
@@ -369,7 +373,7 @@ def unit_of(name: str, params: Mapping[str, Any]) -> str:
 
 
 def banner(result: CalibrationResult) -> str:
-    """Return a warning that names the failed checks, or an empty text if no check fails."""
+    """Return a warning that lists the failed checks; empty if no check fails."""
     failures = [f"{check.name}: {check.found}" for check in result.checks if check.mark == "fail"]
     if not failures:
         return ""
@@ -403,9 +407,7 @@ def lead(result: CalibrationResult) -> str:
 
 
 def estimated_models(result: CalibrationResult) -> list[ModelSpread]:
-    """Return the models of the response for each parameter that the frames determine; others
-    have no value.
-    """
+    """Return the response models for each parameter that the frames determine."""
     return [
         model for model in result.models if result.identifiability.kinds[model.name] == "estimate"
     ]
@@ -446,7 +448,7 @@ def _frames(result: CalibrationResult) -> Section:
 
 
 def _parameters(result: CalibrationResult) -> Section:
-    """Return the table of all parameters.
+    """Return the table of all parameters, with estimate or limit, interval and the recipe's value.
 
     It has estimate or limit, interval, and the recipe's own value.
     """
@@ -512,7 +514,7 @@ def _between(interval: IntervalEstimate) -> str:
 
 
 def _checks(result: CalibrationResult) -> Section:
-    """Return the table of all checks, with the number of those that fail."""
+    """Return the table of all checks, with the number of failed ones."""
     rows = [
         (check.name, check.found, check.bar, Marked(check.mark, check.mark))
         for check in result.checks
@@ -523,7 +525,7 @@ def _checks(result: CalibrationResult) -> Section:
 
 
 def _not_determined(result: CalibrationResult) -> Section:
-    """Return the table of the singular values.
+    """Return the table of the singular values, with the weakest and their directions last.
 
     The weakest stand last, named by the direction that each belongs to.
     """

@@ -1,4 +1,4 @@
-"""A density like the posterior of a camera: widths of noise, and values near zero."""
+"""A density that approximates the posterior of a camera: noise widths, and parameters near zero."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ if TYPE_CHECKING:
 
     from neusee.workflows.calibration.log_posterior import FloatArray, LaplaceFit, SensorPosterior
 
-    #: the numbers of a distribution, each for every set of widths (draw, ...)
+    #: parameters of a conditional distribution, for every set of widths (draw, ...)
     Law = tuple[FloatArray, ...]
 
 
 # --- camera density -------------------------------------------------------------------------------
 
-# A density of all parameters of a camera: a mixture of the widths of its noise, and of all others
-# given the widths.
+# A density of all parameters of a camera: a mixture density of its noise widths, and a distribution
+# of all other parameters conditional on the widths.
 
 
 class Others(Protocol):
-    """The distribution of all other parameters given the widths."""
+    """The distribution of all other parameters conditional on the widths."""
 
     at: NDArray[np.bool_]  #: (free,) True for a width
 
     def law(self, widths: FloatArray) -> Law:
-        """Return the distribution for each set of ``widths`` (draw, width)."""
+        """Return the conditional distribution for each set of ``widths`` (draw, width)."""
 
     def draw(self, widths: FloatArray, law: Law, rng: Random) -> FloatArray:
-        """Return samples (draw, free) with the given ``widths`` and their ``law``."""
+        """Return samples (draw, free) with the given ``widths``, from the distributions ``law``."""
 
     def log_density(self, samples: FloatArray, law: Law) -> FloatArray:
-        """Return the log density of the other parameters at ``samples`` given the widths, up to
-        a constant.
+        """Return the conditional log density of the other parameters at ``samples``, up to a
+        constant.
         """
 
 
 @dataclass(frozen=True)
 class CameraDensity:
-    """A density of all parameters: a mixture of the widths, and the distribution of all others
-    given the widths.
+    """A density of all parameters: a density of the widths, and a distribution of the others
+    conditional on the widths.
     """
 
     widths: Density
@@ -72,8 +72,8 @@ class CameraDensity:
         )
 
     def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
-        """Return new samples like ``own`` (draw, free), and the logarithm of the density at
-        ``own`` over that there.
+        """Return new samples, and the log ratio of the density at ``own`` (draw, free) to the
+        density at each new sample.
         """
         # both densities in one pass: the old samples first, the new ones after them
         old_and_new_widths = np.concatenate(
@@ -95,7 +95,7 @@ class CameraDensity:
 
 # --- given widths ---------------------------------------------------------------------------------
 
-# A density like the posterior of a real camera, whose noise has widths that are parameters
+# A density that approximates the posterior of a real camera, whose noise widths are parameters
 # themselves.
 #
 # The widths come from a mixture. Given the widths, the model is nearly a weighted least-squares
@@ -104,17 +104,17 @@ class CameraDensity:
 # drift makes the dark signal uncertain.
 
 
-_FREEDOM = 20.0  #: degrees of freedom of the other parameters, given the widths
-#: changes of the logarithm of a width, so that it counts for nothing, or for all
+_FREEDOM = 20.0  #: degrees of freedom of the distribution of the other parameters
+#: changes of the logarithm of a width that make it negligible, or dominant
 _NO_WIDTH, _ENLARGED_WIDTH = -20.0, 5.0
 _MOST_LOG_RATIO = (
-    60.0  #: largest logarithm of a ratio of variances, so that a precision stays a number
+    60.0  #: largest logarithm of a ratio of variances, so that a precision stays finite
 )
 
 
 class GivenWidths:
-    """The distribution of all other parameters of a camera given the widths of its noise, linear
-    about the mode.
+    """The conditional distribution of all other parameters of a camera given its noise widths,
+    linearised at the mode.
     """
 
     def __init__(self, problem: SensorPosterior, mode: LaplaceFit) -> None:
@@ -132,7 +132,7 @@ class GivenWidths:
         self.unit = 1 / prior_sd_per_coordinate.diagonal()[~self.at]
         mode_residuals, _ = _parts(problem.likelihood(mode.theta[None]).scaled.numpy())
         slopes = _parts(mode.scaled_slopes.T)[0].T[:, ~self.at]
-        # each residual times its derivatives: their weighted sum is the slope of the log density
+        # residual times its derivatives: their weighted sum is the gradient of the log likelihood
         self._pull = slopes * mode_residuals[0][:, None]
         self._noise, self._shares = self._variances(problem)
         # each residual's outer product of derivatives, flattened: their weighted sum is the
@@ -140,37 +140,37 @@ class GivenWidths:
         self._squares = (slopes[:, :, None] * slopes[:, None]).reshape(len(slopes), -1)
 
     def law(self, widths: FloatArray) -> Law:
-        """Return mean (draw, other) and root of the precision (draw, other, other), in units of
-        the prior.
+        """Return mean (draw, other) and Cholesky root of the precision (draw, other, other), in
+        units of the prior.
         """
         log_slope, precision = self.information(widths)
-        # a step of Newton from the mode: the maximum of a normal density
+        # a Newton step from the mode leads to the maximum of a normal density
         mean_shift: FloatArray = np.linalg.solve(precision, log_slope[..., None])[..., 0].astype(
             np.float64
         )
         return mean_shift, np.linalg.cholesky(precision).astype(np.float64)
 
     def information(self, widths: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return slope (draw, other) of the log density at the mode, and precision (draw, other,
-        other).
+        """Return the gradient (draw, other) of the log density at the mode, and the precision
+        (draw, other, other).
         """
         width_variances = np.exp(
             (2 * (widths - self.theta[self.at])).clip(-_MOST_LOG_RATIO, _MOST_LOG_RATIO)
         )
-        # 1 over the variance of each residual, which is linear in the squares of the widths
+        # weights are inverse variances; each variance is linear in the squares of the widths
         residual_weights = 1 / (self._noise + width_variances @ self._shares)
         other_count = self._pull.shape[1]
-        # J' W J of the residuals, and the precision 1 of the prior
+        # J' W J of the residuals, plus the unit precision of the prior
         precision = (residual_weights @ self._squares).reshape(
             -1, other_count, other_count
         ) + np.eye(other_count)
         return -(residual_weights @ self._pull + self.middle), precision
 
     def _variances(self, problem: SensorPosterior) -> tuple[FloatArray, FloatArray]:
-        """Return the part of the variance of each residual that no width adds, and the part (width,
-        residual) of each.
+        """Return the part of each residual's variance that depends on no width, and the part
+        (width, residual) due to each width.
 
-        The variance is that at the mode, 1, and is linear in the square of each width.
+        Variances are relative to those at the mode and linear in the square of each width.
         """
         log_width_change = np.full((2 + self.at.sum(), self.at.sum()), _NO_WIDTH)
         # row 0 is the mode, row 1 has no width, and each further row has one width alone, enlarged
@@ -186,7 +186,7 @@ class GivenWidths:
         ) * np.exp(-2 * _ENLARGED_WIDTH)
 
     def draw(self, widths: FloatArray, law: Law, rng: Random) -> FloatArray:
-        """Return samples (draw, free) with the given ``widths`` and their ``law``."""
+        """Return samples (draw, free) with the given ``widths``, from the distributions ``law``."""
         mean_shift, precision_root = law
         samples = np.empty((len(mean_shift), len(self.at)))
         samples[:, self.at] = widths
@@ -196,18 +196,19 @@ class GivenWidths:
         return samples
 
     def log_density(self, samples: FloatArray, law: Law) -> FloatArray:
-        """Return the log density of the other parameters at ``samples`` given the widths, up to
-        a constant.
+        """Return the conditional log density of the other parameters at ``samples``, up to a
+        constant.
         """
         mean_shift, precision_root = law
-        # in standard deviations of the prior, as the law; the change of units is the last term
+        # in prior standard deviations, as `law`; the last term is the Jacobian of this change of
+        # units
         distance = (samples[:, ~self.at] - self.theta[~self.at]) / self.unit - mean_shift
         return student_density(distance, precision_root) - float(np.log(np.abs(self.unit)).sum())
 
 
 def draw_student(root: FloatArray, rng: Random) -> FloatArray:
-    """Return distances (draw, other) from the mean, with the ``root`` (draw, other, other) of
-    their precision.
+    """Return random deviations (draw, other) from the mean; ``root`` (draw, other, other) is the
+    lower Cholesky factor of the precision.
     """
     # a normal draw over the root of chi² / degrees of freedom has Student's distribution
     student_draws = rng.standard_normal(root.shape[:2]) / np.sqrt(
@@ -220,12 +221,12 @@ def draw_student(root: FloatArray, rng: Random) -> FloatArray:
 
 
 def student_density(away: FloatArray, root: FloatArray) -> FloatArray:
-    """Return the log density at distances from the mean, up to the constant that `Mixture`
-    leaves out too.
+    """Return the log density at deviations ``away`` from the mean, up to the constant that
+    `Mixture` omits too.
     """
     half_freedom, dimension = 0.5 * _FREEDOM, away.shape[1]
     squared_distance = (np.einsum("nij,ni->nj", root, away) ** 2).sum(1)
-    # log density of a Student distribution: its peak, less the decay with the squared distance
+    # log density of Student's t distribution: its peak minus the decay with the squared distance
     log_peak = (
         math.lgamma(half_freedom + 0.5 * dimension)
         - math.lgamma(half_freedom)
@@ -239,10 +240,11 @@ def student_density(away: FloatArray, root: FloatArray) -> FloatArray:
 
 
 def _parts(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (..., residual) and logarithms of their standard deviations.
+    """Return residuals (..., residual) and the logarithms of their standard deviations.
 
-    The rows of a camera's likelihood have four equal parts: residuals of the variances, the
-    logarithms of their widths, residuals of the means, the logarithms of theirs.
+    The last axis of a camera's likelihood has four equal parts: residuals of the variances,
+    logarithms of their standard deviations, residuals of the means, logarithms of their standard
+    deviations.
     """
     variance_residuals, log_variance_sd, mean_residuals, log_mean_sd = np.split(rows, 4, axis=-1)
     return np.concatenate([variance_residuals, mean_residuals], -1), np.concatenate(
@@ -252,8 +254,8 @@ def _parts(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 # --- value near zero ------------------------------------------------------------------------------
 
-# The distribution of a positive parameter that is hardly told from 0, and of all others, given the
-# widths of noise.
+# The distribution of a positive parameter that is hardly distinguishable from 0, and of all others,
+# conditional on the noise widths.
 #
 # The levels depend on the parameter itself, for example on a dark current, and a sampler moves in
 # its logarithm. Given the widths the parameter is nearly normal, with a prior of its logarithm: the
@@ -262,17 +264,18 @@ def _parts(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 # normal given the widths and the parameter, with a mean that is linear in the parameter.
 
 
-#: cells of the grid, and its reach about the middle of the prior, in its deviations
+#: number of grid cells, and half-width of the grid around the middle of the prior in prior standard
+#: deviations
 _GRID_CELLS, _GRID_REACH = 240, 8.0
 _WIDE_SHARE, _WIDE_POWER = 0.15, 0.4  #: share and power of the part with wider tails
-#: largest change of the logarithm, so that the square of the parameter stays a number
+#: largest change of the logarithm, so that the square of the parameter stays finite
 _FARTHEST_NEAR_ZERO = 300.0
-_SMALLEST_DENSITY = 1e-300  #: a density of which a logarithm can be taken
+_SMALLEST_DENSITY = 1e-300  #: smallest density whose logarithm is finite
 
 
 class NearZero:
-    """The distribution of the parameter ``number`` and of all others, given the widths of the
-    noise of a camera.
+    """The conditional distribution of the parameter with index ``number``, and of all others, given
+    the noise widths of a camera.
     """
 
     def __init__(self, others: GivenWidths, number: int, spread: float) -> None:
@@ -283,20 +286,20 @@ class NearZero:
         self._units, self._scale = others.unit[~self._own], float(np.log(np.abs(others.unit)).sum())
         self._middle = float(others.middle[self._own][0])
         grid_scale = abs(spread / self._unit)
-        # points are equal steps of asinh: dense about the mode, sparse far from it
+        # grid points at equal steps of asinh: dense around the mode, sparse far from it
         grid_start, grid_end = np.arcsinh(
             (np.array([-_GRID_REACH, _GRID_REACH]) - self._middle) / grid_scale
         )
-        #: from the mode, in units of the prior
+        #: grid points as distances from the mode, in prior standard deviations
         self._points = grid_scale * np.sinh(np.linspace(grid_start, grid_end, _GRID_CELLS + 1))
         self._sizes = np.diff(self._points)
-        #: of the trapezoidal rule
+        #: weights of the trapezoidal rule
         self._counts = 0.5 * (np.append(self._sizes, 0.0) + np.append(0.0, self._sizes))
         self._value = self._value_at(self._points)
         self._prior = -0.5 * (self._points + self._middle) ** 2
 
     def law(self, widths: FloatArray) -> Law:
-        """Return the distribution for each set of ``widths`` (draw, width).
+        """Return the conditional distribution for each set of ``widths`` (draw, width).
 
         The density (draw, point) of the logarithm; the mean (draw, other) of all others at the mode
         of the parameter, its change (draw, other) with the parameter, and the root (draw, other,
@@ -304,22 +307,22 @@ class NearZero:
         """
         log_slope, precision = self._others.information(widths)
         is_own, is_other = self._own, ~self._own
-        # the prior of the parameter is that of its logarithm and joins on the grid
+        # remove the parameter's prior, which applies to its logarithm and is added on the grid
         own_slope = log_slope[:, is_own][:, 0] + self._middle
         own_precision = precision[:, is_own][:, :, is_own][:, 0, 0] - 1
         cross_precision = precision[:, is_other][:, :, is_own]
         precision_root = np.linalg.cholesky(precision[:, is_other][:, :, is_other])
-        # both right sides in one solution: columns 0 of the slope, 1 of the coupling
+        # solve for two right-hand sides at once: column 0 is the gradient, column 1 the coupling
         right_sides = np.concatenate([log_slope[:, is_other][..., None], cross_precision], -1)
         solved = np.linalg.solve(precision_root, right_sides)
         steps, coupling = np.moveaxis(
             np.linalg.solve(np.swapaxes(precision_root, 1, 2), solved), -1, 0
         )
-        # Schur complement: what is left for the parameter after all others are integrated out
+        # Schur complement: marginal precision of the parameter, with all others integrated out
         marginal_precision = (own_precision - (solved[..., 1] ** 2).sum(1)).clip(0)
         marginal_slope = own_slope - (solved[..., 0] * solved[..., 1]).sum(1)
-        # some of the density has wider tails, so that no weight becomes too large
-        # on the grid: a parabola in the parameter itself, and the prior of its logarithm
+        # log density on the grid: a parabola in the parameter itself, plus the prior of its
+        # logarithm; a part of the density gets wider tails, so that no weight becomes too large
         log_density = (
             marginal_slope[:, None] * self._value
             - 0.5 * marginal_precision[:, None] * self._value**2
@@ -332,7 +335,7 @@ class NearZero:
         return density, steps, -coupling, precision_root.astype(np.float64)
 
     def draw(self, widths: FloatArray, law: Law, rng: Random) -> FloatArray:
-        """Return samples (draw, free) with the given ``widths`` and their ``law``."""
+        """Return samples (draw, free) with the given ``widths``, from the distributions ``law``."""
         density, steps, coupling, precision_root = law
         position = self._place(density, uniform(len(widths), rng))
         samples = np.empty((len(widths), len(self.at)))
@@ -345,7 +348,7 @@ class NearZero:
         return samples
 
     def log_density(self, samples: FloatArray, law: Law) -> FloatArray:
-        """Return the log density of all parameters but the widths at ``samples``, up to a
+        """Return the log density of all parameters except the widths at ``samples``, up to a
         constant.
         """
         density, steps, coupling, precision_root = law
@@ -356,8 +359,7 @@ class NearZero:
         own_density = (1 - cell_fraction) * density[draw_number, cell] + cell_fraction * density[
             draw_number, cell + 1
         ]
-        # as `Mixture`
-        # the constant is the one that `Mixture` leaves out too
+        # lgamma(0.5): the constant that `Mixture` omits too
         own_log_density = np.log(
             np.where((cell_fraction >= 0) & (cell_fraction <= 1), own_density, 0.0).clip(
                 _SMALLEST_DENSITY
@@ -374,8 +376,8 @@ class NearZero:
         return log_density
 
     def _value_at(self, place: FloatArray) -> FloatArray:
-        """Return the change of the parameter from the mode to each place, in units that are
-        those of a small change.
+        """Return the change of the parameter between the mode and ``place``, a change of its
+        logarithm, scaled to equal ``place`` for small changes.
         """
         change: FloatArray = (
             np.expm1((place * self._unit).clip(max=_FARTHEST_NEAR_ZERO)) / self._unit
@@ -388,28 +390,28 @@ class NearZero:
         return normalised
 
     def _cell(self, place: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-        """Return the cell of each place, and the share of the cell that lies below the place."""
+        """Return the grid cell of each place, and the relative position in the cell from 0 to 1."""
         cell = np.searchsorted(self._points, place).clip(1, _GRID_CELLS) - 1
         return cell, (place - self._points[cell]) / self._sizes[cell]
 
     def _place(self, density: FloatArray, chance: FloatArray) -> FloatArray:
-        """Return the position on the grid below which the probability `chance` (draw,) lies.
+        """Return the quantile on the grid for each probability ``chance`` (draw,).
 
-        It is the inverse of the distribution function of each density (draw, point), which is
-        linear in a cell.
+        It inverts the cumulative distribution of each density (draw, point), which is linear within
+        a cell.
         """
         cell_sizes = self._sizes
-        # trapezoidal rule, cell by cell
+        # cumulative integral by the trapezoidal rule
         cumulative = np.cumsum(0.5 * (density[:, 1:] + density[:, :-1]) * cell_sizes, 1)
-        # the number of cells that lie wholly below
+        # index of the cell that contains the quantile
         cell = (cumulative < (chance * cumulative[:, -1])[:, None]).sum(1).clip(max=_GRID_CELLS - 1)
         draw_number = np.arange(len(chance))
         remainder = chance * cumulative[:, -1] - np.where(
             cell > 0, cumulative[draw_number, cell - 1], 0.0
         )
         left_density, right_density = density[draw_number, cell], density[draw_number, cell + 1]
-        # the root of first * t + (last - first) * t^2 / 2 = left / size, in the form that loses no
-        # digits
+        # root t of left * t + (right - left) * t^2 / 2 = remainder / size, in the form without
+        # cancellation
         mean_height = remainder / cell_sizes[cell]
         cell_fraction = (
             2
@@ -427,28 +429,29 @@ class NearZero:
 
 # --- tail density ---------------------------------------------------------------------------------
 
-# A density with parts for the long lower tails of positive parameters that are hardly told from 0.
+# A density with parts for the long lower tails of positive parameters that are hardly
+# distinguishable from 0.
 #
 # The data see such a parameter as 0 where its logarithm falls, so that the posterior is there the
 # prior, of several units. A density that is fitted about the mode seldom proposes from the tail, in
 # which a walker then stays.
 
 
-#: least deviation of a logarithm whose lower tail counts: 0 is then eight deviations away
+#: standard deviation of a logarithm from which its lower tail counts: 0 is then eight deviations
+#: away
 _DOUBTFUL_SD = 0.12
 _LEAST_PART_SHARE, _SHARE_STEPS = (
     0.03,
     20,
-)  #: least share of a part, and steps in which the shares are found
-#: share of the parts, their distance below the mode, and degrees of freedom
+)  #: least share of a part, and number of steps to find the shares
+#: share of the tail parts in the density, their distance below the mode, and their degrees of
+#: freedom
 _TAIL_SHARE_OF_DENSITY, _TAIL_REACH, _TAIL_FREEDOM = 0.05, 2.5, 6.0
 
 
 @dataclass(frozen=True)
 class TailDensity(Density):
-    """A density of which a fixed share comes from a mixture for the tails; both are normalised
-    alike.
-    """
+    """A density with a fixed share from a mixture for the tails; both are normalised alike."""
 
     body: Density
     tails: Mixture
@@ -478,8 +481,8 @@ class TailDensity(Density):
 def hardly_told(
     problem: SensorPosterior, mode: LaplaceFit, doubt: float = _DOUBTFUL_SD
 ) -> list[int]:
-    """Return the numbers of the positive parameters that are hardly told from 0, the least certain
-    one first.
+    """Return the indices of the positive parameters that are hardly distinguishable from 0, the
+    least certain first.
 
     These have logarithms with a standard deviation above ``doubt`` at the mode.
     """
@@ -494,12 +497,12 @@ def hardly_told(
 
 
 def with_tails(body: Density, numbers: Sequence[int], mode: LaplaceFit) -> Density:
-    """Return a density with a part for the tail of each parameter in ``numbers``, or ``body``
-    without one.
+    """Return a density with a tail part for each parameter in ``numbers``; ``body`` itself if there
+    are none.
 
-    In such a part all other parameters lie where a line through the mode leads them, with the
-    deviations that they have for a known value, because the levels depend on the parameter itself
-    and not on its logarithm.
+    In a tail part all other parameters follow a linear regression at the mode, with the deviations
+    that they have for a known value, because the levels depend on the parameter itself and not on
+    its logarithm.
     """
     if not numbers:
         return body
@@ -517,12 +520,12 @@ def with_prior_tails(
     is_width: NDArray[np.bool_],
     weighted: tuple[FloatArray, ...],
 ) -> Mixture:
-    """Return a density of the parameters ``is_width`` (free,) with a part for each width, in which
-    this width has its prior.
+    """Return a density of the widths (``is_width``) with an extra part for each width, in which
+    this width follows its prior.
 
-    Below some width the levels see none, and the prior alone decides. All other widths lie as in
-    ``body``. The shares of the parts follow from ``weighted``: samples (draw, width) of the
-    posterior and their weights (draw,).
+    Small widths do not affect the levels, so that only the prior constrains them. All other widths
+    are distributed as in ``body``. The shares of the parts are fitted to ``weighted``: samples
+    (draw, width) of the posterior and their weights (draw,).
     """
     mode_in_prior_sd = problem.whitened(mode.theta[None])[0]
     # coordinates of one standard deviation of the prior of each width
@@ -531,7 +534,8 @@ def with_prior_tails(
     )[is_width]
     mean = body.shares @ body.centres
     centre_distance = body.centres - mean
-    # of the whole mixture: that of its parts, and that of their centres
+    # covariance of the whole mixture: mean covariance of its parts, plus covariance of their
+    # centres
     covariance = np.einsum(
         "k,kij,klj->il", body.shares, body.roots, body.roots
     ) + centre_distance.T @ (body.shares[:, None] * centre_distance)
@@ -544,7 +548,7 @@ def with_prior_tails(
         Mixture(np.ones(1), centre[None], root[None], _TAIL_FREEDOM)
         for centre, root in zip(centres, roots, strict=True)
     ]
-    # the shares with which all parts together are most like the samples
+    # the shares that maximise the likelihood of the samples
     body_share, *tail_shares = _shares([body, *width_tails], *weighted)
     body_freedom = np.broadcast_to(body.tails, body.shares.shape)
     return Mixture(
@@ -556,10 +560,11 @@ def with_prior_tails(
 
 
 def _shares(parts: Sequence[Mixture], samples: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the share of each part with which a density is most like weighted samples.
+    """Return the shares of the parts that maximise the likelihood of weighted samples.
 
-    Each share is at least `_LEAST_PART_SHARE` before shares are normalised. Steps of expectation
-    maximisation: the share of a part is the mean probability that a sample belongs to it.
+    Each share is at least `_LEAST_PART_SHARE` before the shares are normalised. Each step of
+    expectation maximisation sets the share of a part to the mean probability that a sample belongs
+    to it.
     """
     log_densities = np.stack([mixture.log_density(samples) for mixture in parts], -1)
     part_shares = np.full(len(parts), 1 / len(parts))
@@ -573,7 +578,9 @@ def _shares(parts: Sequence[Mixture], samples: FloatArray, weight: FloatArray) -
 
 
 def _tail_part(theta: FloatArray, covariance: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
-    """Return centre (free,) and root (free, free) of the part for the tail of the logarithm `i`."""
+    """Return centre (free,) and Cholesky root (free, free) of the tail part for the logarithm with
+    index ``i``.
+    """
     # the other parameters follow their regression on `i`
     tail_centre = theta - covariance[:, i] / covariance[i, i]
     tail_centre[i] = theta[i] - _TAIL_REACH
@@ -581,7 +588,7 @@ def _tail_part(theta: FloatArray, covariance: FloatArray, i: int) -> tuple[Float
 
 
 def _covariance_given(covariance: FloatArray, i: int) -> FloatArray:
-    """Return the covariance of all others for a known value of ``i``."""
+    """Return the covariance of all other parameters conditional on parameter ``i``."""
     conditional: FloatArray = (
         covariance - np.outer(covariance[:, i], covariance[i]) / covariance[i, i]
     )
@@ -589,9 +596,10 @@ def _covariance_given(covariance: FloatArray, i: int) -> FloatArray:
 
 
 def _root(covariance: FloatArray, i: int, spread: float) -> FloatArray:
-    """Return the Cholesky root of a covariance in which `i` is independent and has its own spread.
+    """Return the Cholesky root of a covariance in which parameter ``i`` is independent with the
+    standard deviation ``spread``.
 
-    `covariance` is that of all others for a known value of `i`, and is changed in place.
+    ``covariance`` is that of all others conditional on ``i``, and is changed in place.
     """
     covariance[i], covariance[:, i] = 0.0, 0.0
     covariance[i, i] = spread**2

@@ -1,4 +1,4 @@
-"""Sampling of a posterior with emcee, by ensembles of walkers, until chains are long enough."""
+"""Sampling of a posterior with emcee, by ensembles of walkers, until the chains are long enough."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 # of few numbers takes as long for one ensemble as for four, and less time than the loop of emcee.
 
 
-#: returns the log density (walker,) at (walker, free), never NaN
+#: function that returns the log density (walker,) at samples (walker, free); never NaN
 Weigh = Callable[["FloatArray"], "FloatArray"]
 
 
 class Walk:
-    """An ensemble of walkers, with the draws, the move and the random stream of the ensemble."""
+    """An ensemble of walkers, with its draws, its move and its random stream."""
 
     def __init__(
         self,
@@ -58,9 +58,7 @@ class Walk:
         return int(self.backend.iteration)
 
     def prepare(self, steps: int, weigh: Weigh) -> None:
-        """Reserve memory for ``steps`` more steps of the walkers, and load their state after the
-        last step.
-        """
+        """Reserve memory for ``steps`` more steps, and load the state after the last step."""
         if self.initial_theta is not None and self.iteration == 0:
             self._state = emcee.State(self.initial_theta.copy(), log_prob=weigh(self.initial_theta))
         else:
@@ -68,8 +66,8 @@ class Walk:
         self.backend.grow(steps, None)
 
     def begin_step(self) -> None:
-        """Split the walkers into parts for one step; the proposals for each part depend on the
-        other parts.
+        """Split the walkers into parts for one step; the proposals for one part depend on the other
+        parts.
         """
         self.random.random_sample()  # emcee draws one of several moves with this number
         self.move.setup(self._state.coords)
@@ -94,8 +92,8 @@ class Walk:
     def decide(self, split: int, log: FloatArray) -> None:
         """Accept or reject the proposed coordinates of one part of the walkers."""
         walker_numbers = np.flatnonzero(self._part == split)
-        # rule of Metropolis and Hastings: density of the new place over that of the old one, times
-        # the factor
+        # Metropolis-Hastings rule: ratio of the densities at the new and the old place, times the
+        # factor
         log_acceptance = self._factors + log - self._state.log_prob[walker_numbers]
         accepted = log_acceptance > np.log(self.random.rand(len(walker_numbers)))
         moved = walker_numbers[accepted]
@@ -110,15 +108,13 @@ class Walk:
         self.backend.save_step(self._state, self._accepted)
 
     def rest(self) -> None:
-        """Store the state of the random stream, so that a later run can continue from this
-        state.
-        """
+        """Store the state of the random stream, so that a later run can continue from it."""
         self.backend.random_state = self.random.get_state()
 
 
 def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
-    """Advance the ensembles until each has ``steps`` steps; ensembles with the fewest steps go
-    first.
+    """Advance the ensembles until each has ``steps`` steps; those with the fewest steps
+    go first.
     """
     while (fewest_steps := min(walk.iteration for walk in walks)) < steps:
         walks_to_advance = [walk for walk in walks if walk.iteration == fewest_steps]
@@ -129,10 +125,10 @@ def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
 
 
 def _together(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
-    """Advance ensembles of equal length by `steps` steps.
+    """Advance ensembles with equal numbers of steps by ``steps`` steps.
 
-    The proposals of all ensembles are weighed in one call, because many samples at once cost little
-    more than one.
+    The log density of the proposals of all ensembles is computed in one call, because many samples
+    at once cost little more than one.
     """
     for walk in walks:
         walk.prepare(steps, weigh)
@@ -151,19 +147,19 @@ def _together(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
 
 # --- guided move ----------------------------------------------------------------------------------
 
-# A move of walkers that also proposes places from a density like the posterior, whatever the
-# walkers' own places.
+# A move of walkers that also proposes places from a density that approximates the posterior,
+# independently of the walkers' own places.
 
 
-_GUIDED_SHARE = 0.8  #: of the proposals that come from the density
+_GUIDED_SHARE = 0.8  #: share of the proposals that come from the density
 
 
 class GuidedMove:
-    """A move of emcee that proposes some of the new places from a density, by which walkers also
-    change modes.
+    """A move for emcee that draws some proposals from a density, so that walkers can also jump
+    between modes.
 
-    Each proposal has the factor of Metropolis and Hastings, so that the chains have the posterior
-    as their limit, however well or badly the density agrees with it.
+    Each proposal has its Metropolis-Hastings factor, so that the chains converge to the posterior
+    even if the density approximates it poorly.
     """
 
     def __init__(self, move: Any, density: Density) -> None:
@@ -171,14 +167,14 @@ class GuidedMove:
         self.nsplits, self.randomize_split = move.nsplits, move.randomize_split
 
     def setup(self, places: FloatArray) -> None:
-        """Prepare the move of emcee for walkers at ``places``."""
+        """Prepare emcee's move for walkers at ``places``."""
         self.move.setup(places)
 
     def get_proposal(
         self, own: FloatArray, others: Sequence[FloatArray], random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
-        """Return proposed places (walker, free), and the logarithm of the factor of each in its
-        acceptance.
+        """Return proposed places (walker, free), and the logarithm of the Metropolis-Hastings
+        factor of each.
         """
         proposed, factors = self.move.get_proposal(own, others, random)
         from_density, density_factors = self.density.propose(own, random)
@@ -200,25 +196,28 @@ class GuidedMove:
 
 
 ENSEMBLES = 4
-STRANDED = 20.0  #: nats by which the median of a stranded walker lies below that of all walkers
-#: steps of the first round; growth by round; most steps
+#: a walker is stranded if its median log posterior lies this far below that of all walkers
+STRANDED = 20.0
+#: steps of the first round; growth factor from round to round; most steps
 _FIRST_STEPS, _GROWTH, _MOST_STEPS = 250, 1.25, 32_000
-#: least length of a chain in tau, and the largest change of tau in its last round
+#: least length of a chain in autocorrelation times (tau), and largest relative change of tau in its
+#: last round
 _LEAST_TAUS, _SETTLED_CHANGE = 50.0, 0.01
-_SURE_TAUS = 100.0  #: length of a chain in tau at which any change of tau is allowed
-_START_NATS = 5.0  #: nats for each parameter by which a starting point may lie below the mode
+_SURE_TAUS = 100.0  #: length of a chain in tau from which any change of tau is accepted
+#: log posterior below the mode that is allowed for a starting point, per parameter
+_START_NATS = 5.0
 _SEAL_BYTES = 512  #: bytes of the seal in front of the draws
-_DISCARDED_TAUS = 10.0  #: autocorrelation times that are discarded
+_DISCARDED_TAUS = 10.0  #: length of the discarded start of a chain, in tau
 _MOVES = {"de": emcee.moves.DEMove, "stretch": emcee.moves.StretchMove}
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """The random stream and the move of the walkers, and how many draws they make."""
+    """The random seed, the walkers and their move, and the number of draws to make."""
 
     seed: int
     walkers: int = 64  #: of each ensemble
-    move: str = "de"  #: of emcee, as `move` names it
+    move: str = "de"  #: name of emcee's move, as in `move`
     effective_size: int = 1000  #: least effective sample size of all ensembles together
 
 
@@ -228,9 +227,9 @@ class Chains:
 
     draws: FloatArray  #: (ensemble, step, walker, free) coordinates, without the discarded steps
     log: FloatArray  #: (ensemble, step, walker)
-    accepted: float  #: share of the proposed moves
+    accepted: float  #: share of accepted moves
     tau: float  #: steps, the longest autocorrelation time of any coordinate
-    steps: int  #: with the discarded steps
+    steps: int  #: number of steps, including the discarded ones
     long: bool  #: True if the chains are long enough
 
     @property
@@ -270,19 +269,19 @@ def sample(
     runs = [
         start_ensemble(problem, mode, file, index, sampling, guide) for index in range(ENSEMBLES)
     ]
-    # a run that continues stops at the same steps as one without interruption
+    # a continued run ends its rounds at the same steps as an uninterrupted one
     steps_before, round_end = _round(min(run.iteration for run in runs))
     tau_before, is_stored = _longest_time(runs, steps_before) if steps_before else np.inf, True
     while True:
         walk_until(runs, round_end, problem.log_posterior)
-        # a disk that is full is reported once
+        # report a full disk only once
         warn = progress if is_stored else silent
         is_stored = _keep(file, [run.backend for run in runs], warn)
         tau = _longest_time(runs)
         chains = _gathered(runs, tau, round_end, _are_long(round_end, tau, tau_before))
         effective = chains.flat.shape[0] / tau
         is_finished = _are_enough(chains, effective, sampling.effective_size)
-        # for the message: this round, or what the present rates ask for
+        # for the message: the steps so far, or an estimate from the present rates
         needed = (
             round_end
             if is_finished
@@ -301,7 +300,7 @@ def sample(
 
 
 def _are_long(steps: int, tau: float, tau_before: float) -> bool:
-    """Return True if the chains are many autocorrelation times long, and this time is settled."""
+    """Return True if the chains are many autocorrelation times long, and this time is stable."""
     relative_change = abs(tau - tau_before) / tau
     return steps >= (_LEAST_TAUS + _DISCARDED_TAUS) * tau and (
         relative_change < _SETTLED_CHANGE or steps >= (_SURE_TAUS + _DISCARDED_TAUS) * tau
@@ -309,13 +308,15 @@ def _are_long(steps: int, tau: float, tau_before: float) -> bool:
 
 
 def _are_enough(chains: Chains, size: float, effective_size: int) -> bool:
-    """Return True if the sampling ends: chains are long and draws many, or nothing helps."""
+    """Return True if sampling ends: chains are long and draws numerous, or the largest number of
+    steps is reached.
+    """
     return (chains.long and size >= effective_size) or chains.steps >= _MOST_STEPS
 
 
 def _steps_needed(steps: int, tau: float, size: float, effective_size: int) -> int:
-    """Return how many steps the chains need in all, if autocorrelation time and rate of draws
-    stay as they are.
+    """Return the estimated total number of steps that the chains need, at the present
+    autocorrelation time and effective sample size.
     """
     return min(
         int(max((_LEAST_TAUS + _DISCARDED_TAUS) * tau, steps * effective_size / max(size, 1.0))),
@@ -324,13 +325,15 @@ def _steps_needed(steps: int, tau: float, size: float, effective_size: int) -> i
 
 
 def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
-    """Return the longest autocorrelation time, in steps, of all ensembles' first `steps` steps."""
+    """Return the longest autocorrelation time, in steps, of all ensembles over their first
+    ``steps`` steps.
+    """
     return max(autocorrelation_time(run.backend.get_chain()[:steps]) for run in runs)
 
 
 def _round(iteration: int) -> tuple[int, int]:
-    """Return the numbers of steps at which two successive rounds of sampling end, before and
-    after ``iteration``.
+    """Return the step numbers at which two successive rounds end: the last before ``iteration``,
+    and the first at or after it.
     """
     steps_before, steps = 0, _FIRST_STEPS
     while steps < iteration:
@@ -346,7 +349,7 @@ def start_ensemble(
     sampling: Sampling,
     guide: Guide | None = None,
 ) -> Walk:
-    """Return an ensemble that continues the draws in ``file``, or starts near the mode or at
+    """Return an ensemble that continues the draws in ``file``, or else starts near the mode or at
     samples of the guide.
     """
     walkers, dimensions = sampling.walkers, len(problem.names)
@@ -369,11 +372,11 @@ def start_ensemble(
 def _alive(
     problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Return starting points (walker, parameter) near the posterior mode, where the posterior is
-    not almost zero.
+    """Return starting points (walker, parameter) near the mode, where the posterior density is not
+    too low.
     """
     likely_points = np.empty((0, len(mode.theta)))
-    # each round keeps the likely ones of four times as many candidates
+    # each round draws four times as many candidates as walkers, and keeps the likely ones
     for _ in range(50):
         candidates = mode.draw(4 * walkers, rng)
         is_likely = problem.log_posterior(candidates) > mode.log - _START_NATS * (
@@ -398,8 +401,8 @@ def autocorrelation_time(chain: FloatArray) -> float:
 
 
 def stranded(log: FloatArray) -> int:
-    """Return the number of walkers whose log posterior ``log`` (..., step, walker) is far below
-    that of the others.
+    """Return the number of stranded walkers: those whose median ``log`` (..., step, walker) is far
+    below that of all walkers.
     """
     walker_medians = np.median(log, -2)
     return int((walker_medians < np.median(walker_medians) - STRANDED).sum())
@@ -408,7 +411,8 @@ def stranded(log: FloatArray) -> int:
 def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chains:
     """Return the chains of all ensembles without the discarded steps, with the measures of mixing.
 
-    `tau` is the longest autocorrelation time, `steps` the length and `long` if that is enough.
+    ``tau`` is the longest autocorrelation time, ``steps`` the length, and ``long`` whether it
+    suffices.
     """
     discarded_steps = min(int(_DISCARDED_TAUS * tau) + 1, steps // 2)
     draws = np.stack([run.backend.get_chain(discard=discarded_steps) for run in runs])
@@ -421,7 +425,7 @@ def _read(file: Path, index: int) -> Any:
     """Read the draws of an ensemble into a backend in memory; return None if the file cannot be
     read or trusted.
 
-    A copy is read, because the file may be replaced after its signature was compared.
+    A copy is read, because the file may be replaced after its seal was checked.
     """
     try:
         content = bytes_of(file)
@@ -452,7 +456,7 @@ def _unpacked(file: Path, index: int) -> Any:
 
 
 def _is_whole(memory: Any) -> bool:
-    """Return True if draws and log densities of every step are there and are numbers."""
+    """Return True if draws and log densities are complete and finite for all steps."""
     steps = memory.iteration
     has_all_shapes = memory.chain.shape == (steps, *memory.shape) and memory.log_prob.shape == (
         steps,
@@ -466,7 +470,7 @@ def _is_whole(memory: Any) -> bool:
 
 
 def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> bool:
-    """Write the draws to a file; if this fails, for example on a full disk, report the error and
+    """Write the draws to a file and return True; on an error, such as a full disk, report it and
     return False.
     """
     try:
@@ -489,7 +493,7 @@ def _write(file: Path, backends: Sequence[Any]) -> None:
         with TemporaryDirectory(prefix="neusee-") as folder:
             draws_file = Path(folder) / "draws.h5"
             _write_draws(draws_file, backends)
-            # the first bytes are kept free for the seal, which is computed of the rest
+            # the first bytes are reserved for the seal, which is computed from the rest
             draws_content = draws_file.read_bytes()[_SEAL_BYTES:]
         with open(temporary, "wb") as temporary_file:
             temporary_file.write(
@@ -519,6 +523,6 @@ def _write_draws(path: Path, backends: Sequence[Any]) -> None:
             group["chain"][...], group["log_prob"][...] = memory.chain, memory.log_prob
             group["accepted"][...] = memory.accepted
             group.attrs["iteration"] = memory.iteration
-            # the state of the random stream is a tuple, which HDF5 holds number by number
+            # the state of the random stream is a tuple, stored entry by entry
             for i, value in enumerate(memory.random_state):
                 group.attrs[f"random_state_{i}"] = value

@@ -36,8 +36,8 @@ _BINS = 200  #: points of a curve
 
 
 def photon_transfer(sheet: EmvaSheet) -> Any:
-    """Draw the variance over the signal, both above the dark, with the line of the system gain
-    and saturation.
+    """Draw the temporal variance against the signal, both above the dark, with the line of the
+    system gain and the saturation.
     """
     figure, axes = canvas(_WIDTH, _HEIGHT)
     ax, transfer, gain = axes[0, 0], sheet.transfer, sheet["K"].value
@@ -65,7 +65,7 @@ def photon_transfer(sheet: EmvaSheet) -> Any:
 
 
 def sensitivity(sheet: EmvaSheet) -> Any:
-    """Draw the signal above the dark over the photons, with the line of the responsivity."""
+    """Draw the signal above the dark against the photons, with the line of the responsivity."""
     figure, axes = canvas(_WIDTH, _HEIGHT)
     ax, transfer, responsivity = axes[0, 0], sheet.transfer, sheet["R"].value
     ax.plot(transfer.photons, transfer.signal, label="measured", **_DOTS)
@@ -84,7 +84,7 @@ def sensitivity(sheet: EmvaSheet) -> Any:
 
 
 def signal_to_noise(sheet: EmvaSheet) -> Any:
-    """Draw the signal-to-noise ratio over the light: measured, of the model, with DSNU and PRNU,
+    """Draw the signal-to-noise ratio against the light: measured, linear model, with DSNU and PRNU,
     and ideal.
     """
     figure, axes = canvas(_WIDTH, _HEIGHT)
@@ -115,7 +115,7 @@ def signal_to_noise(sheet: EmvaSheet) -> Any:
 
 
 def _modelled_ratio(ax: Any, sheet: EmvaSheet) -> None:
-    """Draw the ratio of the linear model from threshold to saturation, if the frames tell both."""
+    """Draw the ratio of the linear model from threshold to saturation, if both are known."""
     efficiency, gain, threshold, saturation = (
         sheet[key].value for key in ("eta", "K", "mu_p_min", "mu_p_sat")
     )
@@ -124,7 +124,7 @@ def _modelled_ratio(ax: Any, sheet: EmvaSheet) -> None:
     photons = np.geomspace(threshold, saturation, _BINS)
     # the efficiency is in percent
     electrons = efficiency / 100 * photons
-    # electrons squared: dark noise from DN by the gain, and shot noise
+    # variance in electrons squared: dark noise converted from DN by the gain, plus shot noise
     noise_variance = (sheet["sigma_y_dark"].value or 0.0) ** 2 / gain**2 + electrons
     ax.plot(photons, electrons / np.sqrt(noise_variance), color=BLUE, label="linear model")
     ax.plot(photons, np.sqrt(photons), color=GREEN, linestyle="-.", label="ideal sensor")
@@ -144,8 +144,8 @@ def _modelled_ratio(ax: Any, sheet: EmvaSheet) -> None:
 
 
 def general(sheet: EmvaSheet) -> Any:
-    """Draw the local slope of the response and the signal-to-noise ratio of the light; None with
-    too few levels.
+    """Draw the local slope of the response and the input-referred signal-to-noise ratio; return
+    None with too few levels.
     """
     model = general_model(sheet.transfer)
     if model is None:
@@ -174,8 +174,8 @@ def general(sheet: EmvaSheet) -> Any:
 
 
 def linearity(sheet: EmvaSheet) -> Any:
-    """Draw the response with its line, and the relative deviation from the line, from 5 to 95 %
-    of saturation.
+    """Draw the response with its line, and the relative deviation from this line, between 5 and 95
+    % of saturation.
     """
     figure, axes = canvas(_WIDTH, 6.0, 2, 1, sharex=True, height_ratios=(1.4, 1.0))
     response_panel, deviation_panel, transfer, in_fit = (
@@ -221,8 +221,8 @@ def linearity(sheet: EmvaSheet) -> Any:
 
 
 def dark_current(sheet: EmvaSheet) -> Any:
-    """Draw mean and variance of the dark over the exposure; None where all darks have one
-    exposure.
+    """Draw mean and variance of the dark frames against the exposure; return None if all darks have
+    one exposure.
     """
     transfer = sheet.transfer
     if len(np.unique(transfer.dark_exposure)) < 2:
@@ -242,7 +242,9 @@ def dark_current(sheet: EmvaSheet) -> Any:
 
 
 def spectrograms(sheet: EmvaSheet) -> Any:
-    """Draw the spectrograms of DSNU and PRNU along rows and columns; None without a series."""
+    """Draw the spectrograms of DSNU and PRNU along rows and columns; return None without
+    a series.
+    """
     images = emva_sheet.spectrograms(sheet)
     if not images:
         return None
@@ -282,7 +284,7 @@ def spectrograms(sheet: EmvaSheet) -> Any:
 
 
 def line_profiles(sheet: EmvaSheet) -> Any:
-    """Draw the horizontal and vertical profiles of the averaged dark and lit frames; None
+    """Draw the horizontal and vertical profiles of the averaged dark and lit frames; return None
     without a series.
     """
     images = emva_sheet.line_profiles(sheet)
@@ -302,7 +304,7 @@ def line_profiles(sheet: EmvaSheet) -> Any:
 
 
 def defect_pixels(sheet: EmvaSheet) -> Any:
-    """Draw the logarithmic and the accumulated histograms of DSNU and PRNU; None without a
+    """Draw the logarithmic and accumulated histograms of DSNU and PRNU; return None without a
     series.
     """
     histograms = emva_sheet.defect_histograms(sheet)
@@ -372,21 +374,24 @@ def _picture(draw: Draw, sheet: EmvaSheet) -> bytes | None:
 
 
 def _saturation(ax: Any, sheet: EmvaSheet, level: float) -> None:
-    """Draw a vertical line at the saturation, or at the brightest level if it is not reached.
+    """Draw a vertical line at the saturation, or at the brightest level if saturation is not
+    reached.
 
-    `level` is its place on the horizontal axis of `ax`.
+    ``level`` is its position on the horizontal axis of ``ax``.
     """
     label = "saturation" if sheet.transfer.saturated else "brightest level: saturation not reached"
     ax.axvline(level, color=VERMILION, linestyle="--", label=label)
 
 
 def _light(sheet: EmvaSheet) -> str:
-    """Return the label of the axis of light; without a quantum efficiency the light is relative."""
+    """Return the label of the light axis; without a quantum efficiency the light is only
+    relative.
+    """
     return "light (relative)" if sheet["eta"].value is None else "μ_p (photons per pixel)"
 
 
 def _straight(x: Any, y: Any) -> Any:
-    """Return the values at `x` of the line of least squares through the points (x, y)."""
+    """Return the values at ``x`` of the least-squares line through the points (x, y)."""
     return np.polyval(np.polyfit(x, y, 1), x)
 
 
@@ -395,21 +400,20 @@ def _straight(x: Any, y: Any) -> Any:
 # The PDF of the EMVA 1288 sheet: a page with all quantities, and a page for each picture.
 
 
-_LINE = 105  #: characters of a line of the summary
+_LINE = 105  #: largest number of characters in a line of the summary
 _COLUMNS = ("symbol", "quantity", "value", f"U ({COVERAGE:.0%})")
 _A4 = (8.27, 11.69)  #: inches
 
 
 def pdf(sheet: EmvaSheet, title: str, lines: list[str], budgets: Sequence[Budget] = ()) -> bytes:
-    """Return a PDF: the summary of the sheet on its first page, and the pictures on the pages after
-    it.
+    """Return a PDF with a summary of the sheet on its first page, followed by the pictures.
 
     ``budgets`` have the expanded uncertainty of each quantity with a value.
     """
     from matplotlib.backends.backend_pdf import PdfPages
 
     pdf_file = io.BytesIO()
-    # equal frames give equal bytes
+    # no creation date, so that equal frames give equal bytes
     metadata = {"Title": title, "Creator": "neusee", "CreationDate": None}
     with styled(), PdfPages(pdf_file, metadata=metadata) as pages:
         pages.savefig(_summary(sheet, title, lines, {b.key: b for b in budgets}))
@@ -422,7 +426,7 @@ def pdf(sheet: EmvaSheet, title: str, lines: list[str], budgets: Sequence[Budget
 
 
 def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[str, Budget]) -> Any:
-    """Return a page of A4 with title, what is told of the camera, and the table of all
+    """Return an A4 page with the title, the statements on the camera, and a table of all
     quantities.
     """
     figure, axes = canvas(*_A4, 2, 1, height_ratios=(0.25, 1.0))
@@ -453,9 +457,7 @@ def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[st
 
 
 def _expanded(budget: Budget | None) -> str:
-    """Return the expanded uncertainty in the unit of the value as text; + says that a source is
-    not stated.
-    """
+    """Return the expanded uncertainty as text; a + marks that one of its sources is not stated."""
     if budget is None:
         return "–"
     return two_digits(budget.expanded) + " +" * bool(budget.missing)

@@ -1,4 +1,6 @@
-"""The EMVA 1288 sheet: its frames, its patterns of defects, and the page of quantities."""
+"""The EMVA 1288 sheet: the frames it reads, spectrograms and defect histograms, and its page of
+quantities.
+"""
 
 from __future__ import annotations
 
@@ -51,13 +53,13 @@ T = TypeVar("T")
 
 # --- emva frames ----------------------------------------------------------------------------------
 
-# Light levels and series of frames of a recipe, as the sheet of EMVA 1288 needs them.
+# Light levels and series of frames of a recipe, in the form that the EMVA 1288 sheet needs.
 
 
 Release = Literal["4", "3"]
-#: release of EMVA 1288 since which the variance in time excludes the difference of means
+#: first release of EMVA 1288 whose temporal variance excludes the differences between frame means
 _STEADY = 3.1
-#: what the standard wants to be told of the operating point
+#: statements on the operating point that the standard requires
 OPERATING_POINT = {
     "camera": "camera",
     "sensor": "sensor",
@@ -71,7 +73,7 @@ OPERATING_POINT = {
     "temperature": "temperature",
     "laboratory": "laboratory and date",
 }
-_HALF = 0.5  #: share of saturation at which the lit series is taken
+_HALF = 0.5  #: share of saturation at which the series of lit frames should be taken
 _TEXT = """# EMVA 1288: the sheet of the measurement {name}.
 steps:
   measured: {{node: calibrate.descriptor, with: {{file: {file}, scatter: steady}}}}
@@ -85,13 +87,13 @@ class EmvaFrames(NamedTuple):
     levels: Levels
     spatial: Nonuniformity
     frames: int  #: least number of frames of a level
-    tests: Sequence[FrameTest] = ()  #: of the frames themselves
-    release: Release = "4"  #: whose variance in time the levels have
+    tests: Sequence[FrameTest] = ()  #: tests of the frames themselves
+    release: Release = "4"  #: release that defines the temporal variance of the levels
     stated: str = ""  #: release that the descriptor states
 
 
 def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
-    """Return the recipe of a sheet of the measurement that an EMVA 1288 descriptor file describes.
+    """Return a recipe for the sheet of the measurement that an EMVA 1288 descriptor file describes.
 
     Raises: ValueError for a descriptor or an image that is missing or cannot be read, `RecipeError`
             with all mistakes
@@ -107,8 +109,8 @@ def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
 
 
 def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = None) -> EmvaFrames:
-    """Return levels with the variance in time, and the dark and the lit series, of a recipe that
-    reads frames.
+    """Return the light levels with their temporal variance, and the dark and lit series, of a
+    recipe that reads frames.
 
     In release 4 the variance of a level excludes the difference of the means of its frames; in 3 it
     includes it. By default the release is that which the descriptor states, and 4 where no
@@ -137,22 +139,22 @@ def _steps_of(recipe: Recipe, node: str) -> list[Step]:
 
 
 def _tabled(recipe: Recipe, store: Store, name: str) -> EmvaFrames:
-    """Return the levels of a table of moments, which has no series."""
+    """Return the levels from a table of mean and variance, which has no series of frames."""
     measured = run(recipe, store, (name,)).values[name]
     dark_variances = measured.variance[measured.photons == 0]
     tests = [coarse(float(dark_variances.min()), exact=False)] if len(dark_variances) else []
-    # a table has the moments of two frames or more, and no averaged frames
+    # a table has mean and variance of two frames or more, and no averaged frames
     return EmvaFrames(measured, Nonuniformity(None, None), 2, tests)
 
 
 _READERS = ("calibrate.descriptor", "calibrate.reduce", "calibrate.table")
 _FITTED = 0.7  #: share of saturation up to which the sheet fits its lines
-#: parameter of the nodes that reduce frames
+#: value of the parameter ``scatter`` of the nodes that reduce frames, by release
 _SCATTER: dict[Release, Any] = {"4": "steady", "3": "temporal"}
 
 
 def _described(step: Step, scatter: Any) -> EmvaFrames:
-    """Return levels, series and tests of the frames that a descriptor file names."""
+    """Return levels, series and tests of the frames listed in a descriptor file."""
     files = step.params["file"]
     measured = descriptor(file=files, scatter=scatter)
     averaged_series = [spatial_series(*entry) for entry in descriptor_series(files)]
@@ -169,8 +171,8 @@ def _described(step: Step, scatter: Any) -> EmvaFrames:
 
 
 def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) -> EmvaFrames:
-    """Return levels and series of the steps that reduce frames; the levels of most frames are
-    the series.
+    """Return levels and series of the steps that reduce frames; the series are the levels with the
+    most frames.
     """
     level_parts, frame_counts = [], []
     for step in steps:
@@ -211,7 +213,7 @@ def _nearest_half(series: Sequence[SpatialSeries], measured: Levels) -> Nonunifo
 
 
 def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
-    """Return the dark and the lit one of at most two series; a series without photons is dark."""
+    """Return the dark and the lit series out of at most two; a series without photons is dark."""
     dark: SpatialSeries | None = None
     lit: SpatialSeries | None = None
     for averaged in series:
@@ -220,8 +222,8 @@ def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
 
 
 def _dark_and_half(light: Sequence[tuple[float, float]], measured: Levels) -> list[int]:
-    """Return the indices of the dark and of the lit series nearest to half of saturation, with one
-    exposure if can be.
+    """Return the indices of the dark series, and of the lit series nearest to half of saturation,
+    with equal exposures if possible.
 
     ``light`` has photons and exposure of each series.
     """
@@ -232,7 +234,7 @@ def _dark_and_half(light: Sequence[tuple[float, float]], measured: Levels) -> li
     half_number = _half_of_saturation(light, saturating_photons, dark_times)
     numbers = [] if half_number is None else [half_number]
     if dark_numbers:
-        # the dark with the exposure of the lit series, if can be
+        # the dark series whose exposure is nearest to that of the lit series
         exposure = min(dark_times) if half_number is None else light[half_number][1]
         nearest_dark = int(np.abs(np.array(dark_times) - exposure).argmin())
         numbers.insert(0, dark_numbers[nearest_dark])
@@ -242,8 +244,8 @@ def _dark_and_half(light: Sequence[tuple[float, float]], measured: Levels) -> li
 def _half_of_saturation(
     light: Sequence[tuple[float, float]], top: float, dark_times: Sequence[float]
 ) -> int | None:
-    """Return the index of the lit series nearest to half of ``top``, if can be among those with
-    the exposure of a dark one; None without a lit series.
+    """Return the index of the lit series nearest to half of ``top`` photons, preferably with the
+    exposure of a dark series; None without a lit series.
     """
     lit_numbers = [i for i, (photons, _) in enumerate(light) if photons > 0]
     lit_with_dark = [i for i in lit_numbers if light[i][1] in dark_times]
@@ -254,13 +256,14 @@ def _half_of_saturation(
 
 # --- emva patterns --------------------------------------------------------------------------------
 
-# Spectrograms, profiles and histograms of defect pixels of an EMVA 1288 sheet, for its pictures and
-# its tables.
+# Spectrograms, profiles and defect-pixel histograms of an EMVA 1288 sheet, for its pictures and
+# tables.
 
 
 _DIRECTIONS = {"horizontal": False, "vertical": True}
-# the sum over 5 x 5 pixels, so that whole numbers stay whole
-_HIGHPASS = 25  #: by which `without_trend` multiplies
+# `without_trend` multiplies by 25 = 5 x 5 pixels instead of dividing, so that integers stay
+# integers
+_HIGHPASS = 25  #: factor by which `without_trend` multiplies
 _SPECTROGRAMS = ("frame", "unit", "direction", "cycles_per_pixel", "amplitude")
 _PROFILES = ("frame", "direction", "pixel", *Profiles._fields)
 _DEFECTS = ("frame", "unit", "deviation", "pixels", "normal")
@@ -268,8 +271,8 @@ _BEYOND = ("frame", "unit", "distance", "percent_beyond")
 
 
 def spectrograms(sheet: EmvaSheet) -> dict[tuple[str, str], dict[str, Spectrogram]]:
-    """Return the spectrograms by name and unit of the frame, DSNU in DN and PRNU in percent, and
-    by direction.
+    """Return the spectrograms by name and unit (DSNU in DN, PRNU in percent), and then by
+    direction.
     """
     dark, lit = sheet.spatial
     images: dict[tuple[str, str], Any] = {}
@@ -292,25 +295,26 @@ def line_profiles(sheet: EmvaSheet) -> dict[str, dict[str, Profiles]]:
 
 
 def _by_direction(measure: Callable[[Any, bool], T], image: Any) -> dict[str, T]:
-    """Return what a function measures along the rows and along the columns of an image."""
+    """Return the result of ``measure`` along the rows and along the columns of an image."""
     return {name: measure(image, is_vertical) for name, is_vertical in _DIRECTIONS.items()}
 
 
 def defect_histograms(sheet: EmvaSheet) -> dict[tuple[str, str], DefectHistogram]:
-    """Return the histograms of defect pixels by name and unit, DSNU in DN and PRNU in percent of
-    the signal.
+    """Return the histograms of defect pixels by name and unit: DSNU in DN, PRNU in percent of the
+    signal.
     """
     dark, lit = sheet.spatial
     histograms = {}
     if dark is not None:
         histograms["DSNU", "DN"] = defects(dark.total, 1 / dark.count)
     if dark is not None and lit is not None and (signal := signal_of(dark, lit)) > 0:
-        # sums of whole numbers stay whole: both means times the least common multiple of the counts
+        # integers stay integers: both means are multiplied by the least common multiple of the
+        # frame counts
         common_divisor = math.gcd(dark.count, lit.count)
         trendless = without_trend(
             (lit.total * dark.count - dark.total * lit.count) // common_divisor
         )
-        # the second argument turns the whole numbers into percent of the signal
+        # the second argument scales these integers to percent of the signal
         histograms["PRNU", "%"] = defects(
             trendless, 100 * common_divisor / (_HIGHPASS * dark.count * lit.count * signal)
         )
@@ -318,27 +322,27 @@ def defect_histograms(sheet: EmvaSheet) -> dict[tuple[str, str], DefectHistogram
 
 
 def noise_in_time(sheet: EmvaSheet, name: str) -> tuple[float, float]:
-    """Return the standard deviations in time of a frame and of the average, in the unit of the
-    spectrogram.
+    """Return the temporal standard deviations of one frame and of the average of all frames, in the
+    unit of the spectrogram.
     """
     dark, lit = sheet.spatial
     assert dark is not None
     if name == "DSNU" or lit is None:
         return math.sqrt(dark.temporal), math.sqrt(dark.temporal / dark.count)
     percent_per_dn = 100 / signal_of(dark, lit)
-    # the average of frames less the average of the darks: both variances of a mean add up
+    # average of the lit frames minus average of the darks: the variances of both means add
     return percent_per_dn * math.sqrt(lit.temporal), percent_per_dn * math.sqrt(
         lit.temporal / lit.count + dark.temporal / dark.count
     )
 
 
 def signal_of(dark: SpatialSeries, lit: SpatialSeries) -> float:
-    """Return the mean signal of the lit series above the dark one, DN."""
+    """Return the mean signal in DN of the lit series above the dark series."""
     return float(lit.average.mean() - dark.average.mean())
 
 
 def pattern_tables(sheet: EmvaSheet) -> Mapping[str, CsvTable]:
-    """Return the curves as tables by file name; without a series there is none."""
+    """Return the curves as CSV tables by file name; empty without a series of frames."""
     if not (histograms := defect_histograms(sheet)):
         return {}
     return {
@@ -352,7 +356,7 @@ def pattern_tables(sheet: EmvaSheet) -> Mapping[str, CsvTable]:
 def _histogram_rows(
     histograms: Mapping[tuple[str, str], DefectHistogram], fields: slice
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield name, unit and some fields of each class of each histogram."""
+    """Yield a row for each class of each histogram: name, unit, and the selected ``fields``."""
     for key, histogram in histograms.items():
         yield from ((*key, *row) for row in zip(*map(_plain, histogram[fields]), strict=True))
 
@@ -383,16 +387,15 @@ def _plain(values: Any) -> list[Any]:
 
 # --- emva page ------------------------------------------------------------------------------------
 
-# The page of the EMVA 1288 sheet: quantities, pictures, and what of the standard was measured and
-# told.
+# The page of the EMVA 1288 sheet: quantities, pictures, and which demands of the standard are met.
 
 
 _LEVELS, _EXPOSURES, _SERIES = (
     50,
     6,
     16,
-)  #: lit levels, exposures of darks, frames of a series that the standard asks for
-#: name of the test of frames that says the same as `_COARSE`
+)  #: number of lit levels, dark exposures and frames per series that the standard requires
+#: name of the frame test that has the same meaning as `_COARSE`
 _ROUNDING = "the dark noise exceeds rounding"
 _COARSE = """the temporal dark noise is below 0.49 DN; the standard asks for more, because \
 rounding hides the noise: \
@@ -490,7 +493,7 @@ _SECTIONS = (
 
 
 class Requirement(NamedTuple):
-    """A demand of the standard, what was found, and if it is met."""
+    """A demand of the standard, what was found, and whether it is met."""
 
     demand: str
     found: str
@@ -498,8 +501,8 @@ class Requirement(NamedTuple):
 
 
 def banner(sheet: EmvaSheet, tests: Sequence[FrameTest] = ()) -> str:
-    """Return why the linear model of the standard does not hold for these frames, or an empty
-    text.
+    """Return the reasons why the linear model of the standard does not hold for these frames; empty
+    if it holds.
     """
     is_coarse = sheet["sigma_y_dark"].bound != ""
     reasons: list[str] = []
@@ -517,8 +520,8 @@ def banner(sheet: EmvaSheet, tests: Sequence[FrameTest] = ()) -> str:
 
 
 def temporal_variance(frames: EmvaFrames, by_user: bool) -> str:
-    """Return which variance in time the sheet has, and why; ``by_user`` is True if the user chose
-    the release.
+    """Return a sentence on which temporal variance the sheet uses and why; ``by_user`` is True if
+    the user chose the release.
     """
     text = f"The variance of a level {_VARIANCE[frames.release]}"
     if not frames.stated:
@@ -560,8 +563,8 @@ def sections(
     pictures: Mapping[str, bytes],
     budget: Sequence[Section] = (),
 ) -> list[Section]:
-    """Return the sections of the page in the order of the standard, without plots that the frames
-    do not allow.
+    """Return the sections of the page in the order of the standard; sections without rows or
+    picture are left out.
 
     The sections ``budget`` have the uncertainty of the quantities.
     """
@@ -577,15 +580,15 @@ def sections(
 def requirements(
     sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any]
 ) -> list[Requirement]:
-    """Return each demand of the standard on the frames and on what is told of them."""
+    """Return each demand of the standard on the frames and on the statements about them."""
     return [*_of_transfer(sheet, frames), *_of_series(sheet), *_of_told(statements), *_elsewhere()]
 
 
 def operating_point(
     statements: Sequence[str], traced: Traceability | None = None
 ) -> dict[str, str | None]:
-    """Return what statements such as ``temperature=25 °C`` tell of the operating point; None where
-    nothing is told.
+    """Return the statements on the operating point by key, from texts such as ``temperature=25
+    °C``; None where nothing is stated.
 
     What the recipe states in the block ``traceability`` counts where no statement says otherwise.
     Raises: ValueError for a statement that is not a key of `OPERATING_POINT`, ``=`` and a text.
@@ -605,7 +608,7 @@ def operating_point(
 
 
 def group_of(quantity: Quantity, sheet: EmvaSheet) -> str:
-    """Return the heading under which the sheet has a quantity."""
+    """Return the heading of the table in which the sheet lists a quantity."""
     keys = [row.key for row in sheet.quantities]
     position = keys.index(quantity.key)
     return next(
@@ -657,7 +660,8 @@ def _compliance(sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, A
 
 
 def _of_transfer(sheet: EmvaSheet, frames: EmvaFrames) -> Iterator[Requirement]:
-    """Yield the demands on the levels and their darks.
+    """Yield the demands on the levels and their darks: number, exposures, saturation and dark
+    noise.
 
     They are of number, exposures, saturation and dark noise.
     """
@@ -681,7 +685,9 @@ def _of_transfer(sheet: EmvaSheet, frames: EmvaFrames) -> Iterator[Requirement]:
 
 
 def _of_series(sheet: EmvaSheet) -> Iterator[Requirement]:
-    """Yield the demands on the dark and the lit series. The spatial quantities come from these."""
+    """Yield the demands on the dark and the lit series, from which the spatial quantities are
+    computed.
+    """
     dark, lit = sheet.spatial
     for name, series in (("dark", dark), ("lit", lit)):
         demand = f"series of {_SERIES} or more {name} frames for spatial quantities"
@@ -702,7 +708,9 @@ def _of_series(sheet: EmvaSheet) -> Iterator[Requirement]:
 
 
 def _of_told(statements: Mapping[str, Any]) -> Iterator[Requirement]:
-    """Yield one demand for each statement of the operating point; `statements` has them by key."""
+    """Yield one demand for each statement on the operating point; ``statements`` maps keys to
+    values.
+    """
     for key, name in OPERATING_POINT.items():
         value = statements.get(key)
         text = "not stated" if value is None else str(value)
@@ -710,8 +718,8 @@ def _of_told(statements: Mapping[str, Any]) -> Iterator[Requirement]:
 
 
 def _elsewhere() -> Iterator[Requirement]:
-    """Yield what the standard asks for, or offers, that frames of one light and one temperature
-    cannot show.
+    """Yield the quantities of the standard that frames of one light and one temperature cannot
+    show.
     """
     yield Requirement("spectral sensitivity η(λ)", "not measured: one light", "warn")
     yield Requirement("dark current over temperature", "not measured: one temperature", "warn")
@@ -723,7 +731,7 @@ def _elsewhere() -> Iterator[Requirement]:
 
 
 def _asked(demand: str, text: str, met: bool) -> Requirement:
-    """Return a demand that is met, or that warns if it is not."""
+    """Return a demand with its mark: pass if it is met, else a warning."""
     mark: Mark = "pass" if met else "warn"
     return Requirement(demand, text, mark)
 

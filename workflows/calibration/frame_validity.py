@@ -1,4 +1,4 @@
-"""Tests of the frames of a calibration, and intervals from several response models."""
+"""Tests of the frames of a calibration, and parameter intervals from several response models."""
 
 from __future__ import annotations
 
@@ -42,11 +42,12 @@ if TYPE_CHECKING:
 
 # --- model spread ---------------------------------------------------------------------------------
 
-# Parameter intervals for a camera of unknown response, from posteriors with several models of the
-# response.
+# Parameter intervals for a camera of unknown response, from the posteriors of several response
+# models.
 
 
-TERMS = ("bend", "twist")  #: terms of the response, in the order in which models add them
+#: non-linear terms of the response, in the order in which models add them
+TERMS = ("bend", "twist")
 
 
 @dataclass(frozen=True)
@@ -64,12 +65,12 @@ class IntervalEstimate:
 
 @dataclass(frozen=True)
 class ModelSpread:
-    """The posterior of one parameter with each model of the camera's response, and the interval
-    to report.
+    """The posterior of one parameter for each response model of the camera, and the interval to
+    report.
     """
 
     name: str
-    #: the posterior with 0, 1, 2 terms of the response, as far as they are free
+    #: the posterior with 0, 1 and 2 free terms of the response
     models: tuple[IntervalEstimate, ...]
     stated: IntervalEstimate
 
@@ -78,12 +79,12 @@ _Posterior = dict[str, tuple[float, float]]  #: mean and standard deviation of e
 
 
 def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpread]:
-    """Return the posterior with each model of the camera's response and the interval to report, for
-    each parameter.
+    """Return, for each parameter, its posterior for each response model of the camera and the
+    interval to report.
 
-    The stated value is the mean of the two models with the most terms. The stated width is the
-    standard deviation of this mean (`width_of_mean`) and half the distance of both values, added in
-    quadrature.
+    The stated value is the mean of the two models with the most terms. The stated width combines,
+    in quadrature, the standard deviation of this mean (`width_of_mean`) and half the difference of
+    both values.
 
     One model is not enough. For 36 simulated cameras a response with 1 million pixels a level,
     cubic by 5 % at 4095 DN, the 90 % interval of two terms contained the true gain in 44 % of all
@@ -114,8 +115,8 @@ def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpr
 
 
 def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) -> None:
-    """Raise `ValueError` if too few lit levels exist to tell the non-linear response ``terms`` from
-    lamp drift.
+    """Raise `ValueError` if there are too few lit levels to separate the non-linear response
+    ``terms`` from lamp drift.
 
     For 60 simulated cameras and two terms, 90 % intervals contained the truth in 93 % with 4 lit
     levels, and in 58 % with 2 lit levels.
@@ -132,7 +133,7 @@ def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) ->
 
 
 def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
-    """Return the recipe with the response ``terms`` fixed at zero in the prior and the
+    """Return the recipe with the response ``terms`` fixed at zero, in the prior and in the
     likelihood step ``weighing``.
     """
     steps = dict(recipe.steps)
@@ -145,7 +146,8 @@ def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
 
 
 def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior:
-    """Return mean and standard deviation of each coordinate.
+    """Return mean and standard deviation of each coordinate, from importance samples of the
+    posterior.
 
     They come from importance samples of the posterior.
     """
@@ -162,9 +164,9 @@ def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior
 
 
 def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -> ModelSpread:
-    """Return the intervals of parameter `name` with each model, and the interval to report.
+    """Return the intervals of the parameter ``name`` for each model, and the interval to report.
 
-    `posteriors` are those of the models, with rising numbers of terms.
+    ``posteriors`` are those of the models, with increasing numbers of terms.
     """
     is_linear = name in problem.coordinates.linear
     models = [posterior[name] for posterior in posteriors]
@@ -182,8 +184,8 @@ def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -
 
 
 def width_of_mean(fewer: float, richer: float) -> float:
-    """Return the standard deviation of the mean of the values that two nested models give for the
-    same levels.
+    """Return the standard deviation of the mean of two values from nested models fitted to the same
+    levels.
 
     ``fewer`` and ``richer`` are the widths of the posteriors with fewer and with more terms. An
     efficient estimate and its difference to any other unbiased estimate of the same data are
@@ -210,8 +212,8 @@ def _interval(centre: float, width: float, linear: bool) -> IntervalEstimate:
 
 # --- frame validity -------------------------------------------------------------------------------
 
-# Tests of the frames of a calibration before any likelihood, and what follows from these tests for
-# the posterior.
+# Tests of the frames of a calibration before any likelihood, and the consequences for the
+# posterior.
 
 
 _MARKS: dict[str, Mark] = {
@@ -221,23 +223,23 @@ _MARKS: dict[str, Mark] = {
     "refused": "fail",
 }
 _NOISES = ("read_noise", "temporal_dark_noise")
-#: inversely to the gain
+#: parameters that are inversely proportional to the gain
 _IN_ELECTRONS = (*_NOISES, "offset", "dark_current", "full_well", "quantum_efficiency")
 _SMALL = 1e-5  #: relative error below which no interval is widened
 _LIKELIHOODS = ("calibrate.density", "calibrate.camera", "calibrate.stray_light")
 
 
 def inspect_recipe(recipe: Recipe, store: Store) -> list[FrameTest]:
-    """Return the tests of the frames that the likelihood of a recipe describes; none for a picture
-    of a point source.
+    """Return the tests of the frames behind the likelihood of a recipe; empty for a picture of a
+    point source.
 
-    Of a table of moments only the dark noise is tested.
+    For a table of moments only the dark noise is tested.
     """
     weighing = only_step(recipe, *_LIKELIHOODS)
     if weighing.node.path == "calibrate.stray_light":
         return []
     steps = list(_upstream(recipe, weighing))
-    # this likelihood counts each digital number, so that rounding does no harm
+    # this likelihood uses the histogram of digital numbers, so that rounding does no harm
     is_exact = weighing.node.path == "calibrate.density"
     if any(step.node.path in ("calibrate.reduce", "calibrate.descriptor") for step in steps):
         return inspect_frames(_stacks(recipe, store, steps), is_exact, _share(weighing, steps))
@@ -250,8 +252,8 @@ def inspect_recipe(recipe: Recipe, store: Store) -> list[FrameTest]:
 
 
 def _share(weighing: Step, steps: Sequence[Step]) -> float | None:
-    """Return the share of saturation above which the likelihood leaves levels out, or None if it
-    uses all levels.
+    """Return the share of saturation above which the likelihood ignores levels; None if it uses all
+    levels.
     """
     reduced = next((step for step in steps if step.node.path == "calibrate.sufficient"), weighing)
     share = reduced.params.get("share")
@@ -269,7 +271,8 @@ def _upstream(recipe: Recipe, step: Step) -> Iterator[Step]:
 
 
 def _stacks(recipe: Recipe, store: Store, steps: Sequence[Step]) -> Iterator[Stack]:
-    """Yield the frames of each level.
+    """Yield the frames of each level, with photons, exposure and the kind of scatter that the step
+    measures.
 
     Photons, exposure and the scatter that the step measures are with them.
     """
@@ -288,8 +291,8 @@ def _stacks(recipe: Recipe, store: Store, steps: Sequence[Step]) -> Iterator[Sta
 def frames_and_mask(
     recipe: Recipe, store: Store, step: Step
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Return the frames that a step of `calibrate.reduce` receives, and the mask of its hot
-    pixels if it has one.
+    """Return the input frames of a step of `calibrate.reduce`, and the mask of its hot pixels or
+    None.
     """
     source, mask = str(step.wires["frames"]), step.wires.get("mask")
     outputs = (source, str(mask)) if mask else (source,)
@@ -298,8 +301,8 @@ def frames_and_mask(
 
 
 def lines(tests: Sequence[FrameTest]) -> Iterator[str]:
-    """Yield a line for each test of frames that has something to say, and one for all that
-    passed.
+    """Yield a line for each test of frames that did not pass, and a line with the number of passed
+    tests.
     """
     passed = [test for test in tests if test.verdict == "passed"]
     for test in tests:
@@ -310,8 +313,8 @@ def lines(tests: Sequence[FrameTest]) -> Iterator[str]:
 
 
 def frame_checks(tests: Sequence[FrameTest], has_frames: bool = True) -> list[Check]:
-    """Return each test of frames as a check of the posterior, which fails if the frames are
-    refused.
+    """Return each test of frames as a check of the posterior; it fails if the test refuses the
+    frames.
     """
     checks = [
         Check(t.name, f"{t.verdict}: {t.sentence}", _bar(t), _MARKS[t.verdict]) for t in tests
@@ -323,8 +326,8 @@ def frame_checks(tests: Sequence[FrameTest], has_frames: bool = True) -> list[Ch
 
 
 def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[Check]:
-    """Return what faults that the frames have or may hide leave open, as a check that cannot
-    fail.
+    """Return a check that lists the errors by faults that the frames show or may hide; it cannot
+    fail. Empty without such faults.
     """
     hidden = hidden_faults(tests, may_hide)
     if not hidden:
@@ -342,7 +345,7 @@ def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[
 
 
 def data_check(pairs: float) -> Check:
-    """Return if the frames have the least data of a clean statement, as a check that warns.
+    """Return a check that warns if the frames have too few data.
 
     ``pairs`` is the number of pairs of pixels in the lit levels that the fit uses.
     """
@@ -363,7 +366,7 @@ def data_check(pairs: float) -> Check:
 
 
 def _bar(test: FrameTest) -> str:
-    """Return number and limit of a test in words; a negative limit is a lower one."""
+    """Return value and limit of a test as text; a negative limit marks a lower limit."""
     return (
         f"{abs(test.number):.3g}, {'at least' if test.limit < 0 else 'at most'}"
         f" {abs(test.limit):.3g}"
@@ -397,8 +400,8 @@ def as_rows(tests: Iterable[FrameTest]) -> list[dict[str, Any]]:
 
 
 def hidden_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> list[Hidden]:
-    """Return the faults that change gain and noise: those that a test found, and those that
-    ``may_hide`` from it.
+    """Return the faults that change gain and noise: those found by a test, and those in
+    ``may_hide`` that a test may miss.
     """
     faults: list[Hidden] = []
     for test in tests:
@@ -408,8 +411,8 @@ def hidden_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> list[
 
 
 def relative_shifts(tests: Iterable[FrameTest]) -> dict[str, float]:
-    """Return the relative standard deviations of gain and of dark noise in DN that the tests of
-    frames leave open.
+    """Return the relative standard deviations of the gain and of the dark noise in DN that the
+    tests of frames leave open.
     """
     tests = list(tests)
     return {
@@ -421,10 +424,10 @@ def relative_shifts(tests: Iterable[FrameTest]) -> dict[str, float]:
 def widened(
     problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest], seed: int
 ) -> Chains:
-    """Return the draws of a posterior with the errors that frames leave open, as independent normal
-    draws.
+    """Return the draws of a posterior with the errors that the frames leave open added as
+    independent normal draws.
 
-    An error of the gain changes all values in electrons inversely. No mean is changed.
+    An error of the gain changes all values in electrons inversely. The mean values stay.
     """
     errors = open_by_tests(tests, problem.coordinates.prior.may_hide)
     if max(errors.values()) < _SMALL:
@@ -447,7 +450,9 @@ def widened(
 def widened_models(
     models: Iterable[ModelSpread], tests: Sequence[FrameTest], may_hide: Container[str]
 ) -> list[ModelSpread]:
-    """Return the intervals to report with the errors that the frames leave open."""
+    """Return the models with their reported intervals widened by the errors that the frames leave
+    open.
+    """
     errors = errors_of_parameters(tests, may_hide)
     return [
         replace(m, stated=wider(m.stated, errors[m.name])) if m.name in errors else m
@@ -456,8 +461,8 @@ def widened_models(
 
 
 def open_by_tests(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, float]:
-    """Return the relative standard deviations of gain and of dark noise in DN that tests and
-    hidden faults leave.
+    """Return the relative standard deviations of the gain and of the dark noise in DN that tests
+    and hidden faults leave open.
     """
     tests = list(tests)
     hidden_errors, test_errors = open_errors(hidden_faults(tests, may_hide)), relative_shifts(tests)
@@ -465,9 +470,11 @@ def open_by_tests(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[
 
 
 def errors_of_parameters(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, float]:
-    """Return the relative standard deviation that the frames leave open, by the parameter."""
+    """Return the relative standard deviation that the frames leave open for each parameter, by
+    name.
+    """
     errors = open_by_tests(tests, may_hide)
-    # a noise in electrons is one in DN over the gain
+    # noise in electrons = noise in DN / gain, so that both errors add in quadrature
     gain_error, electron_noise_error = errors["gain"], math.hypot(errors["gain"], errors["noise"])
     return {
         "gain": gain_error,
@@ -477,10 +484,13 @@ def errors_of_parameters(tests: Iterable[FrameTest], may_hide: Container[str]) -
 
 
 def wider(interval: IntervalEstimate, shift: float) -> IntervalEstimate:
-    """Return an interval of a positive value with a further relative standard deviation."""
+    """Return the interval of a positive value, widened by a further relative standard deviation
+    ``shift``.
+    """
     if shift < _SMALL:
         return interval
-    # each half of the interval widens in the logarithm, its own width and the shift in quadrature
+    # each half of the interval is widened in the logarithm: its own width and the shift add in
+    # quadrature
     factors = [
         math.exp(math.hypot(math.log(interval.value / interval_end), Z_90 * shift))
         for interval_end in (interval.low, interval.high)

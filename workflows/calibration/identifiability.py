@@ -17,21 +17,23 @@ from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosteri
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray
 
-#: ratio of the prior's standard deviation to that of the levels; below, the prior constrains more
+#: singular value (prior standard deviation over that from the levels) below which the prior
+#: constrains a direction more than the levels do
 WEAK = 3.0
 _LEAST_COMPONENT = (
-    0.1  #: least component with which a parameter counts as part of a direction of length 1
+    0.1  #: component from which a parameter counts as part of a direction of length 1
 )
-_ALONE = 0.97  #: least component with which a direction counts as that of one parameter alone
-#: largest factor by which doubled priors may widen the posterior of a determined parameter
+_ALONE = 0.97  #: component from which a direction counts as that of a single parameter
+#: a parameter is determined if twice as wide priors widen its posterior by at most this factor
 _MOST_WIDENING = 1.25
 #: distance from the prior's middle, in standard deviations, at which the likelihood is compared
 _FAR_PRIOR_SD = 3.0
-#: standard deviations of the prior by which a limit must lie inside that of the prior alone
+#: distance in prior standard deviations by which a limit must lie inside the limit of the prior
+#: alone
 _TELLS = 0.5
 _ENDS = (0.05, 0.95)
 _ALONE_DRAWS = 20_000  #: draws of the prior
-_FALLS = 4.0  #: nats by which the likelihood must fall at this distance to set a limit
+_FALLS = 4.0  #: decrease of the log likelihood at this distance that sets a limit
 
 KINDS = {
     "estimate": "",
@@ -40,21 +42,21 @@ KINDS = {
     "between": "only limits on both sides",
     "none": "not from these frames",
 }
-#: by parameter and kind: the reason why the frames set only a limit, or none
+#: reason by parameter and kind why the frames set only a limit, or none
 _REASONS = {
     ("full_well", "lower"): ": no frame is saturated by the well",
     ("dark_current", "upper"): ": no dark was exposed for long enough",
     ("dark_current", "none"): ": no dark was exposed for long enough",
     ("read_noise", "upper"): ": the converter is too coarse for it",
 }
-#: parameters in electrons, of which frames that do not tell the gain give no value
+#: parameters in electrons; without a known gain, frames give no value of them
 _ELECTRONS = ("offset", "read_noise", "temporal_dark_noise", "dark_current", "full_well")
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """The parameters and parameter combinations that the measured light levels determine or
-    leave to the prior.
+    """The parameters and combinations that the measured light levels determine, and those that
+    depend on the prior.
     """
 
     kinds: dict[str, str]  #: one of `KINDS` for each parameter
@@ -64,25 +66,25 @@ class Identifiability:
 
     @property
     def estimated(self) -> tuple[str, ...]:
-        """Return the names of the parameters whose values the measured light levels determine."""
+        """Return the names of the parameters whose values the light levels determine."""
         return tuple(name for name, kind in self.kinds.items() if kind == "estimate")
 
     @property
     def told(self) -> tuple[str, ...]:
-        """Return the names of the parameters of which the light levels give a value or a limit."""
+        """Return the names of the parameters for which the light levels give a value or a limit."""
         return tuple(name for name, kind in self.kinds.items() if kind != "none")
 
 
 def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
-    """Find the parameters that the light levels determine, by singular values of the levels'
+    """Find the parameters that the light levels determine, from the singular values of the levels'
     derivatives.
     """
     _, singular_values, directions = np.linalg.svd(mode.scaled_slopes)
-    # directions without a singular value of their own have the value 0
+    # fewer rows than parameters: the missing singular values are 0
     singular_values = np.concatenate(
         [singular_values, np.zeros(len(directions) - len(singular_values))]
     )
-    # a direction of the singular value decomposition that is weak leaves parameters to the prior
+    # a parameter in a weak direction is determined by the prior, not by the levels
     kinds = {
         name: "estimate" if is_own else "none"
         for name, is_own in zip(problem.names, _own(singular_values, directions), strict=True)
@@ -105,8 +107,8 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
 def _weak_direction(
     problem: SensorPosterior, mode: LaplaceFit, direction: FloatArray, kinds: dict[str, str]
 ) -> str:
-    """Return a text about a direction that the light levels do not determine; set the kind of its
-    parameter in ``kinds`` if it is nearly that of one parameter.
+    """Return a sentence on a direction that the light levels do not determine; if it is nearly that
+    of one parameter, set this parameter's kind in ``kinds``.
     """
     large_components = [
         (parameter, component)
@@ -131,13 +133,13 @@ def identify_from_draws(
     samples: FloatArray,
     weight: FloatArray,
 ) -> Identifiability:
-    """Find what the data determine from weighted draws, for a posterior that is not like that about
-    its mode.
+    """Find the parameters that the data determine from weighted draws, for a posterior that is not
+    normal around its mode.
 
-    A parameter whose posterior is less than a third as wide as its prior has a value. Any other has
-    a limit on each side on which the posterior ends clearly inside the prior, counting only the
-    draws of the prior that are possible; where parameters far along a ridge fit as well, the limits
-    are those of the ridge.
+    A parameter has a value if its posterior is less than a third as wide as its prior. Otherwise it
+    has a limit on each side where the posterior ends clearly inside the prior, of which only
+    possible draws count. Along a ridge where distant parameters fit equally well, the limits are
+    those of the ridge.
     """
     prior_units, prior_draws = problem.whitened(samples), _possible(problem)
     kinds = {}
@@ -147,7 +149,7 @@ def identify_from_draws(
     for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
         estimated = "estimate" in [kinds.get(name) for name in ridge.kinds]
         if ridge.text in about_mode.directions and not estimated:
-            # the data alone give no limit along the ridge, whatever the priors say
+            # without priors the data give no limit along the ridge
             kinds |= ridge.kinds
             sentences.append(ridge.text)
             ridge_names |= set(ridge.kinds)
@@ -160,9 +162,10 @@ def identify_from_draws(
 
 
 def _kind_from_draws(z: FloatArray, alone: FloatArray, weight: FloatArray) -> str:
-    """Return if the data give a parameter a value, or on which sides a limit.
+    """Return whether the data give a value of a parameter, or on which sides they give a limit.
 
-    ``z`` has its weighted draws, ``alone`` those of its prior, both in units of the prior.
+    ``z`` are its weighted draws and ``alone`` draws of its prior, both in standard deviations of
+    the prior.
     """
     # narrower than a third of the prior
     if float(np.sqrt(weight @ (z - weight @ z) ** 2)) < 1 / WEAK:
@@ -175,10 +178,11 @@ def _kind_from_draws(z: FloatArray, alone: FloatArray, weight: FloatArray) -> st
 
 
 def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[str]:
-    """Set each parameter in electrons to ``none`` where the gain is ``none``; return the sentences
-    that then hold.
+    """Set the kind of each parameter in electrons to ``none`` if that of the gain is ``none``, and
+    return the sentences that then apply.
 
-    The frames are in digital numbers: without a gain, electrons come from its prior.
+    The frames are in digital numbers: without a measured gain, a value in electrons would come from
+    the prior of the gain.
     """
     withheld = [
         name
@@ -200,7 +204,7 @@ def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[
 def weighted_quantiles(
     values: FloatArray, weight: FloatArray, shares: Sequence[float]
 ) -> FloatArray:
-    """Return the values below which the ``shares`` of the weights lie."""
+    """Return the quantiles of weighted ``values`` at the given ``shares``."""
     order = np.argsort(values)
     position = np.searchsorted(np.cumsum(weight[order]), shares).clip(0, len(values) - 1)
     quantiles: FloatArray = values[order][position]
@@ -222,12 +226,12 @@ def _possible(problem: SensorPosterior) -> FloatArray:
 
 
 def _as_good(problem: SensorPosterior, mode: LaplaceFit, ridge: Ridge) -> bool:
-    """Return True if parameters far from the mode fit as well, the priors of the limited
-    parameters left out.
+    """Return True if the point ``ridge``, far from the mode, fits about as well as the mode; the
+    priors of the limited parameters are ignored.
     """
     ridge_and_mode = np.stack([ridge.place.numpy(), mode.theta])
     limited_columns = [problem.names.index(name) for name in ridge.kinds]
-    # the normal prior of the limited parameters is taken out again
+    # remove the normal prior of the limited parameters
     log_without_prior = problem.log_posterior(ridge_and_mode) + 0.5 * (
         problem.whitened(ridge_and_mode)[:, limited_columns] ** 2
     ).sum(1)
@@ -235,13 +239,13 @@ def _as_good(problem: SensorPosterior, mode: LaplaceFit, ridge: Ridge) -> bool:
 
 
 def _own(s: FloatArray, v: FloatArray) -> FloatArray:
-    """Return an array that is True for each free parameter that the light levels determine rather
-    than the priors.
+    """Return True (free,) for each parameter that the light levels determine more than the priors
+    do.
 
     The posterior of such a parameter is less than a third as wide as its prior, and hardly widens
     with doubled priors.
     """
-    # of the normal posterior: precision s² of the levels and 1/width² of the prior, by direction
+    # normal posterior: in each direction the levels have the precision s², the prior 1/width²
     posterior_sd, sd_of_doubled = (
         (v.T**2 / (s**2 + prior_width**-2)).sum(1) ** 0.5 for prior_width in (1.0, 2.0)
     )
@@ -252,12 +256,11 @@ def _own(s: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
-    """Return orthogonal directions of undetermined parameters: first single parameters, then
-    combinations.
+    """Return orthogonal undetermined directions: single parameters first, then combinations.
 
-    A mixture of weak directions is weak too, so that any basis of the same space is allowed.
+    Any combination of weak directions is weak as well, so that a convenient basis may be chosen.
     """
-    # parameters that lie nearly whole in the space of weak directions
+    # parameters whose axes lie almost entirely in the weak subspace
     single_columns = np.flatnonzero((weak**2).sum(0) > _ALONE**2)
     unit_directions = np.eye(weak.shape[1])[single_columns]
     _, _, combinations = np.linalg.svd(weak - (weak @ unit_directions.T) @ unit_directions)
@@ -265,7 +268,7 @@ def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
 
 
 def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
-    """Return the limit that the light levels set on a parameter: upper, lower or none.
+    """Return the limit that the light levels set on a parameter: ``upper``, ``lower`` or ``none``.
 
     All other parameters stay at the mode.
     """
@@ -281,9 +284,7 @@ def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
 
 
 def _together(parts: Sequence[tuple[str, float]]) -> str:
-    """Return a text about several parameters that the light levels determine only in
-    combination.
-    """
+    """Return a sentence on parameters that the light levels determine only in combination."""
     largest = max(parts, key=lambda pair: abs(pair[1]))
     # which parameters rise with the largest one along the direction
     other_changes = [(name, bool(x * largest[1] > 0)) for name, x in parts if name != largest[0]]

@@ -1,4 +1,4 @@
-"""Importance sampling of a posterior, with a proposal that is fitted in rounds."""
+"""Importance sampling of a posterior, with a proposal density that is fitted in several rounds."""
 
 from __future__ import annotations
 
@@ -39,37 +39,39 @@ if TYPE_CHECKING:
 
 # A density like a posterior with one mode, fitted in rounds to samples from the densities before.
 #
-# Every sample of every round counts, weighted by the posterior over the mean density of all rounds
+# All samples of all rounds are used, weighted by the posterior over the mean density of all rounds
 # (Cornuet et al., Scand. J. Stat. 39, 798 (2012), adaptive multiple importance sampling). The first
-# round draws about the mode.
+# round samples around the mode.
 
 
 _ROUND_SAMPLES = 3000  #: samples of each round
-#: most and fewest rounds; effective sample fraction at which the last one ends
+#: most and fewest rounds; effective sample fraction at which the rounds end
 _MOST_ROUNDS, _LEAST_ROUNDS, _ENOUGH_FRACTION = 8, 3, 0.6
-#: components of a fit, its steps, and the share of samples added to each
+#: number of components, of fit steps, and of samples (as a share) added to the components
 _COMPONENTS, _FIT_STEPS, _BORROWED_SHARE = 6, 8, 0.1
-_MODE_FREEDOM = 6.0  #: degrees of freedom about the mode
-_FREEDOM = 30.0  #: degrees of freedom of the components that are like the posterior
-#: least deviation of a logarithm at the mode, which is many times larger where the widths are
+_MODE_FREEDOM = 6.0  #: degrees of freedom of the first proposal, around the mode
+_FREEDOM = 30.0  #: degrees of freedom of the components fitted to the posterior itself
+#: standard deviation of a logarithm at the mode from which a parameter counts as near 0; it may be
+#: many times larger for other widths
 _DOUBTFUL_SD = 0.05
-#: share, power of the posterior, and degrees of freedom of the wide part
+#: share, power of the posterior, and degrees of freedom of the wider components
 _WIDE_SHARE, _WIDE_POWER, _WIDE_FREEDOM = 0.2, 0.5, 10.0
 
 
 def fit_about_mode(
     problem: SensorPosterior, mode: LaplaceFit, count: int, rng: np.random.Generator
 ) -> tuple[Density, FloatArray, FloatArray]:
-    """Return a density like the posterior, samples of it (count, free), and the log of posterior
-    over density of each.
+    """Return a density that approximates the posterior, samples of it (count, free), and the log
+    ratio of posterior to density for each.
 
-    The density is a mixture; for a real camera, whose noise has widths that are free, a mixture of
-    these widths, with all other parameters as the widths imply: with a long lower tail of one that
-    is hardly told from 0 (`camera_density`). A fifth of the mixture is fitted to the square root
-    of the posterior, which has the same shape and wider tails, so that no sample far out gets a
-    large weight. The density with the largest effective sample size is kept, with parts for the
-    lower tails of further parameters (`camera_density`), and new samples are drawn from it, whose
-    own effective sample size the caller must check.
+    The density is a mixture. For a real camera, whose noise widths are free parameters, the mixture
+    covers only these widths; all other parameters follow a distribution conditional on the widths,
+    with a long lower tail for one that is hardly distinguishable from 0 (`camera_density`). A fifth
+    of the mixture is fitted to the square root of the posterior, which has the same shape and wider
+    tails, so that no sample far out gets a large weight. The density with the largest effective
+    sample size is kept, parts for the lower tails of further parameters are added
+    (`camera_density`), and new samples are drawn from it. The caller must check the effective
+    sample size of these.
     """
     near_zero = hardly_told(problem, mode)
     # only a real camera has widths among its parameters
@@ -79,7 +81,7 @@ def fit_about_mode(
         else None
     )
     in_mixture = law_of_others.at if law_of_others else np.ones(len(mode.theta), dtype=bool)
-    # begins as one component with the mode and the covariance there
+    # start with one component: the mode and the covariance there
     mixture = Mixture(
         np.ones(1),
         mode.theta[None, in_mixture],
@@ -95,7 +97,7 @@ def fit_about_mode(
         new_samples, log_weights = weighed(problem, proposal, _ROUND_SAMPLES, rng)
         mixtures.append(mixture)
         samples.append(new_samples[:, in_mixture])
-        # weight times density: the log density of the posterior, for any later mixture
+        # weight times density is the posterior: kept, so that any later mixture can be used
         log_densities.append(log_weights + mixture.log_density(new_samples[:, in_mixture]))
         fraction = effective(log_weights)
         if fraction > best_fraction:
@@ -116,7 +118,7 @@ def fit_about_mode(
             ),
         )
         width_density = with_prior_tails(best_mixture, problem, mode, in_mixture, weighted_widths)
-        # `others` has the tail of the first one itself
+        # `law_of_others` already has the tail of the first of these parameters
         density = with_tails(CameraDensity(width_density, law_of_others), near_zero[1:], mode)
     else:
         density = with_tails(best_mixture, near_zero, mode)
@@ -124,8 +126,8 @@ def fit_about_mode(
 
 
 def _given_widths(problem: SensorPosterior, mode: LaplaceFit) -> Others:
-    """Return the distribution of all others given the widths, with a long lower tail of the
-    least certain one.
+    """Return the distribution of all other parameters given the widths, with a long lower tail for
+    the least certain one.
     """
     linear_law, near_zero = GivenWidths(problem, mode), hardly_told(problem, mode, _DOUBTFUL_SD)
     return (
@@ -140,8 +142,8 @@ def _given_widths(problem: SensorPosterior, mode: LaplaceFit) -> Others:
 def _next_mixture(
     mixtures: list[Mixture], samples: FloatArray, log: FloatArray, rng: np.random.Generator
 ) -> Mixture:
-    """Return the mixture for the next round from the ``samples`` of all rounds and their log
-    density ``log``.
+    """Return the mixture for the next round; ``log`` is the log posterior of the ``samples`` of all
+    rounds.
     """
     # one mixture like the posterior, one like its square root, which has wider tails
     same_shape, wider_tails = (
@@ -162,9 +164,9 @@ def _next_mixture(
 def _pooled_log_weights(
     mixtures: list[Mixture], samples: FloatArray, log: FloatArray
 ) -> FloatArray:
-    """Return the log weights of samples that were drawn from all `mixtures` together.
+    """Return the log weights of samples drawn from all ``mixtures`` together.
 
-    `log` is the log density that they shall represent.
+    ``log`` is the log density that the weighted samples should represent.
     """
     return finite(
         log - log_sum(np.stack([mixture.log_density(samples) for mixture in mixtures], -1))
@@ -172,7 +174,7 @@ def _pooled_log_weights(
 
 
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
-    """Return the normal mixture that expectation and maximisation find for weighted samples."""
+    """Return the normal mixture fitted to weighted samples by expectation maximisation."""
     _, covariance = moments(samples, weight)
     start_numbers = rng.choice(len(samples), size=_COMPONENTS, p=weight)
     mixture = Mixture(
@@ -189,7 +191,9 @@ def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -
 
 
 def _root(covariance: FloatArray) -> FloatArray:
-    """Return the Cholesky root of a covariance, made firm against rounding."""
+    """Return the lower Cholesky factor of a covariance, with its diagonal raised slightly against
+    rounding.
+    """
     return np.linalg.cholesky(firm(covariance)).astype(np.float64)
 
 
@@ -200,22 +204,18 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 
 DRAWS = 4000
-_LEAST_FRACTION = 0.02  #: least effective sample fraction
+_LEAST_FRACTION = 0.02  #: least effective sample fraction that is accepted
 
 
 class Guide(NamedTuple):
-    """A density like a posterior, and importance samples of the posterior that are drawn from
-    it.
-    """
+    """A density that approximates the posterior, and importance samples drawn from it."""
 
     density: Density
     samples: FloatArray  #: (draw, free)
-    log: FloatArray  #: (draw,) logarithm of posterior density over this density
+    log: FloatArray  #: (draw,) logarithm of the ratio of posterior to this density
 
     def starts(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return ``count`` different samples, drawn by their weights, at which walkers can
-        start.
-        """
+        """Return ``count`` different samples, drawn by weight, as starting points of walkers."""
         weight = normalised(self.log)
         numbers = rng.choice(
             len(weight), size=count, p=weight, replace=int((weight > 0).sum()) < count
@@ -227,8 +227,8 @@ class Guide(NamedTuple):
 def draw_samples(
     problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return importance samples, and for each sample the logarithm of posterior density over
-    proposal density.
+    """Return importance samples, and for each the logarithm of the ratio of posterior to proposal
+    density.
 
     Raises: `ValueError` if the effective sample size stays too small.
     """
@@ -237,7 +237,7 @@ def draw_samples(
 
 
 def draw_guide(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> Guide:
-    """Return a density like the posterior, and importance samples from it.
+    """Return a density that approximates the posterior, with importance samples from it.
 
     The density starts at the mode; where the posterior may be long and bent, at particles that come
     from the prior.

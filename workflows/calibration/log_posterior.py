@@ -1,4 +1,4 @@
-"""The posterior of a sensor as a function of its free parameters; its mode and covariance."""
+"""The posterior of a sensor as a function of its free parameters, with its mode and covariance."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 # The posterior of a sensor as a function of the sensor's free parameters.
 
 
-#: from parameters to the likelihood by step name
+#: function from parameter values to the likelihood, both by name
 _Function = Callable[[Mapping[str, Any]], dict[str, Any]]
-#: from the node of the likelihood to the node of the prior and the class of the coordinates
+#: for each node of a likelihood: the node of its prior, and the class of its coordinates
 _KINDS: dict[
     str, tuple[str, type[Coordinates] | type[CameraCoordinates] | type[ScatterCoordinates]]
 ] = {
@@ -54,18 +54,18 @@ _KINDS: dict[
 
 @dataclass(frozen=True)
 class SensorPosterior:
-    """The posterior of the sensor of a recipe; a sample has one coordinate for each free
-    parameter.
+    """The posterior of the sensor in a recipe; a sample is an array with one coordinate for each
+    free parameter.
     """
 
     recipe: Recipe
     step: str  #: name of the step that computes the likelihood
-    key: str  #: digest of everything that decides the posterior
+    key: str  #: digest of everything that determines the posterior
     coordinates: Coordinates | CameraCoordinates | ScatterCoordinates
     levels: Sufficient | Levels | Rings  #: the data that the likelihood describes
     weigh: _Function
     weigh_in_full: _Function  #: also returns deviances and derivatives
-    #: the statistics of all frames, from which `levels` follow; None for a lens
+    #: statistics of all frames, of which `levels` may be a selection; None for a lens
     measured: Levels | None = None
 
     @classmethod
@@ -77,7 +77,7 @@ class SensorPosterior:
         prior_node, coordinate_kind = _KINDS[likelihood_step.node.path]
         prior_step = only_step(recipe, prior_node)
         source = str(likelihood_step.wires[likelihood_step.node.inputs[0]])
-        # the statistics of all frames, from which those of the likelihood may be a selection
+        # statistics of all frames; the likelihood may use a selection of them
         levels_step = (
             str(recipe.steps[source].wires["levels"])
             if recipe.steps[source].node.path == "calibrate.sufficient"
@@ -88,7 +88,7 @@ class SensorPosterior:
         if isinstance(coordinates, ScatterCoordinates):
             coordinates = coordinates.seen_by(results[source], likelihood_step.params)
         free_inputs = [f"{likelihood_step.name}.{name}" for name in coordinates.names]
-        # without what only a report needs
+        # told=False: skip the deviances and derivatives that only a report needs
         quick_step = replace(likelihood_step, params={**likelihood_step.params, "told": False})
 
         def function(step: Step) -> _Function:
@@ -149,8 +149,8 @@ class SensorPosterior:
         return log_density
 
     def whitened(self, samples: FloatArray) -> FloatArray:
-        """Convert samples to distances from the middle of the prior, in standard deviations of
-        the prior.
+        """Convert samples to distances from the centre of the prior, in standard deviations of the
+        prior.
         """
         whitened: FloatArray = self.coordinates.whitened(self.parameters(samples)).numpy()
         return whitened
@@ -182,22 +182,27 @@ def only_step(recipe: Recipe, *paths: str) -> Step:
 
 
 _ROUNDS = 60
-_CLOSE = 1e-6  #: twice the nats that one more step may gain at the end of the search
-_NEXT = 1e-3  #: twice the nats that one more step may gain at a settled mode beside an edge
-_STEP = 1e-3  #: step of a difference, in standard deviations of the coordinate
-#: standard deviation of a coordinate that nothing determines, so that a step stays a number
+_CLOSE = 1e-6  #: twice the gain in log posterior that ends the search: a further step gains less
+#: twice the gain in log posterior that a further step may still promise at a settled mode beside an
+#: edge
+_NEXT = 1e-3
+_STEP = 1e-3  #: step of a finite difference, in standard deviations of the coordinate
+#: largest standard deviation of a coordinate, so that the step of an undetermined one stays finite
 _WIDEST = 1e3
-_EDGE = 1e3  #: nats: a step of a difference that costs more crosses an edge
-_NARROWER = 0.5 ** np.arange(1, 12)  #: shares of the way from the middle of the prior to the guess
-#: draws of the prior, the best to start from, nats that count as higher
+_EDGE = 1e3  #: a finite-difference step that lowers the log posterior by more crosses an edge
+#: distances of trial points from the middle of the prior, as shares of the way to the guess
+_NARROWER = 0.5 ** np.arange(1, 12)
+#: number of prior draws; number of best draws to start from; difference in log posterior that
+#: counts as higher
 _PRIOR_DRAWS, _START_POINTS, _HIGHER_NATS = 1000, 2, 1.0
-#: step before any standard deviation is known: levels may determine a well to a part in a million
+#: step before any standard deviation is known: levels may determine the full well to one part in a
+#: million
 _SHORT = 1e-7
 
 
 @dataclass(frozen=True)
 class LaplaceFit:
-    """The Laplace approximation of a posterior: the normal distribution about the mode."""
+    """The Laplace approximation of a posterior: a normal distribution around its mode."""
 
     theta: FloatArray  #: (free,)
     log: float  #: log posterior at the mode
@@ -208,7 +213,7 @@ class LaplaceFit:
     settled: bool  #: True if no further step raises the posterior
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Draw samples (count, free) from the normal distribution about the mode."""
+        """Draw samples (count, free) from the normal distribution around the mode."""
         values, vectors = np.linalg.eigh(self.covariance)
         normal = rng.standard_normal((count, len(self.theta)))
         samples: FloatArray = self.theta + (normal * np.sqrt(values.clip(0))) @ vectors.T
@@ -216,8 +221,8 @@ class LaplaceFit:
 
 
 def initial_theta(problem: SensorPosterior) -> FloatArray:
-    """Return the start of the search for the mode, a point between a first guess and the middle of
-    the prior.
+    """Return the starting point of the search for the mode, on the line from a first guess to the
+    middle of the prior.
 
     The start is the point closest to the guess at which the posterior is not zero.
     Raises: `ValueError` if the posterior is zero at all points.
@@ -233,7 +238,8 @@ def initial_theta(problem: SensorPosterior) -> FloatArray:
         problem.theta({name: values[name] for name in problem.names})
         for values in (guessed, believed)
     )
-    # on a straight line from the guess to the middle of the prior, each half as far from it
+    # points on the line from the guess to the middle of the prior; each is half as far from the
+    # middle as the one before
     samples = np.stack(
         [
             guess_theta,
@@ -265,18 +271,18 @@ def _guessed(problem: SensorPosterior, believed: dict[str, float]) -> dict[str, 
 
 
 def search_mode(problem: SensorPosterior) -> LaplaceFit:
-    """Search for the mode from the first guess and from draws of the prior, and return the highest
-    that settles.
+    """Search for the mode from a first guess and from draws of the prior, and return the highest
+    mode that was reached.
 
-    A posterior that may be long and bent is also returned without a settled mode: its samples do
-    not start there.
-    Raises: `ValueError` if no search settles.
+    For a long, curved posterior (`bent`) the highest end point is returned even if no search
+    settled, because its samples do not start there.
+    Raises: `ValueError` for any other posterior if no search settles.
     """
     fits = [find_mode(problem, initial_theta(problem))]
     for starts in (_PRIOR_DRAWS, 4 * _PRIOR_DRAWS):
         fits += [find_mode(problem, theta) for theta in _best_draws(problem, starts)]
         settled = [fit for fit in fits if fit.settled]
-        # unless a search that stopped on the way is much higher: then more starts are tried
+        # a search that stopped early at a much higher point asks for more starts
         if settled and _highest(fits).log <= _highest(settled).log + _HIGHER_NATS:
             return _highest(settled)
     if problem.coordinates.bent:
@@ -289,7 +295,9 @@ def _highest(fits: Sequence[LaplaceFit]) -> LaplaceFit:
 
 
 def _best_draws(problem: SensorPosterior, starts: int) -> list[FloatArray]:
-    """Return the draws of the prior with the highest density of the posterior, of ``starts``."""
+    """Return the `_START_POINTS` draws with the highest posterior density, out of ``starts`` draws
+    of the prior.
+    """
     random = torch.Generator().manual_seed(starts)
     draws = problem.theta(problem.coordinates.draw(starts, random))
     draws = draws[np.isfinite(draws).all(1)]
@@ -302,7 +310,8 @@ def _best_draws(problem: SensorPosterior, starts: int) -> list[FloatArray]:
 
 
 def _unsettled(problem: SensorPosterior, fits: list[LaplaceFit]) -> str:
-    """Return the message of a search without a mode.
+    """Return the error message for a search that found no mode, with the parameter values at the
+    highest point reached.
 
     It has the values at which the highest search stops.
     """
@@ -322,8 +331,7 @@ def _unsettled(problem: SensorPosterior, fits: list[LaplaceFit]) -> str:
 
 
 def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit:
-    """Search for the mode from ``initial_theta``, and return the normal distribution about the
-    mode.
+    """Search for the mode from ``initial_theta``, and return the normal distribution around it.
 
     In a direction that no level constrains, the distribution is as wide as the prior.
     """
@@ -339,13 +347,13 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
         # Fisher's information at this point gives the widths of the posterior
         level_slopes, prior_slopes = _slopes(problem, theta, difference_steps)
         covariance = _covariance(level_slopes, prior_slopes)
-        # in proportion to the width of the posterior along each coordinate
+        # proportional to the width of the posterior along each coordinate
         difference_steps = np.sqrt(covariance.diagonal()).clip(max=_WIDEST) * _STEP
         gradient = _gradient(problem, theta, difference_steps)
         free_gradient = _free(problem, theta, difference_steps, gradient)
-        # the step of Newton among the coordinates that no edge holds
+        # a Newton step in the coordinates that are not held at an edge
         free_step = _within(covariance, free_gradient != gradient) @ free_gradient
-        # twice the gain that the step promises
+        # twice the gain in log posterior that a quadratic model predicts
         if free_gradient @ free_step < _CLOSE:
             break
         theta, log_posterior, has_moved = _climb(
@@ -357,7 +365,7 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
     covariance = _covariance(level_slopes, prior_slopes)
     gradient = _gradient(problem, theta, difference_steps)
     free_gradient = _free(problem, theta, difference_steps, gradient)
-    # no step among the free coordinates promises more
+    # settled: no step in the free coordinates promises a larger gain
     settled = bool(
         free_gradient @ _within(covariance, free_gradient != gradient) @ free_gradient < _NEXT
     )
@@ -370,11 +378,11 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
 def _climb(
     problem: SensorPosterior, theta: FloatArray, log: float, step: FloatArray, within: FloatArray
 ) -> tuple[FloatArray, float, bool]:
-    """Return the most probable point along ``step``, its log posterior, and True if this is higher
-    than at ``theta``.
+    """Return the most probable trial point, its log posterior, and True if it is higher than at
+    ``theta``.
 
-    The points change all coordinates, or all except one, which may be at an edge; or they lie along
-    ``within``, which leaves each coordinate that is at an edge.
+    Trial points lie along ``step``, along ``step`` with one coordinate fixed (it may be at an
+    edge), and along ``within``, which moves no coordinate that is at an edge.
     """
     step_directions = np.concatenate([step[None], within[None], step * (1 - np.eye(len(step)))])
     # each direction at 24 lengths: the whole step, half of it, and so on
@@ -396,8 +404,8 @@ def _differences(
     step: FloatArray,
     sides: FloatArray,
 ) -> FloatArray:
-    """Return the derivatives of ``function`` by finite differences; ``sides`` selects steps up
-    and steps down.
+    """Return the derivatives of ``function`` by finite differences; ``sides`` (2, free) marks which
+    steps up and down are allowed.
     """
     offsets = np.diag(step)
     upper, lower = np.split(
@@ -409,9 +417,10 @@ def _differences(
 
 
 def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return (2, free), first the steps up, then the steps down: 1 where a step meets no edge.
+    """Return an array (2, free) for steps up (row 0) and down (row 1): 1 where the step crosses no
+    edge, else 0.
 
-    An edge is a place beyond which the posterior falls at once, such as a full well.
+    At an edge the posterior falls abruptly, for example at the full well.
     """
     offsets = np.diag(step)
     log_posteriors = problem.log_posterior(
@@ -426,9 +435,10 @@ def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> Flo
 def _slopes(
     problem: SensorPosterior, theta: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives (row, free) of the levels and (free, free) of the whitened prior.
+    """Return the derivatives of the scaled level residuals (row, free) and of the whitened prior
+    (free, free).
 
-    Their Gram matrix is Fisher's information.
+    The sum of their Gram matrices is the Fisher information.
     """
     level_slopes = _differences(
         lambda p: problem.likelihood(p).scaled.numpy(), theta, step, _sides(problem, theta, step)
@@ -455,7 +465,7 @@ def _gradient(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> 
 def _free(
     problem: SensorPosterior, theta: FloatArray, step: FloatArray, gradient: FloatArray
 ) -> FloatArray:
-    """Return the gradient, with 0 for each component that leads to parameters where the
+    """Return the gradient, with 0 for each component that points across an edge, where the
     posterior is zero.
     """
     blocked_up, blocked_down = _sides(problem, theta, step) == 0
@@ -463,7 +473,7 @@ def _free(
 
 
 def _within(covariance: FloatArray, held: NDArray[np.bool_]) -> FloatArray:
-    """Return the covariance of all coordinates where those that are ``held`` stay as they are."""
+    """Return the covariance of all coordinates conditional on those that are ``held`` fixed."""
     if not held.any():
         return covariance
     held_columns = covariance[:, held]
@@ -475,8 +485,8 @@ def _within(covariance: FloatArray, held: NDArray[np.bool_]) -> FloatArray:
 
 
 def _covariance(rows: FloatArray, prior: FloatArray) -> FloatArray:
-    """Return the covariance of the parameters from an SVD of derivatives, which is more precise
-    than an inversion.
+    """Return the covariance of the parameters from an SVD of the derivatives, which is more
+    accurate than inverting the information.
     """
     # the inverse of A'A is V diag(1 / s²) V' for A = U diag(s) V'
     _, singular_values, right_vectors = np.linalg.svd(

@@ -1,4 +1,4 @@
-"""Statistical checks of a posterior: chains, mode, and fit of the model to the levels."""
+"""Statistical checks of a posterior: chains, mode, and goodness of fit of the model."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ if TYPE_CHECKING:
 
 # --- level misfit ---------------------------------------------------------------------------------
 
-# Tests of how the levels of a real camera deviate from its model, where fitted widths take up what
-# the model lacks.
+# Tests of how the levels of a real camera deviate from its model. The fitted widths would absorb a
+# misfit, so that the deviance alone does not show it.
 
 
-ALARM = 1e-3  #: probability with which chance alone fails a test
-_DRAWS = 500  #: of the posterior, for the prediction of a level left out
-_SLOW = 6  #: slowest waves over the levels
-_LEAST_LIT_LEVELS = 10  #: lit levels, with fewer of which their order says too little
-#: largest standard deviations, relative, of the light and of the variances beyond which the model
-#: does not hold
+ALARM = 1e-3  #: p-value below which a test fails
+_DRAWS = 500  #: draws of the posterior that predict a level left out
+_SLOW = 6  #: number of slowest cosine components over the levels
+_LEAST_LIT_LEVELS = 10  #: least number of lit levels; with fewer their order tells too little
+#: largest relative standard deviations of the light and of the variances for which the model is
+#: accepted
 BOUNDS = {"lamp": 0.1, "scatter": 0.05}
 
 
 class Deviations(NamedTuple):
-    """How far each measured level lies from its prediction by the other levels, in standard
+    """The deviation of each measured level from its prediction by the other levels, in standard
     deviations.
     """
 
-    variance: FloatArray  #: (level,), of the levels that are used, in rising order of the mean
+    variance: FloatArray  #: (level,), only levels that the fit uses, in rising order of the mean
     mean: FloatArray  #: (level,) as `variance`
     photons: FloatArray  #: (level,)
     exposure: FloatArray  #: (level,) s
@@ -56,7 +56,9 @@ class Deviations(NamedTuple):
 
 
 class Misfit(NamedTuple):
-    """The result of one test of the levels: what was found, the criterion, and if it holds."""
+    """The result of one test of the levels: what was found, the criterion, and whether it
+    is met.
+    """
 
     name: str
     found: str
@@ -65,7 +67,7 @@ class Misfit(NamedTuple):
 
 
 def is_camera(problem: SensorPosterior) -> bool:
-    """Return True if the likelihood is that of a real camera, whose widths are fitted to the
+    """Return True if the likelihood is that of a real camera, whose noise widths are fitted to the
     levels.
     """
     return problem.recipe.steps[problem.step].node.path == "calibrate.camera"
@@ -76,9 +78,10 @@ def misfits(
 ) -> Iterator[Misfit]:
     """Test the levels of a real camera against posterior ``samples`` (draw, free) with ``weights``.
 
-    ``theta`` (free,) is the mode. The widths of the model grow until its deviance is as expected,
-    so that the deviance finds no misfit. What remains is the order of the deviations along the
-    levels, a level that the others do not predict, and widths that no lamp and no electronics have.
+    ``theta`` (free,) is the mode. The fitted widths grow until the deviance is as expected, so that
+    the deviance cannot show a misfit. Three things can: a pattern of the deviations along the
+    levels, a level that the others do not predict, and widths larger than those of any lamp or
+    electronics.
     """
     deviations = left_out(problem, samples, weights)
     yield _prediction(deviations)
@@ -87,7 +90,7 @@ def misfits(
             ("variances", deviations.variance[deviations.lit]),
             ("means", deviations.mean[deviations.lit]),
         ):
-            # two tests, so that the smaller probability counts twice
+            # Bonferroni correction for two tests: twice the smaller probability
             p_value = min(1.0, 2 * min(runs(deviation), waves(deviation)))
             text = (
                 f"{_signs(deviation)} runs of sign over {len(deviation)} levels, waves of"
@@ -104,8 +107,8 @@ def misfits(
 
 
 def _prediction(deviations: Deviations) -> Misfit:
-    """Return the test of the level that deviates most from its prediction by the others."""
-    # two quantities of each level, two sides: Bonferroni's share of the probability
+    """Return the test result for the level that deviates most from its prediction by the others."""
+    # Bonferroni correction for two quantities per level, each with two sides
     largest_allowed = _limit(ALARM / (4 * len(deviations.variance)))
     quantity, worst_deviations = max(
         (("variance", deviations.variance), ("mean", deviations.mean)),
@@ -138,7 +141,7 @@ def _prediction(deviations: Deviations) -> Misfit:
 
 
 def _widths(problem: SensorPosterior, theta: FloatArray) -> Iterator[Misfit]:
-    """Yield the test of each fitted width, beyond which a misfit is taken for a scatter."""
+    """Yield a test of each fitted width: a larger width would hide a misfit as scatter."""
     params = problem.recipe.steps[problem.step].params
     values = {**params, **{name: float(x) for name, x in problem.parameters(theta).items()}}
     words = {
@@ -153,10 +156,11 @@ def _widths(problem: SensorPosterior, theta: FloatArray) -> Iterator[Misfit]:
 
 
 def left_out(problem: SensorPosterior, samples: FloatArray, weights: FloatArray) -> Deviations:
-    """Return how far each level lies from its prediction by all other levels.
+    """Return the deviation of each level from its prediction by all other levels.
 
-    Draws of the posterior are weighted by the inverse of the likelihood of the level. The weighted
-    probability of less than was measured is given in standard deviations of a normal distribution.
+    Draws of the posterior are weighted by the inverse likelihood of the level. The weighted
+    probability of a smaller value than measured is converted to standard deviations of a normal
+    distribution.
     """
     from scipy.special import ndtr, ndtri
 
@@ -170,7 +174,7 @@ def left_out(problem: SensorPosterior, samples: FloatArray, weights: FloatArray)
     log_likelihood = (
         -0.5 * (variance_residual**2 + mean_residual**2) - log_variance_sd - log_mean_sd
     )
-    # the inverse of the likelihood of a level takes that level out of the posterior
+    # weighting by the inverse likelihood of a level removes this level from the posterior
     inverse_weight = np.exp(-(log_likelihood - log_likelihood.min(0)))
     # truncated importance sampling
     inverse_weight = np.minimum(
@@ -178,7 +182,7 @@ def left_out(problem: SensorPosterior, samples: FloatArray, weights: FloatArray)
     )
     inverse_weight /= inverse_weight.sum(0)
     tiny = 1e-12
-    # probability of less than was measured, as standard deviations of a normal distribution
+    # probability of a smaller value than measured, converted to standard deviations
     normal_scores = [
         ndtri(np.clip((inverse_weight * ndtr(x)).sum(0), tiny, 1 - tiny))
         for x in (variance_residual, mean_residual)
@@ -200,29 +204,29 @@ def left_out(problem: SensorPosterior, samples: FloatArray, weights: FloatArray)
 
 
 def runs(z: FloatArray) -> float:
-    """Return the probability that so few runs of equal sign come by chance (Wald and Wolfowitz
-    1940).
+    """Return the probability that chance gives so few runs of equal sign or fewer (Wald and
+    Wolfowitz 1940).
     """
     from scipy.special import ndtr
 
     above_count, below_count = int((z > 0).sum()), int((z <= 0).sum())
     if not above_count or not below_count:
-        # all of one sign: either sign, with the probability 1/2 for each level
+        # all signs equal: probability 1/2 for each level, for either sign
         return float(2.0 ** (1 - len(z)))
     expected_runs = 1 + 2 * above_count * below_count / len(z)
     variance = (expected_runs - 1) * (expected_runs - 2) / (len(z) - 1)
-    # half a run corrects for whole numbers
+    # continuity correction of half a run
     return float(ndtr((_signs(z) + 0.5 - expected_runs) / math.sqrt(max(variance, 1e-12))))
 
 
 def _signs(z: FloatArray) -> int:
-    """Return the number of runs of equal sign."""
+    """Return the number of runs of equal sign in ``z``."""
     return 1 + int((np.diff(z > 0)).sum())
 
 
 def _strength(z: FloatArray) -> float:
-    """Return the sum of squares of the slowest components of a cosine transform, for deviations
-    of unit size.
+    """Return the sum of squares of the slowest cosine components of ``z``, which is scaled down if
+    its mean square exceeds 1.
     """
     from scipy.fft import dct
 
@@ -232,8 +236,10 @@ def _strength(z: FloatArray) -> float:
 
 
 def waves(z: FloatArray) -> float:
-    """Return the probability that chance alone gives so strong slow waves over the levels."""
-    # the share of white noise in k of n components has a beta distribution
+    """Return the probability that chance alone gives slow waves over the levels at least this
+    strong.
+    """
+    # for white noise, the share of k of n components has a beta distribution
     from scipy.special import betainc
 
     square_sum = float(np.square(z).sum())
@@ -253,23 +259,25 @@ def _limit(probability: float) -> float:
 
 # --- posterior checks -----------------------------------------------------------------------------
 
-# Statistical checks of a posterior: chains, mode, importance sampling, and fit of the model to the
-# levels.
+# Statistical checks of a posterior: chains, mode, importance sampling, and goodness of fit of the
+# model.
 
 
 Mark = Literal["pass", "warn", "fail"]
-MISFIT = 1e-3  #: probability below which chance does not explain a deviance
+MISFIT = 1e-3  #: p-value below which chance does not explain a deviance
 _IMPOSSIBLE_LOG_WEIGHT = -1e6  #: log weight of an impossible sample
-# R-hat; effective sample size; shares of accepted moves
+# largest R-hat; least effective sample size; range of the share of accepted moves
 _RHAT, _INDEPENDENT, _ACCEPTED = 1.01, 1000.0, (0.1, 0.7)
-# k-hat; relative difference of widths; of means in sd; nats of the best draw below the mode
+# k-hat below which a disagreement is a failure; largest relative difference of widths; largest
+# difference of means in sd; largest distance of the best draw from the mode in log posterior
 _TAIL, _SD, _MEAN, _BELOW = 0.5, 0.05, 0.1, 2.0
-_WEIGHTED = 0.1  #: least effective share of weighted draws
-#: slowest waves over the rings, and probability below which chance does not explain them
+_WEIGHTED = 0.1  #: least effective sample size of weighted draws, as a share of their number
+#: number of slowest cosine components over the rings, and the p-value below which chance does not
+#: explain them
 _SLOW_MIXING, _SMOOTH = 8, 5e-3
-#: standard deviations of its prior by which a mean may lie from the middle of the prior
+#: largest distance of a mean from the middle of its prior, in standard deviations of the prior
 _SURPRISE = 3.5
-_LUCK = 4.0  #: standard errors by which the widths of two samples may differ
+_LUCK = 4.0  #: standard errors by which the widths of two samples may differ by chance
 
 
 @dataclass(frozen=True)
@@ -278,14 +286,14 @@ class Check:
 
     name: str
     found: str
-    bar: str  #: the criterion that must hold
+    bar: str  #: the criterion that must be met
     mark: Mark
 
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """The deviance of all light levels, and the probability that chance alone gives a deviance
-    at least as large.
+    """The deviance of all light levels, and the probability of a deviance at least this large by
+    chance.
     """
 
     deviance: float
@@ -304,7 +312,7 @@ class ImportanceSamples:
 
     samples: FloatArray  #: (draw, free)
     weights: FloatArray  #: (draw,) sum 1
-    tail: float  #: k-hat; above 0.7 the weights are unreliable
+    tail: float  #: Pareto k-hat; above 0.7 the weights are unreliable
     guide: Guide  #: the density from which the samples were drawn
 
     def mean(self) -> FloatArray:
@@ -318,7 +326,7 @@ class ImportanceSamples:
         return sd
 
     def doubt(self, like: FloatArray) -> FloatArray:
-        """Return the relative standard error of each standard deviation, with the kurtosis of
+        """Return the relative standard error of each standard deviation; the kurtosis is that of
         the draws ``like``.
         """
         z = (like - like.mean(0)) / like.std(0)
@@ -327,9 +335,7 @@ class ImportanceSamples:
 
 
 def arviz() -> Any:
-    """Import and return ArviZ; raise `ImportError` with the command that installs ArviZ if the
-    import fails.
-    """
+    """Import and return ArviZ; raise `ImportError` with the command to install it if that fails."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # ArviZ warns of its next version
@@ -362,8 +368,8 @@ def checks(
     chains: Chains,
     law: ImportanceSamples,
 ) -> list[Check]:
-    """Run all checks of a posterior and return the results; if a check fails, the posterior is
-    not fit for use.
+    """Return the results of all checks of a posterior; if one fails, the posterior is not fit for
+    use.
     """
     return [
         *_of_chains(chains),
@@ -373,7 +379,8 @@ def checks(
 
 
 def _of_chains(chains: Chains) -> Iterator[Check]:
-    """Yield the checks of the chains themselves.
+    """Yield the checks of the chains: length, agreement, effective size, acceptance and stranded
+    walkers.
 
     They are of length, agreement, effective size, acceptance and stranded walkers.
     """
@@ -407,7 +414,7 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
         f"{least_accepted:.0%} to {largest:.0%}",
         _mark(is_accepted, "warn"),
     )
-    # R-hat cannot see stranded walkers that all ensembles have
+    # R-hat does not show stranded walkers if all ensembles have them
     stranded_walkers = emcee_sampler.stranded(chains.log)
     text = (
         f"{stranded_walkers} of {chains.log.shape[0] * chains.log.shape[2]} lie"
@@ -424,7 +431,9 @@ def _of_peak(
     chains: Chains,
     law: ImportanceSamples,
 ) -> Iterator[Check]:
-    """Yield the checks that search, chains and importance sampling found the same peak."""
+    """Yield checks that search, chains and importance sampling found the same peak of the
+    posterior.
+    """
     search_text = "settled" if mode.settled else "the search stopped"
     yield Check("the search found the mode", search_text, "settled", _mark(mode.settled))
     nats_below = mode.log - float(chains.log.max())
@@ -449,9 +458,9 @@ def _of_peak(
 
 
 def _of_weights(law: ImportanceSamples) -> Check:
-    """Return the check of the effective size of the weighted draws.
+    """Return the check of the effective sample size of the weighted draws.
 
-    It is 1 over the sum of the squared weights.
+    It is 1 over the sum of the squared weights, which sum to 1.
     """
     count = len(law.weights)
     effective_draws = 1 / float((law.weights**2).sum())
@@ -464,7 +473,7 @@ def _of_weights(law: ImportanceSamples) -> Check:
 
 
 def _of_agreement(chains: Chains, law: ImportanceSamples, columns: list[int]) -> Check:
-    """Return if the chains and importance sampling have the same widths and means."""
+    """Return the check that chains and importance sampling give the same widths and means."""
     sd, mean = law.sd()[columns], law.mean()[columns]
     chain_draws = chains.flat[:, columns]
     width_difference = np.abs(chain_draws.std(0) / sd - 1)
@@ -489,7 +498,7 @@ def _of_data(
     identifiability: Identifiability,
     law: ImportanceSamples,
 ) -> Iterator[Check]:
-    """Yield the checks of the data.
+    """Yield checks that the model describes the data and that the data determine the parameters.
 
     The model must describe them, and they must determine the parameters.
     """
@@ -523,7 +532,7 @@ def _of_data(
 
 
 def _of_rings(problem: SensorPosterior, law: ImportanceSamples, guide: Guide) -> Iterator[Check]:
-    """Yield the checks of a lens.
+    """Yield the checks of a lens: the rings deviate without a trend, and priors and picture agree.
 
     The rings must have no trend, and priors and picture must agree.
     """
@@ -549,12 +558,12 @@ def _of_rings(problem: SensorPosterior, law: ImportanceSamples, guide: Guide) ->
 
 
 def slow_waves(deviation: FloatArray) -> tuple[float, float]:
-    """Return the strength of slow waves in the deviations of rings, and the probability that chance
-    alone gives it.
+    """Return the strength of slow waves in the deviations of rings, and the probability of at least
+    this strength by chance.
 
-    ``deviation`` (ring,) is in standard deviations. A wrong model deviates over many rings in one
-    direction, even where the relative scatter of the rings is free and takes up all that the model
-    lacks. The strength is the sum of squares of the slowest components of a cosine transform.
+    ``deviation`` (ring,) is in standard deviations. A wrong model deviates in one direction over
+    many rings, even if the free scatter of the rings absorbs the size of the misfit. The strength
+    is the sum of squares of the slowest components of a cosine transform.
     """
     from scipy.fft import dct
     from scipy.special import chdtrc
@@ -564,7 +573,7 @@ def slow_waves(deviation: FloatArray) -> tuple[float, float]:
 
 
 def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
-    """Return the goodness of fit of one sensor with ``free`` parameters that were fitted to the
+    """Return the goodness of fit of one sensor; ``free`` is the number of parameters fitted to the
     same light levels.
 
     Raises: `ValueError` for a likelihood without deviances, for several sensors, and for no degree
@@ -593,20 +602,20 @@ def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
 
 
 def _mark(good: bool, else_: Mark = "fail") -> Mark:
-    """Return the mark of a check: `pass`, or `else_` if it does not hold."""
+    """Return the mark of a check: `pass` if it holds, else ``else_``."""
     return "pass" if good else else_
 
 
 def _rhat(draws: FloatArray) -> float:
-    """Return R-hat of draws (ensemble, step, walker); an ensemble is one chain, because its
+    """Return R-hat of draws (ensemble, step, walker); an ensemble counts as one chain, because its
     walkers are correlated.
     """
     return float(arviz().rhat(draws.reshape(len(draws), -1)))
 
 
 def _effective_sample_size(draws: FloatArray, method: str) -> float:
-    """Return the effective sample size of draws (ensemble, step, walker) in the ``bulk`` or in
-    the ``tail``.
+    """Return the effective sample size of draws (ensemble, step, walker) by ``method``, ``bulk`` or
+    ``tail``.
     """
     # each walker is a chain of its own here
     chains = draws.transpose(0, 2, 1).reshape(-1, draws.shape[1])

@@ -1,4 +1,6 @@
-"""A mixture of densities like a posterior, from particles that follow the posterior."""
+"""A mixture density that approximates a posterior, fitted to particles that follow the
+posterior.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
 # --- tempered particles ---------------------------------------------------------------------------
 
-# Particles that follow a posterior from its prior on, so that no far mode and no long ridge is
+# Particles that move from the prior to the posterior, so that no distant mode and no long ridge is
 # missed.
 #
 # The likelihood enters by a power that grows from 0 to 1. At each power the particles are resampled
@@ -24,8 +26,8 @@ if TYPE_CHECKING:
 # of the posterior themselves.
 
 
-_KEPT_FRACTION = 0.5  #: effective sample fraction that a larger power leaves
-#: most sweeps at one power; accepted moves of each particle at which the power grows
+_KEPT_FRACTION = 0.5  #: effective sample fraction that remains after each increase of the power
+#: most sweeps at one power; accepted moves per particle after which the power grows
 _MOST_SWEEPS, _ENOUGH_MOVES = 12, 1.5
 _MOST_POWERS = 200  #: most powers
 # 2.38 / sqrt(2 free) suits a normal distribution
@@ -35,9 +37,9 @@ _MOVE_LENGTHS = (
     0.2,
 )  #: lengths of a move in units of that which suits a normal distribution
 _LEAP_SHARE = 0.1  #: share of moves by a whole difference, from mode to mode
-_BLUR = 1e-5  #: coordinates, added to each move
-#: draws of the prior for each particle, because lenses that scatter more than all light are
-#: impossible
+_BLUR = 1e-5  #: standard deviation of a random shift of each move
+#: draws of the prior for each particle; many are impossible, such as lenses that scatter more than
+#: all light
 _PRIOR_DRAWS_PER_PARTICLE = 4
 
 
@@ -48,7 +50,7 @@ class _Particles:
     log: FloatArray  #: (particle,) log posterior
 
     def take(self, numbers: FloatArray) -> None:
-        """Replace the particles by those with these ``numbers``."""
+        """Replace the particles by those with the given ``numbers``."""
         self.place, self.prior, self.log = (
             self.place[numbers],
             self.prior[numbers],
@@ -62,13 +64,14 @@ def follow_posterior(
     """Return the coordinates of particles (particle, free) near the posterior, and the log
     posterior of each.
     """
-    # from the prior (power 0) to the posterior (power 1) of prior times likelihood ** power
+    # target density: prior times likelihood ** power, from the prior (power 0) to the posterior
+    # (power 1)
     particles, power = _from_prior(problem, count, rng), 0.0
     for _ in range(_MOST_POWERS):
         log_likelihood = particles.log - particles.prior
         power_before, power = power, _next_power(log_likelihood, power)
         weights = np.exp((power - power_before) * (log_likelihood - log_likelihood.max()))
-        # systematic resampling: one random offset, equal steps
+        # systematic resampling: one random offset, then equal steps
         cumulative_weights = np.cumsum(weights / weights.sum())
         resampled = np.searchsorted(
             cumulative_weights,
@@ -113,8 +116,8 @@ def _logs(problem: SensorPosterior, place: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _next_power(gain: FloatArray, power: float) -> float:
-    """Return the largest power of the likelihood whose weights, after ``power``, leave enough
-    effective samples.
+    """Return the largest power of the likelihood that keeps the effective sample fraction at
+    `_KEPT_FRACTION` or more; ``gain`` is the log likelihood.
     """
 
     def left(step: float) -> float:
@@ -139,9 +142,10 @@ def _next_power(gain: FloatArray, power: float) -> float:
 def _sweep(
     problem: SensorPosterior, particles: _Particles, power: float, rng: np.random.Generator
 ) -> float:
-    """Propose one move of each particle, and return the share of moves that are accepted.
+    """Propose one move of each particle, and return the mean number of accepted moves per particle.
 
-    The move is a difference of two particles of the other half (differential evolution).
+    A move is a difference of two particles of the other half of all particles (differential
+    evolution).
     """
     halves, accepted_moves = np.array_split(rng.permutation(len(particles.log)), 2), 0
     dimension = particles.place.shape[1]
@@ -159,12 +163,11 @@ def _sweep(
         proposals = proposals + _BLUR * rng.standard_normal(proposals.shape)
         prior, log = _logs(problem, proposals)
         with np.errstate(invalid="ignore"):
-            # of prior times likelihood to the power: log prior + power * (log posterior - log
-            # prior)
+            # log ratio of prior * likelihood ** power; log likelihood = log posterior - log prior
             log_ratio = (1 - power) * (prior - particles.prior[moved_half]) + power * (
                 log - particles.log[moved_half]
             )
-        # the rule of Metropolis
+        # Metropolis rule
         accepted = np.log(rng.random(len(moved_half))) < np.where(
             np.isfinite(log_ratio), log_ratio, -np.inf
         )
@@ -184,27 +187,27 @@ def _sweep(
 
 # --- posterior mixture ----------------------------------------------------------------------------
 
-# A mixture of densities like a posterior that may be long, bent, or in several parts.
+# A mixture density that approximates a posterior which may be long, curved, or in several parts.
 
 
-_PARTICLES, _DRAWS_ABOUT_MODE = 1000, 200  #: particles, and draws about the mode
+_PARTICLES, _DRAWS_ABOUT_MODE = 1000, 200  #: number of particles, and of draws around the mode
 _LOST_NATS = (
-    40.0  #: nats below the best point at which a particle is lost in a mode that does not count
+    40.0  #: particles this far below the best log posterior are dropped: their mode does not count
 )
-_COMPONENTS = 14  #: components that are fitted
-_FREEDOM = 6.0  #: degrees of freedom of each component, where the mixture has no others
-#: most fits, steps of each fit, samples on which a fit is tried
+_COMPONENTS = 14  #: number of fitted components
+_FREEDOM = 6.0  #: default degrees of freedom of each component
+#: most fits, steps of each fit, samples that test a fit
 _MOST_FITS, _FIT_STEPS, _TRIAL_SAMPLES = 16, 8, 2000
 _SOFT_FRACTION, _ENOUGH_FRACTION = (
     0.3,
     0.4,
-)  #: effective sample fractions: to fit the next mixture, to stop
+)  #: effective sample fractions: kept for fitting the next mixture, and at which fitting stops
 _BROAD_SHARE, _BROAD_WIDTH = (
     0.05,
     2.0,
-)  #: share and width of one broad component, which bounds the weights
+)  #: share and relative width of one broad component, which limits the largest weight
 _BORROWED_SHARE = (
-    0.03  #: share of samples whose covariance in all is added to that of the components
+    0.03  #: share of samples, with the covariance of all, that is added to the components
 )
 _IMPOSSIBLE_LOG = -1e300  #: log density of an impossible sample
 
@@ -213,7 +216,7 @@ Random = np.random.Generator | np.random.RandomState
 
 
 class Density(Protocol):
-    """A density like the posterior, from which samples can be drawn."""
+    """A density that approximates the posterior and from which samples can be drawn."""
 
     def draw(self, count: int, rng: Random) -> FloatArray:
         """Draw samples (count, free)."""
@@ -222,8 +225,8 @@ class Density(Protocol):
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
 
     def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
-        """Return new samples like ``own`` (draw, free), and the logarithm of the density at
-        ``own`` over that there.
+        """Return new samples, and the log ratio of the density at ``own`` (draw, free) to the
+        density at each new sample.
         """
         new_samples = self.draw(len(own), rng)
         return new_samples, self.log_density(own) - self.log_density(new_samples)
@@ -231,11 +234,11 @@ class Density(Protocol):
 
 @dataclass(frozen=True)
 class Mixture(Density):
-    """A mixture of Student's t distributions of several coordinates."""
+    """A mixture of multivariate Student's t distributions."""
 
     shares: FloatArray  #: (component,) sum 1
     centres: FloatArray  #: (component, free)
-    roots: FloatArray  #: (component, free, free) lower triangular roots of the scale matrices
+    roots: FloatArray  #: (component, free, free) lower Cholesky factors of the scale matrices
     tails: FloatArray | float = _FREEDOM  #: (component,) degrees of freedom
 
     def draw(self, count: int, rng: Random) -> FloatArray:
@@ -260,8 +263,8 @@ class Mixture(Density):
         )
 
     def normal_shares(self, samples: FloatArray) -> FloatArray:
-        """Return the share (draw, component) of each component in the density of normal
-        components at samples.
+        """Return the share (draw, component) of each component in the density at samples, for
+        normal components.
         """
         logs = self._levels - 0.5 * self._squares(samples)
         shares: FloatArray = np.exp(logs - log_sum(logs)[:, None])
@@ -269,15 +272,17 @@ class Mixture(Density):
 
     @cached_property
     def _levels(self) -> FloatArray:
-        """Return what share and width of each component (component,) add to its log density."""
+        """Return the terms of the log density of each component (component,) that come from its
+        share and width.
+        """
         scales = np.diagonal(self.roots, axis1=1, axis2=2)
         log_heights: FloatArray = np.log(self.shares.clip(1e-300)) - np.log(scales).sum(1)
         return log_heights
 
     @cached_property
     def _constants(self) -> FloatArray:
-        """Return what the degrees of freedom of each component add to its log density at the
-        centre.
+        """Return the terms of the log density of each component that come from its degrees of
+        freedom.
         """
         from scipy.special import gammaln
 
@@ -294,7 +299,7 @@ class Mixture(Density):
         return np.linalg.inv(self.roots).astype(np.float64)
 
     def _squares(self, samples: FloatArray) -> FloatArray:
-        """Return the squared distance (draw, component) from each centre, in widths of the
+        """Return the squared Mahalanobis distance (draw, component) from the centre of each
         component.
         """
         scaled_distance = self._inverses @ (samples.T[None] - self.centres[:, :, None])
@@ -305,14 +310,14 @@ class Mixture(Density):
 def fit_mixture(
     problem: SensorPosterior, mode: LaplaceFit, count: int, rng: np.random.Generator
 ) -> tuple[Mixture, FloatArray, FloatArray]:
-    """Return a mixture like the posterior, samples of it (count, free), and the log of posterior
-    over mixture of each.
+    """Return a mixture that approximates the posterior, samples of it (count, free), and the log
+    ratio of posterior to mixture for each.
 
-    A first mixture is fitted to particles and to draws about the mode, and stays a half of every
-    further one, because a part of the posterior that has no samples is missed without a sign in the
-    weights. The other half is fitted to weighted samples, again and again. The mixture with the
-    largest effective sample size is kept, and new samples are drawn from it, whose own effective
-    sample size the caller must check.
+    A first mixture is fitted to particles and to draws around the mode. It stays half of every
+    later mixture, because a part of the posterior without samples would be missed and the weights
+    would not show it. The other half is fitted repeatedly to weighted samples. The mixture with the
+    largest effective sample size is kept, and new samples are drawn from it. The caller must check
+    the effective sample size of these.
     """
     start_points = _start(problem, mode, rng)
     first_mixture = mixture = best_mixture = _fitted(
@@ -332,7 +337,7 @@ def fit_mixture(
 
 
 def _joined(first: Mixture, second: Mixture) -> Mixture:
-    """Return the mixture of two mixtures in equal parts."""
+    """Return the mixture of two mixtures with equal shares."""
     shares = 0.5 * np.concatenate([first.shares, second.shares])
     centres = np.concatenate([first.centres, second.centres])
     roots = np.concatenate([first.roots, second.roots])
@@ -342,14 +347,14 @@ def _joined(first: Mixture, second: Mixture) -> Mixture:
 def weighed(
     problem: SensorPosterior, density: Density, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return samples of a density, and the logarithm of posterior over density of each."""
+    """Return samples of a density, and for each the log ratio of posterior to density."""
     samples = density.draw(count, rng)
     return samples, finite(problem.log_posterior(samples)) - density.log_density(samples)
 
 
 def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> FloatArray:
-    """Return particles and draws about the mode (point, free), without those that are lost far
-    below the best.
+    """Return particles and draws around the mode (point, free), without those far below the best
+    log posterior.
     """
     points, log_posteriors = follow_posterior(problem, _PARTICLES, rng)
     near_mode = mode.draw(_DRAWS_ABOUT_MODE, rng)
@@ -359,8 +364,8 @@ def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator)
 
 
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
-    """Return the mixture that expectation and maximisation find for weighted samples, and a
-    broad component.
+    """Return the normal mixture fitted to weighted samples by expectation maximisation, with a
+    broad component added.
     """
     centre, covariance = moments(samples, weight)
     overall_root = np.linalg.cholesky(firm(covariance))
@@ -368,7 +373,7 @@ def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -
         np.linalg.solve(overall_root, (samples - centre).T).T, weight, rng
     )
     mixture = Mixture(
-        # narrower than all samples, so that the components can separate
+        # scale factor 0.5: narrower than all samples, so that the components can separate
         np.full(_COMPONENTS, 1 / _COMPONENTS),
         samples[start_numbers],
         np.repeat(0.5 * overall_root[None], _COMPONENTS, 0),
@@ -384,19 +389,19 @@ def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -
 
 
 def _distant_starts(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> list[int]:
-    """Return the numbers of the samples at which the components start.
+    """Return the indices of the samples at which the components start.
 
-    Every second one is drawn by its squared distance from those before, as in k-means++, the others
-    by weight.
+    Every second start is drawn with a probability proportional to its squared distance from the
+    starts before it, as in k-means++; the others are drawn by weight.
     """
-    # drawn by weight, so that a uniform choice of the pool is one by weight
+    # a pool drawn by weight, so that a uniform choice from it is a choice by weight
     pool = rng.choice(len(places), size=4 * _PARTICLES // 10, p=weight)
     starts, squared_distance = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
     for number in range(1, _COMPONENTS):
         takes_far = number % 2 and squared_distance.sum() > 0
         chances = squared_distance / squared_distance.sum() if takes_far else None
         starts.append(int(rng.choice(pool, p=chances)))
-        # to the nearest start so far
+        # squared distance to the nearest start so far
         squared_distance = np.minimum(
             squared_distance, ((places[pool] - places[starts[-1]]) ** 2).sum(1)
         )
@@ -406,8 +411,8 @@ def _distant_starts(places: FloatArray, weight: FloatArray, rng: np.random.Gener
 def maximised(
     samples: FloatArray, parts: FloatArray, overall: FloatArray, borrowed: float = _BORROWED_SHARE
 ) -> Mixture:
-    """Return the mixture of normal components with the moments of samples, by their shares
-    ``parts``.
+    """Return the mixture of normal components with the weighted moments of samples; ``parts``
+    (draw, component) are the weights.
 
     ``borrowed`` is the share of samples with the covariance ``overall`` that is added to all
     components together.
@@ -433,7 +438,9 @@ def moments(samples: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def firm(covariance: FloatArray) -> FloatArray:
-    """Return covariances (..., free, free) whose rounding cannot make a variance negative."""
+    """Return covariances (..., free, free) with slightly raised diagonals, so that rounding cannot
+    make them indefinite.
+    """
     firmed = covariance.copy()
     index = np.arange(covariance.shape[-1])
     firmed[..., index, index] *= 1 + 1e-9
@@ -446,8 +453,8 @@ def uniform(count: int, rng: Random) -> FloatArray:
 
 
 def softened(log: FloatArray) -> FloatArray:
-    """Return ``log`` times the largest factor, up to 1, whose weights leave enough effective
-    samples for a fit.
+    """Return ``log`` times the largest factor, up to 1, that leaves enough effective samples for a
+    fit.
     """
     if effective(log) >= _SOFT_FRACTION:
         return log
@@ -464,8 +471,8 @@ def softened(log: FloatArray) -> FloatArray:
 
 
 def effective(log: FloatArray) -> float:
-    """Return the effective sample size of weights with the logarithms ``log``, divided by their
-    number.
+    """Return the effective sample size of weights with the logarithms ``log``, as a fraction of
+    their number.
     """
     return float(1 / (normalised(log) ** 2).sum() / len(log))
 
@@ -478,13 +485,13 @@ def normalised(log: FloatArray) -> FloatArray:
 
 
 def finite(log: FloatArray) -> FloatArray:
-    """Return logarithms with a very small number in place of minus infinity and NaN."""
+    """Return logarithms with minus infinity and NaN replaced by a very small number."""
     return np.nan_to_num(log, nan=_IMPOSSIBLE_LOG, neginf=_IMPOSSIBLE_LOG)
 
 
 def log_sum(logs: FloatArray) -> FloatArray:
     """Return the logarithm of the sum of exponentials along the last axis."""
-    # taken out first, so that no exponential overflows
+    # the largest is subtracted first, so that no exponential overflows
     largest = logs.max(-1)
     log_total: FloatArray = largest + np.log(np.exp(logs - largest[..., None]).sum(-1))
     return log_total

@@ -79,13 +79,11 @@ _STORED_DRAWS = 4000  #: draws in the file ``draws.npz``
 
 
 class CalibrationRefused(ValueError):
-    """Error raised if the levels constrain the sensor too little for a useful posterior."""
+    """Error raised if the levels constrain the sensor too weakly for a useful posterior."""
 
 
 class FramesRefused(CalibrationRefused):
-    """Error raised if the frames are not such as any likelihood describes; ``tests`` has the
-    tests of the frames.
-    """
+    """Error raised if no likelihood describes the frames; ``tests`` has the tests of the frames."""
 
     def __init__(self, tests: Sequence[FrameTest]) -> None:
         self.tests = tests
@@ -96,11 +94,11 @@ class FramesRefused(CalibrationRefused):
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """How many draws a calibration makes, and with which walkers."""
+    """Number of draws of a calibration, and settings of its walkers."""
 
     walkers: int = 64  #: in each of the four ensembles
     move: str = "de"  #: ``"de"`` or ``"stretch"``
-    draws: int = 1000  #: least number of independent draws
+    draws: int = 1000  #: least effective number of independent draws
 
 
 def calibrate(
@@ -155,7 +153,7 @@ def find_posterior(
     if identifiability.refused:
         raise CalibrationRefused(identifiability.refused)
     samples = importance_samples(problem, mode, recipe.seed)
-    # a long, bent posterior is not like that about its mode
+    # the normal approximation at the mode does not describe a long, curved posterior
     if problem.coordinates.bent:
         identifiability = identify_from_draws(
             problem, mode, identifiability, samples.samples, samples.weights
@@ -178,7 +176,7 @@ def find_posterior(
     ]
     result = CalibrationResult(problem, mode, identifiability, chains, all_checks, models, tests)
     result = _widened(result, laboratory)
-    # only of a real camera the standard's fit and the posterior must agree
+    # only for a real camera must the standard's fit and the posterior agree
     if not is_camera(problem):
         return result
     return replace(result, checks=[*all_checks, *agreement(result.beside)])
@@ -187,14 +185,14 @@ def find_posterior(
 def _models_of_response(
     recipe: Recipe, store: Store, problem: SensorPosterior
 ) -> list[ModelSpread]:
-    """Return the posteriors with several models of the response; none for rings about a source."""
+    """Return the posteriors for several models of the response; empty for rings around a source."""
     if not isinstance(problem.levels, Levels):
         return []
     return compare_models(recipe, store, recipe.seed)
 
 
 def _draws_file(store: Store, problem: SensorPosterior, options: CalibrationOptions) -> Path:
-    """Return the file of the store that keeps the chains of a posterior."""
+    """Return the path in the store of the chains of a posterior."""
     seed = problem.recipe.seed
     code = engine("calibration.emcee_sampler")
     key = digest("posterior", code, problem.key, options.walkers, options.move, seed)
@@ -204,8 +202,8 @@ def _draws_file(store: Store, problem: SensorPosterior, options: CalibrationOpti
 def _data_checks(
     problem: SensorPosterior, mode: LaplaceFit, tests: Sequence[FrameTest]
 ) -> list[Check]:
-    """Return what the frames may hide, and if they have the least data of a clean statement;
-    none without frames.
+    """Return checks on faults that the frames may hide, and on the amount of data; empty without
+    frames.
     """
     checks = hidden_checks(tests, problem.coordinates.prior.may_hide)
     if not checks or not isinstance(problem.levels, Levels):
@@ -219,8 +217,8 @@ def _data_checks(
 
 
 def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationResult:
-    """Return a calibration with what the frames show or may hide, with what the laboratory
-    states, and its budgets.
+    """Return a calibration widened by the errors that frames and laboratory leave open, with its
+    uncertainty budgets.
     """
     problem, tests = result.problem, result.frames
     identifiability = result.identifiability
@@ -239,8 +237,8 @@ def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationRe
 
 
 def _accepted_frames(recipe: Recipe, store: Store, progress: Progress) -> Sequence[FrameTest]:
-    """Return the tests of the frames of a calibration; raises `FramesRefused` where no
-    likelihood describes them.
+    """Return the tests of the frames of a calibration; raise `FramesRefused` if no likelihood
+    describes the frames.
     """
     tests = inspect_recipe(recipe, store)
     for line in lines(tests):
@@ -251,9 +249,7 @@ def _accepted_frames(recipe: Recipe, store: Store, progress: Progress) -> Sequen
 
 
 def _refused_document(refused: FramesRefused) -> dict[str, Any]:
-    """Return the document of a calibration whose frames are refused, without a value of any
-    parameter.
-    """
+    """Return the JSON document of a calibration with refused frames, without parameter values."""
     checks = frame_checks(refused.tests)
     return {
         "failed": count_failures(checks),
@@ -303,7 +299,7 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the results of a parameter, without the numbers that the frames do not give."""
+    """Return the results of a parameter without the fields that the frames do not determine."""
     not_told = NOT_TOLD[row["kind"]]
     stated_values = {name: value for name, value in row.items() if name not in not_told}
     return {
@@ -318,7 +314,7 @@ def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyRepo
     first_name = "rings" if isinstance(result.problem.levels, Rings) else "transfer"
     pictures: dict[str, bytes | None] = {
         name: section.picture
-        # the last three sections are those of curve, pairs and chains
+        # the last three sections are the curve, the pairs and the chains
         for name, section in zip((first_name, "corner", "chains"), page_sections[-3:], strict=True)
     }
     pictures["budget"] = result.budget_picture
@@ -336,8 +332,8 @@ def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyRepo
 
 
 def _draws(result: CalibrationResult) -> bytes:
-    """Return the bytes of an npz file with posterior draws of each parameter that the frames
-    tell, evenly from all.
+    """Return the bytes of an npz file with evenly selected posterior draws of each parameter that
+    the frames constrain.
     """
     stride = max(1, result.chains.flat.shape[0] // _STORED_DRAWS)
     npz_file = io.BytesIO()
@@ -349,7 +345,7 @@ def _draws(result: CalibrationResult) -> bytes:
 
 
 def _inference_data(result: CalibrationResult) -> Any:
-    """Return the draws of what the frames tell as ArviZ inference data, with each walker as a
+    """Return the draws of the constrained parameters as ArviZ inference data; each walker is a
     chain.
     """
     chains = result.chains

@@ -54,12 +54,14 @@ _TRANSFER = ("photons", "exposure", "mean", "variance", "mean_dark", "variance_d
 
 @dataclass(frozen=True)
 class SheetStatements:
-    """What is told of the frames of a sheet beside the recipe."""
+    """Options and statements for a sheet that the recipe does not contain."""
 
-    #: whose variance in time is taken; None for that of the descriptor, otherwise release 4
+    #: release that defines the temporal variance; None: the release of the descriptor, else release
+    #: 4
     release: Release | None = None
-    relative: bool = False  #: the photons of the recipe are known up to a factor
-    state: Sequence[str] = ()  #: of the operating point, such as ``temperature=25 °C``
+    #: True if the photon numbers of the recipe are known only up to a factor
+    relative: bool = False
+    state: Sequence[str] = ()  #: statements on the operating point, such as ``temperature=25 °C``
 
 
 def write_sheet(
@@ -69,8 +71,8 @@ def write_sheet(
     command: Sequence[str] = (),
     statements: SheetStatements | None = None,
 ) -> Path:
-    """Write the EMVA 1288 sheet of the frames of a recipe: page, PDF, JSON, CSV and pictures;
-    return the folder.
+    """Write the EMVA 1288 sheet of the frames of a recipe (page, PDF, JSON, CSV and pictures), and
+    return its folder.
 
     Nothing in photons is stated where they are known up to a factor only.
     Raises: ValueError for a recipe without frames, without dark frames or without two lit levels,

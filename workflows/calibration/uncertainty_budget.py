@@ -1,6 +1,6 @@
 """The uncertainty budget of each parameter: its sources, tables and picture.
 
-Some sources are what the laboratory of a recipe states of its light and its temperature.
+Some sources are statements of the laboratory on its light and temperature, in the recipe.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ if TYPE_CHECKING:
 
 # --- laboratory -----------------------------------------------------------------------------------
 
-# What the laboratory of a recipe states of its light and temperature, and what follows for draws
-# and intervals.
+# Statements of the laboratory on its light and temperature, and their effect on draws and
+# intervals.
 
 
 EFFICIENCY = "quantum_efficiency"
 RELATIVE = "quantum efficiency: not from these frames: the photons are known up to a factor only"
-#: quantities that may have a temperature coefficient: what is positive, so that a relative change
-#: has a meaning
+#: quantities that may have a temperature coefficient: positive ones, for which a relative change
+#: makes sense
 WITH_COEFFICIENT = frozenset(
     {
         "gain",
@@ -80,19 +80,19 @@ WITH_COEFFICIENT = frozenset(
         "full_well",
     }
 )
-_STREAM = 9  #: of random numbers, apart from those of other draws
+_STREAM = 9  #: stream of random numbers, separate from those of other draws
 
 
 def stated(recipe: Recipe) -> Traceability:
-    """Return what the recipe states of its light and temperature; nothing for a recipe without
+    """Return the statements of a recipe on light and temperature; an empty one for a recipe without
     the block.
     """
     return recipe.traceability or Traceability()
 
 
 def laboratory_of(recipe: Recipe) -> Laboratory:
-    """Return the uncertainties that a recipe states; raise ValueError for a coefficient of an
-    unknown quantity.
+    """Return the uncertainties stated in a recipe; raise ValueError for a coefficient of an unknown
+    quantity.
     """
     statements = stated(recipe)
     stated_names = statements.temperature.coefficients
@@ -117,13 +117,13 @@ def laboratory_of(recipe: Recipe) -> Laboratory:
 
 
 def is_relative(recipe: Recipe) -> bool:
-    """Return True if the recipe states that its photons are known up to a factor only."""
+    """Return True if the recipe states that its photon numbers are known only up to a factor."""
     return stated(recipe).photons.known == "relative"
 
 
 def without_efficiency(identifiability: Identifiability) -> Identifiability:
-    """Return what frames determine whose photons are known up to a factor: no quantum
-    efficiency.
+    """Return the identifiability for photon numbers known only up to a factor: the quantum
+    efficiency is undetermined.
     """
     if EFFICIENCY not in identifiability.kinds:
         return identifiability
@@ -137,10 +137,10 @@ def without_efficiency(identifiability: Identifiability) -> Identifiability:
 def with_laboratory(
     problem: SensorPosterior, chains: Chains, laboratory: Laboratory, seed: int
 ) -> Chains:
-    """Return the draws of a posterior with the uncertainty of the light and of the temperature.
+    """Return the draws of a posterior, widened by the uncertainty of light and temperature.
 
-    The light moves the quantum efficiency alone, by errors that are independent of everything else;
-    the temperature moves all parameters with a coefficient together.
+    Errors of the light change only the quantum efficiency, independently of all other parameters;
+    an error of the temperature changes all parameters with a coefficient together.
     """
     values = problem.parameters(chains.draws)
     factors = _factors(laboratory, list(values), chains.log.shape, seed)
@@ -153,7 +153,9 @@ def with_laboratory(
 def _factors(
     laboratory: Laboratory, names: Sequence[str], shape: tuple[int, ...], seed: int
 ) -> dict[str, FloatArray]:
-    """Return a factor for each draw of each parameter that light or temperature move, by name."""
+    """Return, by parameter name, a factor for each draw of each parameter that light or temperature
+    affect.
+    """
     rng = np.random.default_rng([seed, _STREAM])
     factors: dict[str, FloatArray] = {}
     if EFFICIENCY in names:
@@ -170,7 +172,9 @@ def _factors(
 
 
 def _drawn(rng: np.random.Generator, law: str, width: float, shape: tuple[int, ...]) -> FloatArray:
-    """Return draws of a law with the mean 0 and the standard deviation ``width``."""
+    """Return draws with mean 0 and standard deviation ``width`` from a ``law``: rectangular or
+    normal.
+    """
     if law == "rectangular":
         # a rectangle of this half width has the standard deviation `width`
         half_width = math.sqrt(3) * width
@@ -179,7 +183,9 @@ def _drawn(rng: np.random.Generator, law: str, width: float, shape: tuple[int, .
 
 
 def relative_widths(laboratory: Laboratory, names: Sequence[str]) -> Mapping[str, float]:
-    """Return the relative standard uncertainty that light and temperature add to each parameter."""
+    """Return the relative standard uncertainty that light and temperature add to each parameter, by
+    name.
+    """
     kelvin_error = laboratory.temperature or 0.0
     light_error = math.hypot(*(uncertainty for _, uncertainty in laboratory.light), 0.0)
     return {
@@ -194,7 +200,9 @@ def relative_widths(laboratory: Laboratory, names: Sequence[str]) -> Mapping[str
 def with_laboratory_models(
     models: Sequence[ModelSpread], laboratory: Laboratory
 ) -> list[ModelSpread]:
-    """Return the intervals to report with the uncertainty of the light and of the temperature."""
+    """Return the models with their reported intervals widened by the uncertainty of light and
+    temperature.
+    """
     widths = relative_widths(laboratory, [model.name for model in models])
     return [replace(model, stated=wider(model.stated, widths[model.name])) for model in models]
 
@@ -232,7 +240,7 @@ _COLOURS = (
     "#882255",
     "#44AA99",
 )
-#: keys of the quantities of a sheet whose budget the page shows
+#: keys of the EMVA quantities whose budget the page shows
 BUDGETED = (
     "eta",
     "K",
@@ -260,8 +268,8 @@ _LINES = """Each source with its type (A: from a series of observations; B: by o
 def budget_sections(
     budgets: Sequence[Budget], traceability: Traceability, picture: bytes | None, note: str = ""
 ) -> list[Section]:
-    """Return the sections of a page with the budgets, their sources, and what the laboratory
-    states.
+    """Return the page sections with the budgets, their sources, and the statements of the
+    laboratory.
 
     ``note`` is a sentence on where other budgets are.
     """
@@ -366,7 +374,7 @@ def _freedom(freedom: float) -> str:
 
 
 def _traced(traceability: Traceability) -> list[Section]:
-    """Return the section with what the block `traceability` states, as a list of one."""
+    """Return the section on the statements in the block `traceability`, as a list of one."""
     text = """What the block `traceability` of the recipe states of the light and of the
         temperature, so that a value can be traced to a standard."""
     warning = Marked("not stated", "warn")
@@ -378,7 +386,9 @@ def _traced(traceability: Traceability) -> list[Section]:
 
 
 def statements(traceability: Traceability) -> list[tuple[str, str | None]]:
-    """Return each statement of a laboratory by its name, with None for what is not stated."""
+    """Return the statements of a laboratory as pairs of name and value; None for one that is not
+    stated.
+    """
     photons, lamp, temperature = traceability.photons, traceability.lamp, traceability.temperature
     relative = photons.relative_uncertainty
     coefficients = "; ".join(f"{name} {x:g} /K" for name, x in temperature.coefficients.items())
@@ -405,8 +415,8 @@ def statements(traceability: Traceability) -> list[tuple[str, str | None]]:
 
 
 def of_traceability(traceability: Traceability) -> dict[str, str | None]:
-    """Return what a laboratory states of the operating point of a sheet, by the keys of its
-    statements.
+    """Return the statements of a laboratory on the operating point, by the keys of an
+    EMVA sheet.
     """
     photons, lamp, temperature = traceability.photons, traceability.lamp, traceability.temperature
     return {
@@ -454,7 +464,7 @@ def budget_rows(budgets: Sequence[Budget]) -> Iterator[tuple[Any, ...]]:
 
 
 def budget_document(budgets: Sequence[Budget], traceability: Traceability) -> dict[str, Any]:
-    """Return the content of ``budget.json``; infinite degrees of freedom are the text
+    """Return the content of ``budget.json``; infinite degrees of freedom become the text
     ``infinite``.
     """
     return {
@@ -485,7 +495,7 @@ def _budget(b: Budget) -> dict[str, Any]:
 
 
 def _contribution(c: Contribution) -> dict[str, Any]:
-    """Return a source as a mapping for JSON; one that is not stated has its reason alone."""
+    """Return a source as a mapping for JSON; a source that is not stated has only its reason."""
     if c.share is None:
         return {"source": c.source, "kind": c.kind, "reason": c.reason}
     values = {name: value for name, value in asdict(c).items() if name != "reason"}
@@ -497,15 +507,15 @@ def _finite(freedom: float) -> float | str:
 
 
 def two_digits(uncertainty: float) -> str:
-    """Return an uncertainty as text of two significant digits, of large numbers without an
-    exponent: 1000, 710.
+    """Return an uncertainty as text with two significant digits and no exponent for large numbers,
+    such as 1000 or 710.
     """
     return f"{float(f'{uncertainty:.2g}'):.6g}"
 
 
 def budget_figure(budgets: Sequence[Budget]) -> Any:
-    """Draw the share of each source in the variance of each quantity, as bars that add up to 100
-    %.
+    """Draw the share of each source in the variance of each quantity, as bars that add up
+    to 100 %.
     """
     sources = _shown_sources(budgets)
     colours = {source: _COLOURS[i % len(_COLOURS)] for i, source in enumerate(sources)}
@@ -530,7 +540,7 @@ def budget_figure(budgets: Sequence[Budget]) -> Any:
 
 
 def _shown_sources(budgets: Sequence[Budget]) -> list[str]:
-    """Return the sources with a share in any budget, each once."""
+    """Return the sources that contribute to any budget, without repetition."""
     sources = dict[str, None]()
     for budget in budgets:
         sources |= dict.fromkeys(c.source for c in budget.contributions if c.share)
@@ -538,44 +548,44 @@ def _shown_sources(budgets: Sequence[Budget]) -> list[str]:
 
 
 def _percentages(budget: Budget) -> Iterator[tuple[str, float]]:
-    """Yield each source that is wide enough to be drawn, with its share of the variance in %."""
+    """Yield each source with a share large enough to draw, and its share of the variance in %."""
     for c in budget.contributions:
         percent = 100 * ((c.share or 0.0) / budget.combined) ** 2 if budget.combined else 0.0
         if percent > 100 * _LEAST_DRAWN_SHARE:
             yield c.source, percent
 
 
-#: from budgets to the PNG bytes of the picture
+#: function from budgets to the PNG bytes of the picture
 budget_picture = drawn(budget_figure)
 
 
 # --- calibration budget ---------------------------------------------------------------------------
 
-# The uncertainty budget of each parameter of a calibration, whose sources add up to what the
-# calibration states.
+# The uncertainty budget of each parameter of a calibration; its sources add up to the stated
+# uncertainty.
 
 
 _TESTS = "what the tests of the frames leave open"
 _PRIOR = "prior of the recipe"
-_STEP = 1e-4  #: standard deviations of the prior, step of a derivative
+_STEP = 1e-4  #: step of a numerical derivative, in standard deviations of the prior
 
 
 class _Estimate(NamedTuple):
-    """What is stated of a parameter, and the standard uncertainty that its posterior and its
-    models give.
+    """The stated value of a parameter, with the standard uncertainties from its posterior and from
+    the choice of model.
     """
 
     value: float
-    posterior: float  #: of the mean of two models, before any widening
-    #: half the distance of two models of the response; None where there is one model
+    posterior: float  #: standard deviation of the mean of two models, before any widening
+    #: half the difference between two models of the response; None with only one model
     model: float | None
 
 
 def budgets(result: CalibrationResult, laboratory: Laboratory) -> list[Budget]:
-    """Return the uncertainty budget of each parameter of which the calibration states a value.
+    """Return the uncertainty budget of each parameter for which the calibration states a value.
 
-    The variance of the posterior is split among the sources of the levels' scatter by the linear
-    law of propagation.
+    The variance of the posterior is divided among the sources of scatter of the levels by linear
+    propagation.
     """
     rows = [row for row in result.rows() if row.kind == "estimate"]
     shares = _shares(result)
@@ -592,8 +602,8 @@ def _calibration_budget(
 ) -> Budget:
     """Return the budget of one estimated parameter.
 
-    `shares` are those of the sources in the variance of its posterior, `freedom` their degrees of
-    freedom.
+    ``shares`` are the shares of the sources in the variance of its posterior, ``freedom`` their
+    degrees of freedom.
     """
     estimate = _estimate(result, row)
     # the efficiency is inverse to the photons, so that a relative error changes its sign
@@ -610,7 +620,7 @@ def _calibration_budget(
 def _of_posterior(
     estimate: _Estimate, unit: str, shares: Mapping[str, float], freedom: Mapping[str, float]
 ) -> Iterator[Contribution]:
-    """Yield one contribution for each source of the levels' scatter, and one of the prior."""
+    """Yield one contribution for each source of scatter of the levels, and one for the prior."""
     for source, share in shares.items():
         kind: Literal["A", "B"] = "B" if source == _PRIOR else "A"
         degrees_of_freedom = math.inf if source == _PRIOR else freedom.get(source, math.inf)
@@ -621,7 +631,7 @@ def _of_posterior(
 
 
 def _of_model(name: str, estimate: _Estimate, unit: str) -> Contribution:
-    """Return the contribution of the choice of a model; a term of the response itself has none."""
+    """Return the contribution of the choice of model; a term of the response itself gets none."""
     if name in TERMS:
         return Contribution(MODEL, "B", reason=NOT_INVOLVED)
     if estimate.model is None:
@@ -630,7 +640,7 @@ def _of_model(name: str, estimate: _Estimate, unit: str) -> Contribution:
 
 
 def _of_tests(result: CalibrationResult, row: ParameterEstimate, value: float) -> Contribution:
-    """Return the contribution of what the tests of the frames leave open."""
+    """Return the contribution of the errors that the tests of the frames cannot exclude."""
     if len(result.frames) < 2:
         return Contribution(_TESTS, "B", reason=f"{NOT_STATED}: only moments are given")
     errors = errors_of_parameters(result.frames, result.problem.coordinates.prior.may_hide)
@@ -641,7 +651,7 @@ def _of_tests(result: CalibrationResult, row: ParameterEstimate, value: float) -
 
 
 def _estimate(result: CalibrationResult, row: ParameterEstimate) -> _Estimate:
-    """Return value and standard uncertainties of a parameter.
+    """Return the value and the standard uncertainties of a parameter.
 
     Where the response has several models, they are from the two models with the most terms.
     """
@@ -705,7 +715,7 @@ def _derivatives(result: CalibrationResult, z: FloatArray) -> dict[str, FloatArr
 
 
 def _calibration_freedom(result: CalibrationResult) -> dict[str, float]:
-    """Return the degrees of freedom of each source of the levels' scatter; none for rings."""
+    """Return the degrees of freedom of each source of scatter of the levels; empty for rings."""
     levels = result.problem.levels
     if isinstance(levels, Levels):
         return source_freedom(levels, dict(result.params), result.problem.names)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 # --- confidence intervals -------------------------------------------------------------------------
 
-# Confidence intervals of mean image errors over scenes, and of the differences between two methods
-# in these scenes.
+# Confidence intervals of mean image errors over scenes, and of differences between two methods in
+# these scenes.
 
 
 Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
-FEW_PHOTOGRAPHS = 5  #: smallest number of photographs for the bootstrap
+FEW_PHOTOGRAPHS = 5  #: least number of photographs for the bootstrap
 METRICS = (
     "l1",
     "psnr",
@@ -33,8 +33,8 @@ METRICS = (
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over scenes and its 95 % confidence interval, with NaN as limits if there are too
-    few photographs.
+    """A mean over scenes with its 95 % confidence interval; the limits are NaN for too few
+    photographs.
     """
 
     mean: float
@@ -54,13 +54,11 @@ class Interval:
 
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one mask and restorer as arrays (scene, laser strength), with NaN if a
-    value is missing.
-    """
+    """The metrics of one pipeline as arrays (scene, laser strength); NaN marks a missing value."""
 
     strengths: tuple[float, ...]
     values: Mapping[str, Numbers]
-    photographs: Numbers  #: (scene,) the number of the photograph of each scene
+    photographs: Numbers  #: (scene,) index of the photograph of each scene
 
     def scenes(self, metric: str) -> Numbers:
         """Return the mean of a metric over all laser strengths, for each scene."""
@@ -72,8 +70,8 @@ class MetricTable:
         return mean(self.scenes(metric), self.photographs)
 
     def at(self, metric: str, strength: int) -> Interval:
-        """Return the mean of a metric at one laser strength, over the scenes that have a value,
-        and its interval.
+        """Return the mean of a metric at one laser strength over the scenes with a value, and its
+        interval.
         """
         column = self.values[metric][:, strength]
         valid = ~np.isnan(column)
@@ -81,8 +79,8 @@ class MetricTable:
 
 
 def sums_by_photograph(values: Numbers, photographs: Numbers) -> Numbers:
-    """Return the sum of the values of the pictures of each photograph."""
-    # numbers from 0 on, as `bincount` needs
+    """Return the sum of ``values`` for each photograph."""
+    # indices from 0, as required by `bincount`
     _, number = np.unique(photographs, return_inverse=True)
     return np.bincount(number.reshape(-1), weights=values).astype(np.float64)
 
@@ -90,12 +88,11 @@ def sums_by_photograph(values: Numbers, photographs: Numbers) -> Numbers:
 def mean(
     values: Sequence[float] | Numbers, photographs: Sequence[float] | Numbers | None = None
 ) -> Interval:
-    """Return the mean over scenes of a metric, and its confidence interval from Student's t
+    """Return the mean of a metric over scenes, and its confidence interval by Student's t
     distribution.
 
-    ``photographs`` has the number of the photograph of each scene; without it each scene has a
-    photograph of its own. The interval is over photographs: several scenes of one photograph count
-    as one draw.
+    ``photographs`` has the index of each scene's photograph; without it each scene has its own. The
+    interval is over photographs: several scenes of one photograph count as one sample.
     """
     scene_values = np.asarray(values, dtype=np.float64)
     photograph_of_scene = np.asarray(
@@ -110,7 +107,7 @@ def mean(
     from scipy.stats import t
 
     residuals = sums_by_photograph(scene_values - mean_value, photograph_of_scene)
-    # sandwich: residuals of a photograph are added before they are squared
+    # sandwich estimator: residuals of one photograph are summed before squaring
     standard_error = math.sqrt(float((residuals**2).sum()) * count / (count - 1)) / len(
         scene_values
     )
@@ -123,10 +120,9 @@ def metric_table(
     strengths: Sequence[float],
     photographs: Sequence[int] | None = None,
 ) -> MetricTable:
-    """Arrange the metrics of one mask and restorer as arrays (scene, laser strength).
+    """Return the metrics of one pipeline as arrays (scene, laser strength).
 
-    ``photographs`` has the number of the photograph of each scene; without it every scene has its
-    own.
+    ``photographs`` has the index of each scene's photograph; without it each scene has its own.
     """
     values = {
         metric: np.array(
@@ -143,19 +139,20 @@ def metric_table(
 
 # --- paired intervals -----------------------------------------------------------------------------
 
-# Confidence intervals of the difference between two pipelines on the same pictures, drawn over
-# photographs.
+# Confidence intervals of the difference between two pipelines on the same pictures, by resampling
+# of photographs.
 #
-# Pictures of one photograph are alike, so that they are no independent draws: the bootstrap draws
-# whole photographs. It draws the error of the mean in units of its own standard error
-# (bootstrap-t), because quantiles of the plain bootstrap hold the truth of eight to twelve skewed
-# photographs in 81 to 89 instead of 95 of 100 cases.
+# Pictures of one photograph are not independent: the bootstrap resamples whole photographs. It
+# resamples the error of the mean in units of its own standard error (bootstrap-t), because
+# quantiles of the plain bootstrap contain the truth for eight to twelve skewed photographs in 81 to
+# 89 instead of 95 of 100 cases.
 
 
-_BOOTSTRAP_DRAWS = 10_000  #: sets of photographs that the bootstrap draws
-#: photographs below which neither end may lie nearer than that of Student's t distribution
+_BOOTSTRAP_DRAWS = 10_000  #: number of bootstrap samples, each a set of photographs
+#: below this number of photographs, neither limit may be closer than that of Student's t
+#: distribution
 _SMALL = 30
-_AT_ONCE = 500  #: sets in memory at once
+_AT_ONCE = 500  #: bootstrap samples in memory at once
 
 
 def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Interval:
@@ -181,7 +178,7 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
         return Interval(ratio_of_sums, math.nan, math.nan)
     residuals = top_sums - ratio_of_sums * bottom_sums
     standard_error = _standard_error((residuals**2).sum(), bottom_sums.sum(), count)
-    # of the error in units of the standard error in each drawn set
+    # quantiles of the studentised error over the bootstrap samples
     low_error, high_error = np.quantile(
         _drawn_errors(residuals, bottom_sums, seed), _LIMITS, method="inverted_cdf"
     )
@@ -191,7 +188,7 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
             widening * min(low_error, -quantile),
             widening * max(high_error, quantile),
         )
-    # the high quantile of the error is the low end of the interval
+    # the upper quantile of the error gives the lower limit
     return Interval(
         ratio_of_sums,
         *(
@@ -202,7 +199,7 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
 
 
 def _student(freedom: int) -> float:
-    """Return the upper end of Student's t distribution for `CONFIDENCE`."""
+    """Return the upper quantile of Student's t distribution for `CONFIDENCE`."""
     from scipy.stats import t
 
     return float(t.ppf(_LIMITS[1], freedom))
@@ -212,7 +209,7 @@ _LIMITS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
 
 
 def _standard_error(squares: Numbers, total: Numbers, count: int) -> Numbers:
-    """Return the standard error of a ratio from the sum of the squared residuals of the
+    """Return the standard error of a ratio, from the sum of the squared residuals of the
     photographs.
     """
     error: Numbers = np.sqrt(count / (count - 1) * squares) / total
@@ -220,13 +217,13 @@ def _standard_error(squares: Numbers, total: Numbers, count: int) -> Numbers:
 
 
 def _drawn_errors(residuals: Numbers, b: Numbers, seed: int) -> Numbers:
-    """Return the error of the ratio in each drawn set of photographs, in units of the standard
-    error in that set.
+    """Return the error of the ratio in each bootstrap sample, in units of the standard error in
+    that sample.
 
-    ``residuals`` are those of the numerators (photograph,), ``b`` the denominators.
+    ``residuals`` are those of the numerators (photograph,), ``b`` are the denominators.
     """
     rng, count = np.random.default_rng(seed), len(residuals)
-    # sums that each drawn set needs, so that one product of matrices gives all
+    # the sums for all bootstrap samples follow from one matrix product
     products = np.stack([residuals, b, residuals * residuals, residuals * b, b * b], 1)
     errors: list[Numbers] = []
     for _ in range(0, _BOOTSTRAP_DRAWS, _AT_ONCE):
@@ -235,7 +232,7 @@ def _drawn_errors(residuals: Numbers, b: Numbers, seed: int) -> Numbers:
             draw_counts @ products
         ).T
         ratio_errors = residual_sum / denominator_sum
-        # sum of (residual - moved x denominator)^2; rounding may make it negative
+        # sum of (residual - ratio error x denominator)^2; rounding may make it negative
         squares = np.maximum(
             residual_squares
             - 2 * ratio_errors * mixed_products
@@ -254,26 +251,26 @@ def _drawn_errors(residuals: Numbers, b: Numbers, seed: int) -> Numbers:
 
 
 def less(values: Numbers, reference: Numbers, photographs: Numbers, seed: int) -> Interval:
-    """Return by how much a metric lies below that of the reference on the same pictures, in the
-    unit of the metric.
+    """Return the decrease of a metric relative to the reference on the same pictures, in the unit
+    of the metric.
     """
     return ratio(reference - values, np.ones_like(reference), photographs, seed)
 
 
 def gain(values: Numbers, reference: Numbers, photographs: Numbers, seed: int) -> Interval:
-    """Return by which fraction the mean of a metric lies below the mean of the reference, such
-    as 0.101 for 10.1 %.
+    """Return the relative decrease of the mean of a metric from that of the reference, such as
+    0.101 for 10.1 %.
     """
     ratio_to_reference = ratio(values, reference, photographs, seed)
-    # the fraction falls as the ratio rises: the ends change places
+    # the gain falls as the ratio rises, so that the limits swap
     return Interval(
         1.0 - ratio_to_reference.mean, 1.0 - ratio_to_reference.high, 1.0 - ratio_to_reference.low
     )
 
 
 def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
-    """Return the decrease of L1 error against the reference: absolute, relative, and relative
-    for small pictures.
+    """Return the decrease of the L1 error relative to the reference: absolute, relative, and
+    relative for small pictures.
     """
     own_l1, reference_l1, photographs = (
         values.scenes("l1"),
@@ -289,9 +286,7 @@ def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict
 
 
 def gains_by_strength(values: MetricTable, reference: MetricTable, seed: int) -> list[Interval]:
-    """Return by which fraction the L1 error of the small pictures is lower, at each laser
-    strength.
-    """
+    """Return the relative decrease of the L1 error of the small pictures at each laser strength."""
     gains = []
     for strength_index in range(len(values.strengths)):
         own_l1, reference_l1 = (

@@ -53,17 +53,15 @@ if TYPE_CHECKING:
 
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
-_STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
-#: marker of a point beside the line style of a curve
+_STYLES = ("-", "--", ":", "-.")  #: line styles; the next one is used once all colours are used
+#: marker of a point by the line style of the curve
 _MARKERS = dict(zip(_STYLES, "osD^", strict=True))
 _GREY = "#777777"
-_ROW_NAME_LETTERS = 16  #: characters of the longest row name that stays on one line
+_ROW_NAME_LETTERS = 16  #: longest row name, in characters, that stays on one line
 
 
 def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the colour and the line style of the curve of each mask, or of each mask with
-    restorer.
-    """
+    """Return colour and line style for the curve of each name."""
     count = len(_COLOURS)
     return {
         name: {
@@ -76,10 +74,9 @@ def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 @drawn
 def cases(panels: Sequence[Panel]) -> Any:
-    """Draw the pictures of the plain lens, and of every mask with restorer, in rows below the true
-    picture.
+    """Draw pictures in a grid: the true picture, the plain lens, and every pipeline in rows.
 
-    The columns have different lasers. All pictures have the same scale.
+    The columns have different lasers. All pictures have the same brightness scale.
     """
     rows = list(panels[0].pictures)
     white = high(panels[0].pictures["truth"])
@@ -87,7 +84,7 @@ def cases(panels: Sequence[Panel]) -> Any:
     for column, panel in enumerate(panels):
         for row, (name, picture_of_row) in enumerate(panel.pictures.items()):
             title = f"{panel.case}, {_power(panel.strength)}" if panel.strength else "no laser"
-            # a title above the first row alone
+            # a title only above the first row
             picture(axes[row, column], encoded(picture_of_row / white), "" if row else title)
             if column == 0:
                 axes[row, column].set_ylabel(_broken(name), fontsize=10)
@@ -95,12 +92,12 @@ def cases(panels: Sequence[Panel]) -> Any:
 
 
 def _power(strength: float) -> str:
-    """Return a strength as a power of ten, for a figure."""
+    """Return a strength as a power of ten in figure markup."""
     return f"$10^{{{np.log10(strength):.3g}}}$"
 
 
 def _broken(name: str) -> str:
-    """Return a name in several lines if it is long, for the label of an axis."""
+    """Return an axis label, broken into several lines if it is long."""
     return (
         name
         if len(name) <= _ROW_NAME_LETTERS
@@ -110,10 +107,10 @@ def _broken(name: str) -> str:
 
 @drawn
 def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
-    """Draw the L1 error of every mask and restorer with its 95 % interval over the laser strength.
+    """Draw the L1 error of every pipeline with its 95 % interval against the laser strength.
 
     The left plot is for pictures of full size, the right plot for reduced pictures. Intervals of
-    few scenes are much wider than the means are apart; they do not stretch the axis.
+    few scenes are much wider than the differences of the means; they do not extend the axis.
     """
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(tables))
@@ -136,7 +133,7 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
 
 
 def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
-    """Draw the mean of a metric over the laser strength, with its interval."""
+    """Draw the mean of a metric against the laser strength, with its interval."""
     intervals = [table.at(metric, strength_index) for strength_index in range(len(table.strengths))]
     positions = _places(table.strengths)
     ax.plot(
@@ -156,7 +153,7 @@ def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], nam
 
 
 def _axis_end(tables: Iterable[MetricTable], metric: str) -> float:
-    """Return the end of an axis that shows every mean, and intervals up to three times the
+    """Return the upper axis limit that shows every mean, and intervals up to three times the
     largest mean.
     """
     intervals: list[Interval] = []
@@ -179,8 +176,8 @@ def _axis_end(tables: Iterable[MetricTable], metric: str) -> float:
 
 
 def _places(values: Sequence[float]) -> list[float]:
-    """Return the positions of laser strengths on a logarithmic axis, with strength 0 one decade
-    below the others.
+    """Return the positions of laser strengths on a logarithmic axis; strength 0 is one decade below
+    the others.
     """
     logarithms = [float(np.log10(strength)) for strength in values if strength > 0]
     place_of_none = min(logarithms) - 1 if logarithms else 0.0
@@ -189,8 +186,8 @@ def _places(values: Sequence[float]) -> list[float]:
 
 @drawn
 def wavelengths(result: EvaluationResult) -> Any:
-    """Draw the L1 error of the reduced pictures at the largest strength over the drawn
-    wavelength of each scene.
+    """Draw the L1 error of the reduced pictures at the largest strength against the drawn
+    wavelength.
     """
     figure, axes = canvas(11.0, 4.2)
     ax, looks = axes[0, 0], _looks([pipeline.name for pipeline in result.pipelines])
@@ -223,7 +220,7 @@ def wavelengths(result: EvaluationResult) -> Any:
 
 
 def _means(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
-    """Return the mean of x and y in each sixth of the range of x that has a value."""
+    """Return the means of x and y in each sixth of the range of x; empty sixths are omitted."""
     has_both = ~np.isnan(x + y)
     x, y = x[has_both], y[has_both]
     if not len(x):
@@ -238,7 +235,7 @@ def _means(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
 
 @drawn
 def curves(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw the laser and background suppression ratios (LSR, BSR) of every mask over the
+    """Draw the laser and background suppression ratios (LSR, BSR) of every mask against the
     wavelength.
     """
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
@@ -270,8 +267,8 @@ def curves(masks: Mapping[str, MaskOptics]) -> Any:
 
 @drawn
 def plane(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw the image contrast of each mask over its mean laser suppression ratio, and shade what
-    no mask can reach.
+    """Draw the contrast of each mask against its mean laser suppression ratio; shade the region
+    that no mask can reach.
     """
     figure, axes = canvas(8.4, 5.2)
     ax = axes[0, 0]
@@ -339,13 +336,13 @@ COLUMNS = (
     *map(" ".join, itertools.product(METRICS, _STATISTICS)),
     *map(" ".join, itertools.product(("l1 less", "l1 gain", "l1 small gain"), _STATISTICS)),
 )
-#: tolerance of a bound, because a circular aperture is sampled on a square grid of frequencies
+#: factor on a bound, because a circular aperture is sampled on a square grid of frequencies
 _COARSE = 1.05
 _DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "above": ".2f"}
 
 
 def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
-    """Draw the figures of the evaluation page, and return the PNG files by name."""
+    """Return the figures of the evaluation page by name, as PNG bytes."""
     wavelength_figure = {"wavelengths": wavelengths(result)} if _drawn(result) else {}
     return wavelength_figure | {
         "cases": cases(result.panels),
@@ -356,8 +353,8 @@ def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
 
 
 def summary(result: EvaluationResult) -> dict[str, Any]:
-    """Return the mean and the interval of every metric, and the gain over the reference, for
-    each mask and restorer.
+    """Return mean and interval of every metric, and the gain over the reference, for each
+    pipeline.
     """
     return {
         pipeline.name: {
@@ -373,9 +370,7 @@ def summary(result: EvaluationResult) -> dict[str, Any]:
 
 
 def rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    """Return the rows of ``table.csv``, one for each mask and restorer, with the numbers from
-    `summary`.
-    """
+    """Return the rows of ``table.csv``, one for each pipeline, with the numbers of `summary`."""
     table_rows: list[Sequence[Any]] = []
     for pipeline in result.pipelines:
         intervals = [result.tables[pipeline.name].mean(metric) for metric in METRICS] + list(
@@ -405,14 +400,14 @@ def lead(result: EvaluationResult) -> str:
 
 
 def _few_text(result: EvaluationResult) -> str:
-    """Return that the scenes are too few for all lasers, if they are."""
+    """Return a sentence if there are too few scenes for all lasers; else an empty text."""
     if len(result.scenes) >= len(CASES) or _drawn(result):
         return ""
     return f" These are too few scenes for all {len(CASES)} lasers of the protocol."
 
 
 def _drawn_text(result: EvaluationResult) -> str:
-    """Return which values are drawn for each scene."""
+    """Return sentences on the values that are drawn for each scene."""
     laser_sentence = ""
     if _drawn(result):
         laser_sentence = (
@@ -429,7 +424,7 @@ def _drawn_text(result: EvaluationResult) -> str:
 
 
 def _equal_text(result: EvaluationResult) -> str:
-    """Return to which peak filters and stops bring the pipelines, if they do."""
+    """Return a sentence on the peak at equal protection; empty if none was requested."""
     level = result.protection.level if result.protection else 0.0
     if not level:
         return ""
@@ -478,7 +473,7 @@ def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Secti
 
 
 def _crossed(result: EvaluationResult) -> Section:
-    """Return the section with the L1 of each mask (row) with each restorer (column)."""
+    """Return the section with the L1 error of each mask (row) with each restorer (column)."""
     masks = list(dict.fromkeys(pipeline.front for pipeline in result.pipelines))
     restorers = list(dict.fromkeys(pipeline.back for pipeline in result.pipelines))
     l1_texts = {
@@ -510,7 +505,7 @@ def _strength_names(result: EvaluationResult) -> list[str]:
 
 
 def _by_strength(result: EvaluationResult) -> Section:
-    """Return the section with the L1 of the reduced pictures at each strength."""
+    """Return the section with the L1 error of the reduced pictures at each strength."""
     text = f"""L1 of the pictures reduced to {result.small} pixels of their shorter side, at each
         laser strength: mean and 95 % interval."""
     columns = ("pipeline", *_strength_names(result))
@@ -528,7 +523,7 @@ def _by_strength(result: EvaluationResult) -> Section:
 
 
 def _gained(result: EvaluationResult, reference: str) -> Section:
-    """Return the section with the gain of each pipeline over one reference, at each strength."""
+    """Return the section with the gain of each pipeline over one reference, by strength."""
     text = f"""By which fraction the L1 of the reduced pictures lies below that of {reference} on
         the same pictures, at each laser strength, with 95 % intervals as below. A colour marks an
         interval without zero."""
@@ -541,7 +536,7 @@ def _gained(result: EvaluationResult, reference: str) -> Section:
 
 
 def _judged(x: Interval, digits: str) -> Marked:
-    """Return an interval as a cell, which is marked if the interval excludes zero."""
+    """Return an interval as a table cell, marked if the interval excludes zero."""
     interval_text = _between(x, digits)
     if not x.excludes_zero:
         return Marked(interval_text)
@@ -579,8 +574,8 @@ def _numbers(result: EvaluationResult) -> Section:
 
 
 def _mistold(result: EvaluationResult) -> list[Section]:
-    """Return the section of restorers that are told optics or laser with an error, if there are
-    any.
+    """Return the section on restorers with erroneous optics or laser data; empty if there
+    are none.
     """
     if not result.mistold:
         return []
@@ -603,9 +598,9 @@ def _mistold(result: EvaluationResult) -> list[Section]:
 def _mistold_row(
     points: Sequence[MistoldPoint], name: str, errors: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return the PSNR of one pipeline that is told the truth, and that with each error."""
+    """Return the PSNR of one pipeline with exact data, and with each error."""
     points_of_pipeline = [point for point in points if point.pipeline == name]
-    # once for each scene: the points of all errors repeat it
+    # once per scene, because the points of all errors repeat it
     exact_psnr = {point.scene.number: point.true["psnr"] for point in points_of_pipeline}
     cells = [_with_interval(mean(list(exact_psnr.values())), "psnr")]
     for error in errors:
@@ -615,14 +610,14 @@ def _mistold_row(
 
 
 def _column(metric: str) -> str:
-    """Return the heading of a column with a metric, with its unit."""
+    """Return the column heading of a metric, with its unit."""
     units = {"psnr": " (dB)", "saturated": " (pixels)"}
     name = re.sub("l1|psnr|ssim", lambda match: match[0].upper(), metric)
     return name + units.get(metric.partition(" ")[0], "")
 
 
 def _compared(result: EvaluationResult, reference: str) -> Section:
-    """Return the section with the differences of each pipeline from one reference."""
+    """Return the section on the differences of each pipeline from one reference."""
     text = f"""Differences from {reference} in the same scenes. L1 less: by how much L1 is lower.
         Gain: the same as a fraction of the mean L1 of the reference. Intervals of 95 % come from 10
         000 draws of the photographs (bootstrap-t); fewer than five photographs have no interval. A
@@ -646,14 +641,14 @@ def _compared(result: EvaluationResult, reference: str) -> Section:
 
 
 def _between(x: Interval, digits: str) -> str:
-    """Return a mean with its interval as text, without one for too few photographs."""
+    """Return a mean with its interval as text; without the interval for too few photographs."""
     return f"{x.mean:{digits}}" + (
         "" if math.isnan(x.low) else f" ({x.low:{digits}} to {x.high:{digits}})"
     )
 
 
 def _suppression(result: EvaluationResult, picture: bytes) -> Section:
-    """Return the section with the suppression ratios of each mask, and the figure of both."""
+    """Return the section on the suppression ratios of each mask, with their figure."""
     base_mask = next(p.front for p in result.pipelines if p.name == result.reference)
     text = f"""LSR: the brightest pixel of a laser with the mask, divided by the brightest pixel
         without the mask; BSR: share of the scene's light that stays in the field, at most 1, mean
@@ -677,7 +672,7 @@ def _suppression(result: EvaluationResult, picture: bytes) -> Section:
 
 
 def _plane(result: EvaluationResult, picture: bytes) -> Section:
-    """Return the section that compares suppression and contrast of each mask with their bound."""
+    """Return the section that compares suppression and contrast of each mask with their bounds."""
     text = """Means over wavelengths, with the contrast within the band that the clear aperture
         passes. A low peak costs contrast: by Parseval the rms over all sampled frequencies is at
         most sqrt(LSR p0), where p0 is the fraction of light in the brightest pixel of the clear
@@ -704,9 +699,7 @@ def _plane(result: EvaluationResult, picture: bytes) -> Section:
 
 
 def _commands(result: EvaluationResult) -> list[Section]:
-    """Return the section with the command of one point of each pipeline, beside the numbers that
-    it gives.
-    """
+    """Return the section with the command of one point of each pipeline, next to its numbers."""
     table_rows: list[Sequence[Any]] = []
     for name, scene_index, strength, command in shown_commands(result.commands):
         point = result.points[name][scene_index][strength]
@@ -735,7 +728,7 @@ def _commands(result: EvaluationResult) -> list[Section]:
 
 
 def _data(result: EvaluationResult) -> list[Section]:
-    """Return the sections with the scenes, the commands and the photographs that were not read."""
+    """Return the sections on scenes, commands and unreadable photographs."""
     text = """Scenes in the order of their numbers. The seed of the recipe chooses part of a
         photograph for each scene. The seed of a scene decides the direction of the laser and the
         noise, which are the same for every pipeline."""

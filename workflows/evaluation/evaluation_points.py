@@ -50,18 +50,18 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 # --- mistold filter -------------------------------------------------------------------------------
 
-# Recipes whose restorer is told optics and laser with one error, while the camera stays as it is.
+# Recipes whose restorer gets optics and laser data with one error, while the camera stays as it is.
 #
-# The steps that compute what the restorer knows are copied with another parameter; the copies have
-# the prefix ``told_``.
+# The steps that compute the data of the restorer are copied with a changed parameter; the copies
+# have the prefix ``told_``.
 
 
 def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]]:
-    """Return the errors in what the restorer of a recipe is told: by text, what is added to which
-    parameters.
+    """Return the possible errors in the data of the restorer, by description: each maps parameters
+    to offsets.
 
-    A parameter with None is removed: the input ``dirt`` of a pupil. The result is empty if the
-    restorer knows nothing.
+    The offset None removes an input: ``dirt`` of a pupil. The result is empty if the restorer uses
+    no optics or laser data.
     """
     told_steps = known(recipe, _readers(recipe))
     if not told_steps:
@@ -83,7 +83,7 @@ def _laser_errors(
     errors: dict[str, Mapping[str, Any]] = {}
     if mismatch.pixels:
         lens_params = recipe.steps[steps_with_direction[0]].params
-        # pixels on the sensor as a direction
+        # convert pixels on the sensor to an angle
         angle = mismatch.pixels * lens_params["pixel_pitch"] / lens_params["focal_length"]
         errors[f"direction {mismatch.pixels:g} px off"] = {f"{direction}.angle": (angle, angle)}
     if mismatch.wavelength and "wavelength" in recipe.steps[line_step].params:
@@ -108,13 +108,13 @@ def _pupil_errors(
 
 
 def _of_each(steps: Sequence[str], parameter: str, value: Any) -> dict[str, Any]:
-    """Return the same value of a parameter of each step."""
+    """Return a mapping with the same value for a parameter of each step."""
     return {f"{step}.{parameter}": value for step in steps}
 
 
 def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
-    """Return the recipe with a copy of each step that the error changes, from which alone the
-    restorer knows.
+    """Return the recipe with an erroneous copy of each step affected by ``error``, which only the
+    restorer reads.
     """
     errors_of_steps = {
         name: value for name, value in error.items() if name.rpartition(".")[0] in recipe.steps
@@ -130,7 +130,7 @@ def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
 
 
 def shifted(value: Any, by: Any) -> Any:
-    """Return a parameter to which an error is added: a number, or the two angles of a direction."""
+    """Return a parameter plus an error: a number, or the two angles of a direction."""
     return (
         tuple(component + added for component, added in zip(value, by, strict=True))
         if isinstance(by, tuple)
@@ -139,13 +139,13 @@ def shifted(value: Any, by: Any) -> Any:
 
 
 def _readers(recipe: Recipe) -> list[str]:
-    """Return the steps that restore the picture of the mask and know optics or lasers."""
+    """Return the steps that restore the picture behind the mask and use optics or laser data."""
     return knowers(recipe, dependents(recipe, [FRAME])) if FRAME in recipe.steps else []
 
 
 def _changed(step: Step, error: Mapping[str, Any]) -> Step:
-    """Return a step with the errors, by ``step.parameter``, added to its parameters; an error of
-    None removes the input of this name.
+    """Return a step with the errors, by ``step.parameter``, added to its parameters; the error None
+    removes the input of this name.
     """
     params, wires = dict(step.params), dict(step.wires)
     for parameter_path, added_error in error.items():
@@ -161,7 +161,7 @@ def _changed(step: Step, error: Mapping[str, Any]) -> Step:
 
 # --- evaluation points ----------------------------------------------------------------------------
 
-# The evaluation points: the metrics of one scene at one laser strength with one pipeline (mask and
+# Evaluation points: the metrics of one scene at one laser strength with one pipeline (mask and
 # restorer).
 
 
@@ -172,47 +172,43 @@ PointNumbers = dict[str, Any]  #: numbers by name; ``bsr`` is a list
 
 @dataclass(frozen=True)
 class PointRequest:
-    """A request for the metrics of one scene at one laser strength."""
+    """The scene and the laser strength of an evaluation point."""
 
     scene: Scene
     strength: float
 
     @property
     def lit(self) -> str:
-        """Return the name of the laser in the scene, which is ``none`` if the strength is 0."""
+        """Return the name of the laser in the scene; ``none`` if the strength is 0."""
         return self.scene.case if self.strength > 0 else NONE
 
 
 class EvaluationPoints:
-    """The computation of evaluation points, in which a result that several evaluation points use
-    is computed once.
-    """
+    """Computes evaluation points; results that several points use are computed once."""
 
     def __init__(self, store: Store, small: int, device: str = "cpu") -> None:
         """Prepare points whose reduced pictures have ``small`` pixels on their shorter side."""
         self.store, self.small, self.device = store, small, device
-        self.computed = 0  #: evaluation points that were not in the store
-        self.seconds = 0.0  #: computing time of these evaluation points
+        self.computed = 0  #: number of evaluation points that were not in the store
+        self.seconds = 0.0  #: s, computing time of these points
         self._code = Code(store.code_memo)
-        self._functions: dict[tuple[str, str, int], Any] = {}  #: a recipe is known by its identity
-        #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same
-        #: identity
+        #: by name, laser, and `id` of the recipe
+        self._functions: dict[tuple[str, str, int], Any] = {}
+        #: by `id` of a recipe; the recipe is kept too, so that its `id` is not reused
         self._drawn: dict[Any, tuple[Recipe, Inputs | None]] = {}
-        #: by key, results that do not depend on a scene: one copy for all functions
+        #: results that do not depend on a scene, by key: one copy for all functions
         self._fixed: dict[str, Any] = {}
         self._kept = _SharedResults()
 
     def point(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
-        """Return the metrics of an evaluation point from the store, or compute and store the
-        metrics.
-        """
+        """Return the metrics of an evaluation point, from the store or computed now."""
         compute = partial(self._measure, pipeline, point)
         return compute_once(
             self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"}
         )
 
     def _measure(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
-        """Compute the metrics of a point, and count it with its time."""
+        """Compute the metrics of a point, and add to the count and the computing time."""
         began = time.perf_counter()
         numbers = self._numbers(pipeline, self.values(pipeline, point))
         self.seconds += time.perf_counter() - began
@@ -222,7 +218,7 @@ class EvaluationPoints:
     def values(
         self, pipeline: PipelineRecipes, point: PointRequest, further: Sequence[str] = ()
     ) -> dict[str, Any]:
-        """Run a pipeline on one scene and laser, and return the outputs and the results of the
+        """Run a pipeline for one scene and laser; return the outputs and the results of the
         ``further`` steps.
         """
         outputs = (*pipeline.pipeline.outputs, *further)
@@ -238,7 +234,7 @@ class EvaluationPoints:
         return values
 
     def forget(self) -> None:
-        """Remove all results that depend on the laser from memory."""
+        """Free all results that depend on the laser."""
         # the second part of the name is the laser
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
         in_use = set[int]()
@@ -248,15 +244,15 @@ class EvaluationPoints:
         self._kept.clear()
 
     def release(self) -> None:
-        """Remove all results from memory, before pipelines with other recipes are evaluated."""
+        """Free all results, before pipelines with other recipes are evaluated."""
         self._functions.clear()
         self._drawn.clear()
         self._fixed.clear()
         self._kept.clear()
 
     def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
-        """Return the cache key of an evaluation point from the keys of its steps and the
-        settings of the comparison.
+        """Return the cache key of an evaluation point, from the keys of its steps and the settings
+        of the comparison.
         """
         recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         keys = self.point_keys(pipeline, point, outputs)
@@ -294,8 +290,8 @@ class EvaluationPoints:
     def keys(
         self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None
     ) -> dict[str, str]:
-        """Return the cache key of each step, with the seed of the scene for all steps that
-        depend on the scene.
+        """Return the cache key of each step; steps that depend on the scene use the seed of the
+        scene.
         """
         keys = {"scene": scene.key(self._code)} if scene else {}
         depends_on_scene = dependents(recipe, keys)
@@ -307,10 +303,10 @@ class EvaluationPoints:
         return keys
 
     def _function(self, pipeline: PipelineRecipes, case: str, outputs: tuple[str, ...]) -> Any:
-        """Return the recipe as a function of what differs from point to point, built once.
+        """Return the recipe as a function of the inputs that differ between points, built once.
 
-        Free are the scene, the uncertain inputs that the outputs need, and with a laser (``case``)
-        its direction and its strength; also their copies from which a restorer is told.
+        These inputs are the scene, the uncertain inputs that the outputs need and, with a laser
+        (``case``), its direction and strength; also their copies for the restorer.
         """
         name = (f"{pipeline.name} {outputs}", case, id(pipeline.recipe))
         if name not in self._functions:
@@ -334,7 +330,7 @@ class EvaluationPoints:
                     *(f"{spot}.strength" for spot in spots(recipe, outputs)),
                 ]
             free += [TOLD + name for name in free if TOLD + name.rpartition(".")[0] in steps]
-            # results before the laser's strength are shared by scene
+            # results that do not depend on the laser strength are shared within a scene
             shared_caller = self._kept.caller(
                 dependents(full_recipe, list(filter(_is_moved, full_recipe.steps)))
             )
@@ -350,11 +346,10 @@ class EvaluationPoints:
     def _changed(
         self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]
     ) -> dict[str, Any]:
-        """Return the parameters that an evaluation point sets: sampled values, laser direction and
-        laser strength.
+        """Return the parameters set by an evaluation point: drawn values, laser direction and laser
+        strength.
 
-        A copy of a step from which the restorer is told gets the same values, with the error of the
-        pipeline.
+        A step's copy for the restorer gets the same values plus the error of the pipeline.
         """
         recipe = pipeline.recipe(point.lit)
         inputs = self.inputs(pipeline, point.lit, outputs)
@@ -375,11 +370,9 @@ class EvaluationPoints:
         return changed | told_values
 
     def inputs(self, pipeline: PipelineRecipes, case: str, outputs: Sequence[str]) -> Inputs | None:
-        """Return the uncertain inputs of a pipeline, or None if no output depends on an uncertain
-        input.
+        """Return the uncertain inputs of a pipeline, or None if no output depends on one.
 
-        A restorer that is told an error gets the values of the recipe without the error, whose
-        steps it copies.
+        For a pipeline with an error, the inputs are those of the recipe without the error.
         """
         recipe = (pipeline.true or pipeline.recipe)(case)
         if recipe.uncertain is None or not recipe.uncertain.names:
@@ -392,16 +385,16 @@ class EvaluationPoints:
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Replace constant results in a recipe function by the equal results of an earlier
-        function, to save memory.
+        """Replace constant results of a recipe function by equal results of an earlier function, to
+        save memory.
         """
         keys = self.keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
 
     def _numbers(self, pipeline: PipelineRecipes, values: Mapping[str, Any]) -> PointNumbers:
-        """Return the metrics of a point from its outputs: at full size and, where the picture is
-        larger, of the reduced picture.
+        """Return the metrics of a point from its outputs: at full size, and of the reduced picture
+        if it is smaller.
         """
         pipeline_names, truth = pipeline.pipeline, values["truth"]
         small_quality = full_quality = values[pipeline_names.quality]
@@ -424,7 +417,7 @@ class EvaluationPoints:
 
 
 class _SharedResults:
-    """A cache of results that successive evaluation points have in common, by scene and by laser
+    """A cache of results that successive evaluation points share, by scene and by laser
     strength.
     """
 
@@ -441,8 +434,8 @@ class _SharedResults:
         self._of_strength.clear()
 
     def turn(self, point: PointRequest) -> None:
-        """Begin an evaluation point, and remove the cached results of other scenes, lasers and
-        laser strengths.
+        """Start an evaluation point: free the cached results of other scenes, lasers and laser
+        strengths.
         """
         scene = (point.scene.number, point.scene.seed, point.scene.case)
         if scene != self._scene:
@@ -452,8 +445,8 @@ class _SharedResults:
         self._scene, self._strength, self._seed = scene, point.strength, point.scene.seed
 
     def caller(self, moved: set[str]) -> Callable[..., Any]:
-        """Return a function that computes a step, or returns the cached result if the input objects
-        are the same.
+        """Return a function that computes a step, or returns the cached result for identical input
+        objects.
 
         ``moved`` names the steps that depend on the laser strength.
         """
@@ -462,15 +455,15 @@ class _SharedResults:
             step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str
         ) -> Any:
             results = self._of_strength if step.name in moved else self._of_scene
-            # a random step has other results in a scene of another seed
+            # the result of a random step depends on the seed of the scene
             random_key = (step.name, self._seed) if step.node.random else ()
-            # equal inputs are the same objects: they were computed once
+            # equal inputs are identical objects, because each is computed once
             identities = [
                 tuple(map(id, argument)) if type(argument) is list else id(argument)
                 for argument in inputs
             ]
             key = (random_key, step.node.path, repr(sorted(params.items())), device, *identities)
-            # the inputs are kept too, so that no other object gets their identity
+            # keep the inputs too, so that their `id` is not reused
             if key not in results:
                 results[key] = (inputs, call(step, inputs, params, self._seed, device))
             return results[key][1]
@@ -484,13 +477,13 @@ def _is_moved(step: str) -> bool:
 
 
 def spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
-    """Return the names of the steps that have the strength of a laser."""
+    """Return the steps with the strength of a laser as a parameter."""
     return [name for name in needed(recipe, outputs) if name.startswith("spot[")]
 
 
 def reduced(picture: Tensor, side: int) -> Tensor:
-    """Clip a picture to [0, 1], and resize it, antialiased, so that its shorter side has
-    ``side`` pixels.
+    """Clip a picture to [0, 1], and resize it with antialiasing to ``side`` pixels on its shorter
+    side.
     """
     height, width = picture.shape[-2:]
     scale = side / min(height, width)
@@ -499,11 +492,10 @@ def reduced(picture: Tensor, side: int) -> Tensor:
 
 # --- point commands -------------------------------------------------------------------------------
 
-# The command of `neusee run` that gives the numbers of an evaluation point, to the last bit.
+# The `neusee run` command that reproduces the numbers of an evaluation point to the last bit.
 #
-# The command has the camera of the evaluation, the mask and the restorer, the part of the
-# photograph, the laser with its direction, the seed of the scene, and the values that were drawn
-# for the scene.
+# The command contains the camera, the mask and the restorer, the crop of the photograph, the laser
+# with its direction, the seed of the scene, and the values drawn for the scene.
 
 
 _WAVELENGTH, _DIRECTION = f"lasers.{BEAM}.wavelength", f"direction[{BEAM}]"
@@ -511,9 +503,9 @@ _WAVELENGTH, _DIRECTION = f"lasers.{BEAM}.wavelength", f"direction[{BEAM}]"
 
 @dataclass(frozen=True)
 class PointCommands:
-    """What the commands of all points of an evaluation have in common."""
+    """The common parts of the commands of all points of an evaluation."""
 
-    named: NamedRecipe  #: in whose folder the commands are run
+    named: NamedRecipe  #: the recipe; commands are run in its folder
     bench: EvaluationPoints
 
     def commands(
@@ -522,11 +514,11 @@ class PointCommands:
         scenes: Sequence[Scene],
         strengths: Sequence[float],
     ) -> dict[str, list[dict[float, str]]]:
-        """Return the command of each point by pipeline, scene and strength; empty where no command
-        gives the point.
+        """Return the command of each point by pipeline, scene and strength; empty if no command
+        reproduces the point.
 
-        One point of each pipeline is proved, and one beyond the scene 0, which has the seed of the
-        evaluation: the command loads a recipe whose steps have the same keys.
+        For each pipeline one point of scene 0, which has the seed of the evaluation, and one of
+        another scene are checked: the command must load a recipe whose steps have the same keys.
         """
         has_same_keys: dict[tuple[str, bool], bool] = {}
         commands_by_pipeline: dict[str, list[dict[float, str]]] = {}
@@ -556,7 +548,7 @@ class PointCommands:
     def words(
         self, pipeline: PipelineRecipes, point: PointRequest, strength: float | None = None
     ) -> list[str]:
-        """Return the arguments of `neusee run` after the recipe; ``strength`` replaces that of
+        """Return the arguments of `neusee run` after the recipe name; ``strength`` replaces that of
         the laser.
         """
         scene, pipeline_names = point.scene, pipeline.pipeline
@@ -578,7 +570,7 @@ class PointCommands:
         return [*arguments, f"seed={scene.seed}", "estimates=false", f"outputs=[{outputs}]"]
 
     def _drawn(self, pipeline: PipelineRecipes, point: PointRequest) -> dict[str, str]:
-        """Return the values that were drawn for a scene, as they are written in a recipe."""
+        """Return the values drawn for a scene, as recipe texts."""
         inputs = self.bench.inputs(pipeline, point.lit, pipeline.pipeline.outputs)
         if inputs is None:
             return {}
@@ -590,14 +582,14 @@ class PointCommands:
         }
 
     def is_same(self, pipeline: PipelineRecipes, point: PointRequest) -> bool:
-        """Return True if the recipe of a command has the steps of an evaluation point, with equal
-        keys.
+        """Return True if the recipe of the command has steps with the same keys as the evaluation
+        point.
 
-        An evaluation computes a laser of strength 1 and gives each spot its strength, and so does
-        this comparison. A random step that no scene reaches, such as dirt on the lens, has the seed
-        of the evaluation, which the command gives only for the scene 0.
+        An evaluation computes a laser of strength 1 and then sets the strength of each spot; this
+        comparison does the same. A random step that does not depend on the scene, such as dirt on
+        the lens, has the seed of the evaluation, which the command has only for scene 0.
         """
-        # the command does not output the contrast by wavelength
+        # the command does not output bsr[mask]
         outputs = [name for name in pipeline.pipeline.outputs if name != "bsr[mask]"]
         try:
             recipe = load(self.named.name, self.words(pipeline, point, 1.0), self.named.folder)
@@ -613,7 +605,7 @@ class PointCommands:
             steps[name] = replace(
                 steps[name], params={**steps[name].params, "strength": point.strength}
             )
-        # the scene carries its own seed: `keys` gives it to the steps after it
+        # `keys` applies the seed of the scene to the steps that depend on it
         same_seed = replace(recipe, seed=scene.recipe.seed, steps=steps)
         return self.bench.keys(same_seed, outputs, scene) == self.bench.point_keys(
             pipeline, point, outputs
@@ -621,16 +613,14 @@ class PointCommands:
 
 
 def _has_fixed_noise(recipe: Recipe, outputs: Sequence[str]) -> bool:
-    """Return True if an output depends on a random step that neither scene nor laser reaches."""
+    """Return True if an output depends on a random step that depends on neither scene nor laser."""
     order = needed(recipe, outputs)
     varying = dependents(recipe, ["scene"], order) | {_DIRECTION}
     return any(recipe.steps[name].node.random for name in order if name not in varying)
 
 
 def _shows(recipe: Recipe, scene: Scene) -> bool:
-    """Return True if the scene of a recipe is the part of the photograph that an evaluation
-    shows.
-    """
+    """Return True if the scene of a recipe is the crop of the photograph in ``scene``."""
     step = recipe.steps["scene"]
     if step.node.path != PHOTOGRAPH or scene.path is None:
         return False
@@ -644,7 +634,7 @@ def _shows(recipe: Recipe, scene: Scene) -> bool:
 
 
 def _scene_words(recipe: Recipe, scene: Scene) -> list[str]:
-    """Return the words that show a part of a photograph, or nothing for the recipe's own scene."""
+    """Return the recipe arguments for a crop of a photograph; empty for the recipe's own scene."""
     if scene.path is None:
         return []
     file, crop = _quoted(scene.path), f"[{scene.recipe.seed}, {scene.number}]"
@@ -660,7 +650,7 @@ def _scene_words(recipe: Recipe, scene: Scene) -> list[str]:
 def _laser_word(
     pipeline: PipelineRecipes, point: PointRequest, wavelength: str | None, strength: float | None
 ) -> str:
-    """Return the word that sets the laser of a scene, with its direction and strength."""
+    """Return the recipe argument for the laser of a scene, with direction and strength."""
     if point.lit == NONE:
         return "lasers={}"
     # direction cosines, written as angles in rad
@@ -674,15 +664,15 @@ def _laser_word(
 
 
 def _quoted(path: Path) -> str:
-    """Return a path in the quotes of YAML, where a single quote is written twice."""
+    """Return a path as a YAML text in single quotes; quotes within are doubled."""
     return "'" + str(path.absolute()).replace("'", "''") + "'"
 
 
 def shown_commands(
     commands: Mapping[str, Sequence[Mapping[float, str]]],
 ) -> list[tuple[str, int, float, str]]:
-    """Return pipeline, place of the scene, strength and command of one point of each pipeline:
-    the strongest laser.
+    """Return pipeline, scene index, strength and command of one point of each pipeline, with the
+    strongest laser.
     """
     rows: list[tuple[str, int, float, str]] = []
     for pipeline, scenes in commands.items():

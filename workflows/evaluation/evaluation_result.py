@@ -1,4 +1,4 @@
-"""Everything that an evaluation measures: points, mask optics, wrongly told restorers."""
+"""The measurements of an evaluation: points, mask optics, and restorers with erroneous data."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def masks(
     optics: dict[str, MaskOptics] = {}
     for pipeline in pipelines:
         if pipeline.pipeline.front not in optics:
-            # a point has the same contrast at every strength: the first counts
+            # the BSR is the same at every strength: take the first
             contrasts = [next(iter(point.values()))["bsr"] for point in points[pipeline.name]]
             optics[pipeline.pipeline.front] = _mask(
                 pipeline, store, device, np.mean(contrasts, axis=0)
@@ -82,7 +82,7 @@ def masks(
 
 
 def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) -> MaskOptics:
-    """Return the optics of the mask of a pipeline; ``bsr`` is its mean contrast over scenes."""
+    """Return the optics of a pipeline's mask; ``bsr`` is its mean over scenes."""
     names = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
     values = run(pipeline.recipe(NONE), store, names, device=device).values
     bands, lsr, mtf, psf = (values[name] for name in names)
@@ -99,31 +99,28 @@ def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) ->
 
 
 def _numbers(tensor: Tensor) -> Numbers:
-    """Return a tensor as an array of float64."""
+    """Return a tensor as a float64 array."""
     array: Numbers = tensor.double().cpu().numpy()
     return array
 
 
 # --- comparison pictures --------------------------------------------------------------------------
 
-# Pictures for the comparison figure of the paper: one scene with each laser, for each mask and
-# restorer.
+# Pictures for the comparison figure of the paper: one scene with each laser, for each pipeline.
 
 
-_SIDE = 200  #: pixels of the shorter side of a picture in the figure
+_SIDE = 200  #: length of the shorter side of a picture in the figure, in pixels
 _PLAIN, _MASKED = "developed[plain]", "developed[mask]"
 _WEAKEST = 1e4  #: strength of the first laser in the figure of the paper
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A column of the figure that compares masks and restorers: pictures with one laser, in
-    linear sRGB (3, y, x).
-    """
+    """A column of the comparison figure: pictures with one laser, in linear sRGB (3, y, x)."""
 
     case: str
     strength: float
-    pictures: dict[str, Tensor]  #: by name of the row: "truth", "plain lens" or a pipeline
+    pictures: dict[str, Tensor]  #: by row name: "truth"
 
 
 def panels(
@@ -133,17 +130,16 @@ def panels(
     strengths: Sequence[float],
     figure: Collection[str] | None = None,
 ) -> list[Panel]:
-    """Return the columns of the figure that compares masks and restorers, one for each laser and
-    one without a laser.
+    """Return the columns of the comparison figure: one for each laser, and one without a laser.
 
-    The strengths of the lasers rise from 1e4, as in the paper, to the largest of ``strengths``.
-    ``figure`` names the lasers; the columns then have the pictures of the sensor behind each mask
-    too.
+    The laser strengths rise from 1e4, as in the paper, to the largest of ``strengths``. ``figure``
+    has the names of the lasers; with it the columns also contain the pictures of the sensor behind
+    each mask.
     """
     columns = []
     lasers = [case for case in figure or CASES if case != NONE]
     largest_strength = max(max(strengths), _WEAKEST)
-    # equal ratios from 1e4 to the largest
+    # a geometric series from 1e4 to the largest
     rising_strengths = [
         _WEAKEST * (largest_strength / _WEAKEST) ** (number / (len(lasers) - 1))
         for number in range(len(lasers))
@@ -173,8 +169,8 @@ def _develop(
     point: PointRequest,
     sensors: bool,
 ) -> dict[str, Tensor]:
-    """Return the pictures of one laser by name, with those of the sensor behind each mask first
-    if ``sensors``.
+    """Return the pictures of one laser by name; with ``sensors`` also those of the sensor behind
+    each mask.
     """
     pictures: dict[str, Tensor] = {}
     restored: dict[str, Tensor] = {}
@@ -186,7 +182,7 @@ def _develop(
             and f"{pipeline_names.front}, sensor" not in pictures
         )
         further_steps = (_MASKED,) if needs_sensor else ()
-        # truth and plain lens are the same for all pipelines: once
+        # compute truth and plain lens only once: they are the same for all pipelines
         values = bench.values(
             pipeline, point, (_PLAIN, *further_steps) if not pictures else further_steps
         )
@@ -200,7 +196,7 @@ def _develop(
 
 
 def _shrink(picture: Tensor) -> Tensor:
-    """Return a picture whose shorter side has `_SIDE` pixels at most, on the CPU."""
+    """Return a picture with at most `_SIDE` pixels on its shorter side, on the CPU."""
     side = min(_SIDE, *picture.shape[-2:])
     return reduced(picture.detach().cpu().float(), side).contiguous()
 
@@ -213,8 +209,8 @@ def _shrink(picture: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class MistoldPoint:
-    """The metrics of one scene whose restorer was told the truth, and told optics or laser with
-    one error.
+    """The metrics of one scene with exact data of the restorer, and with one error in its optics or
+    laser data.
     """
 
     pipeline: str
@@ -236,29 +232,29 @@ class EvaluationResult:
     broken: Sequence[tuple[Path, str]]
     strengths: tuple[float, ...]
     small: int  #: pixels of the shorter side of the reduced pictures
-    references: Mapping[str, str]  #: by pipeline, the pipeline with which it is compared
+    references: Mapping[str, str]  #: reference of each pipeline
     points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline and scene
     tables: dict[str, MetricTable]  #: by pipeline
-    against: dict[str, dict[str, Interval]]  #: by pipeline, decrease of L1 against the reference
+    #: decrease of L1 relative to the reference, by pipeline
+    against: dict[str, dict[str, Interval]]
     masks: dict[str, MaskOptics]  #: by mask
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]
     mistold: Sequence[MistoldPoint] = ()
-    protection: EqualProtection | None = None  #: if pipelines were brought to one peak
+    protection: EqualProtection | None = None  #: the requested equal protection, if any
     wavelengths: Sequence[float | None] = ()  #: of the laser of each scene, in m
-    #: as `points`, one each
+    #: one command for each entry of `points`
     commands: Mapping[str, Sequence[Mapping[float, str]]] = field(default_factory=dict)
 
     @property
     def reference(self) -> str:
-        """Return the pipeline with which the first pipeline and those like it are compared."""
+        """Return the reference of the first pipeline and of those of the same kind."""
         return next(iter(self.references.values()))
 
 
 # --- mistold points -------------------------------------------------------------------------------
 
-# Evaluation points of restorers that are told optics or laser with an error, beside those that are
-# told the truth.
+# Evaluation points of restorers with erroneous optics or laser data, next to those with exact data.
 
 
 def told_with_errors(
@@ -268,11 +264,11 @@ def told_with_errors(
     strengths: Sequence[float],
     progress: Progress,
 ) -> list[MistoldPoint]:
-    """Compute the metrics of restorers that are told optics or laser with one error, in the first
+    """Compute the metrics of restorers with one error in their optics or laser data, in the first
     scenes with a laser.
 
-    The recipe declares the errors; a pipeline whose restorer knows nothing of optics and lasers has
-    none.
+    The recipe sets the errors; there are none for a pipeline whose restorer uses no optics or laser
+    data.
     """
     mismatch = (pipelines[0].recipe(NONE).evaluation or EvaluateSettings()).mismatch
     if mismatch is None:
@@ -291,12 +287,12 @@ def told_with_errors(
 
 
 def _mismatch_strength(mismatch: Mismatch, strengths: Sequence[float]) -> float:
-    """Return the strength of the laser at which restorers are told errors."""
+    """Return the laser strength for the points with erroneous data."""
     return max(strengths) if mismatch.strength is None else mismatch.strength
 
 
 def _variants(pipeline: PipelineRecipes, mismatch: Mismatch) -> dict[str, PipelineRecipes]:
-    """Return the pipeline with each error in what its restorer is told, by text."""
+    """Return the pipeline with each error in the data of its restorer, by description."""
     errors = errors_of(pipeline.recipe(next(iter(CASES))), mismatch)
     return {text: mistold_pipeline(pipeline, text, error) for text, error in errors.items()}
 
@@ -307,7 +303,7 @@ def _mistold_points(
     variants: Mapping[str, PipelineRecipes],
     requests: Sequence[PointRequest],
 ) -> list[MistoldPoint]:
-    """Return the points of a pipeline with each of its errors, beside those without."""
+    """Return the points of a pipeline with each error, paired with those without."""
     points = []
     for request in requests:
         bench.forget()
@@ -330,7 +326,9 @@ def _mistold_points(
 def mistold_pipeline(
     pipeline: PipelineRecipes, text: str, error: Mapping[str, Any]
 ) -> PipelineRecipes:
-    """Return a pipeline whose restorer is told an error (``text`` and values); its camera stays."""
+    """Return a pipeline with an error (``text`` and values) in the data of its restorer; its camera
+    is unchanged.
+    """
 
     @cache
     def recipe(case: str, *laser: Any) -> Recipe:
@@ -340,7 +338,7 @@ def mistold_pipeline(
 
 
 def mistold_rows(points: Sequence[MistoldPoint]) -> list[Sequence[Any]]:
-    """Return the rows of ``mistold.csv``, with the truth and with each error."""
+    """Return the rows of ``mistold.csv``: with exact data and with each error."""
     rows: dict[Any, Sequence[Any]] = {}
     for point in points:
         for error, metrics_of_point in (("exactly", point.true), (point.error, point.wrong)):
@@ -352,35 +350,35 @@ def mistold_rows(points: Sequence[MistoldPoint]) -> list[Sequence[Any]]:
                 point.scene.case,
                 f"{point.strength:g}",
             )
-            # the exact values of a scene belong to each of its errors: one row is enough
+            # the exact values are repeated for each error: keep one row
             rows[first_cells] = (*first_cells, *(metrics_of_point[metric] for metric in METRICS))
     return list(rows.values())
 
 
 # --- measured points ------------------------------------------------------------------------------
 
-# Everything that an evaluation measures: the points of all scenes, restorers told with errors,
-# masks and pictures.
+# All measurements of an evaluation: the points of all scenes, restorers with erroneous data, masks
+# and pictures.
 
 
 class AskedCamera(NamedTuple):
-    """The camera of an evaluation, and where its results are kept."""
+    """The camera of an evaluation, with the store for its results."""
 
     named: NamedRecipe
     store: Store
     settings: EvaluateSettings
-    progress: Progress  #: receives a line for each scene
+    progress: Progress  #: function that receives a line of text for each scene
 
     @classmethod
     def of(cls, named: NamedRecipe, store: Store, progress: Progress) -> AskedCamera:
-        """Read the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in
-        the recipe.
+        """Read the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all errors in the
+        recipe.
         """
         return cls(named, store, read_settings(named), progress)
 
 
 class Measured(NamedTuple):
-    """What an evaluation measured."""
+    """The measurements of an evaluation."""
 
     points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline and scene
     scenes: list[Scene]
@@ -397,8 +395,8 @@ def measure(
     shown: Sequence[Scene],
     strengths: tuple[float, ...],
 ) -> Measured:
-    """Return the numbers of all points, those of restorers told with errors, the masks, and the
-    pictures to show.
+    """Return the metrics of all points, those with erroneous restorer data, the mask optics, and
+    the pictures to show.
     """
     points, readable, broken = points_of_scenes(bench, pipelines, shown, strengths, asked.progress)
     mistold = told_with_errors(bench, pipelines, readable, strengths, asked.progress)
@@ -425,10 +423,10 @@ def points_of_scenes(
     strengths: Sequence[float],
     progress: Progress,
 ) -> tuple[dict[str, list[dict[float, PointNumbers]]], list[Scene], list[tuple[Path, str]]]:
-    """Compute all evaluation points, and return them, their scenes, and the photographs that could
-    not be decoded.
+    """Compute all evaluation points; return them, their scenes, and the photographs that could not
+    be decoded.
 
-    The scenes come laser by laser, because scenes with the same laser have common optical results.
+    Scenes are processed laser by laser, because scenes with the same laser share optical results.
     """
     points: dict[int, dict[str, dict[float, PointNumbers]]] = {}
     broken: list[tuple[Path, str]] = []
@@ -460,12 +458,12 @@ def points_of_scenes(
 def _by_pipeline(
     scenes: Sequence[Mapping[str, dict[float, PointNumbers]]],
 ) -> dict[str, list[dict[float, PointNumbers]]]:
-    """Return the points of each scene, by pipeline."""
+    """Return the points of all scenes, regrouped by pipeline."""
     return {name: [points[name] for points in scenes] for name in scenes[0]}
 
 
 def _laser_by_laser(shown: Sequence[Scene]) -> list[Scene]:
-    """Return the scenes sorted by their lasers, in the order of the first scene of each laser."""
+    """Return the scenes grouped by laser, in the order of each laser's first scene."""
     order = [scene.case for scene in shown]
     return sorted(shown, key=lambda scene: order.index(scene.case))
 
@@ -477,7 +475,7 @@ def _scene_points(
     strengths: Sequence[float],
     points: dict[str, dict[float, PointNumbers]],
 ) -> None:
-    """Compute the points of one scene into ``points``, by pipeline."""
+    """Compute the points of one scene, and add them to ``points`` by pipeline."""
     scene_copy = replace(scene)  # a copy, which releases the picture when it is deleted
     for strength in strengths if scene.case != NONE else (0.0,):
         for pipeline in pipelines:

@@ -1,4 +1,4 @@
-"""The scenes of an evaluation, each with a crop of a photograph, a laser direction and a random
+"""The scenes of an evaluation, each a crop of a photograph with a laser direction and a random
 seed.
 """
 
@@ -34,18 +34,17 @@ PHOTOGRAPH = "scene.photograph"
 
 
 class UnreadablePhotograph(EvaluationRefused):
-    """Error for a photograph that has the header and the end of a picture, but cannot be
-    decoded.
-    """
+    """Error for a photograph with a valid header and end that cannot be decoded."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene of an evaluation, whose photograph is read at the first use."""
+    """One scene of an evaluation; its photograph is read at the first use."""
 
     number: int
     case: str  #: name of the laser, or none
-    name: str  #: path of the photograph within its folder, or the node of the recipe's own scene
+    #: path of the photograph relative to its folder, or the node of the recipe's own scene
+    name: str
     path: Path | None  #: photograph; None for the recipe's own scene
     shape: tuple[int, int]
     recipe: Recipe
@@ -89,12 +88,12 @@ class Scene:
         )
 
     def draw(self, inputs: Inputs) -> dict[str, float]:
-        """Sample the uncertain values of the scene in SI units, equal for every mask, restorer
+        """Draw the uncertain values of the scene in SI units, equal for every pipeline
         and laser.
         """
         import numpy as np
 
-        # a stream of random numbers for each name, whatever other values are drawn
+        # a separate random stream for each name, independent of the other drawn values
         standard_normal = [
             np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal()
             for name in inputs.names
@@ -104,13 +103,13 @@ class Scene:
         )
 
     def angle(self, recipe: Recipe) -> tuple[float, float]:
-        """Sample the direction cosines (y, x) of the laser from the distribution in the paper."""
+        """Draw the direction cosines (y, x) of the laser from the distribution in the paper."""
         step = recipe.steps[f"direction[{BEAM}]"]
         direction = call(step, [], step.params, self.seed, "cpu")
         return float(direction[0]), float(direction[1])
 
     def wavelength(self, recipe: Recipe, inputs: Inputs | None) -> float:
-        """Return the wavelength of the laser in m, drawn if the recipe has a law."""
+        """Return the wavelength of the laser in m, drawn if the recipe has a law for it."""
         name = f"lasers.{BEAM}.wavelength"
         if inputs is not None and name in inputs.names:
             return self.draw(inputs)[name]
@@ -120,10 +119,10 @@ class Scene:
 def scenes(
     recipe: Recipe, store: Store, root: Path | None, count: int | None, cases: Sequence[str]
 ) -> tuple[list[Scene], list[tuple[Path, str]]]:
-    """Return ``count`` scenes with the lasers ``cases`` in turn, and the photographs that cannot be
-    read, with reasons.
+    """Return ``count`` scenes with the lasers ``cases`` in turn, and the unreadable photographs
+    with reasons.
 
-    Without ``count`` every photograph is in one scene.
+    Without ``count`` there is one scene for each photograph.
     """
     scene_step, shape = recipe.steps["scene"], _shape(recipe)
     paths, unreadable = _photographs(scene_step, root)
@@ -138,8 +137,8 @@ def scenes(
 
 
 def _photographs(own: Step, root: Path | None) -> tuple[Sequence[Path], list[tuple[Path, str]]]:
-    """Return the photographs of the folder ``root``, or that of the recipe's step ``own``; and
-    those that are unreadable, with the reason.
+    """Return the photographs in the folder ``root``, or that of the recipe's step ``own``; and
+    unreadable ones with reasons.
     """
     if root is None:
         return ([own.params["file"]] if own.node.path == PHOTOGRAPH else []), []
@@ -155,17 +154,19 @@ def _photographs(own: Step, root: Path | None) -> tuple[Sequence[Path], list[tup
 
 
 def _scene_name(own: Step, path: Path | None, root: Path | None) -> str:
-    """Return the name of a scene: the photograph within its folder, or the node of the recipe."""
+    """Return the name of a scene: the path of the photograph relative to its folder, or the node of
+    the recipe.
+    """
     if path is None:
         return own.node.path
     return path.relative_to(root).as_posix() if root else path.name
 
 
 def photographs(shown: Sequence[Scene]) -> list[int]:
-    """Return the number of the photograph of each scene, over which intervals are drawn.
+    """Return the index of each scene's photograph, for intervals over photographs.
 
-    Equal files are one photograph, whatever their names. Scenes that are all of one photograph
-    differ in laser and noise only; each then counts as one draw.
+    Equal files count as one photograph under any name. If all scenes show one photograph, they
+    differ only in laser and noise, and each counts as one sample.
     """
     contents = [scene.name if scene.path is None else file_digest(scene.path) for scene in shown]
     contents_once = list(dict.fromkeys(contents))
@@ -177,9 +178,7 @@ def photographs(shown: Sequence[Scene]) -> list[int]:
 
 
 def wavelengths(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> list[float | None]:
-    """Return the wavelength of the laser of each scene in m, or None for a scene without a
-    laser.
-    """
+    """Return the wavelength of the laser of each scene in m; None without a laser."""
     inputs: dict[str, Inputs | None] = {}
     for case in {scene.case for scene in shown if scene.case != NONE}:
         inputs[case] = None
@@ -194,10 +193,11 @@ def wavelengths(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> list[float
 
 
 def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None:
-    """Raise `EvaluationRefused` if the laser of a scene comes from where the pupil of the recipe
-    does not reach.
+    """Raise `EvaluationRefused` if a scene's laser direction is too steep for the pupil sampling of
+    the recipe.
 
-    Of each laser only the scenes with the largest angles over wavelength along y and x are tried.
+    For each laser only the scenes with the largest angle over wavelength along y and along x are
+    checked.
     """
     numbers = (scene.number for scene in shown)
     wavelength_of = dict(zip(numbers, wavelengths(pipeline, shown), strict=True))
@@ -207,7 +207,7 @@ def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None
             (scene, scene.angle(pipeline.recipe(case))) for scene in shown if scene.case == case
         ]
         for axis in (0, 1):
-            # the largest shift of phase from sample to sample of the pupil
+            # largest phase step between samples of the pupil
             scene, direction = max(
                 scenes_and_directions,
                 key=lambda pair: abs(pair[1][axis]) / (wavelength_of[pair[0].number] or 1.0),
@@ -228,9 +228,9 @@ def _direction_faults(
     direction: tuple[float, float],
     wavelength: float | None,
 ) -> dict[str, None]:
-    """Return a line for each mistake of the recipe with the laser of a scene."""
+    """Return a line for each error of the recipe with the laser of a scene."""
     try:
-        # composing the recipe refuses a direction that the pupil does not carry
+        # composing the recipe fails for a direction that the pupil sampling cannot represent
         pipeline.recipe(scene.case, direction, wavelength)
     except RecipeError as error:
         scene_text = f"scene {scene.number + 1} ({scene.case})"
@@ -239,8 +239,8 @@ def _direction_faults(
 
 
 def _shape(recipe: Recipe) -> tuple[int, int]:
-    """Return the size (y, x) of the scene in pixels; raise `EvaluationRefused` if the recipe
-    sets no size.
+    """Return the size (y, x) of the scene in pixels; raise `EvaluationRefused` if the recipe sets
+    none.
     """
     shape = recipe.steps["scene"].params.get("shape")
     if shape is None and recipe.steps["scene"].node.path == PHOTOGRAPH:

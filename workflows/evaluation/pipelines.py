@@ -1,5 +1,5 @@
-"""The pipelines that an evaluation compares: a mask and a restorer each, with one recipe for each
-laser, brought to equal protection of the sensor where this is asked for.
+"""The pipelines that an evaluation compares: each a mask with a restorer and one recipe per laser,
+at equal protection of the sensor if requested.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from neusee.workflows.evaluation.evaluation_result import EvaluationResult
 
 
-NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser
+NONE = "none"  #: name for "no restorer", and for the case without a laser
 FLAT = "flat"  #: option of `doe` without a mask
-BEAM = "beam"  #: name of the laser in every recipe of an evaluation
+BEAM = "beam"  #: name of the laser in all recipes of an evaluation
 
-#: the lasers of the paper with wavelengths in m: where the paper names only a colour, a common
-#: laser of this colour
+#: lasers of the paper with wavelengths in m; where the paper gives only a colour, a common laser of
+#: this colour
 CASES: dict[str, float | None] = {
     "violet": 405e-9,
     "blue": 450e-9,
@@ -49,7 +49,7 @@ CASES: dict[str, float | None] = {
     "red": 650e-9,
     NONE: None,
 }
-DRAWN = "drawn"  #: name of a laser whose wavelength follows the law of the recipe
+DRAWN = "drawn"  #: name of a laser whose wavelength is drawn from the law in the recipe
 #: lasers of the figure with six lasers, with wavelengths in m
 SIX: dict[str, float | None] = {
     "violet": 405e-9,
@@ -68,7 +68,7 @@ _HOW_TO_WRITE = (
 
 
 class NamedRecipe(NamedTuple):
-    """A recipe as it is named on a command line: a name, changes, and the folder of their paths."""
+    """A recipe as given on a command line: a name, changes, and the folder for relative paths."""
 
     name: str
     changes: Sequence[str | Override]
@@ -89,22 +89,20 @@ class EvaluationRefused(ValueError):
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A mask in front of the lens, together with the method that restores the picture behind the
-    lens.
-    """
+    """A mask in front of the lens, with the method that restores the picture behind it."""
 
     mask: str  #: an option of `doe`
     restorer: str  #: an option of `restore`, or none
     height_file: Path | None = None
     weights: Path | None = None
-    #: filter and stop that make the protection of all pipelines equal
+    #: filter and stop that give all pipelines equal protection
     shade: EqualShade | None = None
-    height_name: str = ""  #: of the height map; empty: the name of its file
-    weights_name: str = ""  #: of the weights; empty: the name of their file
+    height_name: str = ""  #: displayed name of the height map; empty: its file name
+    weights_name: str = ""  #: displayed name of the weights; empty: their file name
 
     @property
     def name(self) -> str:
-        """Return the name of a pipeline, such as ``flat+none`` or ``plain lens + filter 0.01,
+        """Return the name of the pipeline, such as ``flat+none`` or ``plain lens + filter 0.01,
         wiener``.
         """
         if self.shade is not None:
@@ -113,9 +111,7 @@ class Pipeline:
 
     @property
     def front(self) -> str:
-        """Return the name of the mask with that of its file, or in words with the filter and the
-        stop that it has.
-        """
+        """Return the name of the mask with its file, or a phrase with its filter and stop."""
         file_text = f"@{self.height_name or self.height_file.name}" if self.height_file else ""
         if self.shade is None:
             return self.mask + file_text
@@ -128,43 +124,39 @@ class Pipeline:
 
     @property
     def back(self) -> str:
-        """Return the name of the restorer, followed by the name of its file if it has a file."""
+        """Return the name of the restorer, with its file if it has one."""
         return self.restorer + (
             f"@{self.weights_name or self.weights.name}" if self.weights else ""
         )
 
     @property
     def picture(self) -> str:
-        """Return the name of the step that gives the picture to compare with the true picture."""
+        """Return the step of the picture that is compared with the true picture."""
         return "developed[mask]" if self.restorer == NONE else "restored"
 
     @property
     def quality(self) -> str:
-        """Return the name of the step that measures the error of a picture against the true
-        picture.
-        """
+        """Return the step that measures the error of the picture against the true picture."""
         return "developed_quality[mask]" if self.restorer == NONE else "restored_quality"
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results an evaluation needs."""
+        """Return the steps whose results an evaluation needs."""
         return (self.picture, "truth", self.quality, "saturated[mask]", "peak[mask]", "bsr[mask]")
 
 
 @dataclass(frozen=True)
 class PipelineRecipes:
-    """A pipeline (mask and restorer) with one recipe for each laser, which differ only in the
-    laser wavelength.
-    """
+    """A pipeline with one recipe for each laser; these differ only in the laser."""
 
     pipeline: Pipeline
-    #: returns the recipe of a laser by name; also by direction, and then by wavelength
+    #: function from the name of a laser, and optionally its direction and wavelength, to the recipe
     recipe: Callable[..., Recipe]
-    told: str = ""  #: the error in what the restorer is told, as text
-    #: what is added to which parameters of what it is told
+    told: str = ""  #: the error in the data of the restorer, as text
+    #: the error, as an offset for each affected parameter of the restorer's data
     error: Mapping[str, Any] = field(default_factory=dict)
-    true: Callable[..., Recipe] | None = None  #: the same without the error
-    #: arguments that make its mask and restorer from the recipe of the evaluation
+    true: Callable[..., Recipe] | None = None  #: function as ``recipe``, without the error
+    #: recipe arguments that set its mask and restorer
     words: tuple[str, ...] = ()
     fwhm: float = 10e-9  #: spectral width of its lasers in m
 
@@ -174,10 +166,10 @@ class PipelineRecipes:
 
 
 def read_pipelines(text: str, folder: Path, mark: Location | None = None) -> list[Pipeline]:
-    """Parse pipelines such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with
-    all mistakes.
+    """Parse a list such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with
+    all errors.
 
-    ``mark`` is the place of the text, if it stands in a recipe.
+    ``mark`` is the place of the text in a recipe, if it is from one.
     """
     pipeline_words = [word for word in map(str.strip, text.split(",")) if word]
     pipelines: list[Pipeline] = []
@@ -199,7 +191,7 @@ def read_pipelines(text: str, folder: Path, mark: Location | None = None) -> lis
 
 
 def _pipeline(word: str, folder: Path) -> Pipeline:
-    """Return the pipeline that a word names; raise `ValueError` for another form of word."""
+    """Parse one pipeline; raise `ValueError` for a malformed one."""
     match = _PIPELINE.fullmatch(word)
     if match is None:
         raise ValueError(_HOW_TO_WRITE)
@@ -210,24 +202,24 @@ def _pipeline(word: str, folder: Path) -> Pipeline:
 
 
 def _faults(pipeline: Pipeline, mark: Location | None) -> list[str]:
-    """Return why files of a pipeline cannot be used."""
+    """Return the reasons why files of a pipeline cannot be used."""
     faults = [_fault(path, mark) for path in (pipeline.height_file, pipeline.weights) if path]
     return [fault for fault in faults if fault]
 
 
 def _named_file(text: str | None, folder: Path) -> Path | None:
-    """Return the file that a pipeline names, if it names one."""
+    """Return the path of a file in a pipeline, or None."""
     return folder / Path(text).expanduser() if text else None
 
 
 def _twice(pipelines: Sequence[Pipeline]) -> list[str]:
-    """Return the names that several pipelines have, in alphabetical order."""
+    """Return the names that occur more than once, in alphabetical order."""
     counts = Counter(pipeline.name for pipeline in pipelines)
     return sorted(name for name, count in counts.items() if count > 1)
 
 
 def _fault(path: Path, mark: Location | None) -> str:
-    """Return why a file of a pipeline cannot be used, or an empty text."""
+    """Return the reason why a file of a pipeline cannot be used; empty if it can."""
     try:
         if mark is not None:
             refuse_outside(path, mark)
@@ -237,8 +229,8 @@ def _fault(path: Path, mark: Location | None) -> str:
 
 
 def named_apart(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
-    """Return pipelines in which different files have different names: with as many folders as
-    that needs.
+    """Return the pipelines with a different name for each different file, with as many parent
+    folders as needed.
     """
     files: list[Path | None] = []
     for pipeline in pipelines:
@@ -255,14 +247,16 @@ def named_apart(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
 
 
 def _shortest_names(files: Sequence[Path]) -> dict[Path | None, str]:
-    """Return the shortest end of each path that no other file has; equal paths are one file."""
+    """Return the shortest end of each path that is unique among the files; equal paths count as one
+    file.
+    """
     absolute_paths = {file: Path(os.path.abspath(file)) for file in files}
     names: dict[Path | None, str] = {}
     for file, absolute_path in absolute_paths.items():
         other_paths = [
             other_path for other_path in absolute_paths.values() if other_path != absolute_path
         ]
-        # the file's name, then with one folder more each time
+        # ends of the path, from the file name on, each with one more folder
         path_ends = (
             Path(*absolute_path.parts[-count:]) for count in range(1, len(absolute_path.parts) + 1)
         )
@@ -279,9 +273,7 @@ def _shortest_names(files: Sequence[Path]) -> dict[Path | None, str]:
 
 
 def compose_pipelines(named: NamedRecipe, pipelines: Sequence[Pipeline]) -> list[PipelineRecipes]:
-    """Return each pipeline (mask and restorer) with its recipes; raise `EvaluationRefused` with
-    all mistakes.
-    """
+    """Return each pipeline with its recipes; raise `EvaluationRefused` with all errors."""
     own_laser = _own_laser(named)
     composed: list[PipelineRecipes] = []
     mistakes: dict[str, None] = {}
@@ -289,7 +281,7 @@ def compose_pipelines(named: NamedRecipe, pipelines: Sequence[Pipeline]) -> list
         try:
             words = _words(pipeline, partial(_takes, named))
             recipe_of = cache(partial(_with_laser, named.changed(words), own_laser))
-            # without a laser and with the first one
+            # check the recipes without a laser and with the first one
             for case in (NONE, next(iter(CASES))):
                 _check(recipe_of(case), pipeline)
             composed.append(
@@ -307,12 +299,12 @@ def compose_pipelines(named: NamedRecipe, pipelines: Sequence[Pipeline]) -> list
 
 
 def one_line(problem: Diagnostic) -> str:
-    """Return a mistake in a recipe as one line of text."""
+    """Return an error in a recipe as one line of text."""
     return " ".join(str(RecipeError([problem])).split())
 
 
 def _words(pipeline: Pipeline, takes: Callable[[str, str], str]) -> list[str]:
-    """Return the recipe arguments that set the mask and the restorer of a pipeline, such as
+    """Return the recipe arguments that set mask and restorer of a pipeline, such as
     ``doe=flat``.
     """
     words = [f"doe={pipeline.mask}"]
@@ -326,11 +318,11 @@ def _words(pipeline: Pipeline, takes: Callable[[str, str], str]) -> list[str]:
 
 
 def _takes(named: NamedRecipe, group: str, option: str) -> str:
-    """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if
-    there is none.
+    """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if it
+    has none.
 
-    The option may be packaged, or of the user: beside the recipe, or in a folder that every recipe
-    searches.
+    The option may be built in, or one of the user's, next to the recipe or in a folder that all
+    recipes search.
     """
     name, changes, folder = named.changed([f"{group}={option}"])
     composed = compose(name, changes, folder) if option != NONE else None
@@ -359,13 +351,13 @@ def _with_laser(
     direction: tuple[float, float] | None = None,
     wavelength: float | None = None,
 ) -> Recipe:
-    """Load a recipe with the laser ``case``; its strength, and usually its direction, is set
-    later for each point.
+    """Load a recipe with the laser ``case``; its strength, and usually its direction, is set later
+    for each point.
     """
     laser = ""
     if case != NONE:
         laser_wavelength = wavelength or WAVELENGTHS.get(case)
-        # no wavelength of its own: that of the recipe, with its law
+        # without a fixed wavelength use that of the recipe, with its law
         laser_text = (
             own.drawn if laser_wavelength is None else laser_line(laser_wavelength, own.fwhm)
         )
@@ -375,12 +367,12 @@ def _with_laser(
 
 
 def laser_line(wavelength: float, fwhm: float) -> str:
-    """Return wavelength and spectral width of a laser, in m, as they are written in a recipe."""
+    """Return the recipe text for wavelength and spectral width (both in m) of a laser."""
     return f"wavelength: {wavelength * 1e9:.12g} nm, fwhm: {fwhm * 1e9:g} nm"
 
 
 class _OwnLaser(NamedTuple):
-    """The first laser of a recipe, or one of 10 nm width if there is no laser."""
+    """The first laser of a recipe, or a default with a width of 10 nm."""
 
     fwhm: float  #: spectral width in m
     drawn: str  #: wavelength and width as written in the recipe, with their laws
@@ -407,7 +399,7 @@ def _own_laser(named: NamedRecipe) -> _OwnLaser:
 
 
 def base_recipe(named: NamedRecipe) -> Recipe:
-    """Load the recipe of an evaluation; raise `EvaluationRefused` with all mistakes in it."""
+    """Load the recipe of an evaluation; raise `EvaluationRefused` with all its errors."""
     try:
         return named.load()
     except RecipeError as error:
@@ -417,15 +409,15 @@ def base_recipe(named: NamedRecipe) -> Recipe:
 
 
 def read_settings(named: NamedRecipe) -> EvaluateSettings:
-    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in
-    the recipe.
+    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all errors in the
+    recipe.
     """
     return base_recipe(named).evaluation or EvaluateSettings()
 
 
 def refuse_fixed_laser(recipe: Recipe) -> None:
-    """Raise `EvaluationRefused` if the first laser of a recipe has no law from which its
-    wavelength is drawn.
+    """Raise `EvaluationRefused` if the wavelength of the recipe's first laser is not drawn from a
+    law.
     """
     # the laser's name in line[name]
     first_laser = next(
@@ -454,15 +446,15 @@ def _check(recipe: Recipe, pipeline: Pipeline) -> None:
 
 # --- equal protection -----------------------------------------------------------------------------
 
-# Each pipeline gets the filter and the stop that bring its peak to one share.
+# Each pipeline gets the filter and the stop that bring its peak to the same value.
 
-_STOP_BANDS = 7  #: wavelengths at which stops are compared
+_STOP_BANDS = 7  #: number of wavelengths at which stops are compared
 PROTECTION_COLUMNS = ("pipeline", "mask alone", "stop", "filter", "exposure", "peak")
 
 
 def read_protection(level: float | None, way: str) -> EqualProtection | None:
-    """Return what was asked for, or None; raise `EvaluationRefused` for a share that no filter
-    can reach.
+    """Return the requested protection, or None; raise `EvaluationRefused` for an
+    impossible value.
     """
     if way not in WAYS:
         raise EvaluationRefused(f"--by {way}: write one of {', '.join(WAYS)}")
@@ -483,11 +475,10 @@ def protect(
     store: Store,
     progress: Progress,
 ) -> list[PipelineRecipes]:
-    """Return the pipelines with the filters and stops that bring every peak to the level that is
-    asked for.
+    """Return the pipelines with the filters and stops that bring every peak to the requested level.
 
-    Raises: `EvaluationRefused` with every mask that is shaded already or protects more than is
-            asked, before any scene.
+    Raises: `EvaluationRefused` with every mask that is already shaded or already protects more than
+    requested, before any scene is computed.
     """
     shades: dict[str, EqualShade] = {}
     faults: dict[str, None] = {}
@@ -517,9 +508,10 @@ def protect(
 def _shade(
     named: NamedRecipe, pipeline: PipelineRecipes, asked: EqualProtection, store: Store
 ) -> EqualShade:
-    """Return the stop and the filter with which the mask of a pipeline has the wanted peak.
+    """Return the stop and the filter that bring the peak of a pipeline's mask to the requested
+    level.
 
-    Raises `EvaluationRefused` for a mask that is shaded already.
+    Raises `EvaluationRefused` for a mask that is already shaded.
     """
     without_laser = pipeline.recipe(NONE)
     if without_laser.steps["pupil[mask]"].wires.get("shade"):
@@ -541,15 +533,15 @@ def _shade(
 
 
 def _scene_light(recipe: Recipe, store: Store) -> float:
-    """Return the mean light of the recipe's scene behind the plain lens, in e- a pixel."""
+    """Return the mean light of the recipe's scene behind the plain lens, in e- per pixel."""
     return max(
         1.0, float(run(recipe, store, ["signal[plain]"]).values["signal[plain]"].double().mean())
     )
 
 
 def protection_document(result: EvaluationResult) -> dict[str, Any]:
-    """Return the protection, and the recipe arguments of each pipeline, as JSON values; nothing
-    if none was asked.
+    """Return the protection and the recipe arguments of each pipeline as JSON values; empty if no
+    protection was requested.
     """
     if result.protection is None:
         return {}
@@ -567,8 +559,8 @@ def protection_document(result: EvaluationResult) -> dict[str, Any]:
 
 
 def protection_rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    """Return mask alone, stop, filter, exposure and the peak with all of them, for each
-    pipeline.
+    """Return a row for each pipeline: peak with the mask alone, stop, filter, exposure factor, and
+    final peak.
     """
     rows: list[Sequence[Any]] = []
     for pipeline in result.pipelines:
@@ -589,8 +581,8 @@ def protection_rows(result: EvaluationResult) -> list[Sequence[Any]]:
 
 
 def protection_section(result: EvaluationResult) -> list[Section]:
-    """Return the section of the page with the filter and the stop of each pipeline, if
-    protection was made equal.
+    """Return the section with the filter and the stop of each pipeline; empty if no protection was
+    requested.
     """
     if result.protection is None:
         return []

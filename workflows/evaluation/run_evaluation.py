@@ -7,8 +7,9 @@ for all.
     evaluate(AskedCamera.of(named, Store(), print), question)
 
 Each point has a scene, a laser strength and a pipeline, and its metrics equal those of a run of the
-recipe to the last bit. A run that cannot prove its tolerance is computed again more strictly; a
-point is computed once. The store keeps all points, so that an interrupted evaluation continues.
+recipe to the last bit. A run that cannot prove its tolerance is repeated with stricter settings.
+All points are kept in the store, so that an interrupted evaluation continues and no point is
+computed twice.
 """
 
 from __future__ import annotations
@@ -89,15 +90,16 @@ SMALL = 256  #: pixels of the shorter side of the pictures that the paper restor
 
 @dataclass(frozen=True)
 class EvaluationQuestion:
-    """What an evaluation compares, and over which scenes and laser strengths."""
+    """The pipelines that an evaluation compares, with its scenes and laser strengths."""
 
     pipelines: Sequence[Pipeline]
     data: Path | None = None  #: folder of photographs; None: the scene of the recipe
-    count: int | None = 20  #: of scenes; None: every photograph once
-    strengths: tuple[float, ...] = STRENGTHS  #: of the laser, in multiples of saturation
-    small: int = SMALL  #: pixels of the shorter side of reduced pictures, which are compared too
+    count: int | None = 20  #: number of scenes; None: every photograph once
+    strengths: tuple[float, ...] = STRENGTHS  #: laser strengths, in multiples of saturation
+    #: length in pixels of the shorter side of reduced pictures, which are compared too
+    small: int = SMALL
     reference: str = ""  #: pipeline with which all others are compared; empty: the first
-    equal: EqualProtection | None = None  #: peak to which filters and stops bring every pipeline
+    equal: EqualProtection | None = None  #: equal peak for every pipeline, by filters and stops
 
 
 def evaluate(
@@ -115,7 +117,7 @@ def evaluate(
     """
     base = base_recipe(asked.named)
     pipelines = named_apart(question.pipelines)
-    # without the filters and stops of equal protection
+    # before filters and stops for equal protection are added
     bare_pipelines = compose_pipelines(asked.named, pipelines)
     question = replace(
         question,
@@ -128,7 +130,7 @@ def evaluate(
         refuse_fixed_laser(base)
         lasers = [DRAWN]
     shown_scenes, unreadable = scenes(base, asked.store, question.data, question.count, lasers)
-    # one pipeline is enough: all have the same lens and sensor
+    # checking one pipeline is enough: all have the same lens and sensor
     refuse_directions(bare_pipelines[0], shown_scenes)
     final_pipelines, references = _equalled(asked, bare_pipelines, question)
     _report_scenes(shown_scenes, unreadable, question.strengths, final_pipelines, asked.progress)
@@ -153,8 +155,8 @@ def options_of(
     equal_protection: float | None,
     by: str | None,
 ) -> dict[str, Any]:
-    """Return fields of `EvaluationQuestion`: those that are given, and else those of the settings
-    of the recipe.
+    """Return fields of `EvaluationQuestion`: from the arguments, or else from the settings of the
+    recipe.
     """
     settings, folder = asked.settings, asked.named.folder
     pipelines_text = settings.pipelines if pipelines is None else pipelines
@@ -175,8 +177,8 @@ def options_of(
 def _equalled(
     asked: AskedCamera, bare: list[PipelineRecipes], question: EvaluationQuestion
 ) -> tuple[list[PipelineRecipes], dict[str, str]]:
-    """Return the pipelines, at equal protection if that was asked for, and the name of the
-    reference of each.
+    """Return the pipelines, at equal protection if requested, and the name of each one's
+    reference.
     """
     reference = question.reference
     if question.equal is None:
@@ -235,7 +237,9 @@ def _result(
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
-    """Return the strengths in rising order, each once; raise `EvaluationRefused` for wrong ones."""
+    """Return the strengths in rising order without repetition; raise `EvaluationRefused` for
+    invalid ones.
+    """
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
         raise EvaluationRefused(
             "--strengths: write finite multiples of saturation that are not negative, such as"
@@ -245,8 +249,8 @@ def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
 
 
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
-    """Return the name of the reference, by default the first pipeline; raise `EvaluationRefused`
-    for one that is not evaluated.
+    """Return the name of the reference, by default the first pipeline; raise `EvaluationRefused` if
+    it is not evaluated.
     """
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
@@ -263,9 +267,7 @@ def _report_scenes(
     pipelines: Sequence[PipelineRecipes],
     progress: Progress,
 ) -> None:
-    """Print how many scenes, strengths and pipelines there are, and which photographs were not
-    read.
-    """
+    """Report the numbers of scenes, strengths and pipelines, and the unreadable photographs."""
     names = ", ".join(pipeline.name for pipeline in pipelines)
     progress(
         f"{len(shown)} scenes, {len(strengths)} strengths, {len(pipelines)} pipelines: {names}"

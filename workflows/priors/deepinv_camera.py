@@ -16,7 +16,7 @@ from neusee.nodes.restore import FrameBlur, MeasuringSensor, colour
 
 
 class SensorNoise(NoiseModel):  # type: ignore[misc]  # deepinv has no types
-    """Noise of a sensor as a noise model of deepinv: photons, dark current, read noise, full
+    """Noise of a sensor as a noise model of deepinv: photon noise, dark current, read noise, full
     well and converter.
     """
 
@@ -28,8 +28,8 @@ class SensorNoise(NoiseModel):  # type: ignore[misc]  # deepinv has no types
         self.register_buffer("pattern", pattern, persistent=False)
 
     def forward(self, input: Tensor, seed: int | None = None, **_: Any) -> Tensor:
-        """Return one measurement of expected electrons, without the known pattern, in units of
-        ``unit``.
+        """Return one measurement of the expected electrons ``input``, without the known pattern, in
+        units of ``unit``.
         """
         self.rng_manual_seed(seed)
         measured = self.sensor.measured(input * self.unit + self.pattern.to(input), self.rng)
@@ -38,8 +38,8 @@ class SensorNoise(NoiseModel):  # type: ignore[misc]  # deepinv has no types
 
 
 class CameraPhysics(LinearPhysics):  # type: ignore[misc]
-    """A camera as a linear physics of deepinv: blurred and cropped scenes, in which clipped pixels
-    are 0.
+    """A camera as a linear physics of deepinv: it blurs and crops scenes, and sets clipped pixels
+    to 0.
 
     Scenes (batch, channel, y, x) are larger than frames: the border beyond the frame is unknown
     too. `crop` returns the part of a scene that lies in the frame, and `colour` this part in linear
@@ -77,11 +77,11 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
 
     @property
     def blur(self) -> FrameBlur:
-        """Return the blur with a largest gain of 1, without the mask of clipped pixels."""
+        """Return the blur, scaled to a largest gain of 1, without the mask of clipped pixels."""
         return FrameBlur(torch.view_as_complex(self.transfer), self.scene_size, self.frame_size)
 
     def A(self, x: Tensor, mask: Tensor | None = None, **_: Any) -> Tensor:
-        """Return the expected frames of scenes; pixels that clipped are 0."""
+        """Return the expected frames of scenes; clipped pixels are 0."""
         self.update_parameters(mask=mask)
         frame: Tensor = self.mask.to(x) * self.blur.seen(x)
         return frame
@@ -92,17 +92,17 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
         return self.blur.adjoint(self.mask.to(y) * y)
 
     def noise(self, x: Tensor, **kwargs: Any) -> Tensor:
-        """Return measurements of expected frames; pixels that clipped are 0."""
+        """Return measurements of expected frames; clipped pixels are 0."""
         noisy: Tensor = self.mask.to(x) * self.noise_model(x, **kwargs)
         return noisy
 
     def unclipped(self, y: Tensor) -> Tensor:
-        """Return 1 for each pixel of frames that is below the clip level, and 0 for the others."""
+        """Return 1 for each pixel below the clip level, and 0 for all others."""
         return (self.electrons(y) < self.sensor_of.level).to(y)
 
     def electrons(self, y: Tensor) -> Tensor:
-        """Return frames in electrons, with the known pattern and the dark electrons, without the
-        offset.
+        """Return frames in electrons, including the known pattern and the dark electrons, without
+        the offset.
         """
         electrons: Tensor = (
             y * self.frame_unit + self.noise_model.pattern.to(y) + self.sensor_of.dark
@@ -110,8 +110,8 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
         return electrons
 
     def even(self) -> Tensor:
-        """Return the scene without contrast that has the mean of each channel of the frame; a
-        good first iterate.
+        """Return a uniform scene with the mean of each channel of the frame, a good first
+        iterate.
         """
         frame_of_ones = self.A(self.frame.new_ones(1, *self.img_size)).sum((-2, -1), keepdim=True)
         # clipped pixels are 0 in both sums
@@ -122,13 +122,11 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
         return even_scene
 
     def crop(self, x: Tensor) -> Tensor:
-        """Return the part of scenes that lies in the frame."""
+        """Return the part of scenes inside the frame."""
         return self.blur.cropped(x)
 
     def colour(self, x: Tensor) -> Tensor:
-        """Return the part of scenes that lies in the frame, in linear sRGB, as the recipe
-        develops its picture.
-        """
+        """Return the part of scenes inside the frame in linear sRGB, developed as in the recipe."""
         picture: Tensor = colour(self.crop(x) * self.unit, self.matrix)
         return picture
 
@@ -140,8 +138,8 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
 
 
 class SensorLikelihood(DataFidelity):  # type: ignore[misc]
-    """The negative log-likelihood of a frame as a data fidelity; a clipped pixel is a lower bound
-    of its light.
+    """The negative log-likelihood of a frame as a data fidelity; a clipped pixel only gives a lower
+    bound of its light.
 
     A known pixel is normal with the variance of photons, read noise and rounding. A clipped pixel,
     where the mask of the physics is 0, contributes the logarithm of the upper tail beyond the clip
@@ -163,7 +161,7 @@ class SensorLikelihood(DataFidelity):  # type: ignore[misc]
         self.scale = variance_at_floor / unit**2 if scale is None else scale
 
     def fn(self, x: Tensor, y: Tensor, physics: CameraPhysics, *_: Any, **__: Any) -> Tensor:
-        """Return the scaled negative log-likelihood of each frame of a batch: (batch,)."""
+        """Return the scaled negative log-likelihood of each frame of a batch (batch,)."""
         return self.scale * self.sensor.surprise(
             *self._electrons(x, y, physics), self.floor
         ).flatten(1).sum(1)
@@ -176,5 +174,5 @@ class SensorLikelihood(DataFidelity):  # type: ignore[misc]
     def _electrons(
         self, x: Tensor, y: Tensor, physics: CameraPhysics
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return expected and measured electrons, and the mask of the pixels that are known."""
+        """Return expected electrons, measured electrons, and the mask of known pixels."""
         return physics.electrons(physics.blur.seen(x)), physics.electrons(y), physics.mask.to(y)

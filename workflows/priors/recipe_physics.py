@@ -17,8 +17,8 @@ from neusee.workflows.store.result_store import Store
 if TYPE_CHECKING:
     from neusee.workflows.priors.deepinv_camera import CameraPhysics
 
-_OPTICS = ("illuminant", "responses", "bands", "matrix")  #: steps without an arm
-#: steps that measure, in each arm
+_OPTICS = ("illuminant", "responses", "bands", "matrix")  #: steps common to all arms
+#: steps of the sensor, one in each arm
 _SENSOR = ("charge", "dark", "read", "well", "digital", "signal")
 
 
@@ -32,8 +32,8 @@ def as_physics(
     store: Store | None = None,
     device: str = "cpu",
 ) -> CameraPhysics:
-    """Return the camera of a recipe as a linear physics of deepinv, with the noise of its sensor
-    and its frame.
+    """Return the camera of a recipe as a linear physics of deepinv, with its sensor noise and its
+    frame.
 
     The physics maps a scene in the channels of the sensor, as behind a perfect lens without losses,
     to the expected electrons on the sensor, by the PSF that a grey scene has. ``frame`` is the
@@ -73,8 +73,8 @@ def as_physics(
 
 
 def _deepinv_camera() -> type[CameraPhysics]:
-    """Import and return the class; raise ModuleNotFoundError with the command that installs what
-    is missing.
+    """Import and return the class; raise ModuleNotFoundError with the command to install a missing
+    package.
     """
     try:
         from neusee.workflows.priors.deepinv_camera import CameraPhysics

@@ -1,4 +1,4 @@
-"""Rivals of equal protection: the grey filter and the stop that protect like a mask."""
+"""Rivals of equal protection: the grey filter and the stop that protect as well as a mask."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from neusee.workflows.store.result_store import Store
 
 # --- equal rivals ---------------------------------------------------------------------------------
 
-# Rivals of equal protection: each front gets the grey filter with which the laser does as much harm
-# as elsewhere.
+# Rivals of equal protection: each front gets the grey filter that brings the harm by the laser to
+# the same value.
 
 
-#: what is measured of a quiet picture, with what it means
+#: measures of a picture without a laser, with their descriptions
 MEASURES: Mapping[str, str] = {
     "error": "error of the filtered picture",
     "information": "information",
@@ -49,27 +49,27 @@ MEASURES: Mapping[str, str] = {
     },
     "text": "detection of a line of text",
 }
-CONTRAST = 0.2  #: of the targets
+CONTRAST = 0.2  #: contrast of the targets
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A front and what was measured of it."""
+    """A front with its measurements."""
 
     front: Front
     found: FrontMeasures
-    protection: float  #: share of the harm of the clear lens: peak, or heat
+    protection: float  #: harm relative to the clear lens: peak, or heat
 
     def transmittance(self, protection: float) -> float:
-        """Return the transmittance of the grey filter with which this front has a
-        ``protection``; at most 1.
+        """Return the transmittance, at most 1, of the grey filter that brings this front to
+        ``protection``.
         """
         return min(1.0, protection / self.protection)
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A front with a grey filter, and the name by which the page calls both."""
+    """A front with a grey filter, and its name on the page."""
 
     name: str
     front: Front
@@ -91,11 +91,11 @@ class Rival:
 def quiet_picture(
     measures: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise
 ) -> dict[str, float]:
-    """Return each of `MEASURES` in dB, more is better, for a frame without a laser at a scene
-    light in e- a pixel.
+    """Return each of `MEASURES` in dB (more is better) for a frame without a laser; ``electrons``
+    is the scene light in e- per pixel.
     """
     amplitude = electrons * transmittance
-    # 0.0: no glare
+    # second argument 0.0: no glare
     noise: Tensor = noise_variance(
         amplitude * measures.spectrum.light, 0.0, pixel.read_noise, pixel.prnu
     )[None]
@@ -103,11 +103,11 @@ def quiet_picture(
     values = {
         "error": -decibels(float(remaining_error(measures.spectrum, amplitude, noise).mean())),
         "information": decibels(max(bits, 1e-30)),
-        # a natural logarithm in dB
+        # convert a natural logarithm to dB
         "NEQ": float(mean_log_neq(measures.spectrum, amplitude, noise).mean()) * decibels(math.e),
     }
     for name, energy in measures.energy.items():
-        # an SNR is an amplitude: 20 log10
+        # an SNR is an amplitude ratio: 20 log10
         values[name] = 2 * decibels(
             max(float(detection_snr(energy, amplitude, CONTRAST, noise)), 1e-30)
         )
@@ -121,8 +121,8 @@ def best(
     pixel: PixelNoise,
     name: str = "",
 ) -> dict[str, tuple[float, Rival]]:
-    """Return the best value of each of `MEASURES` over candidates of equal protection, and the
-    rival with the value.
+    """Return the best value of each of `MEASURES` over candidates at equal protection, with its
+    rival.
     """
     leaders: dict[str, tuple[float, Rival]] = {}
     for candidate in candidates:
@@ -142,8 +142,8 @@ def gains(
     electrons: float,
     pixel: PixelNoise,
 ) -> dict[str, float]:
-    """Return by how many dB the best with the mask exceeds the best stop-and-filter of equal
-    protection, by measure.
+    """Return, by measure, the gain in dB of the best front with the mask over the best stop with
+    filter, at equal protection.
     """
     best_masked, best_plain = (
         best(candidates, protection, electrons, pixel) for candidates in (masked, plain)
@@ -154,7 +154,9 @@ def gains(
 def neq_curve(
     measures: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise
 ) -> list[float]:
-    """Return the NEQ in the rings of frequency, averaged over directions, in electrons."""
+    """Return the NEQ (noise equivalent quanta) in electrons in rings of frequency, averaged over
+    directions.
+    """
     amplitude = electrons * transmittance
     noise = float(
         noise_variance(
@@ -167,8 +169,8 @@ def neq_curve(
 
 
 def colour_shift(measures: FrontMeasures) -> float:
-    """Return the ratio of the largest to the smallest share of light that the channels receive;
-    1: no tint.
+    """Return the ratio of the largest to the smallest share of light among the channels; 1 means no
+    tint.
     """
     light_of_channels = measures.spectrum.light
     return float(light_of_channels.max() / light_of_channels.min().clamp_min(1e-12))
@@ -176,25 +178,23 @@ def colour_shift(measures: FrontMeasures) -> float:
 
 # --- equal shade ----------------------------------------------------------------------------------
 
-# The grey filter and the stop with which a lens, with or without a mask, lowers the peak of a laser
-# to a wanted share.
+# The grey filter and the stop that lower the peak of a laser behind a lens, with or without a mask,
+# to a requested share.
 #
-# A filter of transmittance t lowers the peak to t at every wavelength; a stop lowers it more per
-# light that it takes.
+# A filter of transmittance t lowers the peak to t at every wavelength; for the same loss of light a
+# stop lowers it more.
 
 
-#: what is added to a lens: stop and filter, a filter alone, or a stop alone
+#: additions to a lens: stop and filter, a filter alone, or a stop alone
 WAYS = ("best", "filter", "stop")
-_LEAST_SAMPLES = 16  #: of the pupil, along the diameter of the smallest stop
-_HALVINGS = 12  #: of the interval in which the diameter of a stop is looked for
-_OPEN_FILTER = 0.995  #: transmittance from which a filter is not named
-_DIAMETER_RATIO = 0.85  #: between two diameters of stops
+_LEAST_SAMPLES = 16  #: least number of pupil samples across the diameter of the smallest stop
+_HALVINGS = 12  #: bisection steps of the search for the diameter of a stop
+_OPEN_FILTER = 0.995  #: filters with a higher transmittance are not mentioned
+_DIAMETER_RATIO = 0.85  #: ratio of two successive stop diameters
 
 
 class EqualProtection(NamedTuple):
-    """The peak of a laser that is wanted, as a share of that behind the plain lens, and what is
-    added to reach it.
-    """
+    """The requested peak of a laser relative to the plain lens, and the way to reach it."""
 
     level: float  #: at the worst wavelength
     way: str = WAYS[0]  #: one of `WAYS`
@@ -202,16 +202,18 @@ class EqualProtection(NamedTuple):
 
 @dataclass(frozen=True)
 class EqualShade:
-    """A stop and a grey filter, which together with a mask lower the peak to the wanted share."""
+    """A stop and a grey filter that, together with a mask, lower the peak to the
+    requested share.
+    """
 
     alone: float  #: peak with the mask alone, relative to the clear lens, at the worst wavelength
-    diameter: float = 1.0  #: of the stop, relative to the lens
-    transmittance: float = 1.0  #: of the filter
+    diameter: float = 1.0  #: diameter of the stop relative to the lens
+    transmittance: float = 1.0  #: transmittance of the filter
 
     @property
     def said(self) -> str:
         """Return stop and filter as text, such as `` + stop 0.56 + filter 0.1``; parts without
-        effect are left out.
+        effect are omitted.
         """
         stop = f" + stop {self.diameter:.3g}" if self.diameter < 1 else ""
         return stop + (
@@ -220,17 +222,16 @@ class EqualShade:
 
     @property
     def brightness(self) -> float:
-        """Return the factor that gives a picture behind stop and filter the exposure of one
+        """Return the factor that makes a picture behind stop and filter as bright as
         without them.
         """
         return 1.0 / (self.transmittance * self.diameter**2)
 
     @property
     def words(self) -> list[str]:
-        """Return the arguments that add stop and filter to the arm ``mask`` of a recipe.
+        """Return the recipe arguments that add stop and filter to the arm ``mask``.
 
-        The developed picture behind them has an exposure of its own: it is as bright as without
-        them.
+        The developed picture is brightened to the exposure without stop and filter.
         """
         values = f"transmittance: {self.transmittance!r}, diameter: {self.diameter!r}"
         return [
@@ -246,7 +247,7 @@ class EqualShade:
 
 
 def stop_diameter(camera: ProtectionCamera, level: float) -> float:
-    """Return the diameter of the smallest stop whose peak, with the mask if there is one, is not
+    """Return the relative diameter of the smallest stop whose peak, with the mask if any, is not
     below ``level``.
 
     Raises: ValueError if the samples of the pupil carry no stop that is small enough.
@@ -255,7 +256,7 @@ def stop_diameter(camera: ProtectionCamera, level: float) -> float:
     def peak(diameter: float) -> float:
         return float(metrics.lsr(camera.psf(True, diameter, camera.bands)).max())
 
-    # relative diameters: the peak falls with the diameter
+    # bracket of relative diameters; a smaller stop has a lower peak
     too_small, large_enough = _LEAST_SAMPLES / int(camera.stop.samples), 1.0
     if (smallest := peak(too_small)) > level:
         raise ValueError(
@@ -271,19 +272,19 @@ def stop_diameter(camera: ProtectionCamera, level: float) -> float:
 
 
 def best_diameter(camera: ProtectionCamera, store: Store, level: float, electrons: float) -> float:
-    """Return the diameter of the stop whose filtered picture has the least error, with the filter
-    that it then needs.
+    """Return the relative diameter of the stop with the least error of the filtered picture, at the
+    grey filter needed for ``level``.
 
-    ``electrons`` is the mean light of the scene in e- a pixel behind the plain lens.
+    ``electrons`` is the mean scene light behind the plain lens, in e- per pixel.
     """
     window_side = min(int(pixels) for pixels in camera.lens["shape"])
-    # contrast variance 0.1, NEQ up to 0.12 cycles a pixel, targets 14 pixels high, one field as
-    # wide as the window, and the peak as the harm (no heat)
+    # contrast variance 0.1, NEQ up to 0.12 cycles per pixel, targets 14 pixels high, one field as
+    # wide as the window, and None: the harm is the peak, not the heat
     bench = FrontBench(
         camera, store, FrontSettings(0.1, 0.12, min(14.0, window_side / 4), (window_side,), None)
     )
     usual_values, smallest = usual_condition(), stop_diameter(camera, level)
-    # 40 steps are more than any pupil carries: from the open lens down
+    # from the open lens down; 40 steps are more than any pupil sampling allows
     diameters = [_DIAMETER_RATIO**step for step in range(40) if _DIAMETER_RATIO**step > smallest]
     fronts = [Front(True, diameter) for diameter in (*diameters, smallest)]
     measured = [bench.measure(front, usual_values) for front in fronts]
@@ -291,7 +292,7 @@ def best_diameter(camera: ProtectionCamera, store: Store, level: float, electron
         Candidate(front, measures, measures.peak)
         for front, measures in zip(fronts, measured, strict=True)
     ]
-    # the rival of least error: (value, rival)
+    # element 1 of (value, rival)
     return best(candidates, level, electrons, camera.pixel(0.0, 0.0))["error"][1].front.diameter
 
 
@@ -303,11 +304,10 @@ def shade_equally(
     electrons: Callable[[], float],
     peak_of: Callable[[EqualShade], float],
 ) -> EqualShade:
-    """Return the stop and the filter of one of the `WAYS` with which the peak is ``level``.
+    """Return the stop and the filter, by one of the `WAYS`, that bring the peak to ``level``.
 
-    ``electrons`` returns the mean light of the scene, in e- a pixel behind the plain lens.
-    ``peak_of`` returns the peak behind a shade at the worst of all wavelengths, relative to the
-    clear lens.
+    ``electrons`` returns the mean scene light behind the plain lens, in e- per pixel. ``peak_of``
+    returns the peak behind a shade at the worst of all wavelengths, relative to the clear lens.
     """
     alone = peak_of(EqualShade(1.0))
     # 1e-6 is rounding

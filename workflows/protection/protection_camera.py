@@ -1,5 +1,5 @@
-"""The camera of the protection study: its parts, what is measured of each front, and the conditions
-that nobody knows of an attack before it comes.
+"""The camera of the protection study: its parts, the measurements of each front, and the unknown
+conditions of an attack.
 """
 
 from __future__ import annotations
@@ -38,27 +38,30 @@ from neusee.workflows.store.result_store import Store, compute_once
 
 # --- unknown conditions ---------------------------------------------------------------------------
 
-# What nobody knows of an attack, as probability distributions, and one sampler of all of them.
+# The unknown conditions of an attack as probability distributions, with one sampler for all of
+# them.
 #
-# Studies and trainings draw the same conditions for the same seed: the wavelength and the direction
-# of the laser, the defocus of the lens, the grease on the window, and the light that the lens
-# scatters. A study draws a list, and a training draws by the same `draw_laws` how the camera of one
-# picture differs from what its restorer is told.
+# Studies and trainings draw the same conditions for the same seed: wavelength and direction of the
+# laser, defocus of the lens, grease on the window, and light scattered by the lens. A study draws a
+# list; a training uses the same `draw_laws` for the differences between the camera of one picture
+# and the camera that its restorer assumes.
 
-_MOST_SCATTER = 0.99  #: share of the light; a lens that scatters all light has no picture
+#: largest scattered share of the light; a lens that scatters all light has no picture
+_MOST_SCATTER = 0.99
 
 
 @dataclass(frozen=True)
 class UnknownLaws:
-    """The distributions of the unknown conditions, each as text such as ``normal(0 waves, 0.25
+    """The distributions of the unknown conditions, as texts such as ``normal(0 waves, 0.25
     waves)``.
     """
 
     wavelength: str = "uniform(400 nm, 700 nm)"  #: of the laser
-    direction_y: str = "uniform(-0.25, 0.25)"  #: of the laser, in fields from the middle
+    #: direction of the laser from the axis, in fields of view
+    direction_y: str = "uniform(-0.25, 0.25)"
     direction_x: str = "uniform(-0.25, 0.25)"
     defocus: str = "normal(0 waves, 0.25 waves)"  #: of the lens, peak to valley at 550 nm
-    #: on the window, root mean square at 550 nm
+    #: phase of the grease on the window, root mean square at 550 nm
     grease: str = "loguniform(0.005 waves, 0.05 waves)"
     scatter: str = "lognormal(0.005, 2)"  #: share of the light that the lens scatters
 
@@ -68,31 +71,30 @@ class Condition:
     """One draw of the unknown conditions, in SI units."""
 
     wavelength: float  #: m
-    direction: tuple[float, float]  #: fields from the middle, (y, x)
+    direction: tuple[float, float]  #: (y, x) from the axis, in fields of view
     defocus: float  #: waves at 550 nm
     grease: float  #: waves at 550 nm
     scatter: float  #: share of the light
-    seed: int  #: of the pattern of the grease
+    seed: int  #: random seed of the grease pattern
 
     @property
     def surfaces(self) -> dict[str, dict[str, float]]:
-        """Return the parameter ``surfaces`` of `flare.stray_light` for a lens that scatters this
-        share of the light.
-        """
+        """Return the parameter ``surfaces`` of `flare.stray_light` for this scattered share."""
         return {"lens": surface_of(self.scatter)}
 
     @property
     def plain(self) -> dict[str, float | list[float]]:
-        """Return the condition as a JSON value."""
+        """Return the condition as JSON values."""
         return {**asdict(self), "direction": list(self.direction)}
 
 
 def draw_conditions(
     count: int, seed: int, laws: UnknownLaws | None = None, first: int = 0
 ) -> list[Condition]:
-    """Return ``count`` independent draws of the conditions, from the number ``first`` on.
+    """Return ``count`` independent draws of the conditions, starting with the draw number
+    ``first``.
 
-    The draw of a number depends only on the seed and the laws, so that a larger ``count`` begins
+    Each draw depends only on its number, the seed and the laws, so that a larger ``count`` starts
     with the same draws.
     """
     texts: Mapping[str, str] = asdict(laws or UnknownLaws())
@@ -113,7 +115,9 @@ def draw_conditions(
 
 
 def usual_condition(laws: UnknownLaws | None = None) -> Condition:
-    """Return the condition with every value at its median, and a clean window."""
+    """Return the condition with median values, no defocus, the laser on the axis and a clean
+    window.
+    """
     texts: Mapping[str, str] = asdict(laws or UnknownLaws())
     medians = {name: read_law(text).median for name, text in texts.items()}
     return Condition(medians["wavelength"], (0.0, 0.0), 0.0, 0.0, medians["scatter"], 0)
@@ -134,12 +138,12 @@ _NEEDED = (
     "read[mask]",
     "well[mask]",
 )
-_NO_MASK_LSR = 0.9  #: laser suppression ratio above which a recipe has no mask to compare
+_NO_MASK_LSR = 0.9  #: laser suppression ratio above which a mask is too weak to compare
 
 
 @dataclass(frozen=True)
 class ProtectionCamera:
-    """Lens, mask and sensor of a recipe, as values and parameters from which PSFs of any shade
+    """Lens, mask and sensor of a recipe as values and parameters, from which PSFs with any shade
     are computed.
     """
 
@@ -147,7 +151,7 @@ class ProtectionCamera:
     height: Tensor
     flat: Tensor
     stop: Stop
-    bands: Bands  #: a few bands of the recipe, from end to end, for the scene
+    bands: Bands  #: some bands of the recipe over the whole range, for the scene
     laser_bands: Bands  #: all bands of the recipe, for a laser that may have any wavelength
     illuminant: Tensor
     responses: Tensor
@@ -172,7 +176,7 @@ class ProtectionCamera:
         names += ["illuminant", "responses"]
         result = run(recipe, store, dict.fromkeys(names))
         height, flat, stop, bands, illuminant, responses = (result.values[name] for name in names)
-        # evenly spaced, from the first band to the last
+        # evenly spaced indices from the first band to the last
         chosen_indices = (
             torch.linspace(0, len(bands.centres) - 1, min(count, len(bands.centres))).round().long()
         )
@@ -221,10 +225,10 @@ class ProtectionCamera:
         condition: Condition | None = None,
         **options: Any,
     ) -> Psf:
-        """Return the PSF with or without the mask, in a stop of a relative ``diameter``, under a
+        """Return the PSF with or without the mask, with a stop of relative ``diameter``, under a
         condition.
         """
-        # options of the shade; all others are parameters of the PSF
+        # `notches` and `depth` are options of the shade; all others are parameters of the PSF
         notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
         psf: Psf = optics.psf(
             self._front(masked, diameter, bands, condition, **notches), **{**self.lens, **options}
@@ -234,10 +238,10 @@ class ProtectionCamera:
     def laser_psf(
         self, masked: bool, diameter: float, line: Bands, condition: Condition, **options: Any
     ) -> Psf:
-        """Return the PSF of a laser from the ``angle`` of its direction, with the light that the
-        lens scatters.
+        """Return the PSF of a laser at the direction ``angle``, including the light scattered by
+        the lens.
         """
-        # options of the shade; all others are parameters of the PSF
+        # `notches` and `depth` are options of the shade; all others are parameters of the PSF
         notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
         front = self._front(masked, diameter, line, condition, **notches)
         lens = {**self.lens, **options}
@@ -260,9 +264,9 @@ class ProtectionCamera:
         condition: Condition | None,
         **notches: Any,
     ) -> Pupil:
-        """Return the pupil of a lens with or without the mask, in a stop of a relative diameter.
+        """Return the pupil with or without the mask, with a stop of relative ``diameter``.
 
-        A condition adds its defocus and its film of grease; ``notches`` are options of `doe.shade`.
+        A condition adds defocus and a film of grease; ``notches`` are options of `doe.shade`.
         """
         pupil_step = self.recipe.steps["pupil[mask]"]
         index_step = self.recipe.steps[str(pupil_step.wires["index"])]
@@ -285,7 +289,7 @@ class ProtectionCamera:
         return front
 
     def _film(self, condition: Condition) -> Any:
-        """Return the film of grease on the window under a condition, or None for a clean one."""
+        """Return the film of grease on the window, or None for a clean window."""
         if not condition.grease:
             return None
         return dirt(
@@ -299,8 +303,8 @@ class ProtectionCamera:
         return Bands(unit * wavelength, unit * 1e-9, unit)
 
     def laser_colour(self, line: Bands) -> Tensor:
-        """Return the response of each channel to a laser relative to the channel that responds
-        most: (channel,).
+        """Return the response of each channel to a laser, relative to the most responsive channel
+        (channel,).
         """
         step = self.recipe.steps["responses"]
         response: Tensor = step.node(line, **step.params)[:, 0].double()
@@ -308,7 +312,7 @@ class ProtectionCamera:
 
     @property
     def nodes(self) -> tuple[Node, ...]:
-        """Return the nodes whose code determines a PSF, or a measure of it."""
+        """Return the nodes whose code determines a PSF or a measure of it."""
         index_node = self.recipe.steps[str(self.recipe.steps["pupil[mask]"].wires["index"])].node
         own_nodes = (
             optics.psf,
@@ -324,7 +328,7 @@ class ProtectionCamera:
 
 
 def _refuse_unsuitable(recipe: Recipe) -> None:
-    """Raise ValueError where the recipe lacks a step, or its mask is shaded already."""
+    """Raise ValueError if the recipe lacks a step, or if its mask is already shaded."""
     missing = [name for name in _NEEDED if name not in recipe.steps]
     if missing:
         raise ValueError(
@@ -339,7 +343,7 @@ def _refuse_unsuitable(recipe: Recipe) -> None:
 
 
 def refuse_no_mask(lsr: float) -> None:
-    """Raise ValueError for a mask that lowers the peak too little to compare."""
+    """Raise ValueError for a mask that hardly lowers the peak."""
     if lsr > _NO_MASK_LSR:
         raise ValueError(
             f"the mask of this recipe lowers the peak of a laser to {lsr:.3g} only: choose a mask,"
@@ -349,8 +353,8 @@ def refuse_no_mask(lsr: float) -> None:
 
 # --- front optics ---------------------------------------------------------------------------------
 
-# Fronts, which are a lens with or without the mask in a stop of some diameter, and what is measured
-# of each once.
+# A front is a lens with or without the mask and with a stop of some diameter. Each is measured only
+# once.
 #
 # A grey filter needs no front of its own: it scales the light of scene and laser.
 
@@ -361,48 +365,49 @@ _SOURCES = (channel_psf, picture_spectrum, detail_energy, glare_levels)
 
 @dataclass(frozen=True)
 class Front:
-    """A lens with or without the mask, in a stop of a relative diameter, or with a notch filter."""
+    """A lens with or without the mask, with a stop of relative ``diameter``, or with a notch
+    filter.
+    """
 
     masked: bool
     diameter: float = 1.0
     notch: float | None = None  #: m, centre of a notch filter
-    depth: float = 0.0  #: of the notch
+    depth: float = 0.0  #: depth of the notch
 
     @property
     def notches(self) -> dict[str, Any]:
-        """Return the parameters of `doe.shade` for the notch filter, if there is one."""
+        """Return the parameters of `doe.shade` for the notch filter; empty without one."""
         return {} if self.notch is None else {"notches": (self.notch,), "depth": self.depth}
 
 
 @dataclass(frozen=True)
 class FrontMeasures:
-    """What is measured of one front under one condition."""
+    """The measurements of one front under one condition."""
 
     spectrum: PictureSpectrum
     energy: Mapping[str, Tensor]  #: by target (channel,)
-    peak: float  #: laser suppression ratio at the worst of all bands of the recipe
-    #: heat of the hottest pixel relative to the clear lens, at the worst of them; NaN if not asked
-    #: for
+    peak: float  #: laser suppression ratio in the worst of all bands of the recipe
+    #: heat of the hottest pixel relative to the clear lens in the worst band; NaN if not requested
     heat: float
     radius: Tensor  #: (ring,) cycles per pixel
     square: Tensor  #: (ring,) mean of |OTF|**2
-    glare: Mapping[int, GlareLevels]  #: by the side of the field in pixels
+    glare: Mapping[int, GlareLevels]  #: by side length of the field in pixels
     colour: Tensor  #: (channel,) response to the laser
 
 
 @dataclass(frozen=True)
 class FrontSettings:
-    """The settings of the protection study that determine what is measured of a front."""
+    """The settings of the protection study that determine the measurements of a front."""
 
-    variance: float  #: of the contrast of the scene
-    up_to: float  #: cycles per pixel, of the mean log NEQ
+    variance: float  #: contrast variance of the scene
+    up_to: float  #: cycles per pixel, highest frequency in the mean log NEQ
     size: float  #: height of the targets in pixels
-    fields: tuple[int, ...]  #: sides of the field in pixels
-    dwell: float | None  #: s; None: the peak alone counts
+    fields: tuple[int, ...]  #: side lengths of the fields in pixels
+    dwell: float | None  #: s, dwell time for the heat; None: only the peak counts
 
 
 class FrontBench:
-    """Measures fronts of one camera, each only once, because the store keeps the result."""
+    """Measures fronts of one camera, each only once, because the store keeps the results."""
 
     def __init__(self, camera: ProtectionCamera, store: Store, settings: FrontSettings) -> None:
         """Prepare measurements of fronts; the store keeps each under a key of camera, code and
@@ -434,7 +439,7 @@ class FrontBench:
         ]
 
     def measure(self, front: Front, condition: Condition) -> FrontMeasures:
-        """Return what is measured of a front under a condition, from the store if it is there."""
+        """Return the measurements of a front under a condition, from the store or computed now."""
         key = digest("protection front", self._key, repr(front), condition.plain)
         measures = compute_once(
             self.store, key, dict, lambda: self._measure(front, condition), _ABOUT
@@ -442,9 +447,9 @@ class FrontBench:
         return _measures(measures)
 
     def _measure(self, front: Front, condition: Condition) -> dict[str, Tensor]:
-        """Measure a front under a condition, as tensors by name that the store can save.
+        """Measure a front under a condition; return tensors by name that the store can save.
 
-        The filter assumes the PSF without the condition, and the picture has the true one.
+        The filter assumes the PSF without the condition, while the picture has the true PSF.
         """
         camera, settings = self.camera, self.settings
         light_of_scene = camera.illuminant, camera.responses, camera.bands
@@ -466,13 +471,13 @@ class FrontBench:
         return measures | self._glare(front, condition)
 
     def _harm(self, front: Front) -> dict[str, Tensor]:
-        """Return peak and heat at the worst of all bands of the recipe; they are computed once.
+        """Return peak and heat in the worst of all bands of the recipe, computed once.
 
-        A mask may pass a laser in a narrow band that lies between the few bands of the scene.
+        A mask may transmit a laser in a narrow band between the few bands of the scene.
         """
         if front not in self._harms:
             bands = self.camera.laser_bands
-            # bands of one element each
+            # split into single bands
             split_columns = (torch.split(values, 1) for values in bands)
             single_bands = (Bands(*values) for values in zip(*split_columns, strict=True))
             peaks, heats = zip(*(self._harm_in(front, band) for band in single_bands), strict=True)
@@ -496,31 +501,29 @@ class FrontBench:
         )
 
     def _told_psf(self, front: Front) -> Psf:
-        """Return the PSF that the filter knows, without the unknown conditions; it is computed
-        once.
-        """
+        """Return the PSF that the filter assumes, without the unknown conditions, computed once."""
         if front not in self._psfs:
             self._psfs[front] = self._psf(front, self.camera.bands, None)
         return self._psfs[front]
 
     def _psf(self, front: Front, bands: Bands, condition: Condition | None, **options: Any) -> Psf:
-        """Return the PSF of a front in bands, under a condition or without one."""
+        """Return the PSF of a front in ``bands``, with or without a condition."""
         return self.camera.psf(
             front.masked, front.diameter, bands, condition, **front.notches, **options
         )
 
     def _laser_psf(self, front: Front, line: Bands, condition: Condition, **options: Any) -> Psf:
-        """Return the PSF of a laser behind a front, with the light that the lens scatters."""
+        """Return the PSF of a laser behind a front, including the light scattered by the lens."""
         return self.camera.laser_psf(
             front.masked, front.diameter, line, condition, **front.notches, **options
         )
 
     def _glare(self, front: Front, condition: Condition) -> dict[str, Tensor]:
-        """Return the levels of a laser's light over each field, with the light that the lens
-        scatters.
+        """Return the levels of a laser's light over each field, including the light scattered by
+        the lens.
 
-        Wider fields are for a laser on the axis alone, and only as wide as the samples of the pupil
-        carry.
+        Wider fields are computed only for a laser on the axis, and only as far as the pupil
+        sampling allows.
         """
         camera = self.camera
         laser_band = camera.laser_line(condition.wavelength)
@@ -531,7 +534,7 @@ class FrontBench:
             condition.direction[1] * smallest_field,
         )
         radians_per_pixel = camera.lens["pixel_pitch"] / camera.lens["focal_length"]
-        # other directions are shares of the smallest field
+        # directions off the axis refer to the smallest field
         for side in (
             self.settings.fields if condition.direction == (0.0, 0.0) else (smallest_field,)
         ):
@@ -551,7 +554,7 @@ class FrontBench:
 
 
 def _measures(stored: Mapping[str, Any]) -> FrontMeasures:
-    """Return measures from how the store keeps them, by name."""
+    """Return measurements from their stored form."""
     sides = [int(name.removeprefix("level.")) for name in stored if name.startswith("level.")]
     return FrontMeasures(
         PictureSpectrum(*(stored[f"spectrum.{name}"] for name in PictureSpectrum._fields)),

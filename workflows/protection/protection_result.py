@@ -1,5 +1,5 @@
-"""The result of the protection study: quiet frames over scene light and protection, and frames
-under attack.
+"""The result of the protection study: quiet frames by scene light and protection, and frames under
+attack.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from neusee.workflows.protection.protection_camera import (
     usual_condition,
 )
 
-#: by measure, the best value over candidates and the rival that has it
+#: for each measure: the best value over candidates, and its rival
 Best = Mapping[str, tuple[float, Rival]]
 
 LIGHTS = (10.0, 30.0, 100.0, 300.0, 1e3, 3e3, 1e4)  #: e- a pixel
@@ -40,24 +40,24 @@ LEVELS = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  #: share of the clear lens'
 #: wells in the brightest pixel, open lens
 STRENGTHS = tuple(float(10.0**k) for k in np.arange(0, 9.76, 0.75))
 ATTACKED_AT = 300.0  #: e- a pixel
-SHOWN_AT = 30.0  #: e- a pixel, of the NEQ by frequency
-DRAWN = ("error", "NEQ", "text")  #: measures that are repeated for each draw
-_DIAMETER_RATIO = 0.85  #: between two diameters of stops
+SHOWN_AT = 30.0  #: e- a pixel, scene light for the NEQ by frequency
+DRAWN = ("error", "NEQ", "text")  #: measures that are computed for each draw
+_DIAMETER_RATIO = 0.85  #: ratio of two successive stop diameters
 _MASK_STOPS = (1.0, 0.8, 0.6)
-_SMALL_PSF = (8, 8)  #: pixels of a PSF of which only the lens counts
-#: share of the information of the quiet frame below which a picture counts as lost
+_SMALL_PSF = (8, 8)  #: pixels, window of a PSF of which only the values for the clear lens are used
+#: a picture counts as lost if less than this share of the quiet frame's information remains
 _LOST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class ProtectionResult:
-    """What the page, the table and the figures of the protection study show."""
+    """The data shown on the page, in the table and in the figures of the protection study."""
 
     own: float  #: protection of the mask alone
-    rivals: Mapping[str, Rival]  #: of the mask's own protection, by name
+    rivals: Mapping[str, Rival]  #: rivals with the protection of the mask alone, by name
     #: dB by rival, scene light and measure
     quiet: Mapping[str, Mapping[float, Mapping[str, float]]]
-    stops: Mapping[float, Rival]  #: best stop-and-filter for the error, by scene light
+    stops: Mapping[float, Rival]  #: best stop with filter by the measure ``error``, by scene light
     #: dB by protection, scene light and measure
     gain: Mapping[float, Mapping[float, Mapping[str, float]]]
     #: dB by scene light and measure, one for each draw
@@ -70,11 +70,12 @@ class ProtectionResult:
     forbidden: Mapping[float, float]
     #: by rival and quantity, (draw, strength)
     attack: Mapping[str, Mapping[str, Sequence[Sequence[float]]]]
-    #: share of pixels seen by rival and field, by strength
+    #: share of unsaturated pixels for each strength, by rival and field
     fields: Mapping[str, Mapping[int, Sequence[float]]]
-    #: strength that halves the information, by rival, one for each draw
+    #: strength that halves the information, by rival and draw
     lost: Mapping[str, Sequence[float]]
-    tint: Mapping[str, float]  #: largest over smallest share of light of the channels, by rival
+    #: ratio of the largest to the smallest share of light among the channels, by rival
+    tint: Mapping[str, float]
 
 
 def measure_protection(
@@ -83,13 +84,13 @@ def measure_protection(
     pixel: PixelNoise,
     progress: Callable[[str], None],
 ) -> ProtectionResult:
-    """Measure mask, filters and stops of equal protection, in quiet frames and under attack, for
+    """Measure mask, filters and stops at equal protection, in quiet frames and under attack, for
     each condition.
     """
     usual_values = usual_condition()
 
     def candidate(front: Front, condition: Condition = usual_values) -> Candidate:
-        # harm is judged at the usual condition, as the filter is chosen before
+        # the harm is that at the usual condition, because the filter is chosen in advance
         measures, harm = bench.measure(front, condition), bench.measure(front, usual_values)
         protection = harm.peak if bench.settings.dwell is None else harm.heat
         return Candidate(front, measures, protection)
@@ -116,7 +117,7 @@ def measure_protection(
         for scene_light in LIGHTS
     }
     rivals = _rivals(clear_fronts, masked_fronts, own_protection, pixel, stops)
-    # a notch at the usual wavelength that passes as much as the mask's peak
+    # a notch at the usual wavelength that transmits as much as the mask's peak
     rivals["notch"] = Rival(
         "notch", Front(False, 1.0, usual_values.wavelength, 1 - own_protection), 1.0
     )
@@ -157,7 +158,7 @@ def measure_protection(
 def _quiet_frames(
     rivals: Mapping[str, Rival], measured: Mapping[str, Candidate], pixel: PixelNoise
 ) -> dict[str, dict[float, dict[str, float]]]:
-    """Return what each rival does to frames without a laser."""
+    """Return the measures of frames without a laser, by rival."""
     return {
         name: _quiet(measured[name].found, rival.transmittance, pixel)
         for name, rival in rivals.items()
@@ -167,7 +168,7 @@ def _quiet_frames(
 def _curves(
     rivals: Mapping[str, Rival], measured: Mapping[str, Candidate], pixel: PixelNoise
 ) -> dict[str, list[float]]:
-    """Return the NEQ of each rival in the rings of frequency."""
+    """Return the NEQ in rings of frequency, by rival."""
     return {
         name: neq_curve(measured[name].found, rival.transmittance, SHOWN_AT, pixel)
         for name, rival in rivals.items()
@@ -177,14 +178,14 @@ def _curves(
 def _gains(
     masked: Sequence[Candidate], clear: Sequence[Candidate], level: float, pixel: PixelNoise
 ) -> dict[float, dict[str, float]]:
-    """Return the gain of the mask at each light, at one level of protection."""
+    """Return the gain of the mask by scene light, at one level of protection."""
     return {scene_light: gains(masked, clear, level, scene_light, pixel) for scene_light in LIGHTS}
 
 
 def _quiet(
     measures: FrontMeasures, transmittance: float, pixel: PixelNoise
 ) -> dict[float, dict[str, float]]:
-    """Return the measures of a frame without a laser at each light."""
+    """Return the measures of a frame without a laser, by scene light."""
     return {
         scene_light: quiet_picture(measures, transmittance, scene_light, pixel)
         for scene_light in LIGHTS
@@ -194,7 +195,7 @@ def _quiet(
 def _best_quiet(
     clear: Sequence[Candidate], own: float, pixel: PixelNoise
 ) -> dict[float, dict[str, float]]:
-    """Return the best of each measure over all stops and filters, at each light."""
+    """Return the best value of each measure over all stops and filters, by scene light."""
     values = {}
     for scene_light in LIGHTS:
         leaders = best(clear, own, scene_light, pixel)
@@ -203,10 +204,10 @@ def _best_quiet(
 
 
 def _diameters(bench: FrontBench, own: float) -> list[float]:
-    """Return the relative diameters of stops: a series from the open lens, and the stop that alone
-    protects as wanted.
+    """Return relative stop diameters: a series from the open lens down, and for each level the stop
+    that suffices without a filter.
 
-    The best rival is often a stop without a filter, so that each wanted protection has such a stop.
+    The best rival is often a stop without a filter, so that each level needs such a stop.
     """
     stops_alone = {_stop_alone(bench, level) for level in (own, *LEVELS)}
     series = {
@@ -216,9 +217,9 @@ def _diameters(bench: FrontBench, own: float) -> list[float]:
 
 
 def _stop_alone(bench: FrontBench, level: float) -> float:
-    """Return the diameter of the stop whose peak, or heat, is ``level`` without a filter."""
+    """Return the diameter of the stop that brings peak or heat to ``level`` without a filter."""
     if bench.settings.dwell is not None:
-        # the heat of a spot goes with the third power of the diameter
+        # the heat of a spot is proportional to the third power of the diameter
         return math.pow(level, 1 / 3)
     small_psf = bench.camera.psf(False, 1.0, bench.camera.laser_bands, shape=_SMALL_PSF)
     return float(metrics.stop_diameter(small_psf, level).min())
@@ -231,8 +232,8 @@ def _rivals(
     pixel: PixelNoise,
     stops: Mapping[float, Rival],
 ) -> dict[str, Rival]:
-    """Return the rivals whose protection is that of the mask alone, and the open lens, which
-    protects nothing.
+    """Return the rivals with the protection of the mask alone, and the open lens without
+    protection.
     """
     # the smallest stop that does not protect more than the mask
     stop_alone = min(
@@ -259,8 +260,8 @@ def _drawn_gains(
     pixel: PixelNoise,
     progress: Callable[[str], None],
 ) -> dict[float, dict[str, list[float]]]:
-    """Return the gain of the mask in each draw; mask, stop and filter are chosen before, at the
-    usual condition: the best of both at each light, ``pairs``.
+    """Return the gain of the mask in each draw; ``pairs`` has the best front with and without the
+    mask at each light, chosen at the usual condition.
     """
 
     def value(rival: Rival, condition: Condition, n: float, measure: str) -> float:
@@ -288,10 +289,10 @@ def _attacks(
     pixel: PixelNoise,
     progress: Callable[[str], None],
 ) -> tuple[dict[str, dict[str, list[list[float]]]], dict[str, list[float]]]:
-    """Return what is left of the picture under attack, in each draw.
+    """Return the quality of the picture under attack, in each draw.
 
-    The first maps each rival to error, information and share of seen pixels (draw, strength), the
-    second to the strength at which half of its information is lost (draw,).
+    The first result maps each rival to error, information and share of unsaturated pixels (draw,
+    strength), the second to the strength at which half of its information is lost (draw,).
     """
     names = [name for name in rivals if name != "notch"]
     attack: dict[str, dict[str, list[list[float]]]] = {
@@ -301,7 +302,7 @@ def _attacks(
     for number, condition in enumerate(conditions, 1):
         for name in names:
             measures = candidate(rivals[name].front, condition).found
-            # the field of the recipe; wider ones are for a laser on the axis
+            # the field of the recipe; wider ones are only for a laser on the axis
             field_side = min(measures.glare)
             under_attack = attacked_picture(
                 measures.spectrum,
@@ -313,7 +314,7 @@ def _attacks(
             )
             for quantity, values in under_attack._asdict().items():
                 attack[name][quantity].append(values.tolist())
-            # from dB to bits a pixel
+            # convert dB to bits per pixel
             quiet_bits = 10 ** (
                 quiet_picture(measures, rivals[name].transmittance, ATTACKED_AT, pixel)[
                     "information"
@@ -328,8 +329,8 @@ def _attacks(
 
 
 def _crossing(share: Sequence[float]) -> float:
-    """Return the strength at which a share of information falls below `_LOST_SHARE`, from the first
-    to the last strength.
+    """Return the strength at which the share of information falls below `_LOST_SHARE`, limited to
+    the range of `STRENGTHS`.
     """
     if share[0] < _LOST_SHARE:
         return float(STRENGTHS[0])
@@ -346,8 +347,8 @@ def _crossing(share: Sequence[float]) -> float:
 def _fields(
     rivals: Mapping[str, Rival], measured: Mapping[str, Candidate], pixel: PixelNoise
 ) -> dict[str, dict[int, list[float]]]:
-    """Return the share of pixels that are not full, by rival and by side of the field, for each
-    strength.
+    """Return the share of unsaturated pixels for each strength, by rival and by side length of the
+    field.
     """
     shares: dict[str, dict[int, list[float]]] = {}
     for name, rival in rivals.items():
@@ -369,11 +370,11 @@ def _bounds(
     bench: FrontBench, pixel: PixelNoise
 ) -> tuple[dict[float, tuple[float, float]], dict[float, float]]:
     """Return gain and bound of the mean NEQ over the lens band at the middle wavelength, and the
-    forbidding glare.
+    glare above which no mask wins.
     """
     bands = bench.camera.bands
     middle_band = len(bands.centres) // 2
-    # the one middle band
+    # only the middle band
     psf = bench.camera.psf(
         True, 1.0, type(bands)(*(values[middle_band : middle_band + 1] for values in bands))
     )

@@ -1,4 +1,4 @@
-"""The recipe that restores a frame: a camera, and the frames that a user names."""
+"""The recipe that restores a frame, from a camera and the frames given by a user."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from neusee.workflows.recipe.text.yaml_values import Value, read
 
 # --- frame files ----------------------------------------------------------------------------------
 
-# The files of the frames that a user names: single files, or all frames of a folder.
+# The frame files given by a user: single files, or all frames in a folder.
 
 
 def named_frames(words: Iterable[str], folder: Path) -> list[Path]:
-    """Return the absolute paths of frames; a folder stands for its frames, sorted by name.
+    """Return the absolute paths of frames; a folder is replaced by its frames, sorted by name.
 
-    Raises `RecipeError` with every word that is no file, no folder, or a folder without frames.
+    Raises `RecipeError` with every argument that is no file, no folder, or a folder without frames.
     """
     paths, problems = list[Path](), list[Diagnostic]()
     for number, word in enumerate(words, 1):
@@ -41,9 +41,9 @@ def named_frames(words: Iterable[str], folder: Path) -> list[Path]:
 
 
 def _named(path: Path) -> Iterator[Path]:
-    """Yield the frames that a path is.
+    """Yield the frames of a path.
 
-    A file is one, a folder stands for the frames in it, sorted by name.
+    A file is a frame; a folder yields the frames in it, sorted by name.
     """
     if path.is_file():
         yield path
@@ -55,7 +55,7 @@ def _named(path: Path) -> Iterator[Path]:
 
 
 def _absent(path: Path) -> str:
-    """Return why a path gives no frame."""
+    """Return the reason why a path gives no frame."""
     if path.is_dir():
         return f"the folder has no frames: give files that end in {', '.join(FRAME_SUFFIXES)}"
     return "no such file or folder: give the path of a frame, or of a folder of frames"
@@ -63,13 +63,14 @@ def _absent(path: Path) -> str:
 
 # --- frame recipes --------------------------------------------------------------------------------
 
-# The recipe that restores a frame: the camera of another recipe or of a sensor file, and the frame
+# The recipe that restores a frame: the camera of another recipe or of a sensor file, with the frame
 # as its picture.
 
 
 OUTPUTS = ("raw[mask]", "developed[mask]", "clipped[mask]", "restored", "restored_spread")
-PLAIN_CAMERA = "first_light"  #: recipe around a sensor file, with a plain lens
-_SCENE = ("scene", "cube")  #: steps of the groups `scene` and `lift`, which a frame does not need
+PLAIN_CAMERA = "first_light"  #: recipe for a sensor file, with a plain lens
+#: steps of the groups `scene` and `lift`, which a measured frame does not need
+_SCENE = ("scene", "cube")
 _DROPPED = ("rival", "damage", "safety")  #: groups that compare or judge a simulated laser
 #: restorers for a measured PSF
 _WITH_PSF = {"restore=measured": "measured", "restore=search": "measured_search"}
@@ -77,7 +78,7 @@ _STEM = re.compile(r"[^\w-]+")
 
 
 class FrameCamera(NamedTuple):
-    """The camera that took frames, in the words of a user; empty for what the user does not say."""
+    """The camera that took the frames, as given by a user; empty for values not given."""
 
     camera: str  #: a recipe, or the file of a sensor group
     mask: str = ""  #: an option of the group `doe`, or the file of a height map
@@ -85,8 +86,8 @@ class FrameCamera(NamedTuple):
 
 
 class _CameraRecipe(NamedTuple):
-    """The recipe of a camera, the folder to which its paths are relative, and the words that
-    choose a sensor, a mask and a PSF.
+    """The recipe of a camera, the base folder of its paths, and the overrides that choose sensor,
+    mask and PSF.
     """
 
     name: str
@@ -99,14 +100,14 @@ def recipes_of(
 ) -> list[Recipe]:
     """Return a checked recipe for each frame.
 
-    ``changes`` are the overrides of the user, numbered from ``first``. Raises `RecipeError` with
-    the mistakes of all frames, each mistake once.
+    ``changes`` are the user's overrides, numbered from ``first``. Raises `RecipeError` with the
+    errors of all frames, each error once.
     """
     camera_recipe = _camera(camera.camera, folder)
     camera_recipe.words.extend(_mask(camera.mask, folder))
     camera_recipe.words.extend(_psf(camera.psf, changes, folder, first))
     frames, recipes, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
-    # the choice of a restorer for a measured PSF is among the words already
+    # the restorer for a measured PSF is already among the overrides
     numbered_changes = [
         (number, text)
         for number, text in enumerate(changes, first)
@@ -125,7 +126,9 @@ def recipes_of(
 def _recipe_of(
     frame: Path, camera: _CameraRecipe, changes: Sequence[tuple[int, str]], folder: Path
 ) -> Recipe:
-    """Return the recipe that restores one frame; ``changes`` are the numbered words of the user."""
+    """Return the recipe that restores one frame; ``changes`` are the numbered overrides of the
+    user.
+    """
     overrides = [
         read_override(text, Location(f"argument {number}", folder=str(folder)))
         for number, text in changes
@@ -133,7 +136,7 @@ def _recipe_of(
     file = _program_word(
         "frame", f"frame.file={_quoted(frame)}", folder, shown_as=str(_near(frame, folder))
     )
-    # the words of the user come last, so that they win
+    # the user's overrides come last, so that they take precedence
     recipe = load(
         camera.name,
         [*_prepared(camera.name, camera.folder, overrides), *camera.words, file, *overrides],
@@ -144,7 +147,7 @@ def _recipe_of(
 
 
 def _camera(camera: str, folder: Path) -> _CameraRecipe:
-    """Return the recipe of a camera, with the words that choose a sensor."""
+    """Return the recipe of a camera, with the overrides that choose a sensor."""
     path = folder / Path(camera).expanduser()
     if (
         not camera.endswith((".yaml", ".yml"))
@@ -169,13 +172,13 @@ def _camera(camera: str, folder: Path) -> _CameraRecipe:
 
 
 def _items(path: Path) -> set[str]:
-    """Return the keys at the top of a YAML file."""
+    """Return the top-level keys of a YAML file."""
     return set(map(str, read(path, path.name).root.items))
 
 
 def _mask(mask: str, folder: Path) -> list[Override]:
-    """Return the words that put a mask, an option of the group `doe` or the file of a height
-    map, into the pupil.
+    """Return the overrides that put a mask into the pupil; ``mask`` is an option of the group `doe`
+    or a height-map file.
     """
     if not mask:
         return []
@@ -192,8 +195,8 @@ def _mask(mask: str, folder: Path) -> list[Override]:
 
 
 def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Override]:
-    """Return the words that measure the PSF from the frames of a folder, in place of the PSF of
-    the recipe.
+    """Return the overrides that replace the PSF of the recipe by one measured from the frames of a
+    folder.
     """
     if not psf:
         return []
@@ -214,14 +217,14 @@ def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Ove
             [replace(problem, mark=Location("--psf")) for problem in error.diagnostics]
         ) from None
     points_text = "points.files=[" + ", ".join(map(_quoted, files)) + "]"
-    # each word, with the text that messages show in its place
+    # (override, text shown in messages instead of it)
     words = [(f"restore={restorer}", ""), ("steps.level.from.psf=measured", ""), (points_text, psf)]
     return [_program_word("--psf", word, folder, shown_as) for word, shown_as in words]
 
 
 def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
-    """Return the words that turn a recipe of a camera into one that restores: no scene, no
-    laser, other outputs.
+    """Return the overrides that turn a camera recipe into one for restoration: no scene, no laser,
+    other outputs.
     """
     composed_recipe = compose(name, (), base)
     root, groups = composed_recipe.root, set(composed_recipe.groups)
@@ -232,7 +235,7 @@ def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
     if "restore" not in overridden:
         words.append("restore=wiener_blind" if "restore" in groups else "+restore=wiener_blind")
     words += _simulated_steps(root)
-    # expected numbers are those of the simulated scene
+    # expected numbers apply only to the simulated scene
     if "expect" in root.items.keys() - overridden:
         words.append("~expect")
     if "outputs" not in overridden:
@@ -241,37 +244,39 @@ def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
 
 
 def _simulated_steps(root: Value) -> list[str]:
-    """Return the words that keep the steps of the scene to the simulated arm."""
+    """Return the overrides that keep the steps of the scene in the simulated arm."""
     steps = root.items["steps"].items if "steps" in root.items else {}
     return [f"+steps.{step}.each=simulated" for step in _SCENE if step in steps]
 
 
 def _without_scene(groups: Container[str]) -> list[str]:
-    """Return the words that put frames in the place of the camera, and drop the other groups."""
+    """Return the overrides that put frames in place of the camera, and remove groups for simulated
+    lasers.
+    """
     words = ["camera=frame"] if "camera" in groups else []
     return [*words, *(f"~{group}" for group in _DROPPED if group in groups)]
 
 
 def _no_laser(groups: Container[str], blocks: Container[str]) -> list[str]:
-    """Return the words that take the lasers out of a recipe."""
+    """Return the overrides that remove the lasers from a recipe."""
     words = ["laser=none"] if "laser" in groups else []
     return [*words, "lasers={}"] if "lasers" in blocks else words
 
 
 def _program_word(where: str, text: str, folder: Path, shown_as: str = "") -> Override:
-    """Return the override of a word that the program itself adds.
+    """Return an override that the program itself adds.
 
-    Messages name `where` as its place, and `shown_as` as its text if given.
+    In messages ``where`` is its place, and ``shown_as`` its text if given.
     """
     override = read_override(text, Location(where, folder=str(folder)))
     return replace(override, text=shown_as) if shown_as else override
 
 
 def _quoted(path: Path) -> str:
-    """Return a path as a YAML text, so that no character of it has a meaning."""
+    """Return a path as a quoted YAML text, so that no character has a special meaning."""
     return "'" + str(path.absolute()).replace("'", "''") + "'"
 
 
 def _near(path: Path, folder: Path) -> Path:
-    """Return a path relative to the folder, if it lies in it."""
+    """Return a path relative to ``folder`` if it is inside it; else unchanged."""
     return path.relative_to(folder) if path.is_relative_to(folder) else path

@@ -25,42 +25,43 @@ if TYPE_CHECKING:
 
 # --- damage pattern -------------------------------------------------------------------------------
 
-# Pattern of damage on the sensor: the spot of a laser over the limit of damage, behind lens and
-# mask.
+# Exposure in the spot of a laser, behind lens and mask, divided by the damage limit of the sensor.
 
 
-#: protection by the name of its spot in the settings
+#: name of each protection, by the key of its spot in the settings
 OPTIONS = {"plain": "plain lens", "mask": "mask"}
-#: of the peak; a picture ends where the spot is fainter everywhere, by how strong it is
+#: fractions of the peak: a picture is cut where the spot is fainter than this on all sides; the
+#: fraction used lies between the two and depends on the ratio of exposure to limit
 _FAINT, _DIM = 1e-4, 0.03
 _LEAST_HALF_SAMPLES = 12  #: samples from the peak to each edge of a picture, at least
 
 
 @dataclass(frozen=True)
 class Spot:
-    """The spot of a laser behind one protection, of which the brightest sample is 1."""
+    """The spot (PSF) of a laser behind one protection, normalised to a brightest sample of 1."""
 
     option: str
     light: FloatArray  #: (y, x)
     pitch: float  #: m
-    heated: float  #: m, 1/e2 diameter of the Gaussian spot of equal peak that heats as much or more
+    heated: float  #: m, 1/e2 diameter of a Gaussian spot of equal peak that heats at least as much
 
 
 @dataclass(frozen=True)
 class DamagePattern:
-    """The spot of a laser over the limit of one kind of damage."""
+    """The exposure in the spot of a laser, divided by the limit of one kind of damage."""
 
     option: str
     limit: str
-    ratio: FloatArray  #: (y, x) exposure over limit, cut to what is bright
-    width: float  #: m, of the cut
+    ratio: FloatArray  #: (y, x) exposure over limit, cropped to the bright part of the spot
+    width: float  #: m, of the cropped picture
     peak: float
-    area: float  #: um2 in which the limit is exceeded, in the whole window
+    #: um2, area where the limit is exceeded, in the whole window and not only the cropped part
+    area: float
 
 
 def spots_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Spot, ...]:
-    """Return the spots that the settings name; raise `RecipeError` for a step that does not
-    exist.
+    """Return the spots of the steps named in the settings; raise `RecipeError` for a step that does
+    not exist.
     """
     named_steps = {
         name: step for name, step in safety.settings.protection.spots if step is not None
@@ -77,8 +78,8 @@ def spots_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Spot,
 
 
 def step_of(recipe: Recipe, safety: Safety, setting: str, step: str, arm: str) -> str:
-    """Return the name of a step, completed by the arm and the laser if the step has copies for
-    these.
+    """Return the full name of a step, which may end in the protection and the laser, as in
+    ``psf[mask,pointer]``.
 
     Raises `RecipeError` at the setting for a step that does not exist.
     """
@@ -92,18 +93,18 @@ def step_of(recipe: Recipe, safety: Safety, setting: str, step: str, arm: str) -
 
 
 def _spot(option: str, intensity: FloatArray, params: Mapping[str, float]) -> Spot:
-    """Return the spot of a PSF (band, y, x), summed over bands; ``params`` has its pixel pitch in
-    m.
+    """Return the spot of a PSF (band, y, x), summed over its bands; ``params["pixel_pitch"]`` is
+    the pitch of its samples in m.
     """
     light, pitch = np.asarray(intensity, np.float64).sum(0), params["pixel_pitch"]
-    # light that the window lacks heats as well
+    # light outside the window heats the sensor too
     heated = heated_spot(torch.from_numpy(light), pitch, lost=max(0.0, 1 - float(light.sum())))
     return Spot(option, light / light.max(), pitch, heated or 0.0)
 
 
 def with_heated_spots(options: Sequence[Option], spots: Sequence[Spot]) -> tuple[Option, ...]:
-    """Return the options, of which masked ones know how much wider their heated spot is than
-    that of the clear lens.
+    """Return the options; each option with a mask also gets the width of its heated spot relative
+    to that of the clear lens.
     """
     heated = {spot.option: spot.heated for spot in spots}
     plain_width, mask_width = heated.get(OPTIONS["plain"]), heated.get(OPTIONS["mask"])
@@ -116,8 +117,8 @@ def with_heated_spots(options: Sequence[Option], spots: Sequence[Spot]) -> tuple
 
 
 def damage_patterns(spots: Sequence[Spot], findings: Sequence[Finding]) -> Iterator[DamagePattern]:
-    """Yield the pattern of the most sensitive kind of damage behind each protection whose spot
-    is known.
+    """Yield, for each protection whose spot is known, the pattern of the kind of damage with the
+    largest ratio of exposure to limit.
     """
     for spot in spots:
         damage_findings = [
@@ -130,7 +131,7 @@ def damage_patterns(spots: Sequence[Spot], findings: Sequence[Finding]) -> Itera
         worst_finding = max(damage_findings, key=lambda finding: finding.ratio)
         ratio = spot.light * worst_finding.ratio
         area = float((ratio >= 1).sum()) * (spot.pitch * 1e6) ** 2
-        # show a tenth of the limit, unless that is too faint or too much of the spot
+        # crop where the exposure is a tenth of the limit, within `_FAINT` and `_DIM` of the peak
         bright_part = _cut(spot.light, max(_FAINT, min(_DIM, 0.1 / worst_finding.ratio)))
         width = bright_part.shape[0] * spot.pitch
         yield DamagePattern(
@@ -144,8 +145,8 @@ def damage_patterns(spots: Sequence[Spot], findings: Sequence[Finding]) -> Itera
 
 
 def _cut(light: FloatArray, faint: float) -> FloatArray:
-    """Return the square around the middle of the window that holds everything brighter than
-    ``faint``.
+    """Return the smallest square around the centre of the window that contains every sample
+    brighter than ``faint``.
     """
     middle = np.array(light.shape) // 2
     bright = np.argwhere(light >= faint)
@@ -163,26 +164,28 @@ def _cut(light: FloatArray, faint: float) -> FloatArray:
 _LEAST_HALF_PIXELS, _MOST_HALF_PIXELS = (
     24,
     200,
-)  #: pixels from the spot to each edge of a picture, at least and at most
+)  #: least and greatest number of pixels from the spot to each edge of a picture
 _WHITE, _GREY = 1000, 400  #: DN of a white pixel and of the evenly grey scene in the drawn frame
 
 
 @dataclass(frozen=True)
 class DeadPixels:
-    """A part of the raw frame after the laser has hit the median device, around the spot."""
+    """The part of a raw frame around the spot, after the laser has damaged the median device."""
 
     option: str
     distance: float  #: m
-    kinds: tuple[str, ...]  #: of damage that is reached
-    pixels: int  #: that the light itself damages, without the lines and frames that go with them
-    frame: FloatArray  #: (y, x) from 0 to 1; of a lost frame, what else is damaged, or all black
+    kinds: tuple[str, ...]  #: kinds of damage that occur
+    #: pixels that the light itself damages, without the lines and frames lost with them
+    pixels: int
+    #: (y, x) from 0 to 1; for a lost frame: the other damage, or all black if there is none
+    frame: FloatArray
 
 
 def damaged_frames(
     safety: Safety, spots: Sequence[Spot], findings: Sequence[Finding], exposures: Exposures
 ) -> Iterator[DeadPixels]:
-    """Yield the frame behind each protection whose spot is known, at one distance for all; none if
-    nothing is damaged.
+    """Yield an example of a damaged frame behind each protection whose spot is known, all at one
+    distance; nothing if no damage occurs.
 
     The distance is that of the recipe if the laser damages the median device there behind the plain
     lens, else the largest at which it does.
@@ -195,7 +198,7 @@ def damaged_frames(
     index = index_here if index_here in reached else max(reached)
     pitch = safety.settings.sensor.pixel_pitch
     for spot in spots:
-        if spot.pitch > pitch:  # samples that miss pixels say nothing of them
+        if spot.pitch > pitch:  # samples coarser than the pixels would skip some of them
             continue
         damage_places = _hit(spot, pitch, damage, exposures, index)
         yield _frame(
@@ -210,8 +213,8 @@ def damaged_frames(
 def _hit(
     spot: Spot, pitch: float, damage: Sequence[Finding], exposures: Exposures, index: int
 ) -> list[tuple[str, FloatArray]]:
-    """Return the kinds of damage that are reached behind one protection at a distance, with the
-    places of each.
+    """Return the kinds of damage that occur behind one protection at a distance, and the damaged
+    pixels of each kind.
     """
     findings_behind = [finding for finding in damage if finding.option == spot.option]
     pixels_of_findings = [
@@ -226,7 +229,9 @@ def _hit(
 
 
 def _half_width(hit: Sequence[tuple[str, FloatArray]]) -> int:
-    """Return the pixels from the spot to each edge of a picture that holds all damaged places."""
+    """Return the number of pixels from the spot to each edge of a picture that contains all damaged
+    pixels.
+    """
     farthest = max((np.abs(places).max() for _, places in hit), default=0)
     # half as far again, within the limits of a picture
     return int(np.clip(farthest * 3 // 2, _LEAST_HALF_PIXELS, _MOST_HALF_PIXELS))
@@ -242,7 +247,9 @@ def _reached(damage: Sequence[Finding], exposures: Exposures) -> set[int]:
 
 
 def _ratio(finding: Finding, exposures: Exposures) -> FloatArray:
-    """Return the nominal exposure over the limit of the median device (distance,)."""
+    """Return the nominal exposure divided by the limit of the median device, at each distance
+    (distance,).
+    """
     emitted = exposures.emitted(finding.limit.quantity)[0]
     # `curve[0]` is the nominal limit at the lens
     ratio: FloatArray = emitted * exposures.lens[0] / finding.curve[0]
@@ -250,8 +257,8 @@ def _ratio(finding: Finding, exposures: Exposures) -> FloatArray:
 
 
 def _above(spot: Spot, pitch: float, ratio: float) -> FloatArray:
-    """Return the places (pixel, (y, x)) from the spot of the pixels in which a sample exceeds
-    the limit.
+    """Return the pixels, as offsets (pixel, (y, x)) from the spot, in which at least one sample
+    exceeds the limit.
     """
     middle = np.array(spot.light.shape) // 2
     samples = np.argwhere(spot.light * ratio >= 1) - middle
@@ -289,16 +296,16 @@ def _frame(
 
 # --- lens of recipe -------------------------------------------------------------------------------
 
-# The lens of an estimate against the lens of the recipe's steps: what masks and spots are computed
-# for.
+# Compare the lens of an estimate with the lens in the steps of the recipe, for which masks and
+# spots are computed.
 
 
 _SAME = 1e-6  #: relative difference of two lengths that counts as rounding
 
 
 def refuse_other_lens(recipe: Recipe, safety: Safety, store: Store | None) -> None:
-    """Raise `RecipeError` where the steps of the recipe have another lens than the estimate, or a
-    smaller stop.
+    """Raise `RecipeError` where the recipe's steps and the estimate have different lenses, or where
+    the stop of the protection is wider than the lens.
 
     The stop is the step that the settings name, and each stop on which a named step depends.
     """
@@ -344,13 +351,13 @@ def refuse_other_lens(recipe: Recipe, safety: Safety, store: Store | None) -> No
 
 
 def _named_stop(recipe: Recipe, safety: Safety) -> Iterator[str]:
-    """Yield the step of the stop that the settings name."""
+    """Yield the name of the stop's step, if the settings name one."""
     if safety.settings.lens.stop is not None:
         yield step_of(recipe, safety, "lens.stop", safety.settings.lens.stop, "")
 
 
 def _other_focal_length(recipe: Recipe, safety: Safety) -> Iterator[Diagnostic]:
-    """Yield the mistake of a named step whose PSF has another focal length than the lens of the
+    """Yield an error for the first step whose PSF has another focal length than the lens of the
     estimate.
     """
     focal_length = safety.settings.lens.focal_length
@@ -366,8 +373,8 @@ def _other_focal_length(recipe: Recipe, safety: Safety) -> Iterator[Diagnostic]:
 
 
 def _upstream(recipe: Recipe, safety: Safety, node: str) -> list[str]:
-    """Return the steps of a node on which the steps that the settings of the protection name
-    depend.
+    """Return the names of the steps of a node that lie upstream of the steps named in the settings
+    of the protection.
     """
     waiting, visited = list(_named_steps(recipe, safety)), set[str]()
     while waiting:
@@ -379,7 +386,7 @@ def _upstream(recipe: Recipe, safety: Safety, node: str) -> list[str]:
 
 
 def _named_steps(recipe: Recipe, safety: Safety) -> Iterator[str]:
-    """Yield each step that the settings of the protection name."""
+    """Yield the name of each step that the settings of the protection refer to."""
     protection = safety.settings.protection
     if protection.mask is not None:
         yield step_of(recipe, safety, "protection.mask", protection.mask, "mask")
@@ -390,6 +397,6 @@ def _named_steps(recipe: Recipe, safety: Safety) -> Iterator[str]:
 
 
 def _problem(safety: Safety, setting: str, text: str) -> Diagnostic:
-    """Return a mistake at the place where a setting is written."""
+    """Return an error located where the recipe states the setting."""
     value = safety.values[setting]
     return Diagnostic(value.mark, value.name, text)

@@ -1,5 +1,5 @@
-"""The dazzled area behind each protection over the distance: a clear round lens by its integral,
-a mask by its PSFs.
+"""The dazzled area behind each protection as a function of distance: for a clear round lens by an
+integral over its pupil, for a mask from its PSFs.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ from neusee.workflows.safety.exposures import (
 )
 from neusee.workflows.safety.laser_spots import Grid, Levels, Ranked, Veil, levels_of, veil_of
 
-_RANKS = 80  #: numbers of pixels at which levels are computed
-_STEP, _WAVES = 0.3, 0.25  #: of the ladder of a clear round lens
-_MIDDLE_PIXELS = 16.0  #: pixels of a wide spot that turn bright and dark together with its middle
+_RANKS = 80  #: how many ranks (numbers of pixels) have a computed level
+#: steps of the distances for a clear round lens: relative, and in waves of defocus
+_STEP, _WAVES = 0.3, 0.25
+_MIDDLE_PIXELS = 16.0  #: so many pixels turn bright and dark together at the centre of a wide spot
 _IN_FOCUS_WAVES = 0.1  #: waves below which a change of the defocus does not change the spot
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
@@ -44,8 +45,8 @@ class Area:
 
     @property
     def ranks(self) -> FloatArray:
-        """Return the numbers of pixels at which levels are known, the one that the settings ask
-        for among them.
+        """Return the ranks (numbers of pixels) at which levels are computed; `asked` is one of
+        them.
         """
         rows, columns = self.safety.settings.sensor.shape
         return np.unique(np.append(np.geomspace(1, rows * columns, _RANKS), self.asked))
@@ -57,13 +58,13 @@ class Area:
         return max(1.0, (dazzle.share if dazzle else 1.0) * rows * columns)
 
     def level(self, exposures: Exposures, draws: SettingDraws, veiled: bool) -> FloatArray:
-        """Return the light (1 + draw or 1, distance) of the faintest of the pixels that may be
-        lost.
+        """Return the light (1 + draw or 1, distance) in the faintest of the N brightest pixels,
+        where N pixels may be lost.
 
         It is a share of the light that passes the lens.
         """
         levels, log_distance, grid_values = self._table(exposures, draws, veiled)
-        # the level of the asked number of pixels alone
+        # only the level at the rank `asked`
         rank_index = int(np.searchsorted(self.ranks, self.asked))
         faintest_share: FloatArray = np.exp(
             levels.at(log_distance, grid_values, slice(rank_index, rank_index + 1))[..., 0]
@@ -71,8 +72,8 @@ class Area:
         return faintest_share
 
     def beyond(self, exposures: Exposures, draws: SettingDraws) -> float:
-        """Return the largest share of the lost pixels that lie beyond the window of a PSF, over
-        all distances.
+        """Return the share of the lost pixels that lie outside the window of a PSF, the maximum
+        over draws and distances.
         """
         table, _, _ = self._table(exposures, draws, veiled=False)
         return float(table.beyond[..., int(np.searchsorted(self.ranks, self.asked))].max())
@@ -80,7 +81,7 @@ class Area:
     def saturated(
         self, exposures: Exposures, draws: SettingDraws, index: int, light: FloatArray
     ) -> FloatArray:
-        """Return the number of pixels with at least each light at one distance.
+        """Return the number of pixels at one distance whose light is at least ``light``.
 
         ``light`` (1 + draw or 1, any) is the share of the light that passes the lens.
         """
@@ -104,8 +105,8 @@ class Area:
     def _table(
         self, exposures: Exposures, draws: SettingDraws, veiled: bool
     ) -> tuple[Levels, FloatArray, list[FloatArray]]:
-        """Return the levels, and where draws and distances lie among them; both are kept with the
-        exposures.
+        """Return the levels, and the coordinates of draws and distances in their grids; both are
+        cached in the exposures.
 
         The second is the logarithm of the distance at which the nominal beam is as wide, the third
         are the values along the grids of the levels; all are (1 + draw or 1, distance).
@@ -134,13 +135,11 @@ class Area:
 
     @property
     def _diameter(self) -> float:
-        """Return the diameter in m of the lens with its stop."""
+        """Return the diameter in m of the lens, limited by its stop."""
         return min(self.option.diameter or math.inf, self.safety.settings.lens.diameter)
 
     def _round_spots(self, exposures: Exposures, draws: SettingDraws) -> _RoundSpots:
-        """Return the spots of a clear round lens; they are kept with the exposures, for each
-        diameter.
-        """
+        """Return the spots of a clear round lens, cached in the exposures by diameter."""
         key = "round spots", self._diameter
         if key not in exposures.tables:
             exposures.tables[key] = _round_spots(self, exposures, draws)
@@ -150,15 +149,16 @@ class Area:
 
 @dataclass(frozen=True)
 class _RoundSpots:
-    """The spots of a clear round lens over distance, defocus and size, and where draws and
-    distances lie among them.
+    """The spots of a clear round lens on a grid of distance, defocus and size, and the coordinates
+    of draws and distances on that grid.
     """
 
     rungs: FloatArray  #: (rung,) m
-    #: of the defocus beside the nominal one, and of the logarithm of the size in pixels
+    #: grids of the difference from the nominal defocus (as asinh), and of the logarithm of the size
+    #: in pixels
     grids: tuple[Grid, Grid]
-    #: at each rung and each point of the grids, the last of which runs fastest: spots of one phase,
-    #: or of several
+    #: spots at each rung and each grid point (the last grid runs fastest): of one phase, or of
+    #: several
     groups: tuple[tuple[BrightPixels, ...], ...]
     #: (1 + draw or 1, distance) logarithm of the distance at which the nominal beam is as wide
     place: FloatArray
@@ -167,8 +167,8 @@ class _RoundSpots:
 
 
 def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _RoundSpots:
-    """Return the spots of a clear round lens, by the integral over its pupil at each rung and each
-    point of the grids.
+    """Return the spots of a clear round lens, by the integral over its pupil, at each rung and each
+    grid point.
     """
     lens, sensor, dazzle = (
         area.safety.settings.lens,
@@ -177,7 +177,7 @@ def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _Roun
     )
     option_name, diameter = area.option.name, area._diameter
     beam_radii = diameter / (2 * np.sqrt(exposures.fill[option_name]))
-    # the narrowest beam drawn, so that every radius has a distance
+    # a waist no wider than any drawn beam, so that every radius is reached at some distance
     waist = min(*(beam.waist for beam in exposures.beams), float(beam_radii.min()))
     beam = exposures.beams[0]._replace(waist=waist)
     log_distance = np.log(as_wide(beam, beam_radii))
@@ -211,8 +211,8 @@ def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _Roun
 
 
 def _phases(waves: float) -> list[float]:
-    """Return the defoci whose brightest pixels bound those of a spot: itself, or one wave of them
-    where it oscillates.
+    """Return the defoci (in waves) to evaluate: the given one, or four within one wave where the
+    centre of the spot oscillates.
 
     With each wave of defocus the middle of a wide spot turns from bright to dark, faster than the
     rungs follow.
@@ -223,8 +223,8 @@ def _phases(waves: float) -> list[float]:
 
 
 def _number(levels: FloatArray, ranks: FloatArray, light: FloatArray) -> FloatArray:
-    """Return the number of pixels with at least each light, from the logarithms of the levels of
-    rising ranks.
+    """Return the number of pixels whose light is at least each value of ``light``; ``levels`` are
+    logarithms, falling with rank.
     """
     log_light = np.log(np.maximum(light, 1e-300))
     pixel_number = np.exp(np.interp(log_light, levels[::-1], np.log(ranks)[::-1]))
@@ -232,7 +232,9 @@ def _number(levels: FloatArray, ranks: FloatArray, light: FloatArray) -> FloatAr
 
 
 def _defocus(safety: Safety, beam: Beam, diameter: float) -> Callable[[FloatArray], FloatArray]:
-    """Return the waves of defocus over the distance of a nominal beam behind an aperture."""
+    """Return a function of distance that gives the waves of defocus of the nominal beam behind an
+    aperture.
+    """
     lens = safety.settings.lens
     if lens.focus == "laser":
         return np.zeros_like
@@ -263,7 +265,7 @@ def _spreads(safety: Safety, draws: SettingDraws, diameter: float) -> FloatArray
 def _of_clear(
     area: Area, spots: _RoundSpots, veil: Veil | None, share: FloatArray, veiled: bool
 ) -> Levels:
-    """Return the levels of a clear round lens, from its spots."""
+    """Return the levels behind a clear round lens, from its spots."""
     share_grid, shape = Grid.around(share, 2), area.safety.settings.sensor.shape
 
     def brightest(phases: Sequence[BrightPixels]) -> tuple[FloatArray, FloatArray]:
@@ -273,7 +275,8 @@ def _of_clear(
         ]
         values, beyond = phase_levels[0]
         return (
-            # the few brightest pixels turn with the phase: the brightest of all phases counts
+            # the few brightest pixels change with the phase of the defocus: take the brightest of
+            # all phases
             np.where(
                 area.ranks <= _MIDDLE_PIXELS,
                 np.max([value for value, _ in phase_levels], axis=0),
@@ -304,11 +307,11 @@ def _of_spots(area: Area, veil: Veil | None, share: FloatArray, veiled: bool) ->
     misses = area.ranked.misses
     return Levels(
         rungs, (share_grid,), values, beyond, most=-np.log(area.ranks), misses=misses
-    )  # N pixels share all light at most
+    )  # nearer than the first rung: N pixels share at most all the light
 
 
 def area_of(safety: Safety, option: Option, ranked: Sequence[Ranked]) -> Area | str:
-    """Return the dazzled area behind an option, or the reason why it is not known."""
+    """Return the dazzled area behind an option, or a text that says why the area is not known."""
     arms = {spot.arm: spot for spot in ranked}
     if option.masked:
         if "mask" not in arms:

@@ -1,4 +1,4 @@
-"""Limits of exposure of sensor and eye, and how far a laser exceeds them."""
+"""Exposure limits of sensor and eye, and the ratio of the laser's exposure to them."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ from neusee.workflows.store.result_store import Store
 
 # --- first channel --------------------------------------------------------------------------------
 
-# The colour channel that a laser saturates first, from the responses that a step of the recipe
-# computes.
+# The colour channel that a laser saturates first, from the spectral responses that a step of the
+# recipe computes.
 
 
 _SETTING = "sensor.responses"
 _LINE, _RESPONSES = "spectra.line", "spectra.responses"  #: nodes of the two steps
-_UNSEEN = 1e-3  #: relative response below which no channel counts as seeing a laser
+_UNSEEN = 1e-3  #: relative response below which a channel counts as insensitive to a laser
 
 
 def with_channels(recipe: Recipe, safety: Safety, store: Store | None) -> Safety:
-    """Return the settings with the channels of the sensor at the laser, where the settings name a
-    step of responses.
+    """Return the settings with the channels' responses at the laser, if the settings name a step of
+    responses.
 
     Raises `RecipeError` for a step that does not exist or is of another node.
     """
@@ -78,8 +78,8 @@ def with_channels(recipe: Recipe, safety: Safety, store: Store | None) -> Safety
 
 
 def _step(recipe: Recipe, safety: Safety, named: str) -> Step:
-    """Return the step of responses that the settings name, with the name of the laser added if the
-    step has a copy for each laser.
+    """Return the step of responses named in the settings; a step with a copy for each laser has the
+    laser in its name.
     """
     name = next(
         (
@@ -100,27 +100,27 @@ def _step(recipe: Recipe, safety: Safety, named: str) -> Step:
 
 
 def _refused(safety: Safety, text: str) -> RecipeError:
-    """Return the error of a setting of responses, at its place in the recipe."""
+    """Return an error located at the recipe's setting of the responses."""
     value = safety.values[_SETTING]
     return RecipeError([Diagnostic(value.mark, value.name, text)])
 
 
 def sees(channels: LaserChannels | None) -> bool:
-    """Return True unless the responses are known and no channel sees the laser."""
+    """Return True unless the responses are known and no channel responds to the laser."""
     return channels is None or channels.largest >= _UNSEEN
 
 
 def channel_saturation(
     channels: LaserChannels, wavelength: float, electrons: float, sensor: Mapping[str, float]
 ) -> float:
-    """Return the irradiance in W/m2 at which the channel that saturates first is full, for a laser
-    of a wavelength.
+    """Return the irradiance in W/m2 at which the most responsive channel saturates, for a laser of
+    a given wavelength.
 
     ``sensor`` has the quantum efficiency, the pixel pitch and the exposure.
     """
     laser_bands: Bands = channels.line.node(**{**channels.line.params, "wavelength": wavelength})
     params = {**channels.responses.params}
-    if params.get("quantum_efficiency") is not None:  # what an absolute table is relative to
+    if params.get("quantum_efficiency") is not None:  # an absolute table is divided by this value
         params["quantum_efficiency"] = sensor["quantum_efficiency"]
     return line_saturation(
         laser_bands, channels.responses.node(laser_bands, **params), electrons=electrons, **sensor
@@ -129,14 +129,15 @@ def channel_saturation(
 
 # --- sensor limits --------------------------------------------------------------------------------
 
-# Limits of exposure at the peak on the sensor: published and own thresholds of damage, and the
-# onset of dazzle.
+# Limits of exposure at the peak on the sensor: published and user-supplied damage thresholds, and
+# the onset of dazzle.
 
 
 _THIRD = 0.4307  #: quantile of the standard normal distribution at 2/3
-#: stream of draws of the ends of brackets: all thresholds of one draw are at the same end
+#: stream of random numbers that picks the lower end, middle or upper end of brackets: all
+#: thresholds of one draw are at the same end
 _BRACKET = 999_983
-#: of a sensor, that may be drawn
+#: sensor values that may be uncertain
 _FACTS = ("full_well", "offset", "quantum_efficiency", "exposure", "pixel_pitch")
 Quantity = Literal["irradiance", "fluence"]
 _COUNTED = (
@@ -148,8 +149,8 @@ _ROUND = "integral over a clear round pupil at each distance (nodes.laser.round_
 
 @dataclass(frozen=True)
 class Limit:
-    """A limit of the exposure at the peak on the sensor, in W/m2 or J/m2, with draws of all that
-    is uncertain in it.
+    """A limit of the exposure at the peak on the sensor, in W/m2 or J/m2, with draws of its
+    uncertainty.
     """
 
     name: str
@@ -162,7 +163,8 @@ class Limit:
     source: str
     note: str = ""
     kind: str = ""  #: of damage, such as point; empty for dazzle
-    part: str = ""  #: of the light that the limit judges: pulse, mean, accumulation or incubation
+    #: part of the light that the limit judges: pulse, mean, accumulation or incubation
+    part: str = ""
     open_below: bool = False  #: whether nothing is known of exposures below the limit
     reason: str = ""  #: why nothing is known of them
 
@@ -170,7 +172,7 @@ class Limit:
 def damage_limits(
     safety: Safety, option: Option, exposures: Exposures, draws: SettingDraws
 ) -> Iterator[Limit]:
-    """Yield the limit of each part of the light that a law of damage judges, behind one option."""
+    """Yield a limit for each part of the light that has a damage threshold, behind one option."""
     for damage_part in limit_parts(safety, option, exposures, draws):
         if damage_part.threshold is not None:
             yield _damage_limit(damage_part, safety, exposures, draws)
@@ -179,8 +181,8 @@ def damage_limits(
 def limit_parts(
     safety: Safety, option: Option, exposures: Exposures, draws: SettingDraws
 ) -> tuple[DamagePart, ...]:
-    """Return the parts of the light that have a row of their own, judged or not; none if damage is
-    not asked for.
+    """Return the parts of the light that get a row of their own, judged or not; empty if the recipe
+    has no damage settings.
 
     Continuous light has one row, because its pulse, its mean and its accumulation are the same
     light.
@@ -199,14 +201,15 @@ def limit_parts(
 def light_in_time(
     safety: Safety, option: Option, exposures: Exposures, draws: SettingDraws
 ) -> LightInTime:
-    """Return what decides the thresholds of damage behind an option: nominal values first, then
-    each draw.
+    """Return the temporal properties of the light that determine the damage thresholds behind an
+    option: nominal values first, then each draw.
     """
     damage, beams = safety.settings.damage, exposures.beams
     assert damage is not None
     exponent = draws.column("damage.small_spot_exponent", damage.small_spot_exponent)
     spot = _heated(option, exposures)
-    # spots matter only to laws of a known spot that is narrower, or for a bonus
+    # the spot matters only if it is wider than the spot of a published law, or if narrow spots get
+    # a bonus
     spot_without_effect = exponent.max() == 0 and all(
         spot.max() <= law.spot for law in _with_spot(safety)
     )
@@ -221,14 +224,14 @@ def light_in_time(
 
 
 def _with_spot(safety: Safety) -> list[DamageLaw]:
-    """Return the laws of continuous light whose spot is known."""
+    """Return the damage laws of continuous light that state the diameter of their spot."""
     laws = (*safety.laws, *PUBLISHED_DAMAGE)
     return [law for law in laws if law.quantity == "irradiance" and law.spot is not None]
 
 
 def _heated(option: Option, exposures: Exposures) -> FloatArray:
-    """Return the diameter of the heated spot behind an option (1 + draw, distance), for a mask
-    an upper bound of it.
+    """Return the diameter of the heated spot behind an option (1 + draw, distance); an upper bound
+    for a mask.
     """
     spot = exposures.spot[option.name]
     if option.heated is not None:
@@ -237,14 +240,14 @@ def _heated(option: Option, exposures: Exposures) -> FloatArray:
 
 
 def _narrow(values: FloatArray) -> Tensor:
-    """Return a column (1 + draw, 1), or (1, 1) where all draws are alike."""
+    """Return values as a column (1 + draw, 1), or (1, 1) if all draws are equal."""
     alike = bool((values == values[0]).all())
     return torch.from_numpy(np.ascontiguousarray(values[: 1 if alike else None, None]))
 
 
 def _of_beams(values: Sequence[float | None]) -> Tensor | None:
-    """Return a quantity of the nominal beam and of each draw as a column; None for a beam
-    without it.
+    """Return a quantity of the nominal beam and of each draw as a column; None if the beam lacks
+    it.
     """
     return None if values[0] is None else _narrow(np.array(values, np.float64))
 
@@ -252,8 +255,8 @@ def _of_beams(values: Sequence[float | None]) -> Tensor | None:
 def _damage_limit(
     damage_part: DamagePart, safety: Safety, exposures: Exposures, draws: SettingDraws
 ) -> Limit:
-    """Return the limit of one part of the light, with draws of its bracket, or of devices and
-    medians.
+    """Return the limit of one part of the light, with draws of its bracket, or of its median and of
+    the device.
 
     A third of the draws each is at the lower end of a bracket, in its middle and at its upper end.
     """
@@ -298,8 +301,8 @@ def _damage_limit(
 
 
 def _limit_name(damage_part: DamagePart) -> str:
-    """Return the name of the limit of a part of the light; the first damage, a point, is not
-    named.
+    """Return the name of the limit of a part of the light; the kind of damage is added unless it is
+    a point, the first damage.
     """
     return f"damage: {damage_part.part}" + (
         "" if damage_part.kind == "point" else f", {damage_part.kind}"
@@ -309,8 +312,8 @@ def _limit_name(damage_part: DamagePart) -> str:
 def _stated_as(
     damage_part: DamagePart, exposures: Exposures, safety: Safety, draws: SettingDraws
 ) -> tuple[Quantity, FloatArray]:
-    """Return the quantity of a limit, and the factor that makes it a limit of the emitted power or
-    pulse energy.
+    """Return the quantity of a limit, and the factor that turns its threshold into a limit of
+    emitted power or pulse energy.
 
     The mean of a train that has several pulses in the dwell time is a mean power. With one pulse in
     the dwell time, the mean is a limit of the energy of this pulse.
@@ -332,9 +335,7 @@ def _stated_as(
 
 
 def _scattered(factor: float | None, draws: SettingDraws, stream: int) -> FloatArray:
-    """Return draws (1 + draw, 1) of a lognormal factor around 1; all are 1 for a factor that is
-    not known.
-    """
+    """Return draws (1 + draw, 1) of a lognormal factor around 1; all 1 if its width is unknown."""
     drawn_factors = np.power(factor or 1.0, draws.normal(stream))
     return np.concatenate([[1.0], drawn_factors])[:, None]
 
@@ -342,8 +343,8 @@ def _scattered(factor: float | None, draws: SettingDraws, stream: int) -> FloatA
 def dazzle_limits(
     safety: Safety, area: Area, draws: SettingDraws, exposures: Exposures
 ) -> Iterator[Limit]:
-    """Yield the limits of saturation and of veil over the share of the picture that may be lost,
-    behind one option.
+    """Yield the limits of saturation and of veiling light behind one option, for the share of the
+    picture that may be lost.
 
     A limit is the exposure at the peak at which the faintest of these pixels is lost, at each
     distance.
@@ -381,17 +382,17 @@ def dazzle_limits(
 
 
 def dazzle_source(safety: Safety, area: Area) -> str:
-    """Return from what the light of the pixels is computed."""
+    """Return a text on how the light of the pixels is computed."""
     return (_ROUND if area.ranked is None else _COUNTED) + (
         _STRAY if safety.settings.lens.scatter else ""
     )
 
 
 def veil_level(dazzle: Dazzle, scene: float = 1.0) -> float:
-    """Return the electrons a pixel of the laser's light above which the feature is lost.
+    """Return the laser light in electrons per pixel above which the feature can no longer be seen.
 
-    ``scene`` is the share of the scene's light that a filter or a stop leaves: the background has
-    as much less.
+    ``scene`` is the share of the scene's light that a filter or a stop transmits; it scales the
+    background.
     """
     background = torch.tensor(dazzle.background * scene, dtype=torch.float64)
     options = {
@@ -403,8 +404,8 @@ def veil_level(dazzle: Dazzle, scene: float = 1.0) -> float:
 
 
 def saturating(safety: Safety, draws: SettingDraws) -> FloatArray:
-    """Return the irradiance in W/m2 that fills a pixel within one exposure, nominal and of each
-    draw (1 + draw,).
+    """Return the irradiance in W/m2 that saturates a pixel within one exposure, (1 + draw,):
+    nominal, then each draw.
 
     It is that of the channel that saturates first, where the settings name a step of responses.
     """
@@ -424,7 +425,7 @@ def saturating(safety: Safety, draws: SettingDraws) -> FloatArray:
 
 
 def _saturation(safety: Safety, values: dict[str, float]) -> float:
-    """Return the irradiance in W/m2 that fills a pixel, for drawn values of the sensor and the
+    """Return the irradiance in W/m2 that saturates a pixel, for given values of sensor and
     laser.
     """
     sensor = safety.settings.sensor.model_copy(
@@ -439,13 +440,13 @@ def _saturation(safety: Safety, values: dict[str, float]) -> float:
 
 # --- limit ratios ---------------------------------------------------------------------------------
 
-# How often a laser exceeds a limit: the exposure at the peak on the sensor over the limit there.
+# The ratio of the exposure at the peak on the sensor to the limit there.
 
 
 def limits_behind(
     safety: Safety, draws: SettingDraws, option: Option, area: Area | None, exposures: Exposures
 ) -> Iterator[Limit]:
-    """Yield each limit of damage behind a protection, and each limit of dazzle where its area is
+    """Yield each damage limit behind a protection, and each dazzle limit if the dazzled area is
     known.
     """
     yield from damage_limits(safety, option, exposures, draws)
@@ -454,8 +455,8 @@ def limits_behind(
 
 
 def limit_ratio(safety: Safety, option: str, limit: Limit, exposures: Exposures) -> FloatArray:
-    """Return the exposure over the limit (1 + draw, distance) behind a protection; row 0 has the
-    nominal values.
+    """Return the ratio of exposure to limit (1 + draw, distance) behind a protection; row 0 is
+    nominal.
     """
     return (
         emitted(safety, limit, exposures)
@@ -465,8 +466,8 @@ def limit_ratio(safety: Safety, option: str, limit: Limit, exposures: Exposures)
 
 
 def emitted(safety: Safety, limit: Limit, exposures: Exposures) -> FloatArray:
-    """Return power or pulse energy (1 + draw, 1); for dazzle the mean power of the light that
-    reaches one frame.
+    """Return the emitted power or pulse energy (1 + draw, 1); for dazzle the mean power during one
+    frame.
     """
     if limit.effect == "damage":
         return exposures.emitted(limit.quantity)
@@ -474,8 +475,8 @@ def emitted(safety: Safety, limit: Limit, exposures: Exposures) -> FloatArray:
 
 
 def mean_in_frame(exposures: Exposures, exposure: float) -> FloatArray:
-    """Return the mean power in W during an exposure in which at least one pulse of a pulsed
-    laser falls.
+    """Return the mean power in W during an exposure; of a pulsed laser at least one pulse falls
+    into it.
     """
     rows = [frame_power(beam, exposure) for beam in exposures.beams]
     return np.array(rows, np.float64)[:, None]
@@ -483,8 +484,8 @@ def mean_in_frame(exposures: Exposures, exposure: float) -> FloatArray:
 
 # --- eye findings ---------------------------------------------------------------------------------
 
-# What the laser does to an eye beside the camera: exposure limit and hazard distance, dazzle and
-# dazzle distance.
+# Effect of the laser on an eye next to the camera: exposure limit and hazard distance, dazzle
+# exposure and dazzle distance.
 
 
 DAZZLE_SOURCE = (
@@ -496,7 +497,7 @@ DAZZLE_SOURCE = (
 
 @dataclass(frozen=True)
 class EyeFinding:
-    """The exposure limit of the eye, and the distance beyond which the laser does not exceed it."""
+    """The exposure limit of the eye, and the distance beyond which the laser stays below it."""
 
     duration: float  #: s
     limit: float  #: W/m2, or J/m2 of each pulse
@@ -508,8 +509,8 @@ class EyeFinding:
 
 @dataclass(frozen=True)
 class EyeDazzleRow:
-    """The largest exposure that hides no target from an eye, for one light of the surroundings
-    and one angle.
+    """The largest exposure at which a target stays visible to an eye, for one ambient luminance and
+    one angle.
     """
 
     background: float  #: cd/m2
@@ -522,8 +523,8 @@ class EyeDazzleRow:
 
 @dataclass(frozen=True)
 class EyeDazzleFinding:
-    """Dazzle of the eye for each light of the surroundings and each angle, or the reason why it
-    is not judged.
+    """Dazzle of the eye for each ambient luminance and angle, or the reason why it is not
+    judged.
     """
 
     rows: tuple[EyeDazzleRow, ...]
@@ -533,11 +534,11 @@ class EyeDazzleFinding:
 
 
 def eye_finding(safety: Safety, exposures: Exposures) -> EyeFinding | str:
-    """Return the exposure limit of the eye with its distance, or the sentence that says why
-    there is none.
+    """Return the exposure limit of the eye with its distance, or a sentence that says why there is
+    none.
     """
     beam, index = exposures.beams[0], exposures.at(safety.laser.distance)
-    # by default the reflex of the lid in visible light, else 10 s
+    # default: the blink reflex (0.25 s) in visible light, else 10 s
     duration = safety.settings.eye.exposure or (0.25 if beam.wavelength <= 700e-9 else 10.0)
     rule = safety.settings.eye.rule
     try:
@@ -574,7 +575,7 @@ def eye_dazzle_finding(safety: Safety, exposures: Exposures) -> EyeDazzleFinding
 
 
 def _tasks(asked: EyeDazzle) -> Sequence[DazzleTask]:
-    """Return each light of the surroundings with each angle."""
+    """Return a task for each ambient luminance with each angle."""
     viewer = {
         "contrast": asked.contrast,
         "age": asked.age,

@@ -1,4 +1,6 @@
-"""Exposure at lens and sensor over the distance, and the distances where it exceeds a limit."""
+"""Exposure at lens and sensor as a function of distance, and the distances at which it exceeds a
+limit.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,7 @@ from neusee.workflows.recipe.uncertain_inputs import (
 
 # --- uncertain values -----------------------------------------------------------------------------
 
-# Random draws of the settings of an estimate that a recipe gives as distributions or by a
-# posterior.
+# Random draws of the settings that a recipe gives as distributions or by a posterior.
 
 
 _ROWS = 3  #: stream of random numbers that selects rows of a table of samples
@@ -62,14 +63,14 @@ class SettingDraws:
         return np.concatenate([[nominal], draws])
 
     def normal(self, stream: int) -> FloatArray:
-        """Return a standard normal number for each draw; another ``stream`` has independent
-        numbers.
+        """Return a standard normal number for each draw; different values of ``stream`` give
+        independent numbers.
         """
         return np.random.default_rng([self.seed, 2, stream]).standard_normal(self.count)
 
 
 def draw_settings(recipe: Recipe, safety: Safety) -> SettingDraws:
-    """Return draws of each setting whose value in the recipe is a distribution or belongs to a
+    """Return random draws of each setting that the recipe gives as a distribution or by a
     posterior.
 
     A negligible part of a distribution outside the values that the recipe allows is cut off, and
@@ -96,8 +97,8 @@ def draw_settings(recipe: Recipe, safety: Safety) -> SettingDraws:
 
 
 def _draws(uncertain: Uncertain, count: int, seed: int) -> dict[str, FloatArray]:
-    """Return ``count`` draws of each uncertain value; those of a table of samples are whole rows
-    of the table.
+    """Return ``count`` draws of each uncertain value; values from a table of samples are drawn as
+    whole rows, which keeps their correlation.
     """
     standard_normal = np.random.default_rng([seed, 1]).standard_normal(
         (count, len(uncertain.names))
@@ -109,7 +110,7 @@ def _draws(uncertain: Uncertain, count: int, seed: int) -> dict[str, FloatArray]
     if joint is None:
         return draws_by_name
     if joint.draws is None:
-        # the last columns of random numbers are those of the joint values
+        # the last columns of random numbers are for the joint values
         rows = joint.at(standard_normal[:, len(draws_by_name) :])
     else:
         rows = joint.draws[
@@ -120,15 +121,17 @@ def _draws(uncertain: Uncertain, count: int, seed: int) -> dict[str, FloatArray]
 
 # --- distance ladder ------------------------------------------------------------------------------
 
-# Distances at which the spot of a laser is computed anew: dense where its shape changes, none where
-# it does not.
+# Distances at which the spot of a laser is recomputed: closely spaced where its shape changes, and
+# none where it stays the same.
 
 
-#: largest fill and defocus of a spot that is taken as that of a distant laser
+#: largest fill (D / (2 w))^2 and defocus (waves) at which a spot counts as that of a distant laser
 FAR_FILL, FAR_WAVES = 0.02, 0.03
-#: the same for a lens that is out of focus far away, where each wave counts at first order
+#: largest defocus (waves) for a lens that is out of focus far away, where each wave has a
+#: first-order effect
 UNFOCUSED_WAVES = 0.002
-#: defocus up to which rungs follow how the middle of a spot turns bright and dark
+#: defocus (waves) up to which the distances follow the change of the spot's centre between bright
+#: and dark
 FOLLOWED_WAVES = 2.0
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
@@ -149,7 +152,7 @@ def far_distance(beam: Beam, diameter: float, waves: float = FAR_WAVES) -> float
 
 
 def focus_of(lens: Lens) -> float:
-    """Return the distance in m on which a lens is focused; infinity for a lens that follows the
+    """Return the distance in m at which a lens is focused; infinity for a lens that follows the
     laser.
     """
     return math.inf if isinstance(lens.focus, str) else lens.focus
@@ -191,7 +194,7 @@ def ladder(
 
 
 def miss_between(rungs: FloatArray, misses: Sequence[float], place: FloatArray) -> FloatArray:
-    """Return by how much an interpolation may miss at places: nothing at a rung, the whole miss in
+    """Return an upper bound of the interpolation error at ``place``: 0 at each rung, and largest in
     the middle of a gap.
 
     ``misses`` has one number for each gap between two rungs; without any nothing is missed.
@@ -206,8 +209,8 @@ def miss_between(rungs: FloatArray, misses: Sequence[float], place: FloatArray) 
 
 
 def interpolated(rungs: FloatArray, values: FloatArray, place: FloatArray) -> FloatArray:
-    """Return values (rung, ...) at places (any, ...), without overshoot between rungs; one rung
-    holds everywhere.
+    """Return values (rung, ...) interpolated at ``place`` (any, ...), without overshoot; a single
+    rung gives a constant.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -219,8 +222,8 @@ def interpolated(rungs: FloatArray, values: FloatArray, place: FloatArray) -> Fl
 
 
 def as_wide(beam: Beam, radius: FloatArray) -> FloatArray:
-    """Return the distance in m at which a beam has a 1/e2 radius; 1 mm where it is wider
-    everywhere.
+    """Return the distance in m at which the 1/e2 radius of a beam is ``radius``; 1 mm if the beam
+    is wider at every distance.
     """
     # at least the square of divergence times 1 mm / 2
     reached = np.maximum(radius**2 - beam.waist**2, (5e-4 * beam.divergence) ** 2)
@@ -229,14 +232,14 @@ def as_wide(beam: Beam, radius: FloatArray) -> FloatArray:
 
 
 def fill_at(beam: Beam, diameter: float, distance: float) -> float:
-    """Return (D / (2 w))^2 at a distance."""
+    """Return the fill (D / (2 w))^2 of a lens of diameter D by a beam of radius w at a distance."""
     return diameter**2 / (4 * beam_radius(beam, distance) ** 2)
 
 
 # --- distance zones -------------------------------------------------------------------------------
 
-# Intervals of distance in which an exposure exceeds a limit, for nominal values and for random
-# draws of them.
+# Intervals of distance in which an exposure exceeds a limit, for the nominal values and for random
+# draws.
 
 
 QUANTILES = (0.05, 0.95)  #: ends of the interval that contains 90 % of the draws
@@ -245,8 +248,8 @@ _ROUNDED = 1e-9  #: relative rounding of the logarithm of a distance
 
 @dataclass(frozen=True)
 class Spread:
-    """A number with the interval that contains 90 % of its draws; all three are equal if nothing
-    is uncertain.
+    """A number with the interval that contains 90 % of its draws; all three are equal without
+    uncertainty.
     """
 
     value: float
@@ -255,7 +258,7 @@ class Spread:
 
     @classmethod
     def of(cls, value: float, draws: FloatArray) -> Spread:
-        """Return a number with the interval of its draws; NaN in a draw is left out."""
+        """Return a number with the interval of its draws; draws that are NaN are ignored."""
         finite = draws[~np.isnan(draws)]
         if not finite.size:
             return cls(value, value, value)
@@ -269,29 +272,27 @@ class Zone:
 
     near: Spread
     far: Spread
-    begins_before: bool  #: whether the zone reaches below the shortest distance that is asked for
-    ends_beyond: bool  #: whether the zone reaches beyond the longest distance that is asked for
+    begins_before: bool  #: whether the zone reaches below the shortest distance of the settings
+    ends_beyond: bool  #: whether the zone reaches beyond the longest distance of the settings
 
 
 @dataclass(frozen=True)
 class Zones:
-    """The intervals of distance in which a limit is exceeded, none or several, and how sure each
-    statement is.
-    """
+    """The intervals of distance in which a limit is exceeded, and how certain they are."""
 
     zones: tuple[Zone, ...]  #: at the nominal values
     none: float  #: share of the draws without any zone
-    #: share of the draws with as many zones as the nominal values; ends between zones are from
-    #: these
+    #: share of the draws with as many zones as the nominal values; only these give the ends between
+    #: zones
     alike: float
-    #: largest distance of any zone, over the draws that have one; None without such a draw
+    #: largest distance of any zone, over the draws with a zone; None if no draw has one
     reach: Spread | None
     #: share of the draws in which the limit is exceeded at the distance of the recipe
     inside: float
 
 
 def crossings(distances: FloatArray, ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the near and the far ends (draw, zone) of the intervals in which ``ratio`` (draw,
+    """Return the near and far ends (draw, zone) of the intervals in which ``ratio`` (draw,
     distance) is at least 1.
 
     Ends between two distances are interpolated in the logarithms. Rows with fewer zones than others
@@ -312,8 +313,8 @@ def crossings(distances: FloatArray, ratio: FloatArray) -> tuple[FloatArray, Flo
 def _placed(
     place: FloatArray, height: FloatArray, marks: NDArray[np.bool_], step: int
 ) -> FloatArray:
-    """Return the distance (draw, zone) where the height crosses 0 beside each marked sample, on
-    the side ``step``.
+    """Return the distance (draw, zone) of the zero crossing next to each marked sample; ``step``
+    (-1 or 1) selects the side.
     """
     row, column = np.nonzero(marks)
     neighbour = np.clip(column + step, 0, len(place) - 1)
@@ -339,8 +340,8 @@ def zones_of(
     distance: float,
     asked: tuple[float, float] | None = None,
 ) -> Zones:
-    """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn
-    (draw, distance).
+    """Return the zones of a limit from the ratio of exposure to limit, ``nominal`` (distance,) and
+    ``drawn`` (draw, distance).
 
     Zones lie between the two distances ``asked``, whether or not the ``distance`` of the recipe
     does. The outer ends, such as the farthest distance, have the interval of all draws that have a
@@ -359,7 +360,7 @@ def zones_of(
     zone_counts = (~np.isnan(starts)).sum(1)
     has_as_many_zones = zone_counts == len(near_ends)
     farthest_ends = np.nanmax(stops[zone_counts > 0], 1) if (zone_counts > 0).any() else np.zeros(0)
-    # outer ends are those of every draw with a zone
+    # outer ends: from every draw with a zone
     first_ends, last_zone = starts[zone_counts > 0, :1].ravel(), len(near_ends) - 1
     zones = tuple(
         Zone(
@@ -394,19 +395,19 @@ def zones_of(
 
 
 def _column(ends: FloatArray, zone: int) -> FloatArray:
-    """Return the ends (draw,) of one of several zones; none without a draw."""
+    """Return the ends (draw,) of one zone; empty without draws."""
     return ends[:, zone] if len(ends) else np.zeros(0)
 
 
 def _at(distances: FloatArray, ratio: FloatArray, distance: float) -> FloatArray:
-    """Return the ratio (draw,) at a distance, which is one of the distances."""
+    """Return the ratio (draw,) at ``distance``, which must be an element of ``distances``."""
     column: FloatArray = ratio[:, int(np.argmin(np.abs(distances - distance)))]
     return column
 
 
 def sampled(first: float, last: float, also: Sequence[float] = (), count: int = 600) -> FloatArray:
-    """Return distances from ``first`` to ``last`` at equal ratios, with the distances ``also``
-    among them.
+    """Return rising distances from ``first`` to ``last`` in a geometric series, and the distances
+    ``also``.
     """
     return np.unique(
         np.concatenate([np.geomspace(first, last, count), np.asarray(also, np.float64)])
@@ -415,19 +416,18 @@ def sampled(first: float, last: float, also: Sequence[float] = (), count: int = 
 
 # --- exposures ------------------------------------------------------------------------------------
 
-# Exposure at the lens and on the sensor over the distance, for nominal values and for draws of
-# uncertain ones.
+# Exposure at the lens and on the sensor as a function of distance, for nominal values and for
+# draws.
 
 
 Emission = Literal["continuous", "single pulse", "pulse train"]
-#: relative change of the defocus over which the largest peak counts: that of half a step of
-#: distance
+#: the peak is the largest within this relative change of the defocus: half a step of distance
 WITHIN = 0.01
 
 
 @dataclass(frozen=True)
 class Option:
-    """One way to protect the sensor: what it changes between the lens and the sensor."""
+    """One way to protect the sensor, as changes of the light between lens and sensor."""
 
     name: str
     diameter: float | None = None  #: m, of a smaller stop; None: that of the lens
@@ -436,7 +436,7 @@ class Option:
     masked: bool = False  #: whether the mask is in front of the lens
     #: diameter of the heated spot over that of the clear lens; None: not known
     heated: float | None = None
-    #: share of the scene's light that a filter passes; None: as much as of the laser's
+    #: transmittance of a filter for the scene's light; None: the same as for the laser
     scene: float | None = None
 
     def scene_share(self, diameter: float) -> float:
@@ -448,14 +448,14 @@ class Option:
 
     #: distance in m, and the peak there over that of the lens in focus
     peaks: tuple[tuple[float, float], ...] = ()
-    #: of the logarithm of the peak between two of these distances, counted upward
+    #: interpolation error of the logarithm of the peak between two of these distances, an upper
+    #: bound
     misses: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class Exposures:
-    """Shares of the laser's power per m2 over the distance; times power or pulse energy they are
-    exposures.
+    """Exposure per unit of emitted power or pulse energy (1/m2) as a function of distance.
 
     Every array is (1 + draw or 1, distance), and row 0 has the nominal values.
     """
@@ -469,23 +469,23 @@ class Exposures:
     through: Mapping[str, FloatArray]  #: by option, share of the power that reaches the sensor
     fill: Mapping[str, FloatArray]  #: by option, (D / (2 w))^2
     waves: Mapping[str, FloatArray]  #: by option, defocus at the rim of the lens
-    #: of `Area`, made when asked
+    #: cache of the tables of `Area`
     tables: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def at(self, distance: float) -> int:
-        """Return the index of one of the distances."""
+        """Return the index of the array element nearest to ``distance``."""
         return int(np.argmin(np.abs(self.distances - distance)))
 
     def emitted(self, quantity: Literal["irradiance", "fluence"]) -> FloatArray:
-        """Return the mean power in W, or the energy of a pulse in J, of the nominal values and
-        of each draw.
+        """Return the mean power in W or the pulse energy in J (1 + draw, 1): nominal, then of each
+        draw.
         """
         quantity_name = "power" if quantity == "irradiance" else "pulse_energy"
         return np.array([getattr(beam, quantity_name) for beam in self.beams], np.float64)[:, None]
 
 
 def emission_of(beam: Beam) -> Emission:
-    """Return how a laser emits its light."""
+    """Return whether a laser is continuous, emits a single pulse, or a pulse train."""
     if not beam.is_pulsed:
         return "continuous"
     return "single pulse" if beam.repetition_rate is None else "pulse train"
@@ -497,8 +497,8 @@ def compute_exposures(
     options: tuple[Option, ...],
     distances: FloatArray | None = None,
 ) -> Exposures:
-    """Return the exposures at the lens and behind each option; raise `RecipeError` for a draw that
-    is no beam.
+    """Return the exposures at the lens and behind each option; raise `RecipeError` if a draw gives
+    an impossible beam.
 
     Without ``distances`` they are those of the settings and of the recipe.
     """
@@ -526,7 +526,7 @@ def compute_exposures(
         )
         waves = _waves(safety.settings.lens, beam, distance_row, aperture)
         transmittance = lens_transmittance * option.passing * air_factor
-        # the last argument: a lens without losses
+        # last argument 1.0: no losses in the lens
         focused_density: Any = sensor_density(beam, distance_row, aperture, focal_length, 1.0)
         density = (
             focused_density * _at_width(option, beams[0], beam_radius(beam, distance_row))
@@ -563,8 +563,8 @@ def compute_exposures(
 
 
 def _widened(option: Option, peak: Any) -> Any:
-    """Return the heated spot over that of the clear lens in focus, an upper bound, from the peak
-    over that lens's.
+    """Return an upper bound of the heated spot's diameter relative to the clear lens in focus;
+    ``peak`` is the ratio of the peaks.
 
     The width behind a mask at the distance of the recipe is `Option.heated`, so that the rest
     counts here alone.
@@ -576,13 +576,15 @@ def _widened(option: Option, peak: Any) -> Any:
 
 
 def asked_distances(safety: Safety) -> FloatArray:
-    """Return the distances of the settings at equal ratios, and that of the recipe among them."""
+    """Return the distances of the settings in a geometric series, with the distance of the recipe
+    among them.
+    """
     nearest, furthest = safety.settings.distances
     return sampled(nearest, furthest, (safety.laser.distance,))
 
 
 def _waves(lens: Lens, beam: Beam, where: Any, aperture: Any) -> Any:
-    """Return the waves of defocus at the rim of the aperture over draws and distances."""
+    """Return the defocus in waves at the rim of the aperture (1 + draw or 1, distance)."""
     if lens.focus == "laser":
         return torch.zeros(1, 1, dtype=torch.float64)
     focus = math.inf if isinstance(lens.focus, str) else lens.focus
@@ -592,8 +594,8 @@ def _waves(lens: Lens, beam: Beam, where: Any, aperture: Any) -> Any:
 
 
 def _at_width(option: Option, nominal: Beam, radius: Any) -> Any:
-    """Return the peak behind a mask over that of the clear lens in focus, for beams of a 1/e2
-    radius at the lens.
+    """Return the peak behind a mask relative to the clear lens in focus; ``radius`` is the 1/e2
+    radius of the beam at the lens.
 
     A beam that is drawn has the peak of the nominal beam at the distance where the nominal beam is
     as wide. Nearer than the first peak the ratio is 1, which no mask exceeds.
@@ -616,7 +618,7 @@ def _at_width(option: Option, nominal: Beam, radius: Any) -> Any:
 
 
 def _uneven(safety: Safety, draws: SettingDraws, distances: FloatArray) -> FloatArray:
-    """Return the factor (1 + draw or 1, distance) of hot spots and of turbulent air on every
+    """Return the factor (1 + draw or 1, distance) by which hot spots and turbulence raise the
     irradiance.
     """
     beam = safety.settings.beam
@@ -633,7 +635,7 @@ def _uneven(safety: Safety, draws: SettingDraws, distances: FloatArray) -> Float
 
 
 def _beams(safety: Safety, draws: SettingDraws) -> list[Beam]:
-    """Return the beam of the nominal values and of each draw."""
+    """Return the nominal beam, followed by the beam of each draw."""
     draws_by_name = {
         name: draws.values[f"laser.{name}"] for name in BEAM if f"laser.{name}" in draws.values
     }
@@ -656,8 +658,8 @@ def _beams(safety: Safety, draws: SettingDraws) -> list[Beam]:
 
 
 def _stacked(beams: tuple[Beam, ...]) -> Beam:
-    """Return one beam whose quantities are columns (1 + draw, 1), with which the formulas of a beam
-    compute as well.
+    """Return one beam whose quantities are columns (1 + draw, 1), so that formulas compute all
+    draws at once.
 
     A column of equal values has one row.
     """
@@ -680,8 +682,8 @@ def _exposure_column(draws: SettingDraws, name: str, nominal: float) -> Any:
 
 
 def _air(safety: Safety, draws: SettingDraws, distances: FloatArray) -> FloatArray:
-    """Return the transmittance of the air (1 + draw, distance), from that of one metre: even air
-    has equal metres.
+    """Return the transmittance of the air (1 + draw, distance), the power of the transmittance of
+    one metre of homogeneous air.
     """
     laser = safety.laser
     if laser.air_transmittance is not None:

@@ -1,4 +1,4 @@
-"""The spot of a laser behind lens and mask over the distance: its core, veil and peak."""
+"""The spot of a laser behind lens and mask as a function of distance: core, veil and peak."""
 
 from __future__ import annotations
 
@@ -52,25 +52,30 @@ from neusee.workflows.store.result_store import Store
 # ones and some shares of scatter, and interpolated between these in logarithms.
 
 
-#: factor of one standard deviation of a share of scatter that the recipe does not state
+#: geometric standard deviation of the scattered share where the recipe does not state the share
 ASSUMED = 1.5
-_CERTAIN = 0.02  #: largest range of a logarithm that is taken as one value
+_CERTAIN = 0.02  #: range of a logarithm below which all values count as one
 _ROUNDED = 1e-9  #: rounding of the logarithm of a distance
-_STREAM = 9_001  #: of the random numbers of the assumed share
-#: levels at which pixels with light from elsewhere are counted, of groups and between them
+_STREAM = 9_001  #: stream of random numbers for the assumed share
+#: number of levels at which pixels that receive hidden light are counted: of groups, and between
+#: them
 _STEPS = 600
-_FAINTEST = 1e-12  #: of the brightest level, below which no level stands between those of groups
-#: share of the core in the light of a pixel beyond the window from which the radial law decides it
+#: fraction of the brightest level below which no level is added between those of groups
+_FAINTEST = 1e-12
+#: a pixel beyond the window counts as decided by the radial law if the core is more than this share
+#: of its light
 _OWN_RIM = 0.1
 
 
 @dataclass(frozen=True)
 class Veil:
-    """The light that the lens scatters: its share, with draws, and its law."""
+    """The light scattered by the lens: its share of the total, with draws, and its radial
+    profile.
+    """
 
     share: FloatArray  #: (1 + draw or 1,) of the light that passes the lens
     assumed: bool  #: whether the recipe states none
-    #: of the distance in pixels, in a pixel, for the nominal share
+    #: light in a pixel as a function of its distance from the spot in pixels, for the nominal share
     light: Callable[[FloatArray], FloatArray]
 
 
@@ -105,7 +110,7 @@ def veil_of(safety: Safety, draws: SettingDraws) -> Veil | None:
 def _share(
     safety: Safety, draws: SettingDraws, scatter: Scatter, total: float
 ) -> tuple[FloatArray, bool]:
-    """Return the scattered share of the light (1 + draw or 1,), and whether it is assumed.
+    """Return the scattered share of the light (1 + draw or 1,), and True if the share is assumed.
 
     ``total`` is the share that measured surfaces scatter, which is exact.
     """
@@ -122,14 +127,14 @@ def _share(
 
 @dataclass(frozen=True)
 class Grid:
-    """Points at which levels are computed along one quantity, in its own scale."""
+    """Points along one quantity at which levels are computed, in the scale of that quantity."""
 
     points: FloatArray
 
     @classmethod
     def around(cls, values: FloatArray, per_unit: float) -> Grid:
-        """Return a grid that holds values: one point if they are alike, else ``per_unit`` points
-        a unit, at least 3.
+        """Return a grid over the range of ``values``: one point if they are alike, else
+        ``per_unit`` points for each unit, and 3 or more.
         """
         smallest, largest = float(values.min()), float(values.max())
         if largest - smallest < _CERTAIN:
@@ -142,7 +147,9 @@ class Grid:
 
     @classmethod
     def through_zero(cls, values: FloatArray, per_unit: float) -> Grid:
-        """Return such a grid with a point at 0, so that values of 0 are not interpolated."""
+        """Return a grid as `around` does, with a point at 0, so that values of 0 need no
+        interpolation.
+        """
         points = cls.around(np.append(values, 0.0), per_unit).points
         if len(points) == 1:
             return cls(np.zeros(1))
@@ -155,7 +162,7 @@ class Grid:
         return cls(np.arange(end_indices[0], end_indices[1] + 1) * step)
 
     def weights(self, values: FloatArray) -> list[FloatArray]:
-        """Return the weight of each point in the linear interpolation at values."""
+        """Return the weight of each grid point in the linear interpolation at ``values``."""
         if len(self.points) == 1:
             return [np.ones((1,) * values.ndim)]
         step = self.points[1] - self.points[0]
@@ -166,22 +173,23 @@ class Grid:
 
 @dataclass(frozen=True)
 class Levels:
-    """Logarithms of levels at the rungs of a ladder and at points of grids, for several numbers
-    of pixels.
+    """Logarithms of levels at rungs of distance and points of grids, for several ranks (numbers of
+    pixels).
     """
 
     rungs: FloatArray  #: (rung,) logarithm of the distance
     grids: tuple[Grid, ...]
     values: FloatArray  #: (rung, point of each grid ..., rank)
-    #: of the same shape: share of the pixels whose light is that of the radial law
+    #: share of the pixels, in the same shape, whose light follows the radial law
     beyond: FloatArray
-    misses: tuple[float, ...] = ()  #: of a logarithm between two rungs, counted upward
-    #: (rank,) logarithm of a bound, which counts nearer than the first rung
+    #: interpolation error of a logarithm between two rungs, an upper bound
+    misses: tuple[float, ...] = ()
+    #: (rank,) logarithm of an upper bound, used nearer than the first rung
     most: FloatArray | None = None
 
     def at(self, place: FloatArray, others: Sequence[FloatArray], ranks: slice) -> FloatArray:
-        """Return the logarithms of levels (..., rank); ``place`` is the logarithm of the
-        distance.
+        """Return the logarithms of levels (..., rank) at ``place``, the logarithm of the distance,
+        and at ``others``, the values along the grids.
         """
         weights = [grid.weights(values) for grid, values in zip(self.grids, others, strict=True)]
         full_shape = np.broadcast_shapes(
@@ -199,28 +207,28 @@ class Levels:
                 ),
             )
             weight = np.broadcast_to(weight, full_shape)
-            # a draw lies between two points of a grid, and needs no others
+            # a draw lies between two points of a grid; all other weights are 0
             rows = np.flatnonzero(weight.any(axis=1))
             value_index: Any = (slice(None), *grid_point, ranks)
             total[rows] += weight[rows, :, None] * interpolated(
                 self.rungs, self.values[value_index], log_distance[rows]
             )
-        # the interpolation may miss this much: it counts upward
+        # add the interpolation error, so that the level is an upper bound
         total += miss_between(self.rungs, self.misses, log_distance)[..., None]
         if self.most is None:
             return total
-        # nearer than the first rung nothing is computed: the bound counts
+        # nearer than the first rung nothing is computed: use the upper bound
         return np.where(place[..., None] < self.rungs[0] - _ROUNDED, self.most[ranks], total)
 
 
 @dataclass(frozen=True)
 class Counted:
-    """Falling levels of light, and how many pixels have at least each of them."""
+    """Falling levels of light, and the number of pixels that reach each level."""
 
     light: FloatArray  #: (level,)
-    count: FloatArray  #: of the pixels that have at least this light
-    alike: FloatArray  #: of those among them that have just this light
-    decided: FloatArray  #: of those whose light is that of the radial law
+    count: FloatArray  #: number of pixels with at least this light
+    alike: FloatArray  #: number of pixels with exactly this light
+    decided: FloatArray  #: number of counted pixels whose light follows the radial law
 
 
 def levels_of(
@@ -231,7 +239,7 @@ def levels_of(
     shares: FloatArray,
     smooth: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the logarithms of the levels (share, rank) of groups of pixels.
+    """Return the logarithms of the levels (share, rank) of groups of equally bright pixels.
 
     The second array is the share of the counted pixels that lie beyond the window of a PSF, and
     whose light the radial law of `with_frame` decides. ``shares`` are those of the scattered light;
@@ -260,7 +268,7 @@ def levels_of(
 
 
 def _as_they_are(light: FloatArray, pixels: FloatArray, guessed: NDArray[np.bool_]) -> Counted:
-    """Return the counts of pixels at the levels of their groups, without light from elsewhere.
+    """Return the counts of pixels at the levels of their groups, without hidden light.
 
     ``light`` is that in a pixel of each group and ``pixels`` the number of its pixels; ``guessed``
     marks the groups whose light is that of the radial law.
@@ -278,7 +286,8 @@ def _as_they_are(light: FloatArray, pixels: FloatArray, guessed: NDArray[np.bool
 def _with_hidden(
     light: FloatArray, pixels: FloatArray, added: NDArray[np.bool_], hidden: float
 ) -> Counted:
-    """Return at most how many pixels have each level, when hidden light falls on the pixels beyond.
+    """Return an upper bound of the number of pixels at each level when hidden light falls on the
+    pixels beyond the window.
 
     ``added`` marks the groups beyond the window, and ``hidden`` is the share of the light that
     neither the window nor the radial law accounts for.
@@ -297,8 +306,8 @@ def _with_hidden(
 
 
 def _steps(levels: FloatArray) -> FloatArray:
-    """Return about twice `_STEPS` falling levels: some of the given ones (falling), and others at
-    equal ratios, which close the gaps between these.
+    """Return about twice `_STEPS` falling levels: a selection of ``levels`` (falling), and a
+    geometric series that closes the gaps between them.
     """
     picked = levels[np.unique(np.linspace(0, len(levels) - 1, _STEPS).astype(int))]
     # positive, so that ratios exist
@@ -309,7 +318,7 @@ def _steps(levels: FloatArray) -> FloatArray:
 
 
 def _at_ranks(ranks: FloatArray, counted: Counted) -> FloatArray:
-    """Return the logarithms of the light of the pixels of given ranks, 1 for the brightest pixel.
+    """Return the logarithm of the light of the pixel at each rank; the brightest pixel has rank 1.
 
     All pixels of a group are equally bright; between groups the logarithms are interpolated.
     """
@@ -325,8 +334,8 @@ def _at_ranks(ranks: FloatArray, counted: Counted) -> FloatArray:
 def _lit_at_most(
     light: FloatArray, pixels: FloatArray, hidden: float, levels: FloatArray
 ) -> FloatArray:
-    """Return how many pixels have at least each level, at most, when ``hidden`` light is added to
-    their own.
+    """Return an upper bound of the number of pixels that reach each level once ``hidden`` light is
+    added to their own light.
 
     It is dealt out where least of it is needed: to the brightest pixels first.
     """
@@ -353,53 +362,55 @@ def _lit_at_most(
 
 
 _RANKS = "laser.bright_pixels"
-_FACTOR = 6.0  #: of the distance from one spot to the next at first
-_CLOSE = 0.02  #: error of the interpolation of a peak or a level at which no spot is added
-_MOST_PEAKS = 25  #: peaks behind a mask
-_CLOSE_PEAKS = 0.005  #: error of a peak at which none is added
-_WIDENINGS = 2  #: doublings of the window of a spot that lacks light
-_MOST_SPOTS = 17  #: spots behind one arm
-_FINEST = 1.3  #: factor of the distance between two spots, at least
+_FACTOR = 6.0  #: ratio of two neighbouring distances of the initial ladder
+_CLOSE = 0.02  #: interpolation error of a peak or a level below which no spot is added
+_MOST_PEAKS = 25  #: most peaks behind a mask
+_CLOSE_PEAKS = 0.005  #: interpolation error of a peak below which none is added
+_WIDENINGS = 2  #: most doublings of the window of a spot that lacks light
+_MOST_SPOTS = 17  #: most spots behind lens or mask
+_FINEST = 1.3  #: least ratio of two neighbouring distances
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 #: largest phase step of the wavefront between two samples of the pupil, in turns; the mask adds its
 #: own
 _TURN = 0.25
-_DIM = 3.0  #: half-widths at 1/e2 of the irradiance beyond which the beam in the pupil is dark
+_DIM = 3.0  #: 1/e2 radii of the irradiance beyond which the beam in the pupil counts as dark
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """The pixels of the sensor behind lens or mask at several distances, in shares of the light
-    through the lens.
+    """The pixels behind lens or mask at several distances; light is in shares of the light through
+    the lens.
     """
 
     arm: str  #: ``plain`` or ``mask``
     distances: tuple[float, ...]  #: m, rising
     groups: tuple[BrightPixels, ...]  #: at each distance
     error: float  #: largest error of a level by interpolation between the distances
-    #: of the logarithm of a level, by gap between two distances, counted upward
+    #: interpolation error of the logarithm of a level in each gap between two distances, an upper
+    #: bound
     misses: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """The peak behind the mask, over that of the clear lens in focus with the same beam, at
-    several distances.
+    """The peak behind the mask at several distances, relative to the clear lens in focus with the
+    same beam.
     """
 
     here: float  #: at the distance of the recipe, over the peak of the clear lens without taper
     along: tuple[tuple[float, float], ...]  #: distance in m, and ratio
     error: float  #: largest error of the ratio by interpolation
-    #: of the logarithm of the ratio, by gap between two distances, counted upward
+    #: interpolation error of the logarithm of the ratio in each gap between two distances, an upper
+    #: bound
     misses: tuple[float, ...] = ()
-    #: distance in m, and share of the light that counts as the peak
+    #: distance in m, and share of the light outside the window that is taken as one peak
     outside: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
 class _Runs:
-    """Runs of the steps of a recipe at one distance after the other, which read the code of the
-    steps once.
+    """A series of runs of the recipe's steps at several distances, which reads the code of the
+    steps only once.
     """
 
     recipe: Recipe
@@ -414,15 +425,15 @@ class _Runs:
         return cls(recipe, safety, opened, RunSeries.begun(opened))
 
     def of(self, recipe: Recipe, outputs: Sequence[str]) -> Result:
-        """Return the result of steps of a recipe that differs from that of the series in its
-        parameters.
+        """Return the result of steps of ``recipe``, which may differ from the recipe of the series
+        only in parameters.
         """
         return run(recipe, self.store, outputs, series=self.series)
 
 
 def ranked_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Ranked, ...]:
-    """Return the pixels of the steps that the settings name; raise `RecipeError` for a step of
-    another kind.
+    """Return the ranked pixels of the steps named in the settings; raise `RecipeError` for a step
+    of another kind.
     """
     protection = safety.settings.protection
     named_steps = {
@@ -438,7 +449,7 @@ def ranked_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Rank
 
 
 def peaks_of(recipe: Recipe, safety: Safety, store: Store | None) -> Peaks | None:
-    """Return the peak behind the mask over the distance, or None without a mask."""
+    """Return the peak behind the mask as a function of distance, or None without a mask."""
     if safety.settings.protection.mask is None:
         return None
     step, runs = _mask_step(recipe, safety), _Runs.begun(recipe, safety, store)
@@ -484,24 +495,25 @@ def peaks_of(recipe: Recipe, safety: Safety, store: Store | None) -> Peaks | Non
 
 @dataclass(frozen=True)
 class _Peak:
-    """The peak of a spot over that of the clear lens without taper, and what may be brighter
+    """The peak of a spot relative to the clear lens without taper, and a bound for the light
     outside its window.
     """
 
-    inside: float  #: the window
-    unseen: float  #: share of the light of the beam that may be in one spot outside
+    inside: float  #: in the window
+    unseen: float  #: share of the beam's light that may form one spot outside the window
     focused: float  #: peak of the clear lens in focus with the same beam
 
     @property
     def most(self) -> float:
-        """Return the highest peak that there may be: unseen light in as sharp a spot as that of
+        """Return the highest possible peak: the unseen light may form a spot as sharp as that of
         the clear lens.
         """
         return max(self.inside, self.unseen * self.focused)
 
 
 def _peak(runs: _Runs, recipe: Recipe, step: str, distance: float) -> _Peak:
-    """Return the largest value of a step; of `metrics.lsr` that of the spot between its samples.
+    """Return the largest value of a step; for `metrics.lsr` the maximum of the spot interpolated
+    between its samples.
 
     A window that lacks light which may hold a higher peak is doubled, as far as the samples of the
     pupil carry it. Values are over the peak of the clear lens without taper.
@@ -525,14 +537,14 @@ def _peak(runs: _Runs, recipe: Recipe, step: str, distance: float) -> _Peak:
         recipe = _with_param(recipe, window_step, "shape", shape)
         try:
             peak = _peak_of(runs.of(recipe, [psf_step])[psf_step], fill)
-        except RunError:  # beyond the window that the samples of the pupil carry
+        except RunError:  # the pupil sampling does not support a window of this size
             break
     return peak
 
 
 def _peak_of(psf: Psf, fill: float) -> _Peak:
-    """Return the peak of a PSF of a beam that fills the lens to ``fill`` = (D / (2 w))^2, over the
-    peak of the clear lens without taper; of several bands, the highest.
+    """Return the peak of a PSF relative to the clear lens without taper, the highest of its bands;
+    ``fill`` is (D / (2 w))^2 of the beam.
     """
     passing = _passing(fill)
     bands = list(zip(psf.intensity, psf.clear_peak.tolist(), strict=True))
@@ -551,8 +563,8 @@ def _mask_step(recipe: Recipe, safety: Safety) -> str:
 
 
 def _psf_of(recipe: Recipe, step: str) -> str | None:
-    """Return the name of the PSF whose peak a step of `metrics.lsr` is; None for a step of
-    another node.
+    """Return the name of the PSF that a step of `metrics.lsr` reads; None for a step of another
+    node.
     """
     return (
         str(recipe.steps[step].wires["psf"])
@@ -562,23 +574,25 @@ def _psf_of(recipe: Recipe, step: str) -> str | None:
 
 
 def _passing(fill: float) -> float:
-    """Return the light of a Gaussian beam through the lens over that of an even one with the
-    irradiance of its axis.
+    """Return the power of a Gaussian beam through the lens, relative to a uniform beam with the
+    irradiance on its axis.
     """
     # mean of exp(-2 r^2 / w^2) over the disc of the lens
     return 1.0 if fill < 1e-9 else -math.expm1(-2 * fill) / (2 * fill)
 
 
 def _focused(fill: float) -> float:
-    """Return the peak of a Gaussian beam in focus over that of an even one with the irradiance
-    of its axis.
+    """Return the peak of a focused Gaussian beam, relative to a uniform beam with the irradiance on
+    its axis.
     """
     # squared mean of the amplitude exp(-r^2 / w^2) over the disc of the lens
     return 1.0 if fill < 1e-9 else (-math.expm1(-fill) / fill) ** 2
 
 
 def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
-    """Return the pixels behind one arm at the distances between which they change."""
+    """Return the ranked pixels behind lens or mask at as many distances as their interpolation
+    needs.
+    """
     recipe, safety = runs.recipe, runs.safety
     beam, lens = safety.laser.beam(), safety.settings.lens
     nominal_veil = _nominal_veil(safety)
@@ -589,7 +603,7 @@ def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
         pixels = BrightPixels(
             *runs.of(at_distance(recipe, safety, step, distance), [step, *shared_psf])[step]
         )
-        # from shares of an even beam's light to shares of what passes the lens
+        # convert light relative to a uniform beam to light relative to what passes the lens
         passing_share = _passing(fill_at(beam, lens.diameter, distance))
         pixels_at[distance] = pixels._replace(
             light=pixels.light / passing_share,
@@ -615,8 +629,8 @@ def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
 
 
 def _psf_beside(recipe: Recipe, safety: Safety, arm: str, step: str) -> list[str]:
-    """Return the PSF of the peak behind the mask, if it needs the pupil of a step of pixels,
-    which one run shares.
+    """Return the PSF of the peak behind the mask if it shares the pupil of ``step``, so that one
+    run computes both.
     """
     if arm != "mask" or safety.settings.protection.mask is None:
         return []
@@ -634,7 +648,8 @@ def _nominal_veil(safety: Safety) -> Veil | None:
 
 
 def _log_level(groups: BrightPixels, safety: Safety, veil: Veil | None) -> FloatArray:
-    """Return the logarithm of the level of the asked number of pixels, with the nominal veil.
+    """Return the logarithm of the level at the number of pixels that may be lost, with the nominal
+    veil.
 
     The level is the share of the light in the faintest of these pixels; the array is (rank,), one.
     """
@@ -648,8 +663,8 @@ def _log_level(groups: BrightPixels, safety: Safety, veil: Veil | None) -> Float
 
 
 def _first(safety: Safety, recipe: Recipe, step: str) -> list[float]:
-    """Return the first distances of spots: from the nearest one that the samples of the pupil
-    carry to a far one.
+    """Return the initial distances of spots, from the nearest distance that the pupil's sampling
+    allows to a far one.
     """
     beam, lens = safety.laser.beam(), safety.settings.lens
     far_end = far_distance(beam, lens.diameter)
@@ -662,8 +677,8 @@ def _first(safety: Safety, recipe: Recipe, step: str) -> list[float]:
 
 
 def _carried(safety: Safety, recipe: Recipe, step: str) -> float:
-    """Return the shortest distance in m at which the samples of the pupil carry the curvature of
-    the beam.
+    """Return the shortest distance in m at which the pupil samples resolve the curvature of the
+    beam.
     """
     pupil = _pupils(recipe, step)[0]
     stop = recipe.steps[str(pupil.wires["stop"])].params
@@ -679,7 +694,7 @@ def _carried(safety: Safety, recipe: Recipe, step: str) -> float:
 
 @dataclass(frozen=True)
 class _Refined:
-    """Values at rising distances, and how much an interpolation between two of them may miss."""
+    """Values at rising distances, and the interpolation error in each gap."""
 
     distances: tuple[float, ...]  #: m
     values: tuple[FloatArray, ...]  #: logarithms
@@ -692,8 +707,8 @@ def _refined(
     limit: int,
     close: float = _CLOSE,
 ) -> _Refined:
-    """Return values (logarithms) at distances, and at the middles of the gaps in which
-    interpolation misses most.
+    """Return values (logarithms) at distances, and at the middles of the gaps with the largest
+    interpolation error.
 
     A middle shows how much its gap missed. Each half is then counted with as much, until its own
     middle is known: the peak behind a mask has kinks, where another lobe becomes the brightest.
@@ -725,8 +740,7 @@ def _refined(
 
 
 def at_distance(recipe: Recipe, safety: Safety, step: str, distance: float) -> Recipe:
-    """Return the recipe with another distance of the laser in the wavefront on which a step
-    depends.
+    """Return the recipe with another laser distance in the wavefront upstream of a step.
 
     A lens that is focused on a distance, or on the laser, has the defocus of its pupil changed with
     it.
@@ -758,12 +772,12 @@ def _pupils(recipe: Recipe, step: str) -> list[Step]:
 
 
 def _bend(safety: Safety, distance: float) -> float:
-    """Return the curvature in 1/m of the wavefront of the laser at a distance."""
+    """Return the curvature in 1/m of the laser's wavefront at a distance."""
     return float(1 / curvature_radius(safety.laser.beam(), distance))
 
 
 def _wavefront_of(recipe: Recipe, step: str) -> str | None:
-    """Return the name of the step of the wavefront on which a step depends; None without one."""
+    """Return the name of the wavefront's step upstream of ``step``; None without one."""
     names = (
         source.name for source in _upstream(recipe, step) if source.node.path == "laser.wavefront"
     )
@@ -776,8 +790,8 @@ def _upstream(recipe: Recipe, step: str) -> Iterator[Step]:
 
 
 def _step(recipe: Recipe, safety: Safety, arm: str, named: str) -> str:
-    """Return the name of a step of ranked pixels; raise `RecipeError` for another node, and for
-    another sensor.
+    """Return the name of a step of ranked pixels; raise `RecipeError` for another node or another
+    sensor.
     """
     setting, sensor = f"protection.pixels.{arm}", safety.settings.sensor
     step = step_of(recipe, safety, setting, named, arm)

@@ -1,4 +1,4 @@
-"""The folder of an estimate of safety: page, pictures, table and document."""
+"""The result folder of a safety estimate: page, pictures, table and JSON document."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from neusee.workflows.store.result_store import Store, compute_once
 
 @dataclass(frozen=True)
 class Assessment:
-    """A finished estimate as the store keeps it: its document, its text for a terminal, and its
+    """A finished estimate in the form that the store keeps: JSON document, text for a terminal, and
     page with pictures.
     """
 
@@ -42,7 +42,7 @@ class Assessment:
     paragraphs: list[list[str]]
     title: str
     lead: str
-    #: as `Section`, with a `Marked` cell as its value and its mark
+    #: fields of each `Section`; a `Marked` cell is a mapping of value and mark
     sections: list[dict[str, Any]]
     pictures: dict[str, bytes]
     rows: list[list[Any]]  #: of limits.csv, the header first
@@ -62,7 +62,7 @@ class Assessment:
 
 
 def _section(plain: Mapping[str, Any]) -> Section:
-    """Return a section from how the store keeps it."""
+    """Return a section from its stored form."""
     rows = [
         [Marked(**cell) if isinstance(cell, dict) else cell for cell in row]
         for row in plain["rows"]
@@ -71,7 +71,7 @@ def _section(plain: Mapping[str, Any]) -> Section:
 
 
 def _plain_section(section: Section) -> dict[str, Any]:
-    """Return a section as the store keeps it."""
+    """Return a section in its stored form."""
     rows = [
         [
             {"value": cell.value, "mark": cell.mark} if isinstance(cell, Marked) else cell
@@ -85,8 +85,7 @@ def _plain_section(section: Section) -> dict[str, Any]:
 def assess(
     recipe: Recipe, store: Store, out: Path, command: Sequence[str]
 ) -> tuple[Path, Assessment]:
-    """Estimate damage, dazzle and eye exposure, or take the estimate from the store, and write the
-    folder.
+    """Compute a safety estimate, or take it from the store, and write the result folder.
 
     Raises `RecipeError` for a recipe that cannot be estimated, and `RunError` if a step of its mask
     fails.
@@ -103,13 +102,13 @@ def assess(
 
 
 def _as_text(groups: BrightPixels) -> list[str]:
-    """Return the numbers of groups of pixels as text of their bytes."""
+    """Return the bytes of each array in groups of pixels as hexadecimal text."""
     return [tensor.numpy().tobytes().hex() for tensor in groups]
 
 
 def key_of(recipe: Recipe, prepared: Prepared, store: Store) -> str:
-    """Return the key of an estimate: values, draws, laws, what the steps say of lens and mask,
-    and the code.
+    """Return the cache key of an estimate, from values, draws, laws, results of the recipe's steps
+    for lens and mask, and the code.
     """
     code = Code(store.code_memo)
     modules = [
@@ -148,7 +147,7 @@ def key_of(recipe: Recipe, prepared: Prepared, store: Store) -> str:
 
 
 def _assessed(estimate: Estimate) -> Assessment:
-    """Return an estimate as the store keeps it."""
+    """Return an estimate in its stored form."""
     page = report(estimate)
     pictures = {name: picture for name, picture in page.pictures.items() if picture}
     header, rows = page.tables["limits.csv"]
@@ -192,7 +191,7 @@ def document(estimate: Estimate) -> dict[str, Any]:
 
 
 def _veil(veil: Veil | None) -> dict[str, Any]:
-    """Return the share of the light that the lens scatters."""
+    """Return the JSON entries for the share of the light that the lens scatters."""
     if veil is None:
         return {"scattered_share": None, "scattered_share_is_assumed": False}
     share = Spread.of(float(veil.share[0]), veil.share[1:])
@@ -200,7 +199,7 @@ def _veil(veil: Veil | None) -> dict[str, Any]:
 
 
 def _dead_pixels(dead: DeadPixels) -> dict[str, Any]:
-    """Return an example of damage without its picture."""
+    """Return an example of damage as JSON values, without its picture."""
     return {name: value for name, value in vars(dead).items() if name != "frame"}
 
 
@@ -242,7 +241,7 @@ def _dazzled(area: Dazzled) -> dict[str, Any]:
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
-    """Return what one limit says behind one protection as JSON values."""
+    """Return the comparison with one limit behind one protection as JSON values."""
     return {
         "protection": finding.option,
         "limit": finding.limit.name,

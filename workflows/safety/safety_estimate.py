@@ -1,4 +1,6 @@
-"""Estimate of damage, dazzle and eye exposure by a laser, and what it counts."""
+"""Estimate of damage, dazzle and eye exposure by a laser, and the texts on its assumptions and
+limits.
+"""
 
 from __future__ import annotations
 
@@ -70,25 +72,25 @@ from neusee.workflows.store.result_store import Store
 
 # --- dazzle curves --------------------------------------------------------------------------------
 
-# How many pixels a laser fills behind each protection: at the distance of the recipe, and against
-# the irradiance.
+# Number of pixels that a laser saturates behind each protection: at the distance of the recipe, and
+# as a function of irradiance.
 
 
 _SAMPLES = 300  #: irradiances of a curve
-#: ends of a curve, times the irradiance that loses the stated share behind the plain lens, or
-#: behind any protection
+#: ends of a curve: factors on the irradiance at which the stated share of the picture is lost,
+#: behind the plain lens (lower end) or behind any protection (upper end)
 _FAINT, _STRONG = 1e-6, 1e1
 
 
 @dataclass(frozen=True)
 class Dazzled:
-    """The pixels that the laser fills behind one protection."""
+    """The number of pixels that the laser saturates behind one protection."""
 
     option: str
     masked: bool
     pixels: Spread  #: at the distance of the recipe
     share: float  #: of the picture
-    times: float | None  #: pixels over those behind the plain lens; None where one of both is 0
+    times: float | None  #: ratio to the pixels behind the plain lens; None where either number is 0
     at_lens: FloatArray  #: (irradiance,) mean over the exposure at the lens, W/m2
     curve: FloatArray  #: (irradiance,) share of the picture
 
@@ -100,8 +102,8 @@ def dazzled(
     areas: Sequence[Area],
     mean: FloatArray,
 ) -> tuple[Dazzled, ...]:
-    """Return the filled pixels behind each protection; ``mean`` (1 + draw, 1) is the mean power
-    in a frame in W.
+    """Return the number of saturated pixels behind each protection; ``mean`` (1 + draw, 1) is the
+    mean power in W during one exposure.
     """
     if not areas:
         return ()
@@ -109,7 +111,7 @@ def dazzled(
     pixel_count = safety.settings.sensor.shape[0] * safety.settings.sensor.shape[1]
     pixel_area = safety.settings.sensor.pixel_pitch**2
     irradiance_here = float(mean[0, 0] * exposures.lens[0, index])
-    # emitted W that would fill a pixel which gets all the light behind the lens
+    # emitted power in W that would saturate a single pixel if it received all light behind the lens
     filling_powers = [
         full_irradiance[:, None]
         * pixel_area
@@ -119,7 +121,7 @@ def dazzled(
     faintest_shares = [
         float(area.level(exposures, draws, veiled=False)[0, index]) for area in areas
     ]
-    # irradiance at the lens that fills all pixels that may be lost
+    # irradiance at the lens at which exactly the share of pixels that may be lost is saturated
     limits_at_lens = [
         filling_power[0, 0] / faintest_share * exposures.lens[0, index]
         for filling_power, faintest_share in zip(filling_powers, faintest_shares, strict=True)
@@ -141,7 +143,7 @@ def dazzled(
             if pixels.value > 0 and plain_pixels.value > 0
             else None
         )
-        # share of the passing light that fills a pixel, falling with the irradiance
+        # share of the transmitted light that saturates a pixel, falling with the irradiance
         light_shares = filling_power[:1] * exposures.lens[0, index] / irradiances[None]
         curve = np.minimum(
             area.saturated(exposures, draws, index, light_shares)[0] / pixel_count, 1.0
@@ -157,29 +159,31 @@ def dazzled(
 
 # --- damage verdict -------------------------------------------------------------------------------
 
-# The verdict of damage behind each protection: one state, one sentence, and a row for each part of
-# the light.
+# The damage verdict behind each protection: one state, one sentence, and a row for each part of the
+# light (such as one pulse, or the mean over time).
 
 
-_ALIKE = 0.98  #: share of the largest ratio from which a simpler part is named in its place
+#: a row with at least this share of the largest ratio may be named in place of the row with that
+#: ratio, if it comes first in the table
+_ALIKE = 0.98
 _CONTINUOUS = ("pulse", "mean", "accumulation")
 
 
 @dataclass(frozen=True)
 class DamageRow:
-    """What is said of one part of the light: where it is beside its threshold, or why no law
-    judges it.
+    """The judgement of one part of the light: its ratio to the damage threshold, or why no
+    threshold is known for it.
     """
 
     part: str  #: pulse, mean, accumulation or incubation
     kind: str  #: of damage
     state: State
-    reason: str  #: why the part is not judged; empty for a part that is
-    finding: Finding | None  #: of the limit of this part; None: not judged
+    reason: str  #: why the part is not judged; empty if it is judged
+    finding: Finding | None  #: for the limit of this part; None: not judged
 
     @property
     def ratio(self) -> float:
-        """Return the exposure over the threshold; 0 for a part without a threshold."""
+        """Return the ratio of exposure to threshold; 0 for a part without a threshold."""
         return 0.0 if self.finding is None else self.finding.ratio
 
 
@@ -193,8 +197,8 @@ class DamageVerdict:
 
     @property
     def nearest(self) -> DamageRow | None:
-        """Return the row that the verdict names: of its state, the largest ratio; None if no law
-        judges any row.
+        """Return the row that the verdict quotes: about the largest ratio among the rows in the
+        state of the verdict; None if no row has a limit.
 
         A verdict that is not judged names the largest ratio of what is judged. Incubation is an
         assumption: it is named only where no other part has the state of the verdict.
@@ -204,7 +208,7 @@ class DamageVerdict:
         return next((row for row in candidates if row.ratio >= _ALIKE * largest), None)
 
     def _candidates(self) -> list[DamageRow]:
-        """Return the rows of which the verdict names one."""
+        """Return the rows from which the verdict quotes one."""
         rows = [row for row in self.with_limit if row.state == self.state]
         if self.state == "not judged":
             rows = [row for row in self.with_limit if row not in self.unjudged] or rows
@@ -223,7 +227,7 @@ class DamageVerdict:
 
 
 def _measured(rows: Sequence[DamageRow]) -> list[DamageRow]:
-    """Return the rows without those of the incubation, which is an assumption."""
+    """Return all rows but those of incubation, whose threshold is an assumption."""
     return [row for row in rows if row.part != "incubation"]
 
 
@@ -234,7 +238,7 @@ def damage_verdicts(
     draws: SettingDraws,
     findings: Sequence[Finding],
 ) -> Iterator[DamageVerdict]:
-    """Yield the verdict of damage behind each option; none if damage is not asked for."""
+    """Yield the damage verdict behind each option; nothing if the recipe has no damage settings."""
     for option in options:
         light_parts = limit_parts(safety, option, exposures, draws)
         damage_findings = [
@@ -252,8 +256,8 @@ def damage_verdicts(
 def _rows(
     parts: Sequence[DamagePart], findings: Sequence[Finding], continuous: bool
 ) -> Iterator[DamageRow]:
-    """Yield the row of each part; the findings are those of the parts with a threshold, in their
-    order.
+    """Yield the row of each part of the light; ``findings`` has one entry for each part with a
+    threshold, in the same order.
     """
     findings_in_order = iter(findings)
     for damage_part in parts:
@@ -266,8 +270,8 @@ def _rows(
 
 
 def state_of_finding(finding: Finding) -> State:
-    """Return where the exposure at the distance of the recipe is beside a limit of damage, with
-    what is uncertain.
+    """Return whether the exposure at the distance of the recipe is above, within or below the
+    uncertainty interval of a damage limit.
     """
     assert finding.ratios is not None
     return state_of(finding.ratios.low, finding.ratios.high, finding.limit.open_below)
@@ -275,7 +279,7 @@ def state_of_finding(finding: Finding) -> State:
 
 # --- counted parts --------------------------------------------------------------------------------
 
-# Sentences on what an estimate counts along the axis and what it does not: scatter, focus, air and
+# Sentences on which effects an estimate includes along the optical axis: scatter, focus, air and
 # the beam itself.
 
 
@@ -284,8 +288,8 @@ _REMEDY = "more optics.samples, and a step laser.wavefront, carry a nearer one"
 
 
 def scatter_text(veil: Veil | None) -> str:
-    """Return which share of the light the lens scatters, whether it is assumed, and what it
-    does.
+    """Return a sentence on the share of the light that the lens scatters, whether it is assumed,
+    and what it affects.
     """
     if veil is None:
         return (
@@ -307,7 +311,9 @@ def scatter_text(veil: Veil | None) -> str:
 
 
 def focus_text(safety: Safety) -> str:
-    """Return on which distance the lens is focused, and what another focus does."""
+    """Return a sentence on the distance at which the lens is focused, and on the effect of another
+    focus.
+    """
     focus = safety.settings.lens.focus
     if focus == "laser":
         return "The lens is focused on the laser at every distance, which gives the highest peak."
@@ -319,8 +325,8 @@ def focus_text(safety: Safety) -> str:
 
 
 def counted(safety: Safety) -> Iterator[str]:
-    """Yield one sentence for each property of beam and air: counted with its value, or not
-    counted.
+    """Yield one sentence for each property of beam and air: either included, with its value, or not
+    included.
     """
     beam, m_squared = safety.settings.beam, safety.laser.beam().m_squared
     if beam.hot_spots > 1 or "beam.hot_spots" in safety.values:
@@ -351,7 +357,9 @@ def counted(safety: Safety) -> Iterator[str]:
 
 
 def ladder_text(ranked: tuple[Ranked, ...], peaks: Peaks | None) -> str:
-    """Return at how many distances the spot is computed, and how exact it is between them."""
+    """Return a text on the number of distances at which the spot is computed, and on the
+    interpolation error between them.
+    """
     text = (
         "The spot of the clear lens is computed at every distance; from where the beam fills the"
         f" lens to (D / 2w)^2 = {FAR_FILL:g} with {FAR_WAVES:g} waves of curvature it is that of a"
@@ -372,7 +380,7 @@ def ladder_text(ranked: tuple[Ranked, ...], peaks: Peaks | None) -> str:
 
 def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> Iterator[str]:
     """Yield one sentence for each point-spread function that is not computed at the nearest
-    distance asked (m).
+    distance of the settings, ``asked`` (m).
 
     Another one says at which distances light outside the window of the spot behind the mask counts
     as its peak.
@@ -405,15 +413,15 @@ def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> 
 
 # --- unsaid parts ---------------------------------------------------------------------------------
 
-# Sentences on what an estimate does not say, each with its reason.
+# Sentences on what an estimate leaves out, each with its reason.
 
 
-_BEYOND = 0.2  #: share of the lost pixels beyond a window from which a sentence says so
+_BEYOND = 0.2  #: largest share of the lost pixels outside a window that is not reported
 
 
 def unsaid_of_damage(safety: Safety, verdicts: Sequence[DamageVerdict]) -> Iterator[str]:
-    """Yield a sentence for each reason why a part of the light is not judged; or that damage is
-    not asked for.
+    """Yield one sentence for each reason why a part of the light is not judged, or one sentence if
+    the recipe has no damage settings.
     """
     if safety.settings.damage is None:
         yield "Nothing is said of damage: the recipe does not ask for it (safety.damage)."
@@ -430,8 +438,8 @@ def unsaid_of_damage(safety: Safety, verdicts: Sequence[DamageVerdict]) -> Itera
 
 
 def unsaid_of_dazzle(safety: Safety, areas: Mapping[str, Area | str]) -> Iterator[str]:
-    """Yield sentences on what is not said of dazzle; ``areas`` has the area behind each
-    protection, or a reason.
+    """Yield sentences on what the estimate leaves out of dazzle; ``areas`` maps each protection to
+    its dazzled area or to the reason why it is unknown.
     """
     dazzle, sensor = safety.settings.dazzle, safety.settings.sensor
     if dazzle is None:
@@ -460,8 +468,8 @@ def unsaid_of_dazzle(safety: Safety, areas: Mapping[str, Area | str]) -> Iterato
 
 
 def _unsaid_areas(areas: Mapping[str, Area | str]) -> Iterator[str]:
-    """Yield one sentence for each reason why the dazzled area behind some protections is not
-    known.
+    """Yield one sentence for each reason why a dazzled area is unknown, with the protections it
+    applies to.
     """
     reasons: dict[str, list[str]] = {}
     for name, area in areas.items():
@@ -475,8 +483,8 @@ def _unsaid_areas(areas: Mapping[str, Area | str]) -> Iterator[str]:
 
 
 def beyond_window(shares: Mapping[str, float]) -> Iterator[str]:
-    """Yield one sentence if many of the lost pixels lie beyond the window of a PSF; ``shares``
-    are by protection.
+    """Yield one sentence if many of the lost pixels lie outside the window of a PSF; ``shares``
+    maps each protection to the share of such pixels.
     """
     shares_to_name = {name: share for name, share in shares.items() if share > _BEYOND}
     if shares_to_name:
@@ -502,8 +510,8 @@ CERTIFICATE = "An estimate, no certificate: neusee decides nothing about eyes or
 
 @dataclass(frozen=True)
 class Finding:
-    """What one limit says behind one option: the limit at the lens, the exposure, and the zones
-    of distance.
+    """The comparison of the exposure with one limit behind one option: limit at the lens, exposure,
+    and zones of distance.
     """
 
     option: str
@@ -513,7 +521,7 @@ class Finding:
     #: at the peak on the sensor at the distance of the recipe, in the quantity of the limit
     exposure: Spread
     ratio: float  #: nominal exposure over the nominal limit
-    #: of damage to a device drawn from all; None where the spread of devices is unknown
+    #: probability of damage to a randomly drawn device; None where the spread of devices is unknown
     probability: Spread | None
     zones: Zones
     curve: FloatArray  #: (3, distance) of the limit at the lens: nominal, 5 % and 95 %
@@ -522,7 +530,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Everything that `neusee safety` says of a recipe."""
+    """The complete result of `neusee safety` for one recipe."""
 
     recipe: Recipe
     safety: Safety
@@ -533,35 +541,35 @@ class Estimate:
     findings: tuple[Finding, ...]
     eye: EyeFinding | None
     eye_dazzle: EyeDazzleFinding
-    unsaid: tuple[str, ...]  #: what the estimate does not say, with the reason
+    unsaid: tuple[str, ...]  #: what the estimate leaves out, with the reason
     patterns: tuple[DamagePattern, ...] = ()
     dazzled: tuple[Dazzled, ...] = ()  #: behind each protection for which the dazzled area is known
     dead: tuple[DeadPixels, ...] = ()  #: examples of damage in a raw frame
     ranked: tuple[Ranked, ...] = ()
-    #: behind each protection; empty if damage is not asked for
+    #: behind each protection; empty if the recipe has no damage settings
     damage: tuple[DamageVerdict, ...] = ()
-    #: filter, notch, stop or exposure for each limit behind the plain lens
+    #: filter, notch filter, stop or exposure time that meets each limit behind the plain lens
     helps: tuple[Remedy, ...] = ()
     peaks: Peaks | None = None
     veil: Veil | None = None
 
     @property
     def at(self) -> int:
-        """Return the index of the distance of the recipe among all distances."""
+        """Return the index of the distance of the recipe in the array of distances."""
         return self.exposures.at(self.safety.laser.distance)
 
     @property
     def mean_at_lens(self) -> float:
-        """Return the nominal irradiance at the lens at the distance of the recipe, the mean over
-        one exposure, W/m2.
+        """Return the nominal irradiance at the lens in W/m2 at the distance of the recipe, averaged
+        over one exposure.
         """
         mean = mean_in_frame(self.exposures, self.safety.settings.sensor.exposure or 1.0)
         return float(mean[0, 0] * self.exposures.lens[0, self.at])
 
 
 def estimate(recipe: Recipe, store: Store | None = None) -> Estimate:
-    """Return the estimate of a recipe with a block ``safety``; the peak behind the mask comes from
-    the store if it can.
+    """Return the estimate of a recipe with a block ``safety``; results of its steps come from the
+    store if present.
 
     Raises `RecipeError` for a recipe without the block, for a distribution with values that are not
     allowed and for a step that does not exist, all before anything is computed, and `RunError` if a
@@ -572,8 +580,8 @@ def estimate(recipe: Recipe, store: Store | None = None) -> Estimate:
 
 @dataclass(frozen=True)
 class Prepared:
-    """Everything that decides an estimate: settings, draws, and what the steps of the recipe say
-    of lens and mask.
+    """All inputs of an estimate: settings, draws, and the results of the recipe's steps for lens
+    and mask.
     """
 
     safety: Safety
@@ -585,7 +593,7 @@ class Prepared:
 
 
 def prepare(recipe: Recipe, store: Store | None) -> Prepared:
-    """Return what decides an estimate, with the errors that `estimate` lists."""
+    """Return all inputs of an estimate; raises the errors that `estimate` lists."""
     safety = settings_of(recipe)
     refuse_other_lens(recipe, safety, store)
     safety = with_channels(recipe, safety, store)
@@ -602,7 +610,7 @@ def prepare(recipe: Recipe, store: Store | None) -> Prepared:
 
 
 def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
-    """Return the estimate from everything that decides it."""
+    """Return the estimate from its inputs."""
     safety, draws, options = prepared.safety, prepared.draws, prepared.options
     exposures = compute_exposures(safety, draws, options)
     area_behind = {option.name: area_of(safety, option, prepared.ranked) for option in options}
@@ -647,13 +655,15 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
 
 
 def _dazzles(safety: Safety) -> bool:
-    """Return True if dazzle is asked for and some channel of the sensor sees the laser."""
+    """Return True if the recipe has dazzle settings and at least one channel of the sensor sees the
+    laser.
+    """
     return safety.settings.dazzle is not None and sees(safety.channels)
 
 
 def settings_of(recipe: Recipe) -> Safety:
-    """Return the settings of a recipe's block ``safety``; raise `RecipeError` for a recipe
-    without them.
+    """Return the settings in the block ``safety`` of a recipe; raise `RecipeError` if there is no
+    such block.
     """
     if recipe.safety is None:
         text = (
@@ -671,7 +681,7 @@ def _findings(
     exposures: Exposures,
     areas: tuple[Area, ...],
 ) -> Iterator[Finding]:
-    """Yield what each limit says behind each option."""
+    """Yield the comparison with each limit behind each option."""
     area_behind = {area.option: area for area in areas}
     for option in options:
         for limit in limits_behind(safety, draws, option, area_behind.get(option), exposures):
@@ -679,7 +689,8 @@ def _findings(
 
 
 def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures) -> Finding:
-    """Return what one limit says behind one option, over all distances and at that of the recipe.
+    """Return the comparison with one limit behind one option, at all distances and at the distance
+    of the recipe.
 
     Rows of arrays are the nominal values and then the draws.
     """
@@ -690,7 +701,7 @@ def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures)
         limit_ratio(safety, option.name, limit, exposures),
         limit_values * exposures.lens / per_power,
     )
-    # the exposure at the peak on the sensor: emitted light times exposure per unit of it
+    # exposure at the peak on the sensor: emitted power or energy times exposure per unit of it
     exposure_here = emitted_light[:, 0] * per_power[:, index]
     return Finding(
         option.name,
@@ -713,13 +724,13 @@ def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures)
 
 
 def _spread(values: FloatArray) -> Spread:
-    """Return the nominal value, which comes first, with the interval of the draws after it."""
+    """Return the nominal value (first element) with the interval of the draws (all others)."""
     return Spread.of(float(values[0]), values[1:])
 
 
 def _probability(limit: Limit, ratio: FloatArray) -> Spread | None:
-    """Return the share of devices that are damaged, with the interval from everything but the
-    device.
+    """Return the share of devices that are damaged, with its interval over all uncertain inputs but
+    the device.
 
     ``ratio`` (draw,) is that of the exposure to the limit of the median device.
     """

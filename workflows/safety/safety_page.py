@@ -31,11 +31,12 @@ from neusee.workflows.safety.safety_text import is_bracket, limit_rows, verdict,
 
 # --- safety figures -------------------------------------------------------------------------------
 
-# Figures of an estimate of safety: irradiance over distance with its limits, and zones of distance.
+# Figures of a safety estimate: irradiance as a function of distance with its limits, and zones of
+# distance.
 
 
 _COLOURS = (VERMILION, ORANGE, "#CC79A7", "#56B4E9", "#8c510a", "#7f7f7f")
-_BELOW = 1.5  #: decades below the peak of a spot that a picture of the spot shows at least
+_BELOW = 1.5  #: least number of decades below the peak that a picture of a spot shows
 _DASHES = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
 _NAMES = {
     "irradiance": "irradiance at the lens (W/m2)",
@@ -45,8 +46,8 @@ _NAMES = {
 
 @drawn
 def over_distance(estimate: Estimate) -> Any:
-    """Draw the exposure at the lens over the distance, and the limits at the lens behind the
-    plain lens.
+    """Draw the exposure at the lens as a function of distance, with the limits behind the plain
+    lens.
     """
     plain_findings = [
         finding for finding in estimate.findings if finding.option == estimate.options[0].name
@@ -75,7 +76,7 @@ def _has_mean(estimate: Estimate) -> bool:
 
 
 def _panel(axis: Any, estimate: Estimate, kind: Any, findings: list[Finding]) -> None:
-    """Draw one panel: the exposure of the laser over the distance, and the limits of its quantity.
+    """Draw one panel: the exposure as a function of distance, and the limits of the same quantity.
 
     ``kind`` is ``irradiance`` or ``fluence``; ``findings`` are those of this quantity.
     """
@@ -84,7 +85,7 @@ def _panel(axis: Any, estimate: Estimate, kind: Any, findings: list[Finding]) ->
     low_curve, high_curve = np.quantile(curve[1:], QUANTILES, axis=0)
     axis.fill_between(distances, low_curve, high_curve, color=BLUE, alpha=0.25, linewidth=0)
     axis.plot(distances, curve[0], color=BLUE, linewidth=2, label="laser")
-    # rows of `curve`: nominal, 5 % and 95 %
+    # rows of `finding.curve`: nominal, 5 % and 95 %
     for number, finding in enumerate(findings):
         colour, dash = _COLOURS[number % len(_COLOURS)], _DASHES[number % len(_DASHES)]
         axis.fill_between(
@@ -116,7 +117,9 @@ def _panel(axis: Any, estimate: Estimate, kind: Any, findings: list[Finding]) ->
 
 @drawn
 def spots(patterns: Sequence[DamagePattern]) -> Any:
-    """Draw the exposure on the sensor over the limit of damage: red above the limit, blue below."""
+    """Draw the ratio of the exposure on the sensor to the damage limit: red above the limit, blue
+    below.
+    """
     figure, axes = canvas(4.6 * len(patterns), 4.0, 1, len(patterns))
     for axis, pattern in zip(axes[0], patterns, strict=True):
         half_width, log_peak = pattern.width / 2 * 1e6, float(np.log10(pattern.peak))
@@ -211,7 +214,7 @@ def dazzled_share(estimate: Estimate) -> Any:
 
 @drawn
 def dead_frames(dead: Sequence[DeadPixels]) -> Any:
-    """Draw a part of the raw frame of an evenly grey scene with its dead pixels, behind each
+    """Draw the part of a raw frame of a uniform grey scene with its dead pixels, behind each
     protection.
     """
     figure, axes = canvas(3.6 * len(dead), 3.8, 1, len(dead))
@@ -247,7 +250,7 @@ def dead_frames(dead: Sequence[DeadPixels]) -> Any:
 
 # --- safety page ----------------------------------------------------------------------------------
 
-# The page of an estimate of safety: limits, distances, the eye, what is not said, assumptions and
+# The page of a safety estimate: limits, distances, the eye, what is left out, assumptions and
 # sources.
 
 
@@ -339,8 +342,8 @@ def _limits(estimate: Estimate) -> Section | None:
 
 
 def _mark(finding: Finding) -> Mark:
-    """Return the mark of a limit; a limit of damage passes only if its exposure is below the
-    whole bracket.
+    """Return the mark of a limit; a damage limit passes only if the exposure is below the whole
+    bracket.
     """
     if finding.ratio >= 1:
         return "fail"
@@ -384,8 +387,8 @@ def _dazzled(estimate: Estimate, picture: bytes | None) -> Section | None:
 
 
 def _dead(estimate: Estimate, picture: bytes | None) -> Section | None:
-    """Return the section of the dead pixels; without a picture, that no distance damages the
-    median device.
+    """Return the section on dead pixels; without a picture it says that no damage occurs at any
+    distance.
     """
     if not estimate.patterns:
         return None
@@ -445,7 +448,7 @@ def _eye(estimate: Estimate) -> Section | None:
 
 
 def _helps(estimate: Estimate) -> Section | None:
-    """Return the section on what helps; None without any means."""
+    """Return the section on protective measures; None if there are none."""
     if not estimate.helps:
         return None
     text = " ".join([safety_text.EXPLAINED, *safety_text.sentences(estimate.helps), CERTIFICATE])
@@ -468,9 +471,7 @@ def _unsaid(estimate: Estimate) -> Section | None:
 
 
 def _assumed(estimate: Estimate) -> Section:
-    """Return the section on what the estimate assumes: beam, air, focus, scatter,
-    spots and damage.
-    """
+    """Return the section on the assumptions: beam, air, focus, scatter, spots and damage."""
     laser = estimate.safety.laser
     air = "Clear air."
     if laser.air_transmittance is not None:
@@ -508,7 +509,7 @@ def _assumed(estimate: Estimate) -> Section:
 
 
 def _damage_assumed(estimate: Estimate) -> str:
-    """Return what is assumed of damage."""
+    """Return the assumptions on damage as text."""
     damage = estimate.safety.settings.damage
     if damage is None:
         return "Damage is not asked for."
@@ -568,7 +569,9 @@ def _row(finding: Finding) -> list[object]:
 
 
 def _beside(finding: Finding) -> list[object]:
-    """Return the last columns of a limit: state, ends of the ratio, and the note of its law."""
+    """Return the last columns of a limit's row: state, ends of the ratio, and the note of its
+    law.
+    """
     low, high = (finding.ratios.low, finding.ratios.high) if finding.ratios else (None, None)
     state = state_of_finding(finding) if finding.limit.effect == "damage" else ""
     return [state, low, high, finding.limit.note]
@@ -588,7 +591,7 @@ def _unjudged(estimate: Estimate) -> list[list[object]]:
 
 def _unjudged_row(option: str, row: DamageRow) -> list[object]:
     """Return the row of an unjudged part of the light in limits.csv, with the columns of `_CSV`."""
-    # from "quantity" to "source", where the reason stands in place of a source
+    # cells from "quantity" up to "source"; the reason takes the place of the source
     empty_cells = [""] * 12
     names = [option, f"damage: {row.part}", "damage"]
     return [*names, *empty_cells, row.reason, "not judged", "", "", ""]

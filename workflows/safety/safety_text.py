@@ -1,4 +1,4 @@
-"""Cells and sentences of an estimate, and the estimate as text for a terminal."""
+"""Table cells and sentences of an estimate, and the whole estimate as text for a terminal."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from neusee.workflows.safety.what_helps import MET, PictureCost, Remedy
 
 # --- safety words ---------------------------------------------------------------------------------
 
-# Cells and sentences of an estimate, which its page and the terminal share.
+# Table cells and sentences of an estimate, shared by its page and the terminal.
 
 
 _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 _PER_CM2 = 1e-4  #: of a quantity per m2
-_LEAST_RELATIVE_WIDTH = 0.01  #: relative width of an interval that is not written
+_LEAST_RELATIVE_WIDTH = 0.01  #: intervals narrower than this relative width are not written
 _LEAST_SHARE = 1e-4  #: smallest share that is written as a number
 UNITS = {"irradiance": "W", "fluence": "J"}
 
@@ -51,7 +51,7 @@ ZONE_COLUMNS = (
 
 
 def scaled(value: float, unit: str) -> str:
-    """Return a positive number with three digits and a prefix of its unit, such as ``20.4 MW``."""
+    """Return a positive number with three digits and an SI prefix, such as ``20.4 MW``."""
     if not (math.isfinite(value) and value > 0):
         return f"{value:g} {unit}"
     # the largest multiple of 3 below the logarithm; 1e-12 is its rounding
@@ -68,8 +68,8 @@ def scaled(value: float, unit: str) -> str:
 
 
 def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
-    """Return a number with the interval of its draws in brackets, or alone if nothing is
-    uncertain.
+    """Return a number with the interval of its draws in brackets, or the number alone without
+    uncertainty.
     """
     nominal_text = scaled(factor * spread.value, unit)
     if math.isclose(spread.low, spread.high, rel_tol=_LEAST_RELATIVE_WIDTH):
@@ -81,9 +81,7 @@ def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
 
 
 def plain(number: str) -> str:
-    """Return a number of three digits without an exponent where this is short, such as 1020 for
-    1.02e+03.
-    """
+    """Return a number text such as 1.02e+03 without its exponent (1020), if that is short."""
     return f"{float(number):.0f}" if "e+" in number and abs(float(number)) < 1e5 else number
 
 
@@ -93,7 +91,7 @@ def metres(distance: float) -> str:
 
 
 def end(spread: Spread) -> str:
-    """Return a distance with the interval of its draws."""
+    """Return a distance as text, with the interval of its draws."""
     if math.isclose(spread.low, spread.high, rel_tol=_LEAST_RELATIVE_WIDTH):
         return metres(spread.value)
     return f"{metres(spread.value)} ({metres(spread.low)} to {metres(spread.high)})"
@@ -107,8 +105,8 @@ def zone_text(zone: Zone) -> str:
 
 
 def zones_text(zones: Zones) -> str:
-    """Return the zones of a limit as text; without one at the nominal values, how far one
-    reaches in some draws.
+    """Return the zones of a limit as text; without a nominal zone, how far the zones of the draws
+    reach.
     """
     if zones.zones:
         return "; ".join(map(zone_text, zones.zones))
@@ -118,7 +116,9 @@ def zones_text(zones: Zones) -> str:
 
 
 def share(value: float) -> str:
-    """Return a probability as a percentage with two digits, and nothing more exact than 0.01 %."""
+    """Return a probability as a percentage with two digits, never closer to 0 or 100 % than
+    0.01 %.
+    """
     if value in (0.0, 1.0):
         return f"{100 * value:.0f} %"
     if value < _LEAST_SHARE:
@@ -129,9 +129,7 @@ def share(value: float) -> str:
 
 
 def probability(finding: Finding) -> str:
-    """Return the probability that a device is damaged, with its interval; a dash where no
-    probability is stated.
-    """
+    """Return the probability of damage as text with its interval; a dash where none is stated."""
     spread = finding.probability
     if spread is None:
         return "–" if finding.limit.effect == "dazzle" else "not known: no spread published"
@@ -144,8 +142,8 @@ def probability(finding: Finding) -> str:
 
 
 def limit_cells(finding: Finding) -> list[str]:
-    """Return the row of a limit: protection, limit, limit on the sensor, its share that is
-    reached, at the lens.
+    """Return the table row of a limit: protection, name, limit on the sensor, ratio, limit at the
+    lens, probability.
     """
     unit = UNITS[finding.limit.quantity]
     ratio_text = (
@@ -163,7 +161,7 @@ def limit_cells(finding: Finding) -> list[str]:
 
 
 def zone_cells(finding: Finding) -> list[str]:
-    """Return the row of a limit in the table of distances."""
+    """Return the row of a limit in the table of distance zones."""
     zones = finding.zones
     return [
         finding.option,
@@ -175,7 +173,7 @@ def zone_cells(finding: Finding) -> list[str]:
 
 
 def eye_text(eye: EyeFinding) -> str:
-    """Return what is said of the eye in two sentences."""
+    """Return two sentences on the exposure limit of the eye."""
     unit = f"{UNITS[eye.quantity]}/m²"
     per_pulse = " of each pulse" if eye.quantity == "fluence" else ""
     verb = "exceeds" if eye.exposure.value > eye.limit else "does not exceed"
@@ -188,7 +186,7 @@ def eye_text(eye: EyeFinding) -> str:
 
 
 def laser_text(estimate: Estimate) -> str:
-    """Return the laser, its distance and its exposure at the lens in one sentence."""
+    """Return one sentence on the laser, its distance and its exposure at the lens."""
     beam, index = estimate.exposures.beams[0], estimate.at
     rate_text = f" at {scaled(beam.repetition_rate, 'Hz')}" if beam.repetition_rate else ""
     output = (
@@ -215,7 +213,7 @@ def laser_text(estimate: Estimate) -> str:
 
 
 def intervals_text(estimate: Estimate) -> str:
-    """Return what the numbers in brackets mean."""
+    """Return a sentence on the meaning of the numbers in brackets."""
     laws = estimate.draws.laws
     laws_text = f" {', '.join(f'{name} {text}' for name, text in laws.items())};" if laws else ""
     text = f"In brackets: the middle 90 % of {estimate.draws.count} draws of all that is uncertain"
@@ -242,15 +240,15 @@ def dazzled_cells(area: Dazzled) -> list[str]:
 
 
 def _pixels(number: float) -> str:
-    """Return a number of pixels with three digits, or a dash for one that is not known."""
+    """Return a number of pixels with three digits as text, or a dash for NaN."""
     if math.isnan(number):
         return "–"
     return f"{float(f'{number:.3g}'):.0f}"
 
 
 def enlarged_text(estimate: Estimate) -> str:
-    """Return whether the mask makes the dazzled area larger than the plain lens, and by how
-    much; empty: not known.
+    """Return sentences that compare the dazzled area behind the mask with that behind the plain
+    lens; empty if unknown.
     """
     parts = [text for text in (_counted_text(estimate), _sooner_text(estimate)) if text]
     mask = _both(estimate)[1]
@@ -259,8 +257,8 @@ def enlarged_text(estimate: Estimate) -> str:
 
 
 def _both(estimate: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
-    """Return the dazzled areas behind the plain lens and behind the mask, each None
-    if not known.
+    """Return the dazzled areas behind the plain lens and behind the mask; None for one that is
+    unknown.
     """
     return next(iter(estimate.dazzled), None), next(
         (area for area in estimate.dazzled if area.masked), None
@@ -268,7 +266,9 @@ def _both(estimate: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
 
 
 def _counted_text(estimate: Estimate) -> str:
-    """Return the filled pixels behind mask and plain lens at the distance of the recipe."""
+    """Return a sentence with the number of saturated pixels behind mask and plain lens, at the
+    distance of the recipe.
+    """
     plain, mask = _both(estimate)
     if plain is None or mask is None:
         return ""
@@ -281,8 +281,8 @@ def _counted_text(estimate: Estimate) -> str:
 
 
 def _sooner_text(estimate: Estimate) -> str:
-    """Return by how much less light at the lens the stated share of the picture is lost behind
-    the mask.
+    """Return a sentence on how much less light at the lens is enough behind the mask to lose the
+    stated share of the picture.
     """
     plain_area, mask_area = _both(estimate)
     dazzle_findings = [
@@ -311,7 +311,7 @@ def _sooner_text(estimate: Estimate) -> str:
 
 # --- damage words ---------------------------------------------------------------------------------
 
-# Sentences and cells on damage: one verdict, and what is said of each part of the light.
+# Sentences and table cells on damage: the verdict, and each part of the light.
 
 _SUBJECTS = {
     "pulse": "one pulse",
@@ -328,8 +328,8 @@ STATES = {
 
 
 def verdict(estimate: Estimate) -> list[str]:
-    """Return the verdict of damage behind the plain lens, and a sentence for each limit of
-    dazzle behind it.
+    """Return the damage verdict behind the plain lens, and a sentence for each dazzle limit
+    there.
     """
     lens = estimate.options[0].name
     damage_sentences = [
@@ -350,8 +350,8 @@ def verdict(estimate: Estimate) -> list[str]:
 
 
 def damage_sentence(verdict: DamageVerdict, estimate: Estimate) -> str:
-    """Return the verdict of damage behind one protection in W/cm2 or J/cm2, with the distances
-    of the worst part.
+    """Return the damage verdict behind one protection, with exposure and threshold in W/cm2 or
+    J/cm2 and the zones of the quoted part.
     """
     place_text = f"at {metres(estimate.safety.laser.distance)} behind the {verdict.option}"
     nearest = verdict.nearest
@@ -374,8 +374,8 @@ def damage_sentence(verdict: DamageVerdict, estimate: Estimate) -> str:
 
 
 def _compared(row: DamageRow, estimate: Estimate) -> str:
-    """Return as a sentence: the exposure by one part of the light, and its ratio to
-    the threshold.
+    """Return a sentence with the exposure by one part of the light, and its ratio to the
+    threshold.
     """
     finding = row.finding
     assert finding is not None
@@ -393,7 +393,7 @@ def _compared(row: DamageRow, estimate: Estimate) -> str:
 
 
 def times(finding: Finding) -> str:
-    """Return the ratio of exposure to limit with its interval, such as ``0.34 (0.1 to 1.1)
+    """Return the ratio of exposure to limit with its interval as text, such as ``0.34 (0.1 to 1.1)
     times``.
     """
     spread = finding.ratios
@@ -408,8 +408,8 @@ def times(finding: Finding) -> str:
 
 
 def _zones(verdict: DamageVerdict, finding: Finding) -> str:
-    """Return where the worst part of the light exceeds its threshold; nothing where a part is
-    not judged.
+    """Return a sentence on the distances at which the threshold is exceeded; empty if a part of the
+    light is not judged.
     """
     if finding.zones.zones:
         return f"It exceeds the threshold from {zones_text(finding.zones)}."
@@ -424,12 +424,16 @@ def _zones(verdict: DamageVerdict, finding: Finding) -> str:
 
 
 def is_bracket(finding: Finding) -> bool:
-    """Return True for a limit of damage without data of devices, which has no probability."""
+    """Return True for a damage limit that is a published bracket without data of devices, and so
+    has no probability.
+    """
     return finding.limit.effect == "damage" and finding.limit.factor is None
 
 
 def limit_rows(estimate: Estimate) -> list[list[str]]:
-    """Return the table of limits, with the parts of the light that are not judged."""
+    """Return the rows of the table of limits, followed by those of the parts of the light that are
+    not judged.
+    """
     rows = [_limit_cells(finding) for finding in estimate.findings]
     for verdict in estimate.damage:
         rows += [_unjudged_cells(verdict, row) for row in _without_limit(verdict)]
@@ -437,7 +441,9 @@ def limit_rows(estimate: Estimate) -> list[list[str]]:
 
 
 def zone_rows(estimate: Estimate) -> list[list[str]]:
-    """Return the table of distances, with the parts of the light that are not judged."""
+    """Return the rows of the table of distance zones, followed by those of the parts of the light
+    that are not judged.
+    """
     partial = {verdict.option for verdict in estimate.damage if verdict.unjudged}
     rows = [_zone_cells(finding, finding.option in partial) for finding in estimate.findings]
     for verdict in estimate.damage:
@@ -449,19 +455,17 @@ def zone_rows(estimate: Estimate) -> list[list[str]]:
 
 
 def _without_limit(verdict: DamageVerdict) -> list[DamageRow]:
-    """Return the rows without a limit."""
+    """Return the rows of a verdict that have no limit."""
     return [row for row in verdict.rows if row.finding is None]
 
 
 def _unjudged_cells(verdict: DamageVerdict, row: DamageRow) -> list[str]:
-    """Return the row of a part of the light without a law in the table of limits."""
+    """Return the row in the table of limits for a part of the light that no law covers."""
     return [verdict.option, f"damage: {row.part}", "no law", "not judged", "–", "–"]
 
 
 def _limit_cells(finding: Finding) -> list[str]:
-    """Return the row of a limit, for damage with the ratio's bracket and where the exposure is
-    beside the limit.
-    """
+    """Return the table row of a limit; for damage with the interval of the ratio and the state."""
     cells = limit_cells(finding)
     if finding.limit.effect != "damage" or finding.ratios is None:
         return cells
@@ -473,8 +477,8 @@ def _limit_cells(finding: Finding) -> list[str]:
 
 
 def _zone_cells(finding: Finding, partial: bool) -> list[str]:
-    """Return the row of a limit in the table of distances; without device data it has no
-    probabilities.
+    """Return the row of a limit in the table of distance zones; without device data its
+    probabilities are dashes.
     """
     zones = finding.zones
     text = zones_text(zones)
@@ -486,7 +490,7 @@ def _zone_cells(finding: Finding, partial: bool) -> list[str]:
 
 # --- eye words ------------------------------------------------------------------------------------
 
-# Cells and sentences on the dazzle of the eye, which the page and the terminal share.
+# Table cells and sentences on dazzle of the eye, shared by the page and the terminal.
 
 
 EYE_DAZZLE_COLUMNS = (
@@ -499,7 +503,7 @@ EYE_DAZZLE_COLUMNS = (
 
 
 def dazzle_cells(row: EyeDazzleRow) -> list[str]:
-    """Return the row of one light of the surroundings and one angle."""
+    """Return the table row for one ambient luminance and one angle."""
     first_cells = [f"{row.background:g} cd/m²", f"{row.angle:.3g}°"]
     if row.distance is None:
         return [*first_cells, "not seen without a laser", "–", "–"]
@@ -512,8 +516,8 @@ def dazzle_cells(row: EyeDazzleRow) -> list[str]:
 
 
 def distance_table(rows: Sequence[EyeDazzleRow]) -> list[list[str]]:
-    """Return the dazzle distance for each light of the surroundings (row) and each angle
-    (column), the header first.
+    """Return the table of dazzle distances, header first: a row for each ambient luminance, a
+    column for each angle.
     """
     angles = list(dict.fromkeys(row.angle for row in rows))
     table = [["surroundings", *(f"{angle:.3g}° from the laser" for angle in angles)]]
@@ -529,7 +533,7 @@ def distance_table(rows: Sequence[EyeDazzleRow]) -> list[list[str]]:
 
 
 def dazzle_text(finding: EyeDazzleFinding, asked: EyeDazzle) -> str:
-    """Return what is asked of the eye, or why its dazzle is not judged."""
+    """Return a sentence on the viewing task, or why dazzle of the eye is not judged."""
     if finding.reason:
         return f"Dazzle of the eye is not judged: {finding.reason}."
     size = math.degrees(asked.size) * 60
@@ -543,7 +547,7 @@ def dazzle_text(finding: EyeDazzleFinding, asked: EyeDazzle) -> str:
 
 # --- helps words ----------------------------------------------------------------------------------
 
-# Cells and sentences on what helps, which the page and the terminal share.
+# Table cells and sentences on protective measures, shared by the page and the terminal.
 
 
 COLUMNS = (
@@ -564,8 +568,8 @@ EXPLAINED = """Damage, saturation and contrast are three problems, and each is s
 
 
 def table(remedies: Sequence[Remedy]) -> list[list[str]]:
-    """Return a row for each means against each limit, and a single row for a limit that is met
-    without any.
+    """Return a table row for each protective measure against each limit, and a single row for a
+    limit that needs none.
     """
     rows = []
     for limit in dict.fromkeys(remedy.limit for remedy in remedies):
@@ -578,7 +582,7 @@ def table(remedies: Sequence[Remedy]) -> list[list[str]]:
 
 
 def cells(remedy: Remedy) -> list[str]:
-    """Return the row of one means against one limit."""
+    """Return the table row that compares one protective measure with one limit."""
     cost = remedy.cost
     scene_text = "–" if cost is None else f"{100 * cost.scene:.3g} %"
     return [
@@ -593,7 +597,9 @@ def cells(remedy: Remedy) -> list[str]:
 
 
 def _value(remedy: Remedy) -> str:
-    """Return the value at the limit with its interval, or that there is none."""
+    """Return the value of a measure that meets the limit, with its interval, or that there is
+    none.
+    """
     if remedy.reason == MET:
         return MET
     if remedy.value is None:
@@ -618,14 +624,14 @@ def _number(means: str, value: float) -> str:
 
 
 def _snr(cost: PictureCost) -> str:
-    """Return the signal-to-noise ratio of the stated feature before and after."""
+    """Return the signal-to-noise ratio of the stated feature without and with the measure."""
     if cost.snr_before is None or cost.snr_after is None:
         return "–"
     return f"{cost.snr_before:.3g} to {cost.snr_after:.3g}"
 
 
 def _note(remedy: Remedy) -> str:
-    """Return what has to be known with a value, or why there is none."""
+    """Return the remarks on a value, or why there is none."""
     if remedy.reason == MET:
         return ""
     if remedy.value is None:
@@ -635,7 +641,7 @@ def _note(remedy: Remedy) -> str:
 
 
 def _notch_note(remedy: Remedy) -> str:
-    """Return the band that a notch filter has to block."""
+    """Return a remark on the band that a notch filter has to block."""
     if remedy.band is None:
         return ""
     low, high = (f"{wavelength * 1e9:.4g}" for wavelength in remedy.band)
@@ -643,7 +649,9 @@ def _notch_note(remedy: Remedy) -> str:
 
 
 def _picture_notes(remedy: Remedy) -> Iterator[str]:
-    """Yield what a stop, a grey filter or an exposure does to white and to fine detail."""
+    """Yield remarks on what a stop, a grey filter or an exposure does to white and to fine
+    detail.
+    """
     cost = remedy.cost
     if cost is None:
         return
@@ -654,8 +662,8 @@ def _picture_notes(remedy: Remedy) -> Iterator[str]:
 
 
 def sentences(remedies: Sequence[Remedy]) -> Iterator[str]:
-    """Yield that an exposure never changes damage, and each limit against which no grey filter
-    and no stop helps.
+    """Yield a sentence that exposure never changes damage, and one for each limit that neither grey
+    filter nor stop can meet.
     """
     if any(remedy.problem == "damage" for remedy in remedies):
         yield "An exposure never changes damage."
@@ -677,8 +685,8 @@ Paragraphs = Sequence[Sequence[str]]
 
 
 def paragraphs(estimate: Estimate) -> list[list[str]]:
-    """Return the verdict, the tables of limits and distances, the eye, and the sources, before
-    lines are wrapped.
+    """Return the estimate as paragraphs, before lines are wrapped: verdict, tables, eye, notes and
+    sources.
     """
     texts = [
         [f"{estimate.recipe.name}: {estimate.recipe.title}", CERTIFICATE, ""],
@@ -731,14 +739,14 @@ def _dazzled_area(estimate: Estimate) -> Iterator[list[str]]:
 
 
 def _unsaid(estimate: Estimate) -> Iterator[list[str]]:
-    """Yield what the estimate does not say."""
+    """Yield what the estimate leaves out."""
     if estimate.unsaid:
         yield ["", "not said"]
         yield from ([text] for text in estimate.unsaid)
 
 
 def _counted(estimate: Estimate) -> Iterator[list[str]]:
-    """Yield what is counted along the axis."""
+    """Yield the effects included along the optical axis."""
     yield from (
         ["", "counted along the axis"],
         [safety_estimate.scatter_text(estimate.veil)],
@@ -748,7 +756,7 @@ def _counted(estimate: Estimate) -> Iterator[list[str]]:
 
 
 def _intervals(estimate: Estimate) -> Iterator[list[str]]:
-    """Yield what the numbers in brackets mean."""
+    """Yield the meaning of the numbers in brackets."""
     yield from (["", "intervals"], [intervals_text(estimate)])
 
 
@@ -759,7 +767,7 @@ def _sources(estimate: Estimate) -> Iterator[list[str]]:
 
 
 def _helps(estimate: Estimate) -> Iterator[list[str]]:
-    """Yield what helps, without the notes of the page."""
+    """Yield the table of protective measures, without the notes column of the page."""
     if estimate.helps:
         cells = [row[:-1] for row in table(estimate.helps)]
         yield _table("what helps, behind the plain lens", COLUMNS[:-1], cells)
@@ -777,7 +785,7 @@ def _eye(estimate: Estimate) -> Iterator[list[str]]:
 
 
 def _eye_sources(estimate: Estimate) -> Iterator[list[str]]:
-    """Yield the sources of what is said of the eye."""
+    """Yield the sources for the eye."""
     if estimate.eye:
         yield [f"eye: {estimate.eye.source}"]
     if estimate.eye_dazzle.rows:
@@ -785,7 +793,7 @@ def _eye_sources(estimate: Estimate) -> Iterator[list[str]]:
 
 
 def lines(parts: Paragraphs) -> list[str]:
-    """Return paragraphs as lines that are no wider than the terminal, but for tables."""
+    """Return paragraphs as lines no wider than the terminal; tables are not wrapped."""
     printed: list[str] = []
     for paragraph in parts:
         printed += wrapped(paragraph[0]) if len(paragraph) == 1 else paragraph
@@ -793,11 +801,13 @@ def lines(parts: Paragraphs) -> list[str]:
 
 
 def _source(finding: Finding) -> str:
-    """Return the source of a limit, with what is interpolated, extrapolated or assumed in it."""
+    """Return the source of a limit, with a note on interpolation, extrapolation or assumptions."""
     note = f" ({finding.limit.note})" if finding.limit.note else ""
     return f"{finding.limit.name}: {finding.limit.source}{note}"
 
 
 def _table(title: str, header: tuple[str, ...], rows: list[list[str]]) -> list[str]:
-    """Return a table as lines: an empty one, the title, and header and rows in aligned columns."""
+    """Return a table as lines: an empty line, the title, then header and rows in aligned
+    columns.
+    """
     return ["", title, *(f"  {line}" for line in columns([list(header), *rows]))]

@@ -1,9 +1,9 @@
-"""What helps: the filter, the notch filter, the stop or the exposure that brings each limit down to
-its threshold.
+"""Protective measures: the grey filter, notch filter, stop or exposure time that brings the laser
+down to each limit.
 
-Damage, saturation and contrast are three problems, and each is solved apart behind the plain lens
-at the distance of the recipe. A remedy is found by asking the functions that make the verdict, and
-it is put back into them.
+Damage, saturation and contrast are treated separately, behind the plain lens at the distance of the
+recipe. The value of a measure is found with the same functions that compute the verdict, and is
+checked with them again.
 """
 
 from __future__ import annotations
@@ -38,14 +38,15 @@ Ratios = Mapping[str, FloatArray]
 #: transmittances that are tried, from none to the strongest
 _FILTERS = tuple(10.0**-x for x in (0, 1, 2, 4, 8, 12))
 _SLOWEST_F_NUMBER = 64.0  #: f-number of the smallest stop
-#: half a stop, as a ratio of diameters: two stops that are tried are two of it apart at most
+#: half a photographic stop, as a ratio of diameters; neighbouring trial diameters differ by at most
+#: twice this step
 _HALF_STOP = 2.0**-0.25
 _SHORTER = tuple(10.0**-x for x in (0, 0.5, 1, 2, 3, 4, 5, 6))  #: exposures over that of the recipe
 _LONGER = tuple(10.0 ** (x / 4) for x in range(13))
-_SAFE_SHARE = 0.95  #: share of the draws in which a safe value holds
-_SEARCH_STEPS = 60  #: of the search for a nominal value
-_AGREED_LOG = 1e-7  #: of the logarithm of a nominal ratio
-_REFINING_ROUNDS = 3  #: rounds in which a safe value is put back and tried again
+_SAFE_SHARE = 0.95  #: share of the draws in which a safe value must be sufficient
+_SEARCH_STEPS = 60  #: most steps of the search for a nominal value
+_AGREED_LOG = 1e-7  #: largest logarithm of a nominal ratio at the end of the search
+_REFINING_ROUNDS = 3  #: rounds of correcting a safe value by computing its ratio again
 _UNCHANGED_RATIO = 1e-6  #: relative difference of ratios that count as equal
 _FLOOR, _CEILING = 1e-300, 1e300
 
@@ -56,12 +57,12 @@ UNSAFE = "no value holds in 95 % of the draws"
 
 @dataclass(frozen=True)
 class PictureCost:
-    """What a remedy takes from the picture while no laser shines."""
+    """The effect of a measure on the picture while no laser shines."""
 
     scene: float  #: share of the scene's light that a pixel collects in one exposure
     cutoff_before: float  #: cycles a pixel, finest detail that diffraction leaves
     cutoff_after: float
-    #: e- of a white that filled the well before; None: the well is not known
+    #: e- of a white that filled the well without the measure; None: the well is not known
     white: float | None = None
     #: e- behind the stated feature; None here and below: no feature is stated
     background: float | None = None
@@ -71,25 +72,27 @@ class PictureCost:
 
 @dataclass(frozen=True)
 class Remedy:
-    """What one means does against one limit behind the plain lens."""
+    """The effect of one protective measure on one limit behind the plain lens."""
 
     problem: Problem
     limit: str
     means: Means
     value: Spread | None  #: optical density, diameter in m or exposure in s; None: it does not help
-    safe: float | None = None  #: value that holds in 95 % of the draws; None: there is none
+    safe: float | None = None  #: value that is sufficient in 95 % of the draws; None
     reason: str = ""  #: why it is not needed, does not help or is not judged
-    put_back: float | None = None  #: nominal exposure over limit with the value, computed again
+    #: nominal ratio of exposure to limit with the value, computed again
+    put_back: float | None = None
     #: share of the draws below the limit with the safe value, computed again
     covered: float | None = None
-    band: tuple[float, float] | None = None  #: m at normal incidence, that a notch has to cover
-    #: of the safe value, or of the nominal one where no value is safe
+    #: m, wavelengths at normal incidence that a notch filter has to cover
+    band: tuple[float, float] | None = None
+    #: cost of the safe value, or of the nominal one where no value is safe
     cost: PictureCost | None = None
 
 
 def remedies(safety: Safety, draws: SettingDraws, ranked: Sequence[Ranked]) -> tuple[Remedy, ...]:
-    """Return what each means does against each limit behind the plain lens at the distance of
-    the recipe.
+    """Return the effect of each protective measure on each limit behind the plain lens, at the
+    distance of the recipe.
     """
     question = _Question(safety, draws, ranked)
     plain_ratios = question.ratios(_Trial(Option("plain lens")))
@@ -102,7 +105,9 @@ def remedies(safety: Safety, draws: SettingDraws, ranked: Sequence[Ranked]) -> t
 
 
 def _open(remedy: Remedy) -> Remedy:
-    """Return a means against a limit that is open below, with which nothing is safe."""
+    """Return a remedy marked as not judged: nothing is known of exposures below its limit, so no
+    value is safe.
+    """
     return replace(remedy, value=None, safe=None, cost=None, reason=OPEN)
 
 
@@ -119,7 +124,7 @@ def problem_of(limit: str) -> Problem:
 
 @dataclass(frozen=True)
 class _Trial:
-    """A protection to ask for, and the exposure over that of the recipe."""
+    """A protection to evaluate, with the exposure time relative to that of the recipe."""
 
     option: Option
     exposure: float = 1.0
@@ -127,18 +132,20 @@ class _Trial:
 
 @dataclass(frozen=True)
 class _Question:
-    """How often the laser exceeds each limit at the distance of the recipe."""
+    """The ratios of exposure to limit behind any trial protection, at the distance of the
+    recipe.
+    """
 
     safety: Safety
     draws: SettingDraws
     ranked: Sequence[Ranked]
-    #: limits below which nothing is known, once a question was asked
+    #: names of limits below which nothing is known, filled by `ratios`
     open: set[str] = field(default_factory=set)
-    #: `Exposures.tables`
+    #: `Exposures.tables`, shared by all trials: with draws, and without
     tables: Mapping[bool, dict[Any, Any]] = field(default_factory=lambda: {True: {}, False: {}})
 
     def ratios(self, trial: _Trial, drawn: bool = True) -> Ratios:
-        """Return the ratio (1 + draw,) of each limit that is judged, or (1,) without the draws."""
+        """Return the ratio (1 + draw,) for each limit that is judged; (1,) without draws."""
         safety, draws = _exposed(self.safety, self.draws, trial.exposure)
         if not drawn:
             draws = replace(
@@ -159,7 +166,7 @@ class _Question:
         }
 
     def of(self, limit: str, asked: Ratios, trial: _Trial) -> FloatArray | None:
-        """Return the ratio of one limit; None where it is not judged.
+        """Return the ratio for one limit from ``asked``; None where the limit is not judged.
 
         A veil is infinite where the scene alone fills the well and where the feature is lost
         without a laser. Without a limit of its own it is that of saturation, which hides the
@@ -179,8 +186,8 @@ class _Question:
 
 
 def _exposed(safety: Safety, draws: SettingDraws, factor: float) -> tuple[Safety, SettingDraws]:
-    """Return settings and draws whose exposure, and with it the electrons of the scene, are
-    larger by a factor.
+    """Return settings and draws with the exposure time, and the electrons of the scene, multiplied
+    by ``factor``.
     """
     settings = safety.settings
     if factor == 1.0 or settings.sensor.exposure is None:
@@ -202,8 +209,8 @@ def _exposed(safety: Safety, draws: SettingDraws, factor: float) -> tuple[Safety
 
 @dataclass
 class _Way:
-    """One means: factors from the present one, 1, to the strongest that is tried, and what each
-    answers.
+    """One protective measure with its trial factors, from 1 (no change) to the strongest, and the
+    ratios at each factor.
     """
 
     question: _Question
@@ -215,24 +222,26 @@ class _Way:
     answers: dict[float, Ratios] = field(default_factory=dict)
 
     def ratio(self, limit: str, factor: float) -> FloatArray | None:
-        """Return the ratio (1 + draw,) of a limit at a factor; None where it is not judged."""
+        """Return the ratio (1 + draw,) for a limit at a factor; None where it is not judged."""
         trial = self.trial(factor)
         if factor not in self.answers:
             self.answers[factor] = self.question.ratios(trial)
         return self.question.of(limit, self.answers[factor], trial)
 
     def nominal(self, limit: str, factor: float) -> float:
-        """Return the nominal ratio of a limit at a factor."""
+        """Return the nominal ratio for a limit at a factor."""
         trial = self.trial(factor)
         ratio = self.question.of(limit, self.question.ratios(trial, drawn=False), trial)
         return math.inf if ratio is None else float(ratio[0])
 
     def value(self, factor: float) -> float:
-        """Return the optical density, the diameter in m or the exposure in s of a factor."""
+        """Return the optical density, the diameter in m or the exposure time in s that a factor
+        stands for.
+        """
         return optical_density(1 / factor) if self.unit is None else factor * self.unit
 
     def cost(self, factor: float) -> PictureCost:
-        """Return what a factor takes from the picture."""
+        """Return the effect of a factor on the picture."""
         settings, trial = self.question.safety.settings, self.trial(factor)
         lens, sensor, dazzle = settings.lens, settings.sensor, settings.dazzle
         scene = trial.option.scene_share(lens.diameter) * trial.exposure
@@ -265,7 +274,7 @@ class _Way:
 
 
 def _ways(question: _Question) -> Iterator[_Way]:
-    """Yield the means that are tried; the exposure is tried shorter and longer."""
+    """Yield the protective measures to try; the exposure time is tried both shorter and longer."""
     diameter, exposure = (
         question.safety.settings.lens.diameter,
         question.safety.settings.sensor.exposure,
@@ -295,7 +304,7 @@ def _ways(question: _Question) -> Iterator[_Way]:
 
 
 def _stops(f_number: float) -> tuple[float, ...]:
-    """Return diameters over that of a lens, from 1 down to f/64, or to half for a lens slower
+    """Return diameters relative to the lens, from 1 down to f/64, or to one half for a lens slower
     than f/32.
     """
     smallest = min(0.5, f_number / _SLOWEST_F_NUMBER)
@@ -305,8 +314,8 @@ def _stops(f_number: float) -> tuple[float, ...]:
 
 
 def _notch(question: _Question) -> tuple[float, float]:
-    """Return the band at normal incidence of a notch that covers the laser, its draws too, over
-    the whole field.
+    """Return the band at normal incidence of a notch filter that blocks the laser, with all its
+    draws, over the whole field.
     """
     settings = question.safety.settings
     wavelengths = question.draws.column("laser.wavelength", question.safety.laser.wavelength)
@@ -322,7 +331,7 @@ def _notch(question: _Question) -> tuple[float, float]:
 
 
 def _remedies(limit: str, ways: Sequence[_Way]) -> Iterator[Remedy]:
-    """Yield what each means does against one limit; of the two directions of the exposure the
+    """Yield the effect of each measure on one limit; of a shorter and a longer exposure only the
     one that helps.
     """
     yield from (_remedy(limit, way) for way in ways if way.means != "exposure")
@@ -335,7 +344,7 @@ def _remedies(limit: str, ways: Sequence[_Way]) -> Iterator[Remedy]:
 
 
 def _remedy(limit: str, way: _Way) -> Remedy:
-    """Return what one means does against one limit."""
+    """Return the effect of one protective measure on one limit."""
     problem, present_value = problem_of(limit), way.value(1.0)
     present_ratio = way.ratio(limit, 1.0)
     if present_ratio is not None and _is_met(present_ratio):
@@ -371,8 +380,8 @@ def _remedy(limit: str, way: _Way) -> Remedy:
 
 
 def _solved(limit: str, way: _Way, factors: FloatArray) -> Remedy:
-    """Return the remedy of factors (1 + draw,) that bring the laser to a limit, put back into
-    the verdict.
+    """Return the remedy from the factors (1 + draw,) at which the laser reaches a limit, checked by
+    computing the ratio again.
     """
     nominal = _refined(limit, way, float(factors[0]))
     safe, covered = _safe(limit, way, factors[1:]) if len(factors) > 1 else (nominal, None)
@@ -392,7 +401,9 @@ def _solved(limit: str, way: _Way, factors: FloatArray) -> Remedy:
 
 
 def _is_met(ratio: FloatArray) -> bool:
-    """Return True if a limit is met at the nominal values and in 95 % of the draws."""
+    """Return True if the exposure is below a limit at the nominal values and in 95 % of the
+    draws.
+    """
     return (
         bool(ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE_SHARE)
         if len(ratio) > 1
@@ -401,7 +412,8 @@ def _is_met(ratio: FloatArray) -> bool:
 
 
 def crossing(factors: FloatArray, ratio: FloatArray, problem: Problem) -> FloatArray:
-    """Return the factor (1 + draw,) at which the ratio (factor, 1 + draw) passes 1; NaN for none.
+    """Return the factor (1 + draw,) at which the ratio (factor, 1 + draw) falls below 1; NaN if it
+    never does.
 
     The factors run from the present one to the strongest. For damage and saturation every stronger
     factor has to stay below 1 too. For contrast the first factor counts, since a stronger one dims
@@ -417,7 +429,7 @@ def crossing(factors: FloatArray, ratio: FloatArray, problem: Problem) -> FloatA
     column = np.arange(ratio.shape[1])
     log_ratio = np.log(np.clip(ratio, _FLOOR, _CEILING))
     height_before, height_within = log_ratio[one_before, column], log_ratio[first_within, column]
-    # how far between both the logarithm is 0; the present factor stays
+    # position of the zero of the logarithm between both factors; the present factor stays
     share = np.where(
         first_within == 0,
         1.0,
@@ -430,11 +442,11 @@ def crossing(factors: FloatArray, ratio: FloatArray, problem: Problem) -> FloatA
 
 
 def _refined(limit: str, way: _Way, factor: float) -> float:
-    """Return the nominal factor at which the ratio, computed again, is 1, near an interpolated
+    """Return the nominal factor at which the recomputed ratio is 1, starting from an interpolated
     factor.
 
-    False position in the logarithms of factor and ratio, where the end that stays is drawn in: its
-    height is halved (Illinois).
+    False position in the logarithms of factor and ratio; if one end of the bracket stays twice, its
+    height is halved (Illinois algorithm).
     """
     if factor in (way.factors[0], way.factors[-1]):
         return factor
@@ -461,13 +473,13 @@ def _refined(limit: str, way: _Way, factor: float) -> float:
 
 
 def _height(limit: str, way: _Way, place: float) -> float:
-    """Return the logarithm of the nominal ratio at the logarithm of a factor."""
+    """Return the logarithm of the nominal ratio; ``place`` is the logarithm of the factor."""
     return math.log(min(max(way.nominal(limit, math.exp(place)), _FLOOR), _CEILING))
 
 
 def _safe(limit: str, way: _Way, factors: FloatArray) -> tuple[float | None, float | None]:
-    """Return the factor that holds in 95 % of the draws, and the share of the draws below the
-    limit with it.
+    """Return the factor that keeps 95 % of the draws below the limit, and the share of the draws
+    below the limit with it.
     """
     # stronger is smaller, or for a longer exposure larger
     direction = -1 if way.factors[-1] < 1 else 1
@@ -488,13 +500,14 @@ def _safe(limit: str, way: _Way, factors: FloatArray) -> tuple[float | None, flo
         if covered_share >= _SAFE_SHARE or ratio is None:
             return safe, covered_share
         ratio_at_quantile = float(np.quantile(ratio[1:], _SAFE_SHARE, method="higher"))
-        # the ratio goes with a transmittance; of a stop or an exposure with up to its square
+        # the ratio is proportional to a transmittance, and to up to the square of a diameter or an
+        # exposure
         safe *= ratio_at_quantile ** (-1.0 if way.unit is None else 0.5 * direction)
     return None, None
 
 
 def _why_not(problem: Problem, means: Means, table: FloatArray) -> str:
-    """Return why a means does not help against a limit."""
+    """Return why a protective measure does not help against a limit."""
     # nominal ratio at the strongest factor over that at the present one
     changes_ratio = bool(np.abs(table[-1, 0] / table[0, 0] - 1) > _UNCHANGED_RATIO)
     if problem == "damage" and means == "exposure" and not changes_ratio:

@@ -1,5 +1,5 @@
-"""A worksheet to print: the inputs, each formula with its numbers put in, the limits, and what
-is assumed.
+"""A printable worksheet: the inputs, each formula with its numbers, the limits, and the
+assumptions.
 """
 
 from __future__ import annotations
@@ -36,9 +36,7 @@ _SYMBOL = re.compile(r"\b[A-Za-z]\w*\b")
 
 @dataclass(frozen=True)
 class Line:
-    """A quantity of the worksheet, with its formula and the numbers that are put into it, as
-    text in SI units.
-    """
+    """A quantity of the worksheet, with its formula and the numbers in it, as text in SI units."""
 
     symbol: str
     quantity: str
@@ -50,22 +48,22 @@ class Line:
 
 @dataclass
 class Sheet:
-    """Lines of the worksheet, and the value of each symbol that a formula may use."""
+    """The lines of the worksheet, and the value of each symbol for use in formulas."""
 
     values: dict[str, float] = field(default_factory=dict)
     parts: list[dict[str, object]] = field(default_factory=list)
     lines: list[Line] = field(default_factory=list)
 
     def given(self, symbol: str, quantity: str, value: float, unit: str = "") -> None:
-        """Add a quantity that has no formula here."""
+        """Add a quantity without a formula."""
         self.values[symbol] = value
         self.lines.append(Line(symbol, quantity, put(value), unit))
 
     def computed(
         self, symbol: str, quantity: str, value: float, unit: str, formula: str, numbers: str = ""
     ) -> None:
-        """Add a quantity with its formula; the numbers are put in for the symbols unless they
-        are written out.
+        """Add a quantity with its formula; ``numbers`` is the formula with numbers in place of
+        symbols, by default filled in from the values.
         """
         self.values[symbol] = value
         with_numbers = numbers or _SYMBOL.sub(lambda match: self._number(match[0]), formula)
@@ -74,7 +72,7 @@ class Sheet:
         )
 
     def end_part(self, heading: str, text: str = "") -> None:
-        """Make the lines since the last part a part of their own."""
+        """Collect the lines added since the last part under a heading."""
         if self.lines or text:
             self.parts.append({"heading": heading, "text": text, "lines": self.lines})
         self.lines = []
@@ -84,17 +82,17 @@ class Sheet:
 
 
 def put(value: float) -> str:
-    """Return a number with the six digits with which it is printed and put into formulas."""
+    """Return a number as text with six significant digits, for print and for formulas."""
     return f"{value:.6g}"
 
 
 def _signs(formula: str) -> str:
-    """Return a formula with a cross for the product and a caret for the power."""
+    """Return a formula with × for the product and ^ for the power."""
     return formula.replace("**", "^").replace("*", "×")
 
 
 def worksheet_page(estimate: Estimate) -> str:
-    """Return the worksheet of an estimate as one HTML file, which loads no other file."""
+    """Return the worksheet of an estimate as one self-contained HTML file."""
     sheet = Sheet()
     for add, heading, text in _contents(estimate):
         add(sheet, estimate)
@@ -219,13 +217,13 @@ def _light(sheet: Sheet, estimate: Estimate) -> None:
 
 
 def _plain(estimate: Estimate) -> list[Finding]:
-    """Return what the limits say behind the plain lens."""
+    """Return the findings behind the plain lens."""
     return [finding for finding in estimate.findings if finding.option == estimate.options[0].name]
 
 
 def _limits(sheet: Sheet, estimate: Estimate) -> None:
-    """Add the saturation of a pixel, and each limit with the exposure over it and the density
-    that meets it.
+    """Add the saturation of a pixel, and each limit with the ratio of exposure to limit and the
+    optical density that meets it.
     """
     # inputs that not every recipe states
     if {"eta", "n", "t"} <= set(sheet.values):
@@ -243,7 +241,9 @@ def _limits(sheet: Sheet, estimate: Estimate) -> None:
 
 
 def _limit(sheet: Sheet, number: int, finding: Finding, remedies: Sequence[Remedy]) -> None:
-    """Add one limit, the exposure over it, and the optical density that brings the laser to it."""
+    """Add one limit, the ratio of exposure to limit, and the optical density that brings the laser
+    down to it.
+    """
     unit, name = f"{UNITS[finding.limit.quantity]}/m²", finding.limit.name
     limit, exposure = finding.at_sensor.value, finding.exposure.value
     sheet.given(f"L{number}", f"{name}: limit at the peak", limit, unit)
@@ -269,7 +269,7 @@ def _limit(sheet: Sheet, number: int, finding: Finding, remedies: Sequence[Remed
 
 
 def _limits_text(estimate: Estimate) -> str:
-    """Return where the limits are from."""
+    """Return the sources of the limits."""
     sources = dict.fromkeys(
         f"{finding.limit.name}: {finding.limit.source}." for finding in _plain(estimate)
     )
@@ -280,7 +280,7 @@ def _limits_text(estimate: Estimate) -> str:
 
 
 def _eye(sheet: Sheet, estimate: Estimate) -> None:
-    """Add the limit of the eye by the rule that decides it, and the hazard distance."""
+    """Add the exposure limit of the eye by the rule in force, and the hazard distance."""
     eye, beam = estimate.eye, estimate.exposures.beams[0]
     if eye is None:
         return
@@ -363,7 +363,7 @@ def _eye_limit(sheet: Sheet, estimate: Estimate, eye: EyeFinding, unit: str) -> 
 
 
 def _dazzle(sheet: Sheet, estimate: Estimate) -> None:
-    """Add the maximum dazzle exposure at the smallest angle, the least of all angles, and its
+    """Add the maximum dazzle exposure at the smallest angle, where it is lowest, and the dazzle
     distance.
     """
     if not estimate.eye_dazzle.rows:
@@ -377,7 +377,7 @@ def _dazzle(sheet: Sheet, estimate: Estimate) -> None:
 
 
 def _dazzle_row(sheet: Sheet, number: int, row: EyeDazzleRow) -> None:
-    """Add the exposure that hides the target, for one light of the surroundings and one angle."""
+    """Add the exposure that hides the target, for one ambient luminance and one angle."""
     condition_text = f"{row.background:g} cd/m², {row.angle:.3g}°"
     sheet.given(
         f"lx{number}", f"{condition_text}: illuminance that hides the target", row.illuminance, "lx"
@@ -399,7 +399,7 @@ def _dazzle_row(sheet: Sheet, number: int, row: EyeDazzleRow) -> None:
 
 
 def _dazzle_text(estimate: Estimate) -> str:
-    """Return what is asked of the eye and the source, or why its dazzle is not judged."""
+    """Return the viewing task and the source, or why dazzle of the eye is not judged."""
     dazzle, asked = estimate.eye_dazzle, estimate.safety.settings.eye.dazzle
     if dazzle.reason:
         return f"Not judged: {dazzle.reason}."
@@ -411,7 +411,7 @@ def _dazzle_text(estimate: Estimate) -> str:
 
 
 def _assumed(estimate: Estimate) -> str:
-    """Return what is uncertain and what is assumed, as text."""
+    """Return the uncertain values and the assumptions as text."""
     laws = "; ".join(f"{name} {law_text}" for name, law_text in estimate.draws.laws.items())
     start = f"Uncertain: {laws}. The values above are the nominal ones. " if laws else ""
     return (

@@ -43,13 +43,13 @@ from neusee.workflows.studies.work_precision import (
 # Diagrams of the accuracy study: error against run time, and measured error against tolerance.
 
 
-EXACT = 1e-9  #: the level at which smaller errors are drawn, because a logarithmic axis has no 0
-#: the same level in the diagrams of single steps, some of which are in double precision
+EXACT = 1e-9  #: smaller errors are drawn at this level, because a logarithmic axis has no 0
+#: the same for the diagrams of single steps, some of which are in double precision
 _STEP_EXACT = 1e-17
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, "#CC79A7", "#56B4E9", "#8B7500", "#555555")
 _MARKERS = "osD^vP*X"
 _GREY = "#777777"
-_ENTRY = 2.1  #: inches, room for an entry of a legend
+_ENTRY = 2.1  #: inches, width of a legend entry
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Dot:
     own: bool = False  #: whether the recipe itself has this setting
 
 
-Styles = Mapping[str, tuple[str, str]]  #: colour and marker of each line by its name
+Styles = Mapping[str, tuple[str, str]]  #: colour and marker by the name of a line
 #: axes, lines, styles, `EXACT` or `_STEP_EXACT`
 Diagram = tuple[Any, Sequence["Line"], Styles, float]
 
@@ -82,8 +82,8 @@ class Line:
 def work_precision_diagram(
     lines: Sequence[Line], pareto_front: Sequence[tuple[float, float]], tolerance: float, title: str
 ) -> Any:
-    """Draw error against run time: a line for each parameter, the Pareto front, and a ring at
-    the recipe's settings.
+    """Draw error against run time: a line for each parameter, the Pareto front, and a ring at the
+    recipe's own settings.
     """
     figure, axes = canvas(10.0, 7.0)
     ax = axes[0, 0]
@@ -114,12 +114,12 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
     reference node.
     """
     columns = min(3, len(diagrams))
-    # rounded up
+    # number of rows, rounded up
     rows = -(-len(diagrams) // columns)
     styles = _styles(line.name for line in itertools.chain(*(lines for _, lines, _ in diagrams)))
     figure_width = 3.9 * columns + 0.4
     legend_columns = min(int(figure_width / _ENTRY), 1 + len(styles))
-    # inches: a row of the legend is 0.25 high
+    # inches, 0.25 for each row of the legend
     legend_height = max(0.7, 0.25 * math.ceil((1 + len(styles)) / legend_columns))
     figure, axes = canvas(figure_width, 3.5 * rows + legend_height, rows, columns)
     scaled_diagrams: list[Diagram] = []
@@ -152,7 +152,7 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
 def promises(
     asked: Sequence[float], measured: Mapping[str, Sequence[float]], stated: Sequence[float | None]
 ) -> Any:
-    """Draw the measured error of each output and the stated error against the requested
+    """Draw the measured error of each output, and the stated error, against the requested
     tolerance.
     """
     figure, axes = canvas(8.4, 5.0)
@@ -179,8 +179,8 @@ def promises(
 
 
 def _styles(names: Iterable[str]) -> Styles:
-    """Return colour and marker of each line; when all colours are used, each begins again with
-    the next marker.
+    """Return colour and marker of each line; once all colours are used, they repeat with the next
+    marker.
     """
     count = len(_COLOURS)
     looks = ((_COLOURS[i % count], _MARKERS[(i + i // count) % count]) for i in itertools.count())
@@ -200,9 +200,8 @@ def _draw_diagram(
     drawn_errors = [max(dot.error, exact) for dot in dots] + [
         max(dot.most or dot.error, exact) for dot in dots
     ]
-    # set limits first: with automatic limits, matplotlib warns of errors that differ in the last
-    # digit only
-    # a ratio of 10 at least, and a margin of 1.5 around the dots
+    # set limits first: with automatic limits matplotlib warns of errors that differ only in the
+    # last digit. The arguments are the least ratio of both limits, and the margin factor.
     ax.set_xlim(*_axis_limits([*(dot.seconds for dot in dots), *seconds], 10.0, 1.5))
     ax.set_ylim(*_axis_limits([*drawn_errors, *errors], 100.0, 4.0))
     for line in lines:
@@ -228,7 +227,7 @@ def _axis_limits(values: Sequence[float], ratio: float, margin: float) -> tuple[
 
 def _draw(ax: Any, line: Line, colour: str, mark: str, exact: float) -> None:
     """Draw one line with a marker at each point, and error bars from the smallest to the largest
-    error of the point.
+    error.
     """
     errors = np.maximum([dot.error for dot in line.dots], exact)
     lower = np.maximum([dot.error if dot.least is None else dot.least for dot in line.dots], exact)
@@ -256,14 +255,14 @@ def _ring_own_setting(ax: Any, lines: Sequence[Line]) -> None:
         "markeredgecolor": BLACK,
         "linestyle": "",
     }
-    # all lines meet there: one ring is enough
+    # all lines meet there, so that one ring is enough
     for dot in [d for d in _dots(lines) if d.own][:1]:
         position = [dot.seconds], [max(dot.error, EXACT)]
         ax.plot(*position, **ring, markeredgewidth=1.6, label="the recipe's own settings", zorder=4)
 
 
 def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
-    """Draw a line with a note where some errors are smaller, so that their dots lie on it."""
+    """Draw a line with a note at the level ``exact`` if some errors are smaller and drawn there."""
     if any(error < exact for error in errors):
         ax.axhline(exact, color=_GREY, linewidth=0.8, linestyle=":")
         transform = ax.get_yaxis_transform()
@@ -279,9 +278,7 @@ def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
 
 
 def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
-    """Write the label of each point of the diagrams where the label covers no marker, no note
-    and no other label.
-    """
+    """Write the label of each point where it covers no marker, note or other label."""
     labels: dict[Any, list[PointLabel]] = {}
     for ax, lines, styles, exact in diagrams:
         labels[ax] = []
@@ -312,10 +309,10 @@ HEADER = (
     "stated",
     "refused",
 )
-_BUSY = 1.5  #: processes for each core, above which times are not reliable
-#: factor on the error of the full computation, which is one draw of its rounding error
+_BUSY = 1.5  #: load per core above which run times are unreliable
+#: factor on the error of the full computation, which is only one sample of its rounding error
 _NO_WORSE = 2.0
-_ABREAST = 6  #: outputs side by side in a table
+_ABREAST = 6  #: largest number of outputs side by side in a table
 _FACTOR = 2.0  #: the largest accepted ratio of the chosen run time to the cheapest
 
 _REFERENCE = """The reference is the recipe at its own sampling (bands, pupil samples, window),
@@ -346,7 +343,7 @@ class AccuracyResult:
     recipe: Recipe
     points: tuple[WorkPrecisionPoint, ...]
     steps: tuple[StepTried, ...]
-    without: tuple[str, ...]  #: parameters that are not varied, and why
+    without: tuple[str, ...]  #: parameters that are not varied, with the reasons
     seeds: int
 
 
@@ -376,8 +373,8 @@ def summary_line(point: WorkPrecisionPoint) -> str:
 
 
 def choices(points: Points) -> list[ToleranceChoice]:
-    """Return the engine's choice for each tolerance, and the quickest measured setting within
-    the tolerance.
+    """Return the engine's choice for each tolerance, and the fastest measured setting within the
+    tolerance.
     """
     measured = [point for point in points if point.sound]
     with_tolerances = ((point.trial.value, point) for point in measured)
@@ -408,7 +405,7 @@ def lead(recipe: Recipe, points: Points) -> str:
 
 
 def _times(recipe: Recipe, points: Points) -> Iterator[str]:
-    """Yield how long the recipe and the full computation take."""
+    """Yield sentences on the run times of the recipe and of the full computation."""
     own_point, full_point = _own(points), _whole(points)
     if own_point is None:
         return
@@ -423,7 +420,9 @@ def _times(recipe: Recipe, points: Points) -> Iterator[str]:
 
 
 def _kept_tolerances(points: Points) -> Iterator[str]:
-    """Yield how many tolerances were held, and how good the choices are."""
+    """Yield sentences on the number of tolerances held, and on the quality of the
+    engine's choices.
+    """
     full_computation, decisions = _whole(points), choices(points)
     yield f"{sum(choice.held for choice in decisions)} of {len(decisions)} tolerances were held."
     if full_computation is not None and (
@@ -477,7 +476,7 @@ def pictures(result: AccuracyResult) -> dict[str, bytes]:
 
 
 def _promises(asked: Sequence[ToleranceChoice]) -> bytes:
-    """Return the diagram of the measured against the requested error of the engine's choices."""
+    """Return the diagram of measured against requested errors for the engine's choices."""
     measurements = [choice.chosen.found for choice in asked]
     measured = {
         name: [max(point.errors[name]) for point in measurements] for name in measurements[0].errors
@@ -488,8 +487,8 @@ def _promises(asked: Sequence[ToleranceChoice]) -> bytes:
 
 
 def sections(result: AccuracyResult, drawn: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the accuracy study's page; ``drawn`` has the PNG bytes of each
-    diagram by name.
+    """Return the sections of the accuracy study's page; ``drawn`` maps names to the PNG bytes of
+    diagrams.
     """
     seeds = _SEEDS.format(result.seeds) if result.seeds > 1 else _ONE_SEED
     if result.seeds > 1 and any(
@@ -516,7 +515,7 @@ def _all_points(points: Points, text: str, picture: bytes | None) -> Section:
     columns = ["parameter", "setting", "run time, s", "of it computing, s"]
     columns += ["error", "least", "most", "stated", "worst output"]
     measured = [p for p in points if p.sound]
-    # identities, because points cannot be hashed
+    # `id`, because points are not hashable
     front = {id(p) for p in pareto_front(measured)}
     rows = []
     for p in measured:
@@ -534,7 +533,7 @@ def _all_points(points: Points, text: str, picture: bytes | None) -> Section:
 
 
 def _chosen(points: Points) -> Section:
-    """Return the section that compares the engine's choice for each tolerance with the quickest
+    """Return the section that compares the engine's choice for each tolerance with the fastest
     point.
     """
     columns = (
@@ -567,7 +566,7 @@ def _chosen(points: Points) -> Section:
 
 
 def _outputs(points: Points, picture: bytes | None) -> list[Section]:
-    """Return the errors of all outputs in tables of a few columns each, which fit the page."""
+    """Return sections with the errors of all outputs, in tables narrow enough for the page."""
     names = list(dict.fromkeys(itertools.chain(*(point.found.errors for point in points))))
     groups = [names[i : i + _ABREAST] for i in range(0, len(names), _ABREAST)] or [[]]
     text = (
@@ -581,7 +580,7 @@ def _outputs(points: Points, picture: bytes | None) -> list[Section]:
         parts.append(
             Section(heading, "" if number else text, columns, _errors(points, group), picture)
         )
-        # in the first table alone
+        # only in the first table
         picture = None
     return parts
 
@@ -642,7 +641,7 @@ def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:
 
 
 def _not_varied(result: AccuracyResult) -> Section:
-    """Return the section with what could not be varied, and why."""
+    """Return the section on settings that could not be varied, with the reasons."""
     # texts such as "bands: this recipe has no such value"
     rows = [
         (knob, "", reason) for knob, _, reason in (text.partition(": ") for text in result.without)
@@ -697,7 +696,7 @@ def table(result: AccuracyResult) -> Iterator[tuple[Any, ...]]:
 
 
 def _lines(recipe: Recipe, points: Points) -> list[Line]:
-    """Return a line of dots for each varied parameter; that of the tolerance is thicker."""
+    """Return a line of dots for each varied parameter; the one for the tolerance is thicker."""
     varied = dict.fromkeys(point.trial.line for point in points if point.trial.recipe is not recipe)
     of_line = {
         name: [_dot(point, recipe) for point in points if point.trial.line == name]
@@ -707,16 +706,16 @@ def _lines(recipe: Recipe, points: Points) -> list[Line]:
 
 
 def _dot(p: WorkPrecisionPoint, recipe: Recipe) -> Dot:
-    """Return the dot of a measured setting, without a label at the recipe's own settings, where
-    all lines meet.
+    """Return the dot of a measured setting; it has no label at the recipe's own settings, where all
+    lines meet.
     """
     label = "" if p.trial.recipe is recipe else p.trial.label
     return Dot(p.seconds, p.error, label, min(p.by_seed), p.most, p.trial.own)
 
 
 def _diagram(s: StepTried) -> tuple[str, list[Line], float]:
-    """Return the data of a step's diagram: title, a line for each changed property, and the
-    reference's time in s.
+    """Return title, lines (one for each changed property) and reference time in s of a step's
+    diagram.
     """
     names = dict.fromkeys(variant.line for variant in s.variants)
     lines = [

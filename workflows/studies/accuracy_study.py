@@ -37,7 +37,7 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 _QUICK_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
-#: s that the reference of a step may take; the second value is for ``quick``
+#: s, largest run time of a step's reference; the second value is for ``quick``
 _PATIENCE, _LITTLE = 4.0, 1.0
 _LEFT = "not measured within the budget: run the study again to continue"
 
@@ -46,10 +46,10 @@ _LEFT = "not measured within the budget: run the study again to continue"
 class AccuracyOptions:
     """How much the study measures."""
 
-    seeds: int = 3  #: of the noise, which give the range of each error
+    seeds: int = 3  #: number of noise seeds, which give the range of each error
     quick: bool = False  #: True for fewer settings
-    #: seconds after which no further setting of a parameter is measured; the page names the
-    #: settings that are left, and the next study measures them
+    #: time in s after which no further parameter setting is measured; the page lists the remaining
+    #: settings, and the next study measures them
     budget: float | None = None
     device: str = "cpu"
 
@@ -112,7 +112,7 @@ def _measure(
 ) -> AccuracyResult:
     """Measure all points, then again for their times, then the slow steps.
 
-    ``until`` is the monotonic time after which no further setting of a parameter is measured.
+    ``until`` is the monotonic time after which no further parameter setting is measured.
     """
     varied = knobs(recipe, quick)
     queue = list(trials(recipe, varied, quick))
@@ -127,7 +127,7 @@ def _measure(
             cache.point(replace(trial, recipe=None, refused=_LEFT) if out_of_time else trial)
         )
         progress(f"{number}/{len(queue)}  {accuracy_page.summary_line(points[-1])}")
-    # in turn, so that other work of the machine disturbs all points alike
+    # repeat all points in turn, so that other load on the machine affects them alike
     for number in range(2, TIMES + 1):
         points = [cache.time_again(point, number) for point in points]
         progress(f"timed again: {number} of {TIMES}")
@@ -141,8 +141,8 @@ def _measure(
 
 
 def _may_wait(trial: Trial, cache: PointCache) -> bool:
-    """Return True if a later study may measure the setting: it varies a parameter and has no
-    measurement yet.
+    """Return True if the setting may be left to a later study: it varies a parameter and is not
+    measured yet.
     """
     if trial.recipe is None or trial.line in (TOLERANCE, KEEP_ALL):
         return False
@@ -152,8 +152,8 @@ def _may_wait(trial: Trial, cache: PointCache) -> bool:
 def _slow_steps(
     recipe: Recipe, points: Sequence[WorkPrecisionPoint]
 ) -> Iterator[tuple[Recipe, str, float]]:
-    """Yield (recipe, step name, share of run time) of each slow step, and of slow steps that
-    replace other steps.
+    """Yield (recipe, step name, share of run time) of each slow step, also of cheaper steps that
+    replace others.
     """
     seconds = next((point.found.steps for point in points if point.trial.line == KEEP_ALL), {})
     for name, share in steps_that_matter(recipe, seconds):
@@ -167,7 +167,7 @@ def _slow_steps(
 
 
 def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[str, Any]:
-    """Return what provenance.json says of the study."""
+    """Return the entries for provenance.json."""
     return {
         "tolerance": result.recipe.tolerance,
         "seed": result.recipe.seed,

@@ -40,8 +40,8 @@ from neusee.workflows.studies.posterior_tests import (
 )
 
 PIXELS = 128
-_SIMULATIONS_A_LINE = 20  #: simulations for each line of progress
-_WEIGHED = 1000  #: draws for the sensitivity
+_SIMULATIONS_A_LINE = 20  #: number of simulations per line of progress
+_WEIGHED = 1000  #: number of draws for the sensitivity
 _COLUMNS = (
     "parameter",
     "simulations",
@@ -58,15 +58,15 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class CalibrationStudyResult:
-    """The result of the calibration study: simulations, a test of each parameter, and the
-    sensitivity to the prior.
+    """The result of the calibration study: simulations, tests of each parameter, and sensitivity to
+    the prior.
     """
 
     simulations: Sequence[SensorSimulation]
     rank_tests: Sequence[RankTest]
     prior_widths: Mapping[str, float]
     sensitivity: Sensitivity | None
-    no_sensitivity: str  #: the reason if there is no sensitivity
+    no_sensitivity: str  #: why the sensitivity is unknown
 
     @property
     def refused(self) -> Sequence[str]:
@@ -83,15 +83,15 @@ class CalibrationStudyResult:
 
     @property
     def stranded(self) -> int:
-        """Return the number of simulations in which a walker stays where the posterior is almost
-        0.
+        """Return the number of simulations in which a walker stays where the posterior is
+        almost 0.
         """
         return sum(simulation.stranded > 0 for simulation in self.simulations)
 
     @property
     def failed(self) -> int:
-        """Return the number of failed criteria, of two for each parameter and three for the set
-        of simulations.
+        """Return the number of failed criteria: two for each parameter, and three for all
+        simulations together.
         """
         return (
             sum(test.failed for test in self.rank_tests)
@@ -108,7 +108,7 @@ class CalibrationOptions:
     simulations: int = 200
     move: str = "de"  #: of the walkers
     pixels: int = PIXELS
-    sampler: Sampler | None = None  #: in place of the walkers
+    sampler: Sampler | None = None  #: sampler to use instead of the walkers
 
 
 def study(
@@ -147,8 +147,8 @@ def _simulate_all(
 
 
 def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
-    """Return the sensitivity of the recipe's posterior to the prior, or None and the reason why
-    there is none.
+    """Return the sensitivity of the recipe's posterior to the prior, or None and the reason why it
+    is unknown.
     """
     with TemporaryDirectory(prefix="neusee-") as folder:
         problem = SensorPosterior.of(recipe, Store(folder))
@@ -236,7 +236,7 @@ def _lead(result: CalibrationStudyResult) -> str:
 
 
 def _ranks(result: CalibrationStudyResult, picture: bytes, pixels: int) -> Section:
-    """Return the section on the ranks of the true parameters, with the widths of the prior."""
+    """Return the section on the ranks of the true parameters, with the widths of the priors."""
     text = f"""Parameters are drawn from the prior, the recipe's own steps simulate frames of
         {pixels} x {pixels} pixels with these parameters, and {DRAWS} nearly independent draws are
         made from the posterior of the frames. If the posterior is correct, the number of draws
@@ -281,7 +281,7 @@ def _intervals(result: CalibrationStudyResult) -> Section:
 
 
 def _count_kinds(result: CalibrationStudyResult, name: str) -> str:
-    """Return in how many simulations a parameter is estimated, or only limited, as text."""
+    """Return as text in how many simulations a parameter is estimated, or only limited."""
     simulations_by_kind = Counter(
         simulation.kinds[name] for simulation in result.simulations if not simulation.refused
     )
@@ -292,7 +292,7 @@ def _count_kinds(result: CalibrationStudyResult, name: str) -> str:
 
 
 def _weighed(result: CalibrationStudyResult) -> Section:
-    """Return the section on the sensitivity to the prior, or on why it is not known."""
+    """Return the section on the sensitivity to the prior, or on the reason why it is unknown."""
     heading = "Sensitivity to the prior"
     if result.sensitivity is None:
         return Section(
@@ -336,8 +336,8 @@ def _weighed(result: CalibrationStudyResult) -> Section:
 
 
 def _refusals(result: CalibrationStudyResult) -> list[Section]:
-    """Return the section with the simulations that have no posterior, and why; none if all have
-    one.
+    """Return the section on simulations without a posterior and the reasons; empty if all
+    have one.
     """
     if not result.refused:
         return []

@@ -21,12 +21,11 @@ from neusee.workflows.tolerance.error_norm import largest_error
 
 # --- step runs ------------------------------------------------------------------------------------
 
-# The runs of one step of the stability study: as a recipe uses the step, and in float64 as the
-# reference.
+# The runs of one step of the stability study: as used in a recipe, and in float64 as the reference.
 
 
-SINGLE, DOUBLE = 2.0**-24, 2.0**-53  #: largest relative rounding
-HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}  #: largest relative rounding
+SINGLE, DOUBLE = 2.0**-24, 2.0**-53  #: unit roundoff (largest relative rounding error)
+HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}  #: unit roundoff
 
 
 class Refused(Exception):
@@ -34,8 +33,8 @@ class Refused(Exception):
 
 
 class _CountedInSingle(TorchFunctionMode):
-    """A PyTorch function mode that samples float64 Poisson counts with the mean rounded to
-    single precision.
+    """A PyTorch function mode that draws float64 Poisson counts with the mean rounded to single
+    precision.
     """
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -62,9 +61,7 @@ def run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) ->
 
 
 def as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    """Compute a step with its own parameters and return its result; raise `Refused` for a
-    `ValueError`.
-    """
+    """Return the result of a step with its own parameters; raise `Refused` for a `ValueError`."""
     try:
         return run(step, step.node.fn, inputs, seed)
     except ValueError as error:
@@ -79,8 +76,8 @@ def in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 
 
 def rounded(inputs: Sequence[Any], draw: int, unit: float) -> list[Any]:
-    """Return a step's inputs in float64, each element moved at random by up to four roundings of
-    ``unit``.
+    """Return a step's inputs in float64, each element changed at random by up to four times its
+    rounding error ``unit``.
     """
     rng = torch.Generator().manual_seed(draw)
 
@@ -98,7 +95,7 @@ def rounded(inputs: Sequence[Any], draw: int, unit: float) -> list[Any]:
 # The error of the gradient of one step, against the gradient of its float64 reference.
 
 
-#: the least scale of an error, far above denormal numbers
+#: least divisor of a relative error, far above denormal numbers
 LEAST = math.sqrt(torch.finfo(torch.float32).tiny)
 
 
@@ -109,8 +106,8 @@ def finite(value: Any) -> bool:
 
 
 def slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
-    """Return the error of the gradient of a weighted sum of the result, or None if the result
-    has no gradient.
+    """Return the gradient error of a weighted sum of the result, or None if the result has no
+    gradient.
     """
     with torch.enable_grad():
         gradients = _slopes(inputs, lambda values: run(step, step.node.fn, values, seed))
@@ -121,8 +118,8 @@ def slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
 
 
 def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int, unit: float) -> float:
-    """Return the largest change of the reference gradient by random roundings of the inputs by
-    up to four ``unit``.
+    """Return the largest change of the reference gradient when inputs are randomly rounded by up to
+    four ``unit``.
     """
     with torch.enable_grad():
         true_gradients = true_slopes(step, inputs, seed)
@@ -140,10 +137,10 @@ def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int, unit: flo
 
 
 def _apart(usual: list[Tensor], truth: list[Tensor] | None, inputs: list[Any]) -> float:
-    """Return the largest error of the gradients, one for each picture of the inputs.
+    """Return the largest error of the gradients, of which there is one for each input picture.
 
-    It is infinite if the reference gradient is not finite, and 0 if it exceeds the numbers that the
-    type of the picture has.
+    It is infinite if the reference gradient is not finite, and 0 if the reference gradient exceeds
+    the range of the picture's type.
     """
     if truth is None or not finite(truth):
         return math.inf
@@ -164,8 +161,8 @@ def _apart(usual: list[Tensor], truth: list[Tensor] | None, inputs: list[Any]) -
 
 
 def _slight(picture: Tensor) -> float:
-    """Return the least divisor of a gradient error: the gradient of a normalised mean, or the
-    least normal number.
+    """Return the least divisor of a gradient error: the gradient of a normalised mean, or the least
+    normal number.
     """
     largest = float(picture.detach().double().abs().max())
     # the mean over the largest element has the gradient 1 / (count x largest)
@@ -179,15 +176,15 @@ def true_slopes(
     number: int | None = None,
     moved: tuple[int, float] | None = None,
 ) -> list[Tensor] | None:
-    """Return the gradients of the reference in float64: of the tensor ``number`` of the result, at
-    inputs that `rounded` moved.
+    """Return the gradients of the float64 reference: of the result's tensor ``number`` or of all,
+    at exact or `rounded` inputs.
     """
     double_inputs = (
         rounded(inputs, *moved)
         if moved
         else each_tensor(lambda x: x.double() if is_picture(x) else x, inputs)
     )
-    # gradients are those of the pictures, which are not pictures in float64
+    # differentiate with respect to the pictures; in float64 `is_picture` no longer finds them
     leaves = [
         id(double_tensor)
         for double_tensor, tensor in zip(tensors_in(double_inputs), tensors_in(inputs), strict=True)
@@ -204,7 +201,7 @@ def true_slopes(
         value = way(values, seed)
         return value if number is None else tensors_in(value)[number]
 
-    # the reference of a node may have no gradient: then the node in float64
+    # fall back to the node in float64 if its reference has no gradient
     for computation in computations:
         slopes = _slopes(double_inputs, partial(of, computation), leaves)
         if slopes:
@@ -228,7 +225,7 @@ def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Te
     if weighted_sum is None or not pictures:
         return None
     gradients = torch.autograd.grad(weighted_sum, pictures, allow_unused=True)
-    # a picture that the result does not depend on has the gradient 0
+    # the gradient is 0 for a picture that the result does not depend on
     return [
         torch.zeros_like(picture) if gradient is None else gradient
         for picture, gradient in zip(pictures, gradients, strict=True)
@@ -236,8 +233,8 @@ def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Te
 
 
 def _weighed(value: Any) -> Tensor | None:
-    """Return the sum of all differentiable results, each scaled to about 1 and multiplied by
-    fixed random weights.
+    """Return the sum of all differentiable results, each scaled to about 1 and weighted by fixed
+    random numbers.
     """
     weighted_sums = [
         (tensor.double() * _weight(tensor) / _near(tensor)).sum()
@@ -248,7 +245,7 @@ def _weighed(value: Any) -> Tensor | None:
 
 
 def _weight(x: Tensor) -> Tensor:
-    """Return random weights from 0 to 1, the same for each tensor of a shape."""
+    """Return random weights from 0 to 1, equal for tensors of equal shape."""
     return torch.rand(x.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float32)
 
 
@@ -266,11 +263,11 @@ def _near(x: Tensor) -> float:
 
 
 def terms(step: Step, inputs: list[Any], truth: Tensor, number: int, seed: int) -> float:
-    """Return the sum of the terms of a scalar result f(x), sum |x df/dx|, beside which their
-    rounding counts.
+    """Return the sum of the absolute terms of a scalar result f(x), sum |x df/dx|, which sets the
+    scale of its rounding error.
 
-    Where terms cancel, f is smaller than this sum, which is 0 if it is not finite. ``number`` is
-    the position of ``truth`` among the scalars that the step returns.
+    Where terms cancel, f is smaller than this sum. The sum is set to 0 if it is not finite.
+    ``number`` is the position of ``truth`` among the scalars that the step returns.
     """
     with torch.enable_grad():
         gradients = true_slopes(step, inputs, seed, number) or []
@@ -278,21 +275,21 @@ def terms(step: Step, inputs: list[Any], truth: Tensor, number: int, seed: int) 
         float((picture.double() * gradient).abs().sum())
         for picture, gradient in zip(pictures_in(inputs), gradients, strict=False)
     )
-    # `true_slopes` is that of a sum in which the scalar has a weight and a scale
+    # undo the weight and the scale that `true_slopes` applied to the scalar
     return (
         sum_of_terms * _near(truth) / float(_weight(truth)) if math.isfinite(sum_of_terms) else 0.0
     )
 
 
 def over(a: Tensor, b: Tensor, floor: float) -> float:
-    """Return the largest difference of ``a`` and ``b``, divided by the larger of the largest
-    ``|b|`` and ``floor``.
+    """Return the largest difference of ``a`` and ``b``, divided by the largest ``|b|`` or, if that
+    is smaller, by ``floor``.
     """
     error, largest = (
         largest_error(a, b),
         float(b.detach().double().abs().max()) if b.numel() else 0.0,
     )
-    # `largest_error` is over the largest |b|: here over the floor
+    # `largest_error` divides by the largest |b|: convert to division by the floor
     return error if largest >= floor else error * (largest or 1.0) / floor
 
 
@@ -314,17 +311,17 @@ def over(a: Tensor, b: Tensor, floor: float) -> float:
 # precision: a step computes its inputs as they are given.
 
 
-ROUNDING = 2.0**-23  #: the least bound of a result in single precision
-SLOPE = 1e-4  #: the least bound of a gradient in single precision
+ROUNDING = 2.0**-23  #: least error bound of a result in single precision
+SLOPE = 1e-4  #: least error bound of a gradient in single precision
 _NEAR = 0.5  #: share of a bound above which the mark is ``warn``
 _STEEPER = 10.0  #: ratio of the bound of a gradient to the bound of the result
-_DIM = 1e-3  #: share of the brightest element below which an element is dim
-#: nodes that must keep dim parts
+_DIM = 1e-3  #: elements below this fraction of the brightest element are dim
+#: nodes that must preserve dim parts
 _LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")
-#: nodes whose gradient is that of a largest element
+#: nodes whose gradient is that of the largest element
 _LARGEST = ("metrics.peak_irradiance", "sensor.level")
-_HUGE = 1e30  #: the large number with which infinity is compared
-_ROUNDINGS = 10  #: random roundings of the inputs that are tried
+_HUGE = 1e30  #: large number that must have the same effect as infinity
+_ROUNDINGS = 10  #: number of random roundings of the inputs
 
 
 @dataclass(frozen=True)
@@ -335,15 +332,15 @@ class Cell:
 
     mark: Mark
     note: str
-    error: float | None = None  #: of the result
+    error: float | None = None  #: error of the result
     bound: float | None = None
     slope: float | None = None  #: error of the gradient
     slope_bound: float | None = None
 
 
 def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
-    """Test a step in an extreme case and return the test result, or None if the case changes no
-    input of the step.
+    """Test a step in an extreme case, and return the test result or None if the case changes no
+    input.
     """
     changed = _changed_inputs(inputs, case)
     if changed is None:
@@ -361,8 +358,8 @@ def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell
 
 
 def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
-    """Return a step's inputs with the pictures changed for an extreme case, or None if no input
-    is a picture.
+    """Return a step's inputs with the pictures changed by an extreme case, or None if no input is a
+    picture.
     """
     changed = list(inputs)
     if case.alike:
@@ -386,7 +383,7 @@ def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     """Compare result and gradient of a step with its reference, and return the outcome.
 
-    A gradient beyond its bound is excused where rounding of the inputs alone moves it as much.
+    A gradient beyond its bound is accepted if rounding of the inputs alone changes it as much.
     """
     with torch.no_grad():
         value, truth = as_used(step, inputs, seed), _truth(step, inputs, seed)
@@ -394,13 +391,13 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
         return _overflow(truth)
     bound = max([step.node.rtol, ROUNDING, *_roundings(value)])
     error = _dim_error(value, truth) if _is_dim(step, case) else _error(value, truth)
-    # of a gradient, as of its input
+    # a gradient is rounded like its input
     input_rounding = max(_roundings(inputs), default=0.0)
     gradient_error, gradient_bound = (
         slope_error(step, inputs, seed),
         max(SLOPE, _STEEPER * bound, 2 * input_rounding),
     )
-    # scalars: terms that cancel count with their sum
+    # scalars: take the sum of the absolute terms as the scale if terms cancel
     if error > bound and all(tensor.ndim == 0 for tensor in tensors_in(truth)):
         error = _error_beside_terms(step, inputs, value, truth, seed)
     beyond_bound = (
@@ -417,29 +414,31 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
 
 
 def _input_precision(step: Step) -> tuple[str, float]:
-    """Return the precision in which the inputs of a step are rounded, and its unit."""
+    """Return the precision to which the inputs of a step are rounded, and its unit roundoff."""
     return ("single", SINGLE) if step.node.path in _LARGEST else ("double", DOUBLE)
 
 
 def _overflow(truth: Any) -> Cell:
-    """Return the outcome of a result that is not finite."""
+    """Return the outcome for a result that is not finite."""
     if _fits_single_precision(truth):
         return Cell("fail", "not finite")
     return Cell("pass", "overflows visibly, as the reference does in single precision")
 
 
 def _roundings(value: Any) -> list[float]:
-    """Return the largest relative rounding of each tensor in half precision, and 0 of others."""
+    """Return the unit roundoff of each tensor in half precision, and 0 for all others."""
     return [HALVES.get(tensor.dtype, 0.0) for tensor in tensors_in(value)]
 
 
 def _is_dim(step: Step, case: Case) -> bool:
-    """Return True if only the dim elements of the result count."""
+    """Return True if only the dim elements of the result are judged."""
     return case.expect == "dim part" and step.node.path.startswith(_LIGHT)
 
 
 def _error_beside_terms(step: Step, inputs: list[Any], value: Any, truth: Any, seed: int) -> float:
-    """Return the largest error of scalars, each relative to the sum of its terms."""
+    """Return the largest error of scalar results, each relative to the sum of its
+    absolute terms.
+    """
     errors = []
     for number, (scalar, true_scalar) in enumerate(
         zip(tensors_in(value), tensors_in(truth), strict=True)
@@ -451,7 +450,7 @@ def _error_beside_terms(step: Step, inputs: list[Any], value: Any, truth: Any, s
 
 
 def _ill_conditioned(cell: Cell, moved: float, precision: str) -> Cell:
-    """Return the outcome of a step whose gradient moves with the rounding of its inputs."""
+    """Return the outcome for a step whose gradient changes with the rounding of its inputs."""
     if cell.mark == "fail":
         return cell
     changes = (
@@ -462,14 +461,14 @@ def _ill_conditioned(cell: Cell, moved: float, precision: str) -> Cell:
 
 
 def _truth(step: Step, inputs: list[Any], seed: int) -> Any:
-    """Return the result of the node's own reference, or of the node in float64 without one."""
+    """Return the result of the node's reference, or without one of the node in float64."""
     reference = step.node.hooks.reference
     return run(step, reference, inputs, seed) if reference else in_double(step, inputs, seed)
 
 
 def _marked(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
-    """Return the outcome of a test: pass if errors are below half of their bounds, warn up to
-    the bounds, else fail.
+    """Return the outcome of a test: pass up to half of the bounds, warn up to the bounds, else
+    fail.
     """
     error_over_bound = [error / bound] if slope is None else [error / bound, slope / steeper]
     within = all(share <= 1.0 for share in error_over_bound)  # NaN is not within its bound
@@ -483,8 +482,8 @@ def _marked(error: float, bound: float, slope: float | None, steeper: float) -> 
 
 
 def _error(value: Any, truth: Any) -> float:
-    """Return the largest difference of a result from the reference, relative to the reference's
-    largest element.
+    """Return the largest difference of a result from the reference, relative to the largest element
+    of the reference.
     """
     results_and_truths = list(zip(tensors_in(value), tensors_in(truth), strict=True))
     return max(
@@ -523,7 +522,7 @@ def _fits_single_precision(truth: Any) -> bool:
 
 
 def _seen(step: Step, inputs: Sequence[Any], changed: list[Any], case: Case, seed: int) -> Cell:
-    """Return a test result that fails if a step's result does not show NaN or infinity of an
+    """Return a test result that fails if the step's result does not show NaN or infinity in an
     input picture.
     """
     notes = [
@@ -538,8 +537,8 @@ def _seen(step: Step, inputs: Sequence[Any], changed: list[Any], case: Case, see
 
 
 def _one_seen(step: Step, inputs: list[Any], seed: int) -> str:
-    """Return how a step treats NaN or infinity in an input: refused, seen in the result, as a
-    large number, hidden.
+    """Return how a step treats NaN or infinity in an input: refused, seen in the result, like a
+    large number, or hidden.
     """
     with torch.no_grad():
         try:
@@ -568,7 +567,7 @@ def _one_seen(step: Step, inputs: list[Any], seed: int) -> str:
 
 
 def _with_one_changed(which: int, inputs: Sequence[Any], changed: Sequence[Any]) -> list[Any]:
-    """Return the inputs with one picture, number ``which``, as the case changed it."""
+    """Return the inputs with only the picture number ``which`` changed as in the case."""
     replacement = {id(pictures_in(inputs)[which]): pictures_in(changed)[which]}
     with_one: list[Any] = each_tensor(lambda x: replacement.get(id(x), x), list(inputs))
     return with_one

@@ -37,7 +37,7 @@ Expect = Literal["accurate", "dim part", "seen"]
 class Size:
     """The reduced size of a recipe: its pixels, pupil samples and bands."""
 
-    pixels: int = 24  #: side of the scene; the rest in proportion
+    pixels: int = 24  #: side of the scene in pixels; other shapes scale in proportion
     samples: int = 64  #: side of the pupil
     bands: int = 5
 
@@ -51,19 +51,19 @@ class Case:
     name: str
     what: str  #: the extreme property
     group: str
-    #: a value, or a function of the step's parameters
+    #: by ``node.parameter``: a value, or a function of the step's parameters
     params: Mapping[str, Any] = field(default_factory=dict)
-    #: by the start of a node's path
+    #: function that changes the result, by the start of a node's path
     values: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
-    #: changes one picture among the inputs of a step
+    #: function that changes each picture among the inputs of a step
     inputs: Callable[[Tensor], Tensor] | None = None
     alike: bool = False  #: whether a step that compares two pictures gets the same picture twice
     size: Size = field(default_factory=Size)
     expect: Expect = "accurate"
 
 
-#: by node and case: words of the node's docstring about NaN in the inputs, if the result cannot
-#: show NaN
+#: phrase about NaN in the docstring of a node, by node and case, for nodes whose result cannot show
+#: NaN
 _STATED = {
     ("restore.clipped", "NaN"): "so is what is not a number",
     ("metrics.light_outside", "NaN"): "have no effect, not even where they are NaN",
@@ -74,9 +74,7 @@ _STATED = {
 
 
 def stated_words(node: Node, case: str) -> str | None:
-    """Return the words about NaN in the docstring of a node, or None if the docstring does not
-    have these words.
-    """
+    """Return the phrase about NaN in the docstring of a node, or None if the docstring lacks it."""
     documented_words = _STATED.get((node.path, case))
     return (
         documented_words
@@ -150,7 +148,7 @@ def _closed(pupil: Pupil) -> Pupil:
 
 def _off_axis(share: float) -> Callable[[Params], tuple[float, float]]:
     """Return a function that computes the angle of a laser whose spot is ``share`` sensor widths
-    from the centre.
+    off centre.
     """
     return lambda p: (
         # angle (y, x)
@@ -346,7 +344,7 @@ CASES: tuple[Case, ...] = (
 # each step.
 
 
-# by node: nodes for the same inputs
+# nodes that are tested with the same inputs, by node
 _COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
     "metrics.lsr": (("losses.suppression_loss", {}), ("losses.suppression_loss", {"log": True})),
     "metrics.bsr": (("losses.background_loss", {}),),
@@ -358,20 +356,20 @@ _COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
         ("losses.gradient_penalty", {}),
     ),
 }
-#: limits of other parameters that make a step slow
+#: upper limits of other parameters that make a step slow
 _SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}
 
 
 def with_losses(recipe: Recipe) -> dict[str, Step]:
-    """Return the steps of the recipe, and extra steps that compute losses and related results
-    from the same inputs.
+    """Return the steps of the recipe, with extra steps for losses and related results of the same
+    inputs.
     """
     steps = dict(recipe.steps)
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
             node = find_node(path)
             inputs = {
-                # the losses have the inputs of the metric, in the same order
+                # a loss has the same inputs as the metric, in the same order
                 input_name: step.wires[source]
                 for input_name, source in zip(node.inputs, step.node.inputs, strict=False)
             }
@@ -389,9 +387,7 @@ def with_losses(recipe: Recipe) -> dict[str, Step]:
 
 
 def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
-    """Reduce the pixels, pupil samples and spectral bands of the steps, and keep the pupil
-    diameters.
-    """
+    """Reduce pixels, pupil samples and spectral bands of the steps at constant pupil diameters."""
     longest_sides = [
         max(step.params["shape"]) for step in steps.values() if step.params.get("shape")
     ]
@@ -400,9 +396,9 @@ def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
 
 
 def _smaller(step: Step, size: Size, scale: float) -> dict[str, Any]:
-    """Return the parameters of a step at a reduced size; ``scale`` is that of the pixels.
+    """Return the parameters of a step at reduced size; ``scale`` is the factor for pixels.
 
-    The pitch grows as the samples become fewer, so that the diameter of the pupil stays.
+    The pitch grows as the number of samples falls, so that the pupil diameter stays.
     """
     params = dict(step.params)
     if params.get("shape"):
@@ -422,7 +418,7 @@ def _smaller(step: Step, size: Size, scale: float) -> dict[str, Any]:
 
 
 def _limited(params: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a random node that are limited for a quick test."""
+    """Return the parameters of a random node that are lowered for a quick test."""
     return {name: min(limit, params[name]) for name, limit in _SMALLER.items() if name in params}
 
 
@@ -432,7 +428,9 @@ def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
 
 
 def _changed(step: Step, case: Case) -> dict[str, Any]:
-    """Return the parameters of a step with the values of a case, by ``*.name`` or ``node.name``."""
+    """Return the parameters of a step with the values of a case, which have the names ``*.name`` or
+    ``node.name``.
+    """
     params = dict(step.params)
     for name in step.params:
         for path in (f"*.{name}", f"{step.node.path}.{name}"):
@@ -456,22 +454,22 @@ class CaseRecipe:
     steps: dict[str, Step]
     keys: dict[str, Key] = field(default_factory=dict)
     values: dict[str, Any] = field(default_factory=dict)
-    refused: dict[str, str] = field(default_factory=dict)  #: reasons of steps that gave no value
-    #: the recipe without changes, for results that the case leaves alone
+    refused: dict[str, str] = field(default_factory=dict)  #: why a step gave no result, by step
+    #: the recipe of the usual case, for results that this case does not change
     usual: CaseRecipe | None = None
 
     @classmethod
     def of(
         cls, recipe: Recipe, case: Case, code: Code, usual: CaseRecipe | None = None
     ) -> CaseRecipe:
-        """Return the recipe of an extreme case and the store key of each step; changed results
-        have other keys.
+        """Return the recipe of an extreme case with the store key of each step; changed results get
+        other keys.
         """
         steps = with_parameters(with_size(with_losses(recipe), case.size), case)
         chain = cls(recipe, case, steps, usual=usual)
         for name in in_order({n: step.sources for n, step in steps.items()}, steps):
             key, _ = key_of(steps[name], chain.keys, recipe.seed, code)
-            # a result that the case changes differs from that of its inputs
+            # a result changed by the case gets a key of its own
             chain.keys[name] = digest(key, case.name) if _put(steps[name], case) else key
         return chain
 
@@ -480,15 +478,15 @@ class CaseRecipe:
         return [self._gathered(self.steps[name].wires.get(i)) for i in self.steps[name].node.inputs]
 
     def _gathered(self, wire: Any) -> Any:
-        """Return the value of a wire: one result, a list of results, or None without a wire."""
+        """Return the value at an input: one result, a list of results, or None if it is not
+        connected.
+        """
         if wire is None or isinstance(wire, str):
             return wire and self._value(wire)
         return [self._value(name) for name in wire]
 
     def _value(self, step: str) -> Any:
-        """Return the result of a step, computing what is lacking; raise `LookupError` if there is
-        none.
-        """
+        """Return the result of a step, computed if needed; raise `LookupError` if there is none."""
         for name in in_order(
             {step_name: any_step.sources for step_name, any_step in self.steps.items()},
             [step],
@@ -500,7 +498,9 @@ class CaseRecipe:
         return self.values[step]
 
     def _compute(self, name: str) -> None:
-        """Compute one step whose inputs are known, and keep its result or why there is none."""
+        """Compute one step whose inputs are known, and keep its result or the reason why there is
+        none.
+        """
         step, usual_recipe = self.steps[name], self.usual
         if usual_recipe and usual_recipe.keys[name] == self.keys[name]:
             try:
@@ -519,7 +519,7 @@ class CaseRecipe:
             self.refused[name] = str(error.cause)
             if not step.node.path.startswith("spectra.lift"):
                 return
-            # a grey cube, so that later steps are tested
+            # use a grey cube, so that later steps can be tested
             value = inputs[0].mean(0).expand(len(inputs[1].centres), -1, -1).clone()
             del self.refused[name]
         change = _put(step, self.case)
@@ -527,15 +527,15 @@ class CaseRecipe:
 
 
 def _put(step: Step, case: Case) -> Any:
-    """Return the function with which a case changes the result of a step, or None."""
+    """Return the function by which a case changes the result of a step, or None."""
     return next(
         (change for path, change in case.values.items() if step.node.path.startswith(path)), None
     )
 
 
 def unchanged_steps(chain: CaseRecipe, usual: CaseRecipe) -> Iterator[str]:
-    """Yield the steps with the same inputs and parameters in an extreme case as in the recipe
-    without changes.
+    """Yield the steps whose inputs and parameters are the same in an extreme case as in the usual
+    case.
     """
     if chain.case is usual.case or chain.case.inputs or chain.case.alike:
         return

@@ -38,17 +38,17 @@ from neusee.workflows.studies.run_study import key_parts, run_cold
 # window.
 
 
-_TIMES = 3  #: cold runs of a scene; the median of their times counts
+_TIMES = 3  #: cold runs of a scene, of which the median time is used
 _QUICK_SECONDS = 5.0  #: s; a scene that takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
-#: works even with one band
+#: a node that also works with a single band
 _LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"
 _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
 
 
 @dataclass(frozen=True)
 class SceneCost:
-    """The run time of a recipe with one scene, and the steps that the engine left out."""
+    """The run time of a recipe with one scene, and the steps that the engine omitted."""
 
     scene: str
     seconds: float  #: median of the engine's cold runs; NaN if the scene could not be run
@@ -61,9 +61,7 @@ class SceneCost:
 def measure_scenes(
     recipe: Recipe, store: Store, progress: Callable[[str], None]
 ) -> Iterator[SceneCost]:
-    """Yield the run time of ``recipe`` with each simpler scene; measure the time if the store
-    does not have it.
-    """
+    """Yield the run time of ``recipe`` with each simpler scene, from the store or measured now."""
     code, warm = Code(store.code_memo), list[Result]()
     for scene, changed_recipe in scenes(recipe).items():
         if isinstance(changed_recipe, str):
@@ -77,7 +75,7 @@ def measure_scenes(
 
         code_and_machine = engine("studies.leave_out_study", "engine.runner"), machine()
         key = digest("content", key_parts(changed_recipe, code), *code_and_machine)
-        # scenes of the same steps share a stored result, with another name
+        # scenes with equal steps share a stored result under another name
         cost = replace(
             compute_once(store, key, SceneCost, compute, {"step": "study leave-out"}), scene=scene
         )
@@ -86,8 +84,8 @@ def measure_scenes(
 
 
 def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
-    """Return the recipe with each simpler scene by name, or the reason why the recipe cannot
-    have the scene.
+    """Return the recipe with each simpler scene by name, or the reason why this scene is
+    impossible.
     """
     recipe_of_scene: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
     recipe_of_scene["as the recipe chooses"] = recipe
@@ -100,22 +98,22 @@ def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
 
 
 def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Apply overrides to ``recipe``, and remove (``~path``) the recipe values that no step reads
-    any more.
+    """Apply overrides to ``recipe``, and remove (``~path``) recipe values that no step reads any
+    more.
     """
     try:
         return changed(recipe, overrides)
     except RecipeError as error:
         removals = [f"~{problem.path}" for problem in error.diagnostics if problem.code == UNREAD]
-        # another mistake, which no removal mends
+        # another error, which removals do not fix
         if len(removals) < len(error.diagnostics):
             raise
         return changed(recipe, [*overrides, *removals])
 
 
 def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
-    """Return the overrides that make each simpler scene; without those that the
-    recipe cannot have.
+    """Return the overrides for each simpler scene; scenes that the recipe cannot have are
+    omitted.
     """
     no_laser, clean_window = _no_laser(recipe), _clean_window(recipe)
     lift = [_LIFT] if "cube" in recipe.steps else []
@@ -147,8 +145,8 @@ def _grey_scene(recipe: Recipe) -> list[str]:
 
 
 def _window_steps(recipe: Recipe) -> set[str]:
-    """Return the names of the steps that compute window dirt or ghosts, and of steps that
-    require these results.
+    """Return the steps that compute window dirt or ghosts, and all steps that require their
+    results.
     """
     window = {name for name, step in recipe.steps.items() if step.node.path in _WINDOW}
     for name, step in recipe.steps.items():
@@ -163,8 +161,8 @@ def _window_steps(recipe: Recipe) -> set[str]:
 
 
 def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
-    """Return overrides for ``count`` bands between two wavelengths, or none without
-    such settings.
+    """Return overrides for ``count`` bands between two wavelengths; empty if the recipe lacks these
+    settings.
     """
     names = ("optics.shortest", "optics.longest", "optics.bands")
     if any(name not in recipe.config.settings for name in names):
@@ -173,7 +171,7 @@ def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
 
 
 def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
-    """Return the run time of a scene, or why it could not be run."""
+    """Return the run time of a scene, or why the scene could not be run."""
     try:
         result = _median_run(recipe, store)
     except RunError as error:
@@ -187,7 +185,7 @@ def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
 
 
 def _median_run(recipe: Recipe, store: Store) -> Result:
-    """Return the run of median time; a quick one is repeated."""
+    """Return the run with the median time; only fast runs are repeated."""
     results = [run_cold(recipe, store)]
     while max(measured.seconds for measured in results) < _QUICK_SECONDS and len(results) < _TIMES:
         results.append(run_cold(recipe, store))
@@ -200,7 +198,7 @@ def _median_run(recipe: Recipe, store: Store) -> Result:
 # scenes.
 
 
-_WAITING = "#9DB8CC"  #: the colour of the seconds that the engine takes outside the steps
+_WAITING = "#9DB8CC"  #: colour of the time that the engine spends outside the steps
 _COLUMNS = (
     "what",
     "name",
@@ -220,8 +218,8 @@ _HELD = {True: Marked("holds", "pass"), False: Marked("fails", "fail")}
 
 @dataclass(frozen=True)
 class LeaveOutResult:
-    """The result of the leave-out study: errors of outputs, errors of left-out steps, and run
-    times of scenes.
+    """The result of the leave-out study: errors of outputs and omissions, and run times
+    of scenes.
     """
 
     output_errors: Sequence[OutputError]
@@ -230,7 +228,7 @@ class LeaveOutResult:
 
     @property
     def failed(self) -> int:
-        """Return how many outputs and left-out steps exceed their error bounds."""
+        """Return the number of outputs and omissions that exceed their error bounds."""
         return sum(not output.holds for output in self.output_errors) + sum(
             not row.holds for row in self.rows
         )
@@ -238,9 +236,9 @@ class LeaveOutResult:
 
 @dataclass(frozen=True)
 class LeaveOutOptions:
-    """What the study measures beside the errors of steps that are left out."""
+    """What the study measures in addition to the errors of omissions."""
 
-    contents: bool = True  #: True for the run times of simpler scenes too
+    contents: bool = True  #: whether to measure the run times of simpler scenes
 
 
 def study(
@@ -427,7 +425,7 @@ def _scenes(result: LeaveOutResult) -> Section:
 
 @drawn
 def _bars(costs: Sequence[SceneCost]) -> Any:
-    """Draw the run time of each scene: in the steps, and beside them."""
+    """Plot the run time of each scene, split into time inside the steps and time outside them."""
     figure, axes = canvas(8.0, 0.42 * len(costs) + 1.3)
     ax = axes[0, 0]
     names = [cost.scene for cost in costs]
@@ -449,6 +447,6 @@ def _bars(costs: Sequence[SceneCost]) -> Any:
     ax.grid(False, axis="y")
     ax.set_xlabel("seconds, from an empty store")
     ax.set_xlim(0, 1.15 * max(cost.seconds for cost in costs) or 1.0)
-    # no bar and no note is there, whatever the times
+    # above the axes, where no bar and no label can be
     figure.legend(loc="outside upper center", ncols=2)
     return figure

@@ -26,7 +26,7 @@ from neusee.workflows.tolerance.skip_decision import FactsOf, judge, without
 
 # --- possible omissions ---------------------------------------------------------------------------
 
-# The ways to leave out steps of a recipe, each as a change of the recipe that computes every step.
+# The ways to omit steps of a recipe, each as a change of the full recipe.
 #
 # There are three kinds. ``handed on``: a step whose node bounds its effect is left out, and the
 # first input of the step takes the place of its result. ``not added``: light or dirt whose largest
@@ -39,24 +39,22 @@ OmissionKind = Literal["handed on", "not added", "stands in"]
 
 @dataclass(frozen=True)
 class Omission:
-    """One way to save run time: steps of a recipe that can be left out or replaced by cheaper
-    steps.
-    """
+    """One way to save run time: steps that can be omitted or replaced by cheaper steps."""
 
     name: str
     kind: OmissionKind
-    #: for each omitted step, the step that replaces it, or an empty text
+    #: the replacement of each omitted step; empty text for none
     exchange: Mapping[str, str]
-    #: largest relative change at the compared steps; NaN if only a run can determine the bound
+    #: upper bound of the relative change at the compared steps; NaN if only a run can give it
     bound: float
     why: str
-    taken: bool  #: whether the recipe's own run has this omission
-    #: the steps whose results are compared: the step itself, or the steps that read it
+    taken: bool  #: whether a normal run of the recipe has this omission
+    #: compared steps: the omitted step itself, or the steps that read it
     at: tuple[str, ...]
     beside: tuple[Step, ...] = ()  #: replacing steps that are not in the recipe
 
     def applied_to(self, recipe: Recipe) -> Recipe:
-        """Return ``recipe`` with this omission of steps and no other change."""
+        """Return ``recipe`` with only this omission applied."""
         readers = set(recipe.steps) if self.kind != "stands in" else set(self.at)
         steps = {**recipe.steps, **{step.name: step for step in self.beside}}
         for name in readers & recipe.steps.keys():
@@ -67,14 +65,14 @@ class Omission:
         return replace(recipe, steps={name: steps[name] for name in order}, outputs=outputs)
 
     def value_of(self, step: str) -> str:
-        """Return the name of the step whose result replaces the result of ``step`` after this
-        omission of steps.
+        """Return the step whose result takes the place of the result of ``step`` after this
+        omission.
         """
         return self.exchange.get(step, step) if self.kind == "handed on" else step
 
     def _wires(self, reader: Step) -> Mapping[str, Wire]:
-        """Return the wires of a step that reads an omitted result, without it or with its
-        replacement.
+        """Return the inputs of a step that reads an omitted result, with the result removed or
+        replaced.
         """
         if self.kind == "not added":
             return without(reader, dict.fromkeys(self.exchange))
@@ -82,22 +80,22 @@ class Omission:
 
 
 def _exchanged(wire: Wire, exchange: Mapping[str, str]) -> Wire:
-    """Return a wire with the names of replaced steps exchanged."""
+    """Return a connection with replaced steps exchanged."""
     if isinstance(wire, tuple):
         return tuple(exchange.get(name, name) for name in wire)
     return wire and exchange.get(wire, wire)
 
 
 def omissions(full: Recipe, result: Result, facts_of: FactsOf) -> Iterator[Omission]:
-    """Yield each way to leave out steps of the full computation ``full`` for which the error has
-    a bound.
+    """Yield each way to omit steps of the full computation ``full`` for which an error bound is
+    known.
     """
     order = needed(full, full.outputs)
     yield from _stand_ins(full, order, result)
     for name in order:
         done = result.done.get(name)
         reason = done.why if done is not None and done.state == "left out" else ""
-        # a step that the run did not reach was left out with the step that reads it
+        # a step that the run never reached was omitted together with its reader
         is_chosen = done is None or bool(reason)
         for omission in (
             _handed_on(full.steps[name], facts_of),
@@ -108,8 +106,8 @@ def omissions(full: Recipe, result: Result, facts_of: FactsOf) -> Iterator[Omiss
 
 
 def _handed_on(step: Step, facts_of: FactsOf) -> Omission | None:
-    """Return the omission of a step whose first input takes the place of its result; None if its
-    node states no bound.
+    """Return the omission that passes the first input of a step on as its result; None if the node
+    states no bound.
     """
     if step.node.hooks.skip_bound is None:
         return None
@@ -121,33 +119,32 @@ def _handed_on(step: Step, facts_of: FactsOf) -> Omission | None:
         {step.name: decision.instead},
         decision.bound,
         reason,
-        False,  # `omissions` finds out whether the run has it
+        False,  # taken: set by `omissions`
         (step.name,),
     )
 
 
 def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -> Omission | None:
-    """Return the omission of light or dirt that other steps only add; None if it has no bound."""
+    """Return the omission of light or dirt that other steps only add; None without a bound."""
     step = recipe.steps[name]
     readers = _adding(recipe, order, name) if step.node.hooks.zero_bound is not None else ()
     if not readers:
         return None
     largest = _largest(step, facts_of)
     reason = f"no element above {largest:.2g}"
-    # not chosen (False) until `omissions` knows
     return Omission(
         name,
         "not added",
         {name: ""},
         _share(largest, recipe, readers, facts_of),
         reason,
-        False,  # `omissions` finds out whether the run has it
+        False,  # taken: set by `omissions`
         readers,
     )
 
 
 def _stand_ins(full: Recipe, order: list[str], result: Result) -> Iterator[Omission]:
-    """Yield the `Omission` that computes sums over spectral bands instead of images of all bands.
+    """Yield the `Omission` that computes sums over spectral bands in place of images of all bands.
 
     All images are replaced together, because two images that a step compares must be computed in
     the same way.
@@ -174,8 +171,8 @@ def _stand_ins(full: Recipe, order: list[str], result: Result) -> Iterator[Omiss
 
 
 def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
-    """Return the steps that read the result of step ``name`` if all of these steps only add the
-    result, else none.
+    """Return the steps that read the result of ``name``, if all of them only add it; else an empty
+    tuple.
     """
     readers = [
         recipe.steps[reader_name]
@@ -190,7 +187,7 @@ def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
 
 
 def _only_adds(reader: Step, name: str) -> bool:
-    """Return True if a step reads the result of another one only at inputs that it adds."""
+    """Return True if a step reads the result ``name`` only at additive inputs."""
     inputs_read = {
         input_name
         for input_name, wire in reader.wires.items()
@@ -200,8 +197,8 @@ def _only_adds(reader: Step, name: str) -> bool:
 
 
 def _largest(step: Step, facts_of: FactsOf) -> float:
-    """Return an upper bound of the largest element of a step's result, from statistics of the
-    step's inputs.
+    """Return an upper bound of the largest element of a step's result, from statistics of its
+    inputs.
     """
     assert step.node.hooks.zero_bound is not None
     input_statistics = [_facts(step.wires.get(name), facts_of) for name in step.node.inputs]
@@ -212,13 +209,13 @@ def _largest(step: Step, facts_of: FactsOf) -> float:
 
 
 def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | None] | None:
-    """Return the statistics of the result, or of each result, that a wire carries."""
+    """Return the statistics of the result or results at an input."""
     return [facts_of(name) for name in wire] if isinstance(wire, tuple) else wire and facts_of(wire)  # type: ignore[return-value]
 
 
 def _share(largest: float, recipe: Recipe, readers: tuple[str, ...], facts_of: FactsOf) -> float:
-    """Return ``largest`` over the largest element in the results of the ``readers``, or infinity if
-    not tensors.
+    """Return the ratio of ``largest`` to the smallest of the readers' largest elements; infinite if
+    a reader's result is no tensor.
     """
     if largest == 0:
         return 0.0
@@ -229,29 +226,30 @@ def _share(largest: float, recipe: Recipe, readers: tuple[str, ...], facts_of: F
 
 
 def _top(facts: TensorStats | None) -> float:
-    """Return the largest absolute value of a result, or 0 where nothing is known of it."""
+    """Return the largest absolute value of a result; 0 if unknown."""
     return max(abs(facts.min), abs(facts.max)) if facts else 0.0
 
 
 # --- omission rows --------------------------------------------------------------------------------
 
-# Comparison of a recipe with and without left-out steps: error bound, measured error and saved run
-# time.
+# Comparison of a recipe with and without omissions: error bound, measured error and saved run time.
 #
 # The full computation is the recipe without omissions. It is compared with the recipe with all
 # omissions that the engine chooses, and with one omission alone. The recipe with the chosen
 # omissions is also compared with the same recipe after one of the omissions is undone.
 
 
-_SURE = 4.0  #: standard errors by which a mean over pixels may differ from the mean over all noise
+#: number of standard errors by which a mean over pixels may differ from the expectation over the
+#: noise
+_SURE = 4.0
 _STORED_AS = {"step": "study leave-out"}
 _ROUNDING = 2e-7  #: rounding error of a sum in float32, relative to its largest element
 
 
 @dataclass(frozen=True)
 class OmissionRow:
-    """The effect of left-out steps: error bound, errors relative to the largest element, and
-    saved run time.
+    """The effect of an omission: error bound, errors relative to the largest element, and saved run
+    time.
     """
 
     name: str
@@ -259,7 +257,7 @@ class OmissionRow:
     why: str
     taken: bool
     bound: float
-    rms: float  #: error at the step, or at the steps that read its result
+    rms: float  #: root mean square error at the step, or at the steps that read its result
     largest: float
     outputs: dict[str, float]  #: root mean square error of each output with this omission alone
     back: float | None  #: root mean square change of the worst output when this omission is undone
@@ -269,12 +267,10 @@ class OmissionRow:
 
 @dataclass(frozen=True)
 class OutputError:
-    """The error of one output after the engine has left out steps, relative to the full
-    computation.
-    """
+    """The error of one output after the engine's omissions, relative to the full computation."""
 
     output: str
-    bound: float | None  #: error that the run states, as its page does; None if it is unknown
+    bound: float | None  #: error stated by the run and on its page; None if unknown
     kind: Kind
     rms: float
     largest: float
@@ -282,9 +278,7 @@ class OutputError:
 
 
 class OmissionComparison:
-    """The runs to compare: all steps computed, the engine's choice of steps left out, and each
-    step left out alone.
-    """
+    """The runs to compare: full computation, the engine's omissions, and each omission alone."""
 
     def __init__(self, recipe: Recipe, store: Store) -> None:
         self.recipe, self.store = recipe, store
@@ -294,22 +288,22 @@ class OmissionComparison:
         self.found = list(omissions(self.full, self.chosen, self.facts))
 
     def facts(self, step: str) -> TensorStats | None:
-        """Return statistics of a step's result in the full computation, from the store's
-        metadata if possible.
+        """Return statistics of a step's result in the full computation, from the store's metadata
+        if possible.
         """
         return facts_in(self.store.about(self.truth.keys[step])) or TensorStats.of(
             self.truth.value(step)
         )
 
     def output_errors(self) -> list[OutputError]:
-        """Return the error of each output after the engine has left out its choice of steps."""
+        """Return the error of each output after the engine's omissions."""
         errors = []
         for name in self.recipe.outputs:
             value, reference = self.chosen.values[name], self.truth.values[name]
             rms_error, proof = error_of(value, reference), self.chosen.proof
             bound, kind = proof.stated_of(name), proof.kind_of(name)
-            # beyond the tolerance only by what noise and rounding add, which the stated error
-            # counts
+            # an error may exceed the tolerance only by noise and rounding, which the stated error
+            # includes
             holds = rms_error <= (
                 self.recipe.tolerance if bound is None or self.chosen.recipe.exact else bound
             )
@@ -319,8 +313,8 @@ class OmissionComparison:
         return errors
 
     def rows(self) -> Iterator[OmissionRow]:
-        """Yield the errors and saved run time of each omission of steps; measure the omissions
-        that are not stored.
+        """Yield the errors and the saved run time of each omission, from the store or
+        measured now.
         """
         for omission in self.found:
             with_omission = omission.applied_to(self.full)
@@ -331,9 +325,7 @@ class OmissionComparison:
             yield compute_once(self.store, key, OmissionRow, compute, _STORED_AS)
 
     def _row(self, omission: Omission, alone: Recipe) -> OmissionRow:
-        """Compare the recipe with one omission alone with the full computation, and return the
-        result.
-        """
+        """Return the comparison of the full computation with one omission alone."""
         result = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))
         bounds = _bounds(omission, result)
         values_and_truths = {
@@ -354,7 +346,7 @@ class OmissionComparison:
             largest,
             # the errors of the outputs, and their change when the omission is undone
             *self._reached(omission, alone, changed=largest > 0),
-            # s of the omitted steps, less those of the replacing ones
+            # s, run time of the omitted steps minus that of their replacements
             self._seconds(self.full, alone) - self._seconds(alone, self.full),
             all(
                 self._holds(omission, bound, values_and_truths[name], result)
@@ -365,8 +357,8 @@ class OmissionComparison:
     def _reached(
         self, omission: Omission, alone: Recipe, changed: bool
     ) -> tuple[dict[str, float], float | None]:
-        """Return the error of each output with one omission of steps, and the change when this
-        omission is undone.
+        """Return the error of each output with one omission alone, and the change when it is undone
+        in the chosen recipe.
         """
         if not changed:
             return dict.fromkeys(self.recipe.outputs, 0.0), 0.0 if omission.taken else None
@@ -376,8 +368,8 @@ class OmissionComparison:
     def _holds(
         self, omission: Omission, bound: float, pair: tuple[Any, Any], result: Result
     ) -> bool:
-        """Return True if the bound holds for the rms error (noise and band sums) or the largest
-        error (all others).
+        """Return True if the bound holds: for the rms error (noise and band sums) or for the
+        largest error (all others).
         """
         if omission.kind == "stands in":  # both computations have a documented error of their own
             steps = [self.full.steps[name] for name in omission.exchange]
@@ -393,11 +385,9 @@ class OmissionComparison:
         return largest_error(*pair) <= bound * (1 + 1e-5) + (_ROUNDING if bound else 0.0)
 
     def _back(self, omission: Omission) -> float:
-        """Return the largest change of an output when one of the engine's omissions of steps is
-        undone.
-        """
+        """Return the largest change of an output when one of the engine's omissions is undone."""
         without_this = self.full
-        # from the last, because the input that is handed on may be left out too
+        # from last to first, because a passed-on input may itself be omitted
         for chosen_omission in reversed(self.found):
             if chosen_omission.taken and chosen_omission is not omission:
                 without_this = chosen_omission.applied_to(without_this)
@@ -411,10 +401,8 @@ class OmissionComparison:
         )
 
     def _seconds(self, recipe: Recipe, other: Recipe) -> float:
-        """Return the run time of the steps that ``recipe`` needs and recipe ``other`` does
-        not need.
-        """
-        # keys of results in the store, which knows their run times
+        """Return the run time of the steps that ``recipe`` needs and ``other`` does not."""
+        # the store keeps the run time of each result with its key
         keys = resolve(recipe, order := needed(recipe, recipe.outputs), self.store).keys
         not_in_other = [
             keys[name] for name in order if name not in set(needed(other, other.outputs))
@@ -422,8 +410,8 @@ class OmissionComparison:
         return sum(float((self.store.about(key) or {}).get("seconds", 0.0)) for key in not_in_other)
 
     def _key(self, omission: Omission, alone: Recipe) -> Key:
-        """Return the store key of a comparison: output keys of both recipes and of
-        the chosen one.
+        """Return the store key of a comparison, from the output keys of both recipes and of the
+        chosen one.
         """
         outputs = [
             [
@@ -440,9 +428,7 @@ class OmissionComparison:
 def _errors(
     names: Sequence[str], others: Sequence[str], result: Result, truth: Result
 ) -> dict[str, float]:
-    """Return the error of each output in ``names``; ``others`` are the names of the same outputs
-    in ``result``.
-    """
+    """Return the error of each output in ``names``; ``others`` are their names in ``result``."""
     pairs = zip(names, others, strict=True)
     return {
         name: error_of(result.values[name_in_result], truth.values[name])
@@ -451,9 +437,7 @@ def _errors(
 
 
 def _bounds(omission: Omission, result: Result) -> dict[str, float]:
-    """Return the error bound of each compared step: the bound that its node states, or that the
-    engine proves.
-    """
+    """Return the error bound of each compared step, stated by its node or proved by the engine."""
     if omission.kind != "stands in":
         return dict.fromkeys(omission.at, omission.bound)
     bounds = {name: result.proof.of(name) for name in omission.at}
@@ -461,8 +445,8 @@ def _bounds(omission: Omission, result: Result) -> dict[str, float]:
 
 
 def least_error(value: Tensor, reference: Tensor) -> float:
-    """Return a lower limit of the relative root mean square error over all noise, estimated from
-    one noisy result.
+    """Return a lower bound of the relative rms error over all noise, estimated from one noisy
+    result.
 
     Each pixel counts as a draw. If a few large pixels dominate the mean square error, the standard
     error of the mean is as large as the mean. The largest element is random too, so four standard

@@ -33,12 +33,12 @@ from neusee.workflows.store.result_store import Store, compute_once
 
 # --- scatter estimate -----------------------------------------------------------------------------
 
-# Means and standard deviations of quantities over random draws, and standard errors of the standard
-# deviations.
+# Means and standard deviations of quantities over random draws, and the standard errors of these
+# standard deviations.
 
 
 FloatArray = NDArray[np.float64]
-#: share of the largest value; a quantity with a smaller standard deviation is constant
+#: a quantity with a standard deviation below this fraction of its largest value counts as constant
 _CONSTANT = 1e-12
 
 
@@ -83,12 +83,12 @@ def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
 
 
 def _jackknife(x: FloatArray) -> float:
-    """Estimate the relative standard error of the standard deviation of independent draws ``x``
-    by the jackknife.
+    """Return the relative standard error of the standard deviation of independent draws ``x``, by
+    the jackknife.
     """
     count = len(x)
     squared_distances = (x - x.mean()) ** 2
-    # the standard deviation without each draw in turn
+    # leave-one-out standard deviations
     deviation_without = np.sqrt(
         (squared_distances.sum() - squared_distances * count / (count - 1)).clip(0.0) / (count - 2)
     )
@@ -99,7 +99,7 @@ def _jackknife(x: FloatArray) -> float:
 
 
 def _of_sequences(x: FloatArray, count: int) -> float:
-    """Estimate the relative standard error of the standard deviation from the variance in each
+    """Return the relative standard error of the standard deviation, from the variance within each
     Sobol sequence.
     """
     squares = (x - x.mean()) ** 2
@@ -115,19 +115,19 @@ def worst_known(scatter: Mapping[str, Scatter]) -> str:
 
 # --- allowed draws --------------------------------------------------------------------------------
 
-# The draws of a study whose values the recipe allows together; other draws are left out, and their
-# number is stated.
+# Only draws whose values the recipe allows together are used; the number of omitted draws is
+# reported.
 #
-# A value alone may be allowed, and two values may exclude each other, such as a full well below the
+# Each value may be allowed alone while two exclude each other, such as a full well below the
 # offset.
 
 
 class AllowedDraws:
-    """The allowed draws of the inputs, in order, of which a study takes more and more."""
+    """The allowed draws of the inputs in order; a study extends their number step by step."""
 
     def __init__(self, inputs: Inputs, draws: InputDraws, sequences: int) -> None:
         self._inputs, self._draws = inputs, draws
-        #: draws that are left out together, so that Sobol sequences stay equally long
+        #: number of draws that are omitted together, so that Sobol sequences stay equally long
         self._block = max(1, sequences)
         self._allowed: list[int] = []
         self.tried = 0
@@ -141,7 +141,7 @@ class AllowedDraws:
 
     @property
     def statement(self) -> str:
-        """Return how many draws were left out and why, or an empty text."""
+        """Return the number of omitted draws and the reason as text; empty for none."""
         return f"{self.left_out} of {self.tried} draws ({self.reason})" if self.left_out else ""
 
     @property
@@ -155,7 +155,7 @@ class AllowedDraws:
         return self._draws.values[self._allowed]
 
     def extend(self, count: int) -> None:
-        """Try draws until ``count`` draws have been tried."""
+        """Check further draws until ``count`` draws have been checked."""
         while self.tried < min(count, self.available):
             block = range(self.tried, min(self.tried + self._block, self.available))
             problems = [self._inputs.problem(self._draws.values[draw]) for draw in block]
@@ -172,7 +172,7 @@ def refuse_combinations(inputs: Inputs, ends: ShapesFloatArray, draws: AllowedDr
     """Raise `RecipeError` if values of ``ends`` (run, input), or of a draw, are not allowed
     together.
 
-    The draws are those that have been tried before anything runs.
+    The draws are those checked before any run.
     """
     problems = [problem for problem in map(inputs.problem, ends) if problem is not None]
     if problems:
@@ -182,7 +182,7 @@ def refuse_combinations(inputs: Inputs, ends: ShapesFloatArray, draws: AllowedDr
             f"{draws.left_out} of the first {draws.tried} draws have values that are not allowed"
             " together"
         )
-        # the place in the recipe at which the first input is written
+        # the place in the recipe of the first input
         value = inputs.uncertain.composed.root.below(inputs.names[0].split("."))
         assert value is not None
         advice = "give narrower or truncated distributions"
@@ -196,26 +196,26 @@ def refuse_combinations(inputs: Inputs, ends: ShapesFloatArray, draws: AllowedDr
 
 
 def _text(problem: Diagnostic) -> str:
-    """Return a mistake as text, with the path of its value if it has one."""
+    """Return an error as text, with the path of its value if it has one."""
     return f"{problem.path}: {problem.message}" if problem.path else problem.message
 
 
 # --- output draws ---------------------------------------------------------------------------------
 
-# The outputs of a recipe for random values of its uncertain inputs; steps without these inputs run
-# only once.
+# The outputs of a recipe for random values of its uncertain inputs; steps that do not depend on
+# these inputs run only once.
 
 
 Numbers = dict[str, list[float]]  #: elements of each quantity, such as ``restored_quality.psnr``
 #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
 _ARENAS, _MAPPED, _TRIM = -8, -4, -1
 _STORED_AS = {"step": "study uncertainty"}
-_NARROW = 8  #: a tensor of two axes counts as a picture if both are longer
+_NARROW = 8  #: a tensor of two axes counts as a picture if both axes are longer than this
 
 
 class OutputDraws:
-    """The outputs of a recipe for random values of its uncertain inputs; the store keeps the
-    numbers of each draw.
+    """The outputs of a recipe for random values of its uncertain inputs; the numbers of each draw
+    are kept in the store.
     """
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
@@ -236,8 +236,8 @@ class OutputDraws:
 
     @cached_property
     def _function(self) -> Any:
-        """Compute the steps that depend on no uncertain input, and return the recipe as a
-        function of the inputs.
+        """Compute the steps that depend on no uncertain input, and return the recipe as a function
+        of the uncertain inputs.
         """
         free_parameters = tuple(self.inputs.readers)
         return as_function(
@@ -249,16 +249,14 @@ class OutputDraws:
         )
 
     def ready(self) -> float:
-        """Compute the steps that depend on no uncertain input, and return the run time in
-        seconds.
-        """
+        """Compute the steps that depend on no uncertain input, and return the run time in s."""
         began = time.perf_counter()
         _ = self._function
         return time.perf_counter() - began
 
     def numbers(self, values: FloatArray) -> list[Numbers]:
-        """Return all numbers in the outputs for each draw of the inputs; compute draws that the
-        store does not have.
+        """Return all numbers of the outputs for each draw of the inputs, from the store or computed
+        now.
         """
         keys = [self.key(row) for row in values]
         # None for a draw that is not stored
@@ -271,8 +269,8 @@ class OutputDraws:
         return [numbers for numbers in stored if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
-        """Return mean and standard deviation of each output picture over the draws, and store
-        each draw's numbers.
+        """Return mean and standard deviation of each output picture over the draws; the numbers of
+        each draw are stored too.
         """
         keys = [self.key(row) for row in values]
         pictures_key = digest("uncertainty pictures", keys)
@@ -286,7 +284,7 @@ class OutputDraws:
         return moments
 
     def _sums(self, keys: Sequence[str], values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
-        """Compute each draw, keep its numbers, and return mean and standard deviation of each
+        """Compute all draws, store their numbers, and return mean and standard deviation of each
         picture.
         """
         sums = dict[str, _Sum]()
@@ -298,8 +296,8 @@ class OutputDraws:
         return {name: (running.mean, running.sd) for name, running in sums.items()}
 
     def key(self, row: FloatArray) -> str:
-        """Return the store key of one draw: a digest of the output keys of a run with the
-        sampled input values.
+        """Return the store key of one draw: a digest of the output keys of a run with these input
+        values.
         """
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
@@ -336,14 +334,14 @@ class OutputDraws:
         return keys
 
     def _kept(self, key: str) -> dict[str, Any] | None:
-        """Return the numbers of a draw from the store, or None."""
+        """Return the stored record of a draw, or None."""
         with suppress(KeyError):
             record: dict[str, Any] = self.store.get(key)
             return record
         return None
 
     def _keep(self, key: str, result: Mapping[str, Any]) -> Numbers:
-        """Store the numbers of a draw with the names of its pictures, and return the numbers."""
+        """Store the numbers of a draw and the names of its pictures, and return the numbers."""
         numbers = quantities(result)
         picture_names = [name for name, value in result.items() if _is_picture(value)]
         description = {
@@ -361,7 +359,7 @@ class OutputDraws:
         if not rows:
             return
         self.ready()
-        # time in which the caller uses the result does not count
+        # exclude the time in which the caller uses the result
         began = time.perf_counter()
         _keep_memory()
         workers = workers_for(len(rows), self.workers) if self.device == "cpu" else 1
@@ -375,8 +373,8 @@ class OutputDraws:
                 began = time.perf_counter()
 
     def _result(self, row: FloatArray) -> dict[str, Any]:
-        """Return the outputs for one draw ``row`` (input,); raise `ValueError` that names its
-        values.
+        """Return the outputs for one draw ``row`` (input,); raise `ValueError` with the input
+        values if the recipe fails.
         """
         values = self._named(row)
         try:
@@ -403,7 +401,9 @@ def quantities(result: Mapping[str, Any]) -> Numbers:
 
 
 def _reached_steps(inputs: Inputs, order: Sequence[str]) -> set[str]:
-    """Return the steps that depend on an uncertain input; ``order`` has sources before readers."""
+    """Return the steps that depend on an uncertain input; ``order`` lists each step after its
+    sources.
+    """
     reached = {reader.rpartition(".")[0] for reader in inputs.readers}
     for name in order:
         if any(source in reached for source in inputs.recipe.steps[name].sources):
@@ -429,7 +429,7 @@ class _Sum:
         self.count += 1
         distance = new_picture - self.mean
         self.mean = self.mean + distance / self.count
-        # Welford: the distance from the mean before times that from the mean now
+        # Welford: deviation from the old mean times deviation from the new mean
         self._squares = self._squares + distance * (new_picture - self.mean)
 
     @property
@@ -446,6 +446,6 @@ def _keep_memory() -> None:
     if sys.platform.startswith("linux"):
         with suppress(OSError, AttributeError):
             libc = ctypes.CDLL(None)
-            # one arena, no mapping of single blocks, and nothing given back below 2 GiB
+            # one arena, no separately mapped blocks, and no freed memory returned below 2 GiB
             for option, value in ((_ARENAS, 1), (_MAPPED, 0), (_TRIM, 2**31 - 1)):
                 libc.mallopt(option, value)

@@ -1,4 +1,4 @@
-"""Tests of a posterior: ranks of the truth on simulated sensors, and a wider prior."""
+"""Tests of a posterior: ranks of true parameters of simulated sensors, and a wider prior."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from neusee.workflows.store.result_store import Store, compute_once
 
 # --- independent draws ----------------------------------------------------------------------------
 
-# Nearly independent draws from a posterior, made by one ensemble of walkers.
+# Nearly independent draws from a posterior, from one ensemble of walkers.
 
 
 FloatArray = NDArray[np.float64]
@@ -44,9 +44,10 @@ WALKERS, DRAWS = 64, 99
 #: steps of the first round, growth for each round, and most steps
 _FIRST_STEPS, _GROWTH, _MOST_STEPS = 320, 1.5, 4000
 _LEAST_TAUS = 6.0  #: least length of a chain in autocorrelation times; its first half is discarded
-#: ratio of two standard deviations that chance rarely exceeds, for 64 walkers and three tau each
+#: ratio of two standard deviations that is rarely exceeded by chance, for 64 walkers and three tau
+#: each
 _ALIKE = 1.25
-#: a file that never exists, because a simulation is too short to be resumed
+#: a path that never exists: a simulation is too short to be resumed
 _NOT_KEPT = Path("/dev/null/not kept")
 
 
@@ -63,10 +64,10 @@ class PosteriorDraws:
 def walk_draws(
     problem: SensorPosterior, mode: LaplaceFit, seed: int, move_name: str = "de", count: int = DRAWS
 ) -> PosteriorDraws:
-    """Return ``count`` posterior draws from a Markov chain that is thinned to one step per
-    autocorrelation time.
+    """Return ``count`` posterior draws from a Markov chain thinned to one step per autocorrelation
+    time.
 
-    The chain starts and walks as in `emcee_sampler.sample`. It ends sooner, because a simulation
+    The chain starts and moves as in `emcee_sampler.sample`, but ends sooner, because a simulation
     needs few draws.
     """
     run = emcee_sampler.start_ensemble(
@@ -125,8 +126,8 @@ def _steady(chain: FloatArray) -> bool:
 #: function of a posterior, its mode and a seed, which returns draws from the posterior
 Sampler = Callable[[SensorPosterior, LaplaceFit, int], PosteriorDraws]
 _EXPOSE = "calibrate.expose"
-#: largest standard deviation of the prior of each logarithm, and of the offset in e-: with a wider
-#: prior some sensors would be drawn that the recipe's frames do not constrain
+#: largest prior standard deviation of each logarithm, and of the offset in e-; a wider prior would
+#: give sensors that the recipe's frames do not constrain
 WIDEST = {
     "gain": 0.1,
     "offset": 20.0,
@@ -136,7 +137,7 @@ WIDEST = {
     "quantum_efficiency": 0.05,
     "spread": 0.1,
 }
-_TAIL = 0.05  #: share of the draws beyond either end of the interval whose coverage is counted
+_TAIL = 0.05  #: share of the draws beyond each end of the interval whose coverage is tested
 
 
 @dataclass(frozen=True)
@@ -159,8 +160,8 @@ class SensorSimulation:
 
 
 class SensorSimulator:
-    """A simulator of sensors for a recipe's calibration; each simulation has its own sensor and
-    frames.
+    """Simulates and calibrates sensors for the calibration of a recipe; each simulation has its own
+    sensor and frames.
     """
 
     def __init__(
@@ -184,9 +185,7 @@ class SensorSimulator:
             self._weigh, self._weigh_in_full = self._functions(Store(folder))
 
     def simulation(self, number: int) -> SensorSimulation:
-        """Return the simulation with the number ``number``; compute the simulation if the store
-        does not have it.
-        """
+        """Return the simulation with index ``number``, from the store or computed now."""
         key = digest("calibration study", self._key_parts(), number)
         seed, description = (
             stream_seed(self.recipe.seed, f"calibration study {number}"),
@@ -202,7 +201,7 @@ class SensorSimulator:
         return {name: float(value) for name, value in drawn_sensor.items()}
 
     def problem(self, truth: Mapping[str, float], seed: int) -> SensorPosterior:
-        """Simulate frames of a sensor with the parameters ``truth``, and return the posterior of
+        """Simulate frames of a sensor with the parameters ``truth``, and return the posterior given
         these frames.
         """
         levels = self._levels(truth, seed)
@@ -214,14 +213,16 @@ class SensorSimulator:
         return replace(self.nominal, levels=levels, weigh=weigh, weigh_in_full=weigh_in_full)
 
     def prior_widths(self) -> dict[str, float]:
-        """Return the prior standard deviation of the logarithm of each free parameter, or of the
+        """Return the prior standard deviation of each free parameter: of its logarithm, or for the
         offset in e-.
         """
         widths = zip(NAMES, self.nominal.coordinates.prior.width.tolist(), strict=True)
         return {name: width for name, width in widths if np.isfinite(width)}
 
     def _simulate(self, seed: int) -> SensorSimulation:
-        """Draw a sensor, calibrate its simulated frames, and rank the truth among the draws."""
+        """Draw a sensor, calibrate its simulated frames, and return the ranks of its true
+        parameters.
+        """
         began = time.perf_counter()
         truth = self.truth(seed)
         problem = self.problem(truth, seed)
@@ -237,12 +238,12 @@ class SensorSimulator:
         return replace(ranked, kinds=identified.kinds, seconds=time.perf_counter() - began)
 
     def _levels(self, truth: Mapping[str, float], seed: int) -> Sufficient:
-        """Simulate frames of a sensor with the parameters ``truth``, and return statistics of
+        """Simulate frames of a sensor with the parameters ``truth``, and return the statistics of
         each light level.
         """
         values: dict[str, float] = {}
         for step in self.exposed:
-            # every step that exposes frames has the same sensor
+            # all exposing steps simulate the same sensor
             values |= {f"{step}.{name}": value for name, value in truth.items()}
         recipe = replace(self.recipe, seed=seed)
         with TemporaryDirectory(prefix="neusee-") as folder, torch.no_grad():
@@ -251,11 +252,11 @@ class SensorSimulator:
         return levels
 
     def _functions(self, store: Store) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-        """Return the likelihood as a function of light levels and parameters, first without and
-        then with deviances.
+        """Return the likelihood as a function of light levels and parameters, without and with
+        deviances.
         """
         step = self.recipe.steps[self.nominal.step]
-        # the statistics of the levels, and each free parameter
+        # inputs of the function: the level statistics, and each free parameter
         free = [self._source, *(f"{step.name}.{name}" for name in self.nominal.names)]
 
         def function(detailed: bool) -> Callable[[Any], Any]:
@@ -266,15 +267,15 @@ class SensorSimulator:
         return function(False), function(True)
 
     def _key_parts(self) -> list[Any]:
-        """Return what decides a simulation, for its store key."""
+        """Return the parts of the store key of a simulation."""
         prior = [column.tolist() for column in self.nominal.coordinates.prior]
         code = [engine("studies.posterior_tests"), versions(), version("emcee")]
         return [self.nominal.key, self.recipe.seed, prior, self.label, *code]
 
 
 def with_narrow_prior(recipe: Recipe, changed: Mapping[str, Mapping[str, Any]]) -> Recipe:
-    """Return the recipe with the parameters of each step in ``changed``, and with a prior no
-    wider than `WIDEST`.
+    """Return the recipe with the parameters ``changed`` by step, and with priors no wider than
+    `WIDEST`.
     """
     prior = only_step(recipe, "calibrate.prior")
     capped = {
@@ -296,7 +297,7 @@ def _capped(name: str, law: tuple[float, float] | None) -> tuple[float, float] |
     """Return the prior (median, width) of a parameter, no wider than `WIDEST`; None without a
     prior.
 
-    The width of the offset is a standard deviation, that of all others a factor.
+    The width of the offset is a standard deviation; all other widths are factors.
     """
     if law is None:
         return None
@@ -307,8 +308,8 @@ def _capped(name: str, law: tuple[float, float] | None) -> tuple[float, float] |
 def rank_truth(
     problem: SensorPosterior, truth: Mapping[str, float], drawn: PosteriorDraws
 ) -> SensorSimulation:
-    """Return the rank of each true parameter among the draws, and the difference of posterior
-    mean and truth.
+    """Return the rank of each true parameter among the draws, and the normalised deviation of the
+    posterior mean from it.
     """
     values = {name: draws.numpy() for name, draws in problem.parameters(drawn.samples).items()}
     simulation = SensorSimulation(
@@ -316,7 +317,7 @@ def rank_truth(
     )
     for name, draws in values.items():
         simulation.rank[name] = rank = int((draws < truth[name]).sum())
-        # exactly 90 % of uniform ranks
+        # contains exactly 90 % of uniform ranks
         simulation.inside[name] = _TAIL * (len(draws) + 1) <= rank < (1 - _TAIL) * (len(draws) + 1)
         simulation.z[name] = float((draws.mean() - truth[name]) / draws.std(ddof=1))
     return simulation
@@ -328,8 +329,8 @@ def rank_truth(
 
 
 BINS, SHARE = 10, 0.9
-_CHANCE = 0.01  #: probability of a false alarm by the ranks, over all parameters together
-_DRAWN = 0.99  #: share of the bins of uniform ranks inside the drawn band
+_CHANCE = 0.01  #: probability of a false alarm of the rank tests of all parameters together
+_DRAWN = 0.99  #: probability that a bin of uniform ranks is inside the drawn band
 _GREY = "#777777"
 _CERTAIN = 0.999  #: probability that the coverage of a correct posterior is within its limits
 #: limits of the coverage by number of simulations, rounded; the exact limits for 1000 are 0.868 and
@@ -343,7 +344,7 @@ class RankTest:
 
     name: str
     counts: tuple[int, ...]  #: ranks by bin
-    p: float  #: probability that uniform ranks are as uneven as these
+    p: float  #: p-value of the hypothesis of uniform ranks
     least_p: float
     coverage: float  #: share of the simulations whose central 90 % of draws contain the truth
     bar: tuple[float, float]  #: limits of the coverage
@@ -377,9 +378,10 @@ def rank_tests(simulations: Sequence[SensorSimulation]) -> list[RankTest]:
 
 
 def _rank_test(name: str, sound: Sequence[SensorSimulation], parameters: int) -> RankTest:
-    """Return the tests of one parameter over the simulations ``sound``, which have a posterior.
+    """Return the tests of one parameter over the simulations ``sound``, which all have a posterior.
 
-    ``parameters`` is their number, among which the probability of a false alarm is divided.
+    ``parameters`` is the number of parameters, by which the probability of a false alarm is
+    divided.
     """
     from scipy.stats import chisquare
 
@@ -400,8 +402,8 @@ def _rank_test(name: str, sound: Sequence[SensorSimulation], parameters: int) ->
 
 
 def coverage_limits(count: int) -> tuple[float, float]:
-    """Return limits for the coverage of intervals, which a correct posterior exceeds in 1 of
-    1000 studies.
+    """Return limits for the coverage of intervals; a correct posterior violates them in 1 of 1000
+    studies.
     """
     if count in _ROUNDED:
         return _ROUNDED[count]
@@ -410,7 +412,7 @@ def coverage_limits(count: int) -> tuple[float, float]:
 
 
 def chance_band(count: int, share: float, certain: float) -> tuple[float, float]:
-    """Return the central interval of a binomial distribution that contains the probability
+    """Return the central interval of a binomial distribution with the probability content
     ``certain``.
     """
     from scipy.stats import binom
@@ -421,9 +423,7 @@ def chance_band(count: int, share: float, certain: float) -> tuple[float, float]
 
 @drawn
 def ranks(rank_tests: Sequence[RankTest]) -> Any:
-    """Draw a histogram of the ranks of each parameter's true values, with the 99 % band of
-    uniform ranks.
-    """
+    """Draw a histogram of the ranks of each true parameter, with the 99 % band of uniform ranks."""
     figure, axes = panels(len(rank_tests), 3, 3.4, 2.4, below=0.4, sharex=True)
     for ax, test in zip(axes, rank_tests, strict=True):
         _histogram(ax, test)
@@ -458,14 +458,15 @@ def _histogram(ax: Any, test: RankTest) -> None:
 # Sensitivity of a posterior to its prior, by reweighting of draws to a prior that is twice as wide.
 
 
-#: least effective sample fraction; a parameter that only its prior constrains has a quarter or less
+#: least effective sample fraction for reliable reweighting; for a parameter that only its prior
+#: constrains it is a quarter or less
 ENOUGH = 0.5
 
 
 @dataclass(frozen=True)
 class ParameterSensitivity:
-    """The estimate of one parameter, and its estimates after the prior of each parameter is made
-    twice as wide.
+    """The estimate of one parameter, and its estimates with the prior of each parameter twice as
+    wide.
     """
 
     name: str
@@ -473,7 +474,7 @@ class ParameterSensitivity:
     kind: str
     value: float
     sd: float
-    #: by the prior that is twice as wide; None where reweighting is unreliable
+    #: estimate by the parameter whose prior is twice as wide; None where reweighting is unreliable
     doubled: Mapping[str, float | None]
 
 
@@ -529,7 +530,7 @@ def _weights(z: FloatArray) -> FloatArray:
     """Return normalised importance weights of draws ``z`` for a normal prior of standard
     deviation 2 instead of 1.
     """
-    # log of N(z; 0, 2) / N(z; 0, 1), but for a constant
+    # log of N(z; 0, 2) / N(z; 0, 1), up to a constant
     log_ratios = 0.5 * (1.0 - 0.25) * z**2
     ratios = np.exp(log_ratios - log_ratios.max())
     weights: FloatArray = ratios / ratios.sum()

@@ -45,8 +45,8 @@ from neusee.workflows.store.result_store import Store
 
 # --- protection figures ---------------------------------------------------------------------------
 
-# Pictures of the protection study: where the mask wins, NEQ by frequency, bounds, and pictures
-# under attack.
+# Pictures of the protection study: where the mask wins, NEQ (noise equivalent quanta) by frequency,
+# bounds, and pictures under attack.
 
 
 _LOOKS: Mapping[str, tuple[str, str]] = {
@@ -58,14 +58,14 @@ _LOOKS: Mapping[str, tuple[str, str]] = {
     "mask and stop": (ORANGE, "-."),
 }
 _LIGHT = "scene light (e- a pixel)"
-_MAP_VALUES = 121  #: values along each side of the maps
-_COLOUR_LIMIT = 8.0  #: dB, at which the colours of the maps end
+_MAP_VALUES = 121  #: number of values along each side of the maps
+_COLOUR_LIMIT = 8.0  #: dB, end of the colour scale of the maps
 
 
 @drawn
 def winning_region(result: ProtectionResult) -> Any:
-    """Draw the gain of the mask over the best stop-and-filter by scene light and protection;
-    hatched: the mask wins.
+    """Draw the gain of the mask over the best stop with filter, by scene light and protection;
+    hatched where the mask wins.
     """
     figure, axes = canvas(11.6, 4.1, 1, len(DRAWN), sharey=True)
     levels = sorted({result.own, *LEVELS})
@@ -84,7 +84,7 @@ def winning_region(result: ProtectionResult) -> Any:
         colour_mesh = ax.pcolormesh(
             light_axis,
             level,
-            # beyond the colours
+            # limit to the colour scale
             gain.clip(-_COLOUR_LIMIT, _COLOUR_LIMIT),
             cmap="RdBu",
             vmin=-_COLOUR_LIMIT,
@@ -92,7 +92,7 @@ def winning_region(result: ProtectionResult) -> Any:
             shading="gouraud",
             rasterized=True,
         )
-        # the line on which no rival wins
+        # the line on which mask and rival are equal
         if gain.max() > 0 > gain.min():
             ax.contour(light_axis, level, gain, levels=[0.0], colors=BLACK, linewidths=1.4)
         if gain.max() > 0:
@@ -130,7 +130,7 @@ def _between(levels: Sequence[float], gain: Sequence[Sequence[float]]) -> Any:
 
 @drawn
 def gain_with_bounds(result: ProtectionResult) -> Any:
-    """Draw the gain of the mask by scene light, with the middle 90 % of the draws, and the bound
+    """Draw the gain of the mask by scene light, with the central 90 % of the draws, and the bound
     of its gain in NEQ.
     """
     figure, axes = canvas(11.0, 4.2, 1, 2)
@@ -148,7 +148,7 @@ def gain_with_bounds(result: ProtectionResult) -> Any:
     gain_axis.set(xscale="log", xlabel=_LIGHT, ylabel="gain of the mask (dB)")
     gain_axis.set_title("over the best stop-and-filter, all wavelengths")
     gain_axis.legend()
-    # pairs of gain and bound, in dB
+    # gain and bound, converted to dB
     gain_of_mask, bound = (
         10 * np.log10([result.bound[scene_light][column] for scene_light in LIGHTS])
         for column in (0, 1)
@@ -198,8 +198,8 @@ def neq_by_frequency(result: ProtectionResult) -> Any:
 
 @drawn
 def under_attack(result: ProtectionResult) -> Any:
-    """Draw information and seen pixels of each rival by strength of the laser: median and middle
-    90 % of the draws.
+    """Draw information and usable pixels of each rival by laser strength: median and central 90 %
+    of the draws.
     """
     figure, axes = canvas(11.0, 4.4, 1, 2)
     for name, label in _labels(result).items():
@@ -231,8 +231,8 @@ def under_attack(result: ProtectionResult) -> Any:
 
 
 def _labels(result: ProtectionResult) -> dict[str, str]:
-    """Return the rivals to draw, with their labels; where the best stop needs no filter, two
-    rivals are one curve.
+    """Return the labels of the rivals to draw; if the best stop needs no filter, two rivals share
+    one curve.
     """
     labels = {name: name for name in _LOOKS if name in result.rivals}
     stop_and_filter, stop_alone = (
@@ -245,7 +245,9 @@ def _labels(result: ProtectionResult) -> dict[str, str]:
 
 
 def _band(ax: Any, rows: Sequence[Sequence[float]], colour: str, line: str, name: str) -> None:
-    """Draw median and middle 90 % of the draws (draw, strength) over the strength of the laser."""
+    """Draw median and central 90 % of the draws (draw, strength) against the strength of
+    the laser.
+    """
     low_values, median, high_values = np.quantile(
         np.maximum(rows, 1e-12), [0.05, 0.5, 0.95], axis=0
     )
@@ -255,8 +257,8 @@ def _band(ax: Any, rows: Sequence[Sequence[float]], colour: str, line: str, name
 
 # --- protection page ------------------------------------------------------------------------------
 
-# The page of the protection study: a paragraph to quote, the rivals, both questions, and what
-# bounds every mask.
+# The page of the protection study: a paragraph to quote, the rivals, both questions, and the bound
+# of every mask.
 
 
 def draw_pictures(result: ProtectionResult) -> dict[str, bytes]:
@@ -270,8 +272,8 @@ def draw_pictures(result: ProtectionResult) -> dict[str, bytes]:
 
 
 def crossing(gains: Sequence[float]) -> float:
-    """Return the scene light at which a gain falls to 0: below the least light if it never wins,
-    infinite if always.
+    """Return the scene light at which the gain falls to 0: 0 if it is never positive, infinite if
+    it always is.
     """
     if gains[0] <= 0:
         return 0.0
@@ -283,8 +285,8 @@ def crossing(gains: Sequence[float]) -> float:
 
 
 def quotable(result: ProtectionResult, camera: str, light: str) -> str:
-    """Return one paragraph that says where the mask wins, by how much, and where it loses, for
-    both questions.
+    """Return one paragraph on where the mask wins and by how much, and where it loses, for both
+    questions.
     """
     harm = "peak" if light == "pulse" else "heat"
     parts = [
@@ -310,7 +312,9 @@ def quotable(result: ProtectionResult, camera: str, light: str) -> str:
 
 
 def _said(result: ProtectionResult, measure: str) -> str:
-    """Return where the mask wins by one measure: medians over the draws, with intervals."""
+    """Return a phrase on where the mask wins by one measure: medians over the draws, with
+    intervals.
+    """
     draws = np.array([result.drawn[scene_light][measure] for scene_light in LIGHTS])
     gain = np.median(draws, axis=1)
     # the scene light at which the median gain falls to 0
@@ -333,9 +337,11 @@ def _said(result: ProtectionResult, measure: str) -> str:
 
 
 def _why(result: ProtectionResult) -> str:
-    """Return why a mask gains in little light only, with its bound in much and in little light."""
+    """Return a sentence on why a mask gains only in little light, with its bound in much and in
+    little light.
+    """
     brightest = LIGHTS[-1]
-    # a pair of gain and bound: here in dB
+    # element 1 is the bound; in dB
     bound = 10 * math.log10(result.bound[brightest][1])
     dark = 10 * math.log10(result.bound[LIGHTS[0]][1])
     return (
@@ -347,12 +353,12 @@ def _why(result: ProtectionResult) -> str:
 
 
 def _interval(values: Sequence[float], form: str) -> str:
-    """Return the median of values with the middle 90 %, in the number format ``form``."""
+    """Return the median of values with the central 90 % as text, in the number format ``form``."""
     return f"{format(float(np.median(values)), form)} ({_ends(values, form)})"
 
 
 def _ends(values: Any, form: str) -> str:
-    """Return the middle 90 % of values as text, in the number format ``form``."""
+    """Return the central 90 % of values as text, in the number format ``form``."""
     low_end, high_end = np.quantile(values, [0.05, 0.95], method="nearest")
     return f"{format(float(low_end), form)} to {format(float(high_end), form)}"
 
@@ -387,9 +393,7 @@ def _region(result: ProtectionResult, picture: bytes) -> Section:
 
 
 def _quiet(result: ProtectionResult, picture: bytes) -> Section:
-    """Return the section on the picture of a quiet frame: the gain by each measure
-    and scene light.
-    """
+    """Return the section on the quiet frame: the gain by measure and scene light."""
     text = """Insured: the laser may come, and the frame is quiet. The gain of the mask at its own
         protection. Error: error variance of the Wiener-filtered picture of a natural scene.
         Detection: d' of an ideal observer who knows place and shape. Shaded: the middle 90 % of the
@@ -409,7 +413,7 @@ def _quiet(result: ProtectionResult, picture: bytes) -> Section:
 
 
 def _attack(result: ProtectionResult, picture: bytes) -> Section:
-    """Return the section on the information that is left under attack."""
+    """Return the section on the information that remains under attack."""
     text = f"""The laser is there, and the scene has {ATTACKED_AT:g} e- a pixel. A strength of 1
         fills one pixel behind the open lens. A pixel that scene and glare fill holds no
         information; in every other pixel glare adds shot noise, fixed-pattern noise and what is
@@ -423,7 +427,7 @@ def _attack(result: ProtectionResult, picture: bytes) -> Section:
 
 
 def _fields(result: ProtectionResult) -> Section:
-    """Return the section with the pixels that are not full, for fields of several sizes."""
+    """Return the section on the share of unsaturated pixels, for fields of several sizes."""
     text = """Share of the pixels in % that are not full, for a laser in the middle of fields of
         several sizes. A wider field is left out where the samples of the recipe's pupil do not
         carry it: `optics=neusee` carries 2048."""
@@ -443,7 +447,7 @@ def _fields(result: ProtectionResult) -> Section:
 
 
 def _rivals(result: ProtectionResult) -> Section:
-    """Return the section with the rivals, and the error of their filtered pictures."""
+    """Return the section on the rivals and the errors of their filtered pictures."""
     text = """Each rival of the mask, with the error of the filtered picture (dB below the contrast
         of the scene, more is better). The notch protects at one wavelength only. Tint: the largest
         share of light that a channel receives over the smallest."""
@@ -472,7 +476,7 @@ def _rivals(result: ProtectionResult) -> Section:
 
 
 _COLUMNS = ("protection", "scene light", "measure", "gain", "5 %", "95 %")
-#: contrast of a natural scene; highest frequency of the mean log NEQ, cycles per pixel
+#: contrast variance of a natural scene; highest frequency (cycles per pixel) in the mean of log NEQ
 _VARIANCE, _LOW_FREQUENCIES = 0.1, 0.12
 _CONTINUOUS = 0.1  #: s, dwell time of continuous light
 _LAWS = UnknownLaws()
@@ -480,14 +484,17 @@ _LAWS = UnknownLaws()
 
 @dataclass(frozen=True)
 class ProtectionOptions:
-    """What is unknown, which light shines, and what the sensor and its restoration leave."""
+    """Number of draws and bands, the kind of laser light, and residual errors of sensor and
+    restoration.
+    """
 
-    draws: int = 12  #: of the unknown conditions
-    bands: int = 7  #: wavelengths of the scene; the laser may have each of the recipe
-    light: str = "pulse"  #: whose peak does harm; or ``"continuous"``, whose heat does
+    draws: int = 12  #: number of draws of the unknown conditions
+    bands: int = 7  #: number of wavelengths of the scene; the laser may have any of the recipe's
+    #: ``"pulse"``, harmful by its peak; or ``"continuous"``, harmful by its heat
+    light: str = "pulse"
     size: float = 14.0  #: pixels, height of the targets
     prnu: float = 0.01  #: relative spread of the sensitivity of pixels
-    residual: float = 0.02  #: share of the glare that is subtracted wrongly
+    residual: float = 0.02  #: relative error of the subtraction of glare
 
 
 def study(
@@ -497,7 +504,7 @@ def study(
     light, size = options.light, options.size
     camera = ProtectionCamera.of(recipe, store, options.bands)
     side = min(int(pixels) for pixels in camera.lens["shape"])
-    # the four letters of the text are nearly four times as wide as high
+    # a text of four letters is nearly four times as wide as high
     if 4 * size > side:
         raise ValueError(
             f"a text {size:g} pixels high is wider than the PSF window of {side}; give a smaller"
@@ -543,7 +550,7 @@ def _document(result: ProtectionResult, conditions: Sequence[Condition]) -> dict
 
 
 def _texts(rows: Any) -> dict[str, Any]:
-    """Return rows by number as rows by text, for JSON."""
+    """Return a mapping with its numeric keys as text, for JSON."""
     return {f"{key:g}": value for key, value in rows.items()}
 
 
@@ -571,7 +578,7 @@ def _rows(result: ProtectionResult) -> Iterator[Sequence[Any]]:
         for scene_light in LIGHTS:
             for measure in MEASURES:
                 interval: Sequence[Any] = ("", "")
-                # draws are known at the mask's own protection alone
+                # draws exist only at the mask's own protection
                 if level == result.own and measure in DRAWN:
                     interval = np.quantile(
                         result.drawn[scene_light][measure], [0.05, 0.95]
@@ -580,7 +587,7 @@ def _rows(result: ProtectionResult) -> Iterator[Sequence[Any]]:
 
 
 def _notes(camera: ProtectionCamera, options: dict[str, Any]) -> list[str]:
-    """Return what the study assumes, one text for each subject."""
+    """Return the assumptions of the study, one text for each subject."""
     noise = camera.noise
     harm = (
         "peak of the PSF"

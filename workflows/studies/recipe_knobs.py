@@ -1,10 +1,8 @@
-"""Values of a recipe that trade accuracy for run time, such as the number of bands and the
-precision.
+"""Recipe values that trade accuracy for run time, such as the number of bands or the precision.
 
-The values are found by the parameters of nodes: ``count`` of a node that returns bands, ``samples``
+They are identified by the parameters of nodes: ``count`` of a node that returns bands, ``samples``
 and ``pitch`` of a pupil, the window's ``shape`` of a node that returns a PSF, and every
-``precision``. The recipe shows where each value is written and which other steps depend on the
-value.
+``precision``. The recipe gives the place of each value and the other steps that depend on it.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.recipe.loading import changed
 
 _REFERENCE = re.compile(r"\$\{([\w.-]+)\??\}")
-_ONE_BY_ONE = ("item", "each")  #: first names of paths whose value differs from item to item
+_ONE_BY_ONE = ("item", "each")  #: first parts of paths whose value differs between repetitions
 _FACTORS = (0.2, 1 / 3, 0.5, 2.0)  #: factors on the number of intervals between bands
 _QUICK_FACTORS = (1 / 3, 2.0)
 #: factors on the number of samples, and on the side of a window
@@ -29,8 +27,8 @@ _QUICK_SCALES = (0.75, 1.5)
 
 @dataclass(frozen=True)
 class Change:
-    """One value to try for a recipe parameter, as overrides of the recipe (none for the recipe's
-    own value).
+    """One value to try for a recipe parameter, as overrides of the recipe; no overrides for its
+    present value.
     """
 
     label: str
@@ -39,9 +37,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Knob:
-    """A recipe parameter, or several parameters that change together, with the values to
-    measure.
-    """
+    """A recipe parameter, or several that change together, with the values to measure."""
 
     name: str  #: path in the recipe, such as ``optics.bands``
     what: str
@@ -50,9 +46,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class Knobs:
-    """The parameters of a recipe that can be varied, and the reasons why other parameters cannot
-    be varied.
-    """
+    """The recipe parameters that can be varied, and the reasons why others cannot."""
 
     found: tuple[Knob, ...]
     without: tuple[str, ...]
@@ -60,9 +54,7 @@ class Knobs:
 
 @dataclass(frozen=True)
 class _Place:
-    """The path in a recipe at which a parameter value is written, and the steps that read the
-    value.
-    """
+    """The recipe path of a parameter value, and the steps that read it."""
 
     path: str
     value: Any
@@ -94,7 +86,7 @@ def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
 
 
 def finest(recipe: Recipe) -> Recipe:
-    """Return the recipe with all steps computed in full and in their best precision, at the same
+    """Return the recipe with all steps computed in full and in their best precision, at unchanged
     sampling.
     """
     best = [
@@ -105,7 +97,7 @@ def finest(recipe: Recipe) -> Recipe:
 
 
 def _bands(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
-    """Yield a parameter for each number of bands that the recipe sets, with the numbers to try."""
+    """Yield a parameter for each number of bands in the recipe, with the numbers to try."""
     for place in _places(recipe, "count", gives=Bands):
         own_count = int(place.value)
         # `count` bands have `count - 1` intervals between them, which the factors scale
@@ -121,8 +113,8 @@ def _bands(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
 
 
 def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
-    """Yield the parameter of the pupil samples, whose pitch changes so that the width stays; or the
-    reason, as text, why it cannot be varied.
+    """Yield the parameter for the pupil samples, varied at constant pupil width; or a text that
+    says why it cannot be varied.
     """
     samples, pitches = (_places(recipe, name, beside=other) for name, other in _BOTH)
     if len(samples) != 1 or len(pitches) != 1:
@@ -159,7 +151,7 @@ def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
 
 def _sizes(own: int, quick: bool) -> list[int]:
     """Return the numbers of pupil samples that a study tries, the recipe's own among them."""
-    # a pupil has two samples at least
+    # at least two samples
     return sorted(
         {max(2, round(own * factor)) for factor in (1.0, *(_QUICK_SCALES if quick else _SCALES))}
     )
@@ -169,8 +161,8 @@ _BOTH = (("samples", "pitch"), ("pitch", "samples"))
 
 
 def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
-    """Yield a parameter for each window of a PSF, with the shapes to try; or, as text, the reason
-    why it cannot be varied.
+    """Yield a parameter for each PSF window, with the shapes to try; or a text that says why it
+    cannot be varied.
     """
     for place in _places(recipe, "shape", gives=Psf):
         if other_steps := _others(recipe, "shape", place):
@@ -191,7 +183,7 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
 
 
 def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
-    """Yield one parameter for the precisions of all steps, because double precision in one step
+    """Yield one parameter for the precision of all steps, because double precision in a single step
     improves no result.
     """
     if places := _places(recipe, "precision"):
@@ -208,8 +200,8 @@ def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
 
 
 def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: Any) -> Knob:
-    """Return the varied parameter at ``path`` with its ``settings`` (value, label, overrides);
-    ``own`` is unchanged.
+    """Return the parameter at ``path`` with its ``settings`` (value, label, overrides); the value
+    ``own`` gets no overrides.
     """
     return Knob(
         path,
@@ -237,7 +229,7 @@ def _places(
 ) -> list[_Place]:
     """Return the recipe paths that set ``parameter``, each with the steps that read it.
 
-    Only steps count that return the type ``gives`` and also have the parameter ``beside``.
+    Only steps that return the type ``gives`` and also have the parameter ``beside`` are considered.
     """
     places: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
@@ -254,7 +246,7 @@ def _places(
 
 
 def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
-    """Return the recipe path at which a step's parameter is written, following references such as
+    """Return the recipe path of a step's parameter, after following references such as
     ``${optics.bands}``; None if repetitions of the step have different values.
     """
     path = f"steps.{step.name.partition('[')[0]}.with.{parameter}"
@@ -274,8 +266,8 @@ def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
 
 
 def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
-    """Return the names of other steps that read the value at ``place``, or that have an equal
-    pitch at another path.
+    """Return other steps that read the value at ``place``, or that have an equal pitch from another
+    path.
     """
     if parameter == "pitch":
         return _equal_elsewhere(recipe, parameter, place)
@@ -292,7 +284,7 @@ def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
 
 
 def _equal_elsewhere(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
-    """Return the names of steps whose parameter has the value of ``place`` from another path."""
+    """Return steps whose parameter equals the value at ``place`` but is written at another path."""
     with_parameter = [step for step in recipe.steps.values() if parameter in step.params]
     equal_steps = [step for step in with_parameter if step.params[parameter] == place.value]
     return [step.name for step in equal_steps if _written(recipe, step, parameter) != place.path]

@@ -35,8 +35,8 @@ from neusee.workflows.store.result_store import Store
 
 
 class StudyRefused(ValueError):
-    """Error for a study whose recipe or options leave nothing to study; the message names the
-    remedy.
+    """Error for a study whose recipe or options leave nothing to study; the message says how to fix
+    it.
     """
 
 
@@ -80,8 +80,8 @@ def count_failures(folder: Path) -> int:
 
 @contextmanager
 def cold(store: Store) -> Iterator[Store]:
-    """Yield a temporary store with the code digests of ``store`` and no results, and delete the
-    temporary store.
+    """Yield a temporary store that has the code digests of ``store`` but no results; delete it
+    afterwards.
     """
     with TemporaryDirectory(prefix="neusee-") as folder:
         if os.path.isfile(store.code_memo):
@@ -90,16 +90,14 @@ def cold(store: Store) -> Iterator[Store]:
 
 
 def run_cold(recipe: Recipe, store: Store, device: str = "cpu") -> Result:
-    """Run ``recipe`` on ``device`` with a temporary store that has no results, and return the
-    result.
-    """
+    """Run ``recipe`` on ``device`` with an empty temporary store, and return the result."""
     with cold(store) as empty_store:
         return run(recipe, empty_store, device=device)
 
 
 def key_parts(recipe: Recipe, code: Code, device: str = "cpu") -> list[Any]:
-    """Return the parts of a store key that identify a run: output keys, tolerance, and True for
-    a full computation.
+    """Return the parts of a store key that identify a run: output keys, tolerance, and flags for
+    exact computation and estimates.
     """
     keys: dict[str, Key] = {}
     for name in needed(recipe, recipe.outputs):

@@ -31,19 +31,23 @@ Powers = tuple[int, ...]  #: degree of each input in a term
 
 _DEGREE = 10  #: largest degree of a term
 _TOGETHER = 3  #: largest number of inputs in a term
-_CANDIDATES = 400  #: largest number of terms from which a fit selects
-_HYPERBOLIC = 0.75  #: exponent of the norm of degrees, below 1 to prefer terms of few inputs
-#: norms of the terms of low degree: squares and products of two inputs; and somewhat more
+_CANDIDATES = 400  #: largest number of candidate terms of a fit
+#: exponent of the hyperbolic norm of the degrees; below 1 it favours terms of few inputs
+_HYPERBOLIC = 0.75
+#: largest norms of two smaller sets of terms: up to squares and products of two inputs, and
+#: somewhat more
 _NORMS = (2.6, 5.0)
 _BY_TERM = 3  #: smallest number of draws for each selected term
-_PATIENCE = 12  #: terms after the best number of terms that are tried without a gain
-_EXACT = 1e-13  #: share of the variance that may be left where a polynomial is exact
-_SMALLEST = 1e-7  #: norm of a term beside the selected terms, below which it depends on them
+_PATIENCE = 12  #: number of further terms that are tried without a gain
+_EXACT = 1e-13  #: remaining share of the variance below which a polynomial counts as exact
+#: relative norm of a term's part orthogonal to the selected terms, below which the term depends on
+#: them
+_SMALLEST = 1e-7
 
 
 @dataclass(frozen=True)
 class OrthonormalPolynomials:
-    """Polynomials of one input that are orthonormal under its distribution, by their three-term
+    """Polynomials of one input that are orthonormal under its distribution, defined by a three-term
     recurrence.
     """
 
@@ -53,8 +57,8 @@ class OrthonormalPolynomials:
 
     @classmethod
     def of(cls, shape: Shape, degree: int = _DEGREE) -> OrthonormalPolynomials:
-        """Compute the recurrence for a distribution (Stieltjes); the degree is lower for a few
-        separate values.
+        """Compute the recurrence for a distribution (Stieltjes); the degree is lower for a
+        distribution of few discrete values.
         """
         coordinates, weights = shape.measure()
         centres, norms = list[float](), [1.0]
@@ -79,7 +83,9 @@ class OrthonormalPolynomials:
         return len(self.centres)
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Return the polynomials (degree + 1, draw) at standard normal numbers of the input."""
+        """Return the polynomials (degree + 1, draw) at the standard normal numbers ``z`` of the
+        input.
+        """
         coordinates = self.shape.coordinate(z)
         values = [np.ones_like(coordinates)]
         previous_polynomial = np.zeros_like(coordinates)
@@ -94,30 +100,30 @@ class OrthonormalPolynomials:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The terms from which a fit selects, at all draws."""
+    """The candidate terms of a fit, evaluated at all draws."""
 
     powers: tuple[Powers, ...]  #: without the constant term
     columns: FloatArray  #: (draw, term)
-    sizes: tuple[int, ...]  #: numbers of first terms among which terms are selected
+    #: sizes of the nested sets of candidates, each the first terms of ``powers``
+    sizes: tuple[int, ...]
 
     @classmethod
     def of(cls, shapes: Sequence[Shape], z: FloatArray) -> Candidates:
-        """Return products of the inputs' polynomials at draws ``z`` (draw, input), those of low
-        degree first.
+        """Return products of the inputs' polynomials at the draws ``z`` (draw, input), low degrees
+        first.
         """
         bases = [OrthonormalPolynomials.of(shape) for shape in shapes]
         values = [basis.at(z[:, input_number]) for input_number, basis in enumerate(bases)]
         powers = _low_degrees([basis.degree for basis in bases])
         columns = [_product(values, power) for power in powers]
         norms = np.array([_norm(power) for power in powers])
-        # powers rise in their norm, so that each size is a beginning of the terms
+        # powers are sorted by norm, so that each set is a leading part of the terms
         sizes = {int((norms <= largest_norm).sum()) for largest_norm in (*_NORMS, math.inf)}
         return cls(powers, np.stack(columns, 1), tuple(sorted(sizes)))
 
 
 def _product(values: Sequence[FloatArray], power: Powers) -> FloatArray:
-    """Return a term (draw,): the product of the polynomials of the inputs at the degrees in
-    ``power``.
+    """Return a term (draw,): the product of the inputs' polynomials of the degrees in ``power``.
 
     ``values`` has the polynomials (degree + 1, draw) of each input.
     """
@@ -152,7 +158,7 @@ def _degrees_of(inputs: Sequence[int], degrees: Sequence[int]) -> Iterator[Power
             yield tuple(degrees_of_term)
             return
         inputs_after = len(inputs) - place - 1
-        # at least 1 for each input after this one
+        # leave a degree of at least 1 for each further input
         for degree in range(1, min(degrees[inputs[place]], left - inputs_after) + 1):
             degrees_of_term[inputs[place]] = degree
             yield from fill(place + 1, left - degree)
@@ -165,16 +171,16 @@ class PolynomialFit:
     """A fitted polynomial: its constant, and the coefficients of its terms."""
 
     constant: float
-    terms: NDArray[np.int64]  #: (term,) numbers of candidates
+    terms: NDArray[np.int64]  #: (term,) indices of candidates
     coefficients: FloatArray  #: (term,)
 
     @cached_property
     def variances(self) -> FloatArray:
-        """Return the part of each term in the variance of the polynomial."""
+        """Return the contribution of each term to the variance of the polynomial."""
         return np.asarray(self.coefficients**2, np.float64)
 
     def at(self, columns: FloatArray) -> FloatArray:
-        """Return the polynomial at draws, from the candidate terms (draw, term) at these draws."""
+        """Return the polynomial at draws, from the candidate terms ``columns`` (draw, term)."""
         return np.asarray(self.constant + columns[:, self.terms] @ self.coefficients, np.float64)
 
 
@@ -201,11 +207,11 @@ def fit_polynomial(
 
 
 def _select_terms(columns: FloatArray, y: FloatArray) -> tuple[float, list[int]]:
-    """Return the terms of a sparse polynomial by orthogonal matching pursuit, with their error of
-    prediction.
+    """Return the terms of a sparse polynomial by orthogonal matching pursuit, with their prediction
+    error.
 
-    ``columns`` are the candidate terms (draw, term). Returned are the mean squared error and the
-    numbers of the selected terms.
+    ``columns`` are the candidate terms (draw, term). Returned are the mean squared prediction error
+    and the indices of the selected terms.
     """
     count, exact_residual = len(y), _EXACT * len(y) * float(y.var())
     # at least _BY_TERM draws for each term and the constant
@@ -225,7 +231,7 @@ def _select_terms(columns: FloatArray, y: FloatArray) -> tuple[float, list[int]]
         orthogonal_part = _apart(columns[:, term], basis)
         norm = float(np.sqrt(orthogonal_part @ orthogonal_part))
         independent = norm > _SMALLEST * lengths[term]
-        # not to be taken again
+        # infinite length: the term is not selected again
         lengths[term] = np.inf
         if not independent:
             limit = min(limit, int(np.isfinite(lengths).sum()) + len(selected))
@@ -242,15 +248,15 @@ def _select_terms(columns: FloatArray, y: FloatArray) -> tuple[float, list[int]]
 
 
 def _next_term(columns: FloatArray, left: FloatArray, lengths: FloatArray) -> int:
-    """Return the term that is most parallel to what is left; a term of infinite length does not
-    count.
+    """Return the index of the term most parallel to the residual ``left``; terms of infinite length
+    are skipped.
     """
     return int((np.abs(columns.T @ left) / lengths).argmax())
 
 
 def _apart(column: FloatArray, basis: Sequence[FloatArray]) -> FloatArray:
-    """Return the part of a column that is orthogonal to an orthonormal basis; twice is enough
-    for rounding.
+    """Return the part of a column orthogonal to an orthonormal basis, projected twice against
+    rounding.
     """
     matrix = np.stack(basis)
     for _ in range(2):
@@ -259,11 +265,9 @@ def _apart(column: FloatArray, basis: Sequence[FloatArray]) -> FloatArray:
 
 
 def _error_of_prediction(left: FloatArray, leverage: FloatArray, terms: int) -> float:
-    """Return the mean squared error of draws predicted without them, corrected for the number of
-    terms.
-    """
+    """Return the leave-one-out mean squared prediction error, corrected for the number of terms."""
     count = len(left)
-    # a draw that its own fit leaves out: residual / (1 - leverage)
+    # leave-one-out residual: residual / (1 - leverage)
     errors_without = (left / (1.0 - leverage).clip(1e-9)) ** 2
     return float(errors_without.mean()) * count / max(1, count - terms)
 
@@ -278,7 +282,7 @@ def _error_of_prediction(left: FloatArray, leverage: FloatArray, terms: int) -> 
 # belong to any input: every interval contains this share.
 
 
-#: smallest share of the variance that the polynomial predicts where its indices tell enough
+#: smallest predicted share of the variance for which the indices are informative
 EXPLAINED = 0.9
 GROUPS = 8  #: groups of draws, each left out of a fit once
 #: 97.5 % quantile of Student's distribution with GROUPS - 1 degrees of freedom
@@ -314,8 +318,8 @@ def indices(shapes: Sequence[Shape], z: FloatArray, y: FloatArray) -> SobolIndic
 
     Args: shapes: distribution of each input. z: standard normal numbers (draw, input) from which
             the inputs follow.
-    The interval has the scatter between fits without an eighth of the draws (jackknife over
-    `GROUPS` groups; of Sobol sequences each is a group), and above it the share that the polynomial
+    The interval combines the scatter between fits without an eighth of the draws (jackknife over
+    `GROUPS` groups; each Sobol sequence is one group) and, upward, the share that the polynomial
     does not explain.
     """
     largest_deviation = float(np.abs(y - y.mean()).max())
@@ -354,11 +358,11 @@ def _shares(fit: PolynomialFit, candidates: Candidates, inputs: int) -> FloatArr
 
 
 def _with_intervals(shares: FloatArray, half: FloatArray, explained: float) -> SobolIndices:
-    """Return the indices in the whole variance from first and total shares (2, input) in that of
-    the polynomial.
+    """Return the indices relative to the whole variance, from first and total shares (2, input) of
+    the polynomial's variance.
 
-    ``half`` are half-widths of the intervals. The interval of a first index lies below that of the
-    total index.
+    ``half`` are the half-widths of the intervals. The interval of a first index is limited by that
+    of the total index.
     """
     values = explained * shares
     low = np.clip(values - explained * half, 0.0, 1.0)

@@ -51,16 +51,16 @@ Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
 
 @drawn
 def grid_picture(entries: Sequence[Entry]) -> Any:
-    """Draw the grid of test outcomes and errors: a row for each extreme case, a column for each
-    node, losses last.
+    """Draw the grid of outcomes and errors: a row for each extreme case, a column for each node,
+    losses last.
     """
     cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
-    # False before True: losses last
+    # False sorts before True, so that losses come last
     nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
-    # rounded up
+    # number of panels, rounded up
     panels = max(1, -(-len(nodes) // _ACROSS))
     columns = max(1, -(-len(nodes) // panels))
-    # inches: the longest name of a case, and of a node
+    # inches, for the longest name of a case and of a node
     label_width, label_height = (
         _LETTER * max(map(len, names), default=0) for names in ([case for _, case in cases], nodes)
     )
@@ -89,7 +89,7 @@ def grid_picture(entries: Sequence[Entry]) -> Any:
 def _panel(
     ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], nodes: list[str], across: int
 ) -> None:
-    """Draw one panel of the grid: the cells of ``across`` nodes, from the first of ``nodes`` on."""
+    """Draw one panel of the grid: the cells of the first ``across`` nodes in ``nodes``."""
     for group, case, node, cell in entries:
         column, row = nodes.index(node), cases.index((group, case))
         ax.barh(row, 0.96, 0.92, left=column - 0.48, color=_COLOURS[cell.mark])
@@ -115,15 +115,15 @@ def _panel(
 
 
 def cell_text(cell: Cell) -> str:
-    """Return the text of one test in the grid: a sign for warn or fail, and the error that is
-    nearest to its bound.
+    """Return the text of one grid cell: a sign for warn or fail, and the error that is closest to
+    its bound.
     """
     sign = {"pass": "", "warn": "!", "fail": "×"}[cell.mark]
     if cell.error is None:
         if cell.note.startswith("refused"):
             return f"{sign}r"
         return f"{sign}s" if "seen" in cell.note else f"{sign}–"
-    # g: the error of the gradient is a larger share of its bound
+    # g marks the gradient, whose error is a larger share of its bound
     gradient_is_nearer = cell.slope is not None and _share(cell.slope, cell.slope_bound) > _share(
         cell.error, cell.bound
     )
@@ -135,7 +135,7 @@ def cell_text(cell: Cell) -> str:
 
 
 def _share(value: float, bound: float | None) -> float:
-    """Return an error over its bound, 0 without a bound."""
+    """Return the ratio of an error to its bound; 0 without a bound."""
     return value / bound if bound else 0.0
 
 
@@ -188,7 +188,7 @@ empty cell: the step has the inputs of the usual case, or no inputs."""
 
 @dataclass(frozen=True)
 class GridCell:
-    """One test result with the extreme case, the step and the node that were tested."""
+    """The result of one test, with its extreme case, step and node."""
 
     case: Case
     step: str
@@ -197,8 +197,8 @@ class GridCell:
 
     @property
     def severity(self) -> tuple[int, float]:
-        """Return a sort key, largest for the worst result: the outcome, then the largest ratio
-        of error to bound.
+        """Return a sort key that is largest for the worst result: outcome first, then the largest
+        ratio of error to bound.
         """
         cell = self.cell
         pairs = ((cell.error, cell.bound), (cell.slope, cell.slope_bound))
@@ -227,8 +227,8 @@ def study(
 def _rows(
     recipe: Recipe, store: Store, cases: Sequence[Case], progress: Progress
 ) -> Iterator[GridCell]:
-    """Yield the result of each step in each case, without steps that have the inputs of the usual
-    case.
+    """Yield the result of each step in each case, except steps whose inputs the case does not
+    change.
     """
     code = Code(store.code_memo)
     engine_digest = engine("studies.extreme_cases", "studies.case_result")
@@ -247,10 +247,10 @@ def _rows(
 
 
 def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[GridCell]:
-    """Yield the results of one case from the store, or computed now.
+    """Yield the results of one case, from the store or computed now.
 
-    ``same`` names the steps that the case does not change; ``own`` is the digest of the study's
-    code.
+    ``same`` has the names of the steps that the case does not change; ``own`` is the digest of the
+    study's code.
     """
     for name, step in chain.steps.items():
         if name in same:
@@ -274,7 +274,7 @@ def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[
 
 
 def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
-    """Return the test result of a step as a dict, empty if an earlier step failed or the case
+    """Return the result of a step's test as a dict; empty if an earlier step failed or the case
     changes no input.
     """
     try:
@@ -291,7 +291,7 @@ def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
 
 
 def _document(rows: Sequence[GridCell]) -> dict[str, Any]:
-    """Return the numbers of cells by outcome."""
+    """Return the number of cells for each outcome."""
     count = {mark: sum(row.cell.mark == mark for row in rows) for mark in ("pass", "warn", "fail")}
     return {
         "cells": len(rows),
@@ -302,7 +302,7 @@ def _document(rows: Sequence[GridCell]) -> dict[str, Any]:
 
 
 def _report(recipe: Recipe, rows: Sequence[GridCell], content: Mapping[str, Any]) -> StudyReport:
-    """Return the page of the study: the grid, what fails or nearly fails, and the cases."""
+    """Return the page of the study: the grid, the cells that fail or nearly fail, and the cases."""
     worst_cells = _worst_by_case_and_node(rows)
     picture = grid_picture(
         [(row.case.group, row.case.name, row.node, row.cell) for row in worst_cells]
@@ -324,14 +324,14 @@ def _report(recipe: Recipe, rows: Sequence[GridCell], content: Mapping[str, Any]
 
 def _worst_by_case_and_node(rows: Sequence[GridCell]) -> list[GridCell]:
     """Return the worst result of each node in each case, over all steps of the node."""
-    # `groupby` needs equal keys side by side
+    # `groupby` needs equal keys to be adjacent
     ordered = sorted(rows, key=lambda r: (CASES.index(r.case) if r.case in CASES else 0, r.node))
     groups = itertools.groupby(ordered, key=lambda r: (r.case.name, r.node))
     return [max(group, key=lambda r: r.severity) for _, group in groups]
 
 
 def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
-    """Yield the tables of what fails, of what nearly fails, and of the cases."""
+    """Yield the tables of failed cells, of nearly failed cells, and of the cases."""
     headings: dict[Mark, str] = {
         "fail": "What fails",
         "warn": "What uses more than half of its bound",

@@ -38,7 +38,7 @@ from neusee.workflows.studies.sobol_indices import IndexInterval, SobolIndices
 
 # --- uncertainty figures --------------------------------------------------------------------------
 
-# Pictures of the uncertainty study: tornado diagrams, curves with bands, histograms, and means of
+# Pictures of the uncertainty study: tornado diagrams, curves with bands, histograms, and mean
 # images.
 
 
@@ -47,14 +47,16 @@ _COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
 #: ratio of the largest to the least value of curves above which their axis is logarithmic
 _WIDE = 30.0
 _BINS = 24
-_TICKS = 4  #: numbers below a diagram of a number, at most
-_MOST_CHARACTERS = 8  #: characters of such a number without its sign
+_TICKS = 4  #: largest number of labels on the horizontal axis of a diagram
+_MOST_CHARACTERS = 8  #: largest number of characters in such a label, without its sign
 _DIAGRAM_MARGIN = (
     0.1  #: inches around each diagram, so that a title does not touch the numbers above it
 )
-_SLIGHT = 1e-6  #: share of a curve's largest element; no ratio to a smaller median is drawn
-_ALONG = 200  #: signals of a photon-transfer curve
-#: share of the predicted standard deviation below which flat fields are clipped, and not drawn
+#: fraction of a curve's largest element; where the median is smaller, no relative band is drawn
+_SLIGHT = 1e-6
+_ALONG = 200  #: number of signals along a photon-transfer curve
+#: flat fields with less than this fraction of the predicted standard deviation count as clipped,
+#: and are not drawn
 _CLIPPED = 0.9
 
 
@@ -62,8 +64,8 @@ _CLIPPED = 0.9
 def tornado(
     swings: Mapping[str, Sequence[tuple[str, float, float]]], middles: Mapping[str, float]
 ) -> Any:
-    """Draw a tornado diagram of each output number: the values with one input at its 5 % and its
-    95 % quantile.
+    """Draw a tornado diagram of each output number: its values with one input at its 5 % and its 95
+    % quantile.
     """
     most_bars = max(map(len, swings.values()))
     figure, axes = panels(len(swings), 2, 6.6, 0.34 * most_bars + 1.3)
@@ -107,11 +109,11 @@ def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> N
 
 
 def _few_numbers(ax: Any) -> None:
-    """Write few numbers below a diagram, and take what all numbers share out of numbers that
-    would be too long.
+    """Put few labels on the horizontal axis, with a common offset or power of ten if they would be
+    too long.
     """
     least, greatest = ax.get_xlim()
-    # as many as a step between two numbers needs
+    # as many decimals as the step between two labels needs
     decimals = max(0, math.ceil(-math.log10((greatest - least) / _TICKS)))
     if len(f"{max(abs(least), abs(greatest)):.{decimals}f}") > _MOST_CHARACTERS:
         ax.ticklabel_format(axis="x", style="sci", scilimits=(-2, 4), useOffset=True)
@@ -122,10 +124,10 @@ def _few_numbers(ax: Any) -> None:
 
 @drawn
 def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axis: str) -> Any:
-    """Draw the middle 90 % of each family of curves and, in a second row, the same band relative to
-    the median.
+    """Draw the central 90 % of each family of curves and, in a second row, the same band relative
+    to the median.
 
-    Each family has an abscissa, and draws (draw, element) of each curve by name.
+    Each family has an abscissa, and the draws (draw, element) of each curve by name.
     """
     figure, axes = canvas(
         5.6 * len(curves), 5.4, 2, len(curves), sharex="col", height_ratios=[2, 1]
@@ -156,8 +158,8 @@ def transfer(draws: FloatArray) -> Any:
     """Draw bands of photon-transfer curves in DN from ``draws`` (draw, level, signal | variance |
     predicted).
 
-    Where the full well or the converter clips flat fields, their noise collapses; there, a grey
-    area takes their place.
+    Where the full well or the converter clips flat fields, their noise collapses; there a grey area
+    is drawn instead.
     """
     figure, axes = canvas(6.6, 5.8, 2, 1, sharex=True, height_ratios=[2, 1])
     ax, relative_axis = axes[:, 0]
@@ -209,14 +211,14 @@ def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, na
 
 
 def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArray]:
-    """Return signals (signal,) that the curves of all draws reach, and the standard deviation of
-    each draw (draw, signal) at these.
+    """Return signals (signal,) that all draws cover, and the standard deviation of each draw (draw,
+    signal) at these signals.
 
     ``column`` is 1 for the variance of the flat fields, 2 for the predicted variance.
     """
     # the first level is dark
     lit_levels = draws[:, 1:]
-    # from the largest of the least signals to the least of the largest ones
+    # range covered by all draws: from the largest minimum to the smallest maximum
     signal_range = (
         float(lit_levels[..., 0].clip(1e-9).min(1).max()),
         float(lit_levels[..., 0].max(1).min()),
@@ -231,7 +233,7 @@ def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArr
 
 @drawn
 def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) -> Any:
-    """Draw a histogram of each output number over all draws, and a line at the value for median
+    """Draw a histogram of each output number over all draws, with a line at the value for median
     inputs.
     """
     figure, axes = panels(len(draws), 3, 3.6, 2.6, below=0.3)
@@ -258,8 +260,8 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
 
 @drawn
 def pictures(moments: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
-    """Draw the mean of each output picture over the draws, and the standard deviation averaged
-    over the colours.
+    """Draw the mean of each output picture over the draws, and its standard deviation averaged over
+    the colours.
     """
     figure, axes = canvas(9.6, 4.2 * len(moments), len(moments), 2)
     for (mean_axis, deviation_axis), (name, (mean, sd)) in zip(axes, moments.items(), strict=True):
@@ -294,17 +296,18 @@ def pictures(moments: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
 # The result of the uncertainty study, and the page that shows the result.
 
 
-_MOST_NUMBERS = 12  #: numbers in the pictures and in the lead
-_LITTLE = 0.01  #: share of a variance; inputs with a smaller share have no row
-_TOO_LITTLE = 0.5  #: share of a variance that a polynomial must predict for a row of indices
+_MOST_NUMBERS = 12  #: largest number of output numbers in the pictures and in the summary
+_LITTLE = 0.01  #: inputs with a smaller share of a variance have no row
+#: a polynomial must predict this share of a variance, or its indices are not listed
+_TOO_LITTLE = 0.5
 _TRANSFER = "sensor.photon_transfer"
 _CONSTRAINT = {"upper": "only an upper limit", "lower": "only a lower limit", "none": "nothing"}
 
 
 @dataclass(frozen=True)
 class UncertaintyResult:
-    """The result of the uncertainty study: draws of all inputs, and values and statistics of
-    each quantity.
+    """The result of the uncertainty study: draws of all inputs, with values and statistics of each
+    quantity.
     """
 
     inputs: Inputs
@@ -312,7 +315,7 @@ class UncertaintyResult:
     values: Mapping[str, FloatArray]  #: by quantity (draw, element)
     scatter: Mapping[str, Scatter]
     middle: Mapping[str, Sequence[float]]  #: by quantity, with every input at its median
-    #: by number: input, value at its 5 %, value at its 95 %
+    #: for each output number: (input, value at its 5 %, value at its 95 %)
     swings: Mapping[str, Sequence[tuple[str, float, float]]]
     shares: Mapping[str, SobolIndices]  #: by number
     pictures: Mapping[str, tuple[Tensor, Tensor]]  #: mean and standard deviation by output
@@ -320,20 +323,17 @@ class UncertaintyResult:
     wanted: float  #: the requested relative error
     sequences: int  #: number of Sobol sequences; 0 for independent draws
     deciding: tuple[str, ...]  #: quantities whose standard deviations decided when to stop
-    left_out: str  #: draws whose values the recipe does not allow together; empty for none
+    #: statement on draws whose values the recipe does not allow together; empty for none
+    left_out: str
 
     @property
     def worst(self) -> str:
-        """Return the name of the deciding quantity whose standard deviation has the largest
-        relative error.
-        """
+        """Return the deciding quantity whose standard deviation has the largest relative error."""
         return worst_known({name: self.scatter[name] for name in self.deciding})
 
     @property
     def error(self) -> float:
-        """Return the largest relative error of the standard deviations that decided when to
-        stop.
-        """
+        """Return the largest relative error of the standard deviations that decide when to stop."""
         return self.scatter[self.worst].error
 
     @property
@@ -343,8 +343,8 @@ class UncertaintyResult:
 
     @property
     def failed(self) -> int:
-        """Return the number of quantities with NaN or infinity, plus 1 if a standard deviation
-        is too inaccurate.
+        """Return the number of quantities with NaN or infinity, plus 1 if a standard deviation is
+        too inaccurate.
         """
         return len(self.strange) + (not self.error <= self.wanted)
 
@@ -369,16 +369,14 @@ class UncertaintyResult:
 
     @property
     def numbers(self) -> list[str]:
-        """Return the names of scalar quantities that vary between draws, one from each group of
+        """Return the scalar quantities that vary between draws, only one of each group of
         proportional ones.
         """
         return list(self.swings)
 
 
 def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
-    """Draw the pictures of the uncertainty study's page, and return the pictures by name as PNG
-    bytes.
-    """
+    """Return the pictures of the uncertainty study's page by name, as PNG bytes."""
     pictures_by_name = {}
     numbers = result.numbers[:_MOST_NUMBERS]
     if numbers:
@@ -402,14 +400,14 @@ def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
 def _curves(
     result: UncertaintyResult,
 ) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
-    """Return the curves that vary between draws, with their abscissas, by step, and the label of
+    """Return the curves that vary between draws, with their abscissas, by step; and the label of
     the abscissa.
     """
     wavelengths = _wavelengths_nm(result)
     curves: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
     spectral = True
     for name, values in result.values.items():
-        # an element of a curve is in a column
+        # columns are the elements of a curve
         count = values.shape[1]
         varies = np.isfinite(values).all() and not result.scatter[name].is_constant
         if count < 3 or not varies or _node_of(result, name) == _TRANSFER:
@@ -433,7 +431,7 @@ def _wavelengths_nm(result: UncertaintyResult) -> FloatArray:
 
 
 def _node_of(result: UncertaintyResult, quantity: str) -> str:
-    """Return the path of the node that gave a quantity, such as ``step`` or ``step.field``; empty
+    """Return the path of the node that computes a quantity named ``step`` or ``step.field``; empty
     if unknown.
     """
     steps = result.inputs.recipe.steps
@@ -464,7 +462,7 @@ def lead(result: UncertaintyResult) -> str:
 
 
 def _known(result: UncertaintyResult) -> list[str]:
-    """Return how well the standard deviations are known."""
+    """Return phrases on the accuracy of the standard deviations."""
     if len(result.deciding) == len(result.scatter):
         which_deviations, on_others = "every standard deviation", []
     else:
@@ -483,7 +481,7 @@ def _known(result: UncertaintyResult) -> list[str]:
 
 
 def _exceptions(result: UncertaintyResult) -> list[str]:
-    """Return which numbers do not vary, and how many draws were left out."""
+    """Return phrases on the numbers that do not vary, and on the omitted draws."""
     constant = [name for name, scattered in result.scatter.items() if scattered.is_constant]
     parts = (
         [f"{', '.join(constant)} {'does' if len(constant) == 1 else 'do'} not vary"]
@@ -494,8 +492,8 @@ def _exceptions(result: UncertaintyResult) -> list[str]:
 
 
 def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the uncertainty study's page; ``shown`` has the PNG bytes of each
-    picture by name.
+    """Return the sections of the uncertainty study's page; ``shown`` maps names to the PNG bytes of
+    pictures.
     """
     listed_sections = [_inputs(result), *_posterior(result), _numbers(result, shown.get("numbers"))]
     listed_sections += _moves(result, shown.get("tornado"))
@@ -521,9 +519,7 @@ def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Sect
 
 
 def _inputs(result: UncertaintyResult) -> Section:
-    """Return the section with the drawn inputs, their distributions, and what was
-    left out of them.
-    """
+    """Return the section on the drawn inputs, their distributions, and the omitted draws."""
     text = """The drawn values, in SI units. A joint distribution is drawn from independent inputs:
         the first input moves all correlated values, and each further input the part of its value
         that the inputs before it leave free. The same noise is drawn every time, so that only the
@@ -549,7 +545,9 @@ def _inputs(result: UncertaintyResult) -> Section:
 
 
 def _posterior(result: UncertaintyResult) -> list[Section]:
-    """Return the section that places the recipe's own values in the posterior; none without one."""
+    """Return the section that locates the recipe's values in the posterior; empty without a
+    posterior.
+    """
     standings = [
         standing
         for standing in result.inputs.uncertain.standings
@@ -582,7 +580,7 @@ def _posterior(result: UncertaintyResult) -> list[Section]:
 
 
 def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
-    """Return the section with the scatter of each quantity; of a curve, at its most uncertain
+    """Return the section on the scatter of each quantity; for a curve, at its most uncertain
     element.
     """
     method = (
@@ -621,7 +619,7 @@ def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
 
 
 def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
-    """Return the section on the influence of the inputs, with their Sobol indices; none without a
+    """Return the section on the influence of the inputs, with their Sobol indices; empty without a
     picture.
     """
     if picture is None:
@@ -642,8 +640,8 @@ def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
 
 
 def _influence(name: str, labels: Sequence[str], shares: SobolIndices) -> list[Sequence[Any]]:
-    """Return a row for each input that moves a quantity; the first row has the mark of the
-    polynomial.
+    """Return a table row for each input that affects a quantity; the first row is marked if the
+    polynomial explains too little.
     """
     mark_of_polynomial: Mark | None = None if shares.explains_enough else "warn"
     if shares.explained < _TOO_LITTLE:
@@ -652,7 +650,7 @@ def _influence(name: str, labels: Sequence[str], shares: SobolIndices) -> list[S
     rows: list[Sequence[Any]] = []
     for label, first_index, total_index in zip(labels, shares.first, shares.total, strict=True):
         if total_index.value > _LITTLE:
-            # marked in the first row alone
+            # only the first row is marked
             explained = Marked(f"{shares.explained:.1%}", None if rows else mark_of_polynomial)
             effects = (
                 first_index.value,
@@ -670,7 +668,7 @@ def _between(index: IndexInterval) -> str:
 
 
 def _rest(result: UncertaintyResult) -> list[Section]:
-    """Return the section on what does not vary; none if everything does."""
+    """Return the section on outputs and inputs that do not vary; empty if all vary."""
     sentences = (
         [f"Outputs that depend on no input: {', '.join(result.is_constant)}."]
         if result.is_constant

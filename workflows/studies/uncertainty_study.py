@@ -1,4 +1,4 @@
-"""The uncertainty study: the scatter of a recipe's outputs because of uncertain values in the
+"""The uncertainty study: the scatter of a recipe's outputs caused by the uncertain values in the
 recipe.
 """
 
@@ -46,28 +46,31 @@ from neusee.workflows.studies.uncertainty_page import (
 LEAST = 64  #: draws before the first decision to stop
 _RARE = 3.09  #: normal score of the quantile at 99.9 %
 _ROUND = 16  #: independent draws in each further round
-#: draws for the mean and standard deviation of pictures; the deviation is known to 13 %
+#: number of draws for the mean and standard deviation of pictures; it gives the deviation to 13 %
 PICTURED = 32
-_PICTURE_STATISTICS = ("mean", "sd")  #: of each picture
+_PICTURE_STATISTICS = ("mean", "sd")  #: statistics of each picture
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
 
 
 @dataclass(frozen=True)
 class UncertaintyOptions:
-    """When the study ends, and how it draws."""
+    """When the study ends, and how it samples."""
 
     error: float = 0.05  #: relative error of each standard deviation
     most: int = 1000  #: draws
     points: str = "draws"  #: or ``"sobol"``
     workers: int = 0  #: processes that draw on the CPU; 0 means one for each free processor
     device: str = "cpu"
-    until: Sequence[str] = ()  #: outputs or quantities whose deviations decide; empty for all
+    #: outputs or quantities whose standard deviations end the study; empty for all
+    until: Sequence[str] = ()
 
 
 def study(
     recipe: Recipe, store: Store, progress: Progress, options: UncertaintyOptions
 ) -> StudyOutcome:
-    """Sample the inputs until all standard deviations of outputs are known well enough."""
+    """Sample the inputs until the standard deviations of all outputs are known accurately
+    enough.
+    """
     inputs = _inputs(recipe)
     _chosen([name.partition(".")[0] for name in options.until], inputs.recipe.outputs)
     sequences = SCRAMBLES if options.points == "sobol" else 0
@@ -84,15 +87,16 @@ def study(
 
 @dataclass(frozen=True)
 class StopRule:
-    """When a study has enough draws."""
+    """The criterion for enough draws."""
 
     wanted: float  #: relative error of each standard deviation
     sequences: int  #: number of Sobol sequences; 0 for independent draws
-    until: tuple[str, ...]  #: outputs or quantities whose standard deviations decide; empty for all
+    #: outputs or quantities whose standard deviations must be accurate; empty for all
+    until: tuple[str, ...]
 
     @property
     def text(self) -> str:
-        """Return the standard deviations that decide, in words."""
+        """Return in words which standard deviations must be accurate."""
         return (
             f"standard deviations of {', '.join(self.until)}"
             if self.until
@@ -100,7 +104,9 @@ class StopRule:
         )
 
     def needed(self, count: int, error: float, available: int) -> int:
-        """Return about how many draws are needed, from the ``error`` of ``count`` draws."""
+        """Return an estimate of the number of draws needed, from the ``error`` after ``count``
+        draws.
+        """
         return (
             count
             if error <= self.wanted
@@ -114,7 +120,7 @@ class StopRule:
 
 
 def _inputs(recipe: Recipe) -> Inputs:
-    """Return the uncertain inputs of a recipe; raise `StudyRefused` if there are none to vary."""
+    """Return the uncertain inputs of a recipe; raise `StudyRefused` if the recipe has none."""
     try:
         return Inputs.of(recipe, negligible=NEGLIGIBLE)
     except RecipeError:
@@ -124,9 +130,9 @@ def _inputs(recipe: Recipe) -> Inputs:
 
 
 def _points(inputs: Inputs, seed: int, limit: int, points: str) -> InputDraws:
-    """Return ``limit`` draws of the inputs at most: independent ones, or Sobol points.
+    """Return at most ``limit`` draws of the inputs: independent draws or Sobol points.
 
-    Sobol points are as many as `SCRAMBLES` times a power of two.
+    The number of Sobol points is `SCRAMBLES` times a power of two.
     """
     if points == "sobol":
         return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(limit, LEAST) / SCRAMBLES)), seed)
@@ -135,8 +141,8 @@ def _points(inputs: Inputs, seed: int, limit: int, points: str) -> InputDraws:
 
 
 def _ends(inputs: Inputs) -> FloatArray:
-    """Return the input values of each run: all at their medians, then one input at its 5 % and
-    at its 95 % quantile.
+    """Return the input values of the first runs: all at their medians, then each input alone at its
+    5 % and its 95 % quantile.
     """
     return np.concatenate(
         [inputs.at(np.zeros((1, len(inputs.names)))), _one_at_a_time(inputs, Z_90)]
@@ -144,8 +150,8 @@ def _ends(inputs: Inputs) -> FloatArray:
 
 
 def _one_at_a_time(inputs: Inputs, score: float) -> FloatArray:
-    """Return input values with one input at each of two opposite normal scores, and all others
-    at their medians.
+    """Return input values with one input at a time at ``-score`` and ``+score``, and all others at
+    their medians.
     """
     scores = []
     for direction in np.eye(len(inputs.names)):
@@ -154,8 +160,8 @@ def _one_at_a_time(inputs: Inputs, score: float) -> FloatArray:
 
 
 def _chosen(until: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the ``names`` that ``until`` means, or all; raise `StudyRefused` for a name
-    of none of them.
+    """Return the ``names`` selected by ``until``, or all if it is empty; raise `StudyRefused` for
+    an entry that matches no name.
     """
     if not until:
         return tuple(names)
@@ -174,7 +180,7 @@ def _chosen(until: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
 def _deciding(
     until: Sequence[str], varying: Sequence[str], constant: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return the numbers that decide when to stop; raise `StudyRefused` for an output that
+    """Return the numbers whose accuracy ends the study; raise `StudyRefused` for an output that
     depends on no input.
     """
     constants = [name for name in until if _means(name, constant) and not _means(name, varying)]
@@ -186,7 +192,7 @@ def _deciding(
 
 
 def _means(name: str, quantities: Sequence[str]) -> list[str]:
-    """Return those of ``quantities`` of an output or of a single quantity."""
+    """Return the ``quantities`` that belong to an output ``name``, or the quantity of this name."""
     return [
         quantity
         for quantity in quantities
@@ -197,7 +203,7 @@ def _means(name: str, quantities: Sequence[str]) -> list[str]:
 def _measure(
     inputs: Inputs, draws: OutputDraws, allowed: AllowedDraws, progress: Progress, rule: StopRule
 ) -> UncertaintyResult:
-    """Draw until the standard deviations that decide are known well enough, and
+    """Draw samples until the standard deviations in question are known accurately enough, and
     return the result.
     """
     _say_inputs(inputs, draws, rule.sequences, progress)
@@ -214,7 +220,7 @@ def _measure(
     # at least one round
     while allowed.tried < allowed.available or not numbers:
         allowed.extend(rule.following(allowed.tried) if numbers else LEAST)
-        # further draws alone: those before are known
+        # only the new draws: the results of earlier ones are kept
         numbers += draws.numbers(allowed.values[len(numbers) :])
         values = _by_quantity(numbers)
         scattered = {
@@ -248,8 +254,8 @@ def _measure(
 
 
 def _say_inputs(inputs: Inputs, draws: OutputDraws, sequences: int, progress: Progress) -> None:
-    """Print the inputs, what was cut off their distributions, and the outputs that depend on
-    none of them.
+    """Report the inputs, the cut-off parts of their distributions, and the outputs that depend on
+    no input.
     """
     progress(
         f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs"
@@ -276,11 +282,11 @@ def _say_constant(
     deciding: Sequence[str],
     progress: Progress,
 ) -> None:
-    """Print which numbers do not vary in the first runs; raise `StudyRefused` if none of those
-    that decide varies.
+    """Report the numbers that do not vary in the first runs; raise `StudyRefused` if none of the
+    deciding ones varies.
     """
     same_in_all = _constant(ends)
-    if set(deciding) <= set(same_in_all):  # the rare ends of the distributions may tell more
+    if set(deciding) <= set(same_in_all):  # try the extreme ends of the distributions too
         ends = [*ends, *draws.numbers(_one_at_a_time(inputs, _RARE))]
         same_in_all = _constant(ends)
     if same_in_all:
@@ -313,7 +319,7 @@ def _swings(
     values: Mapping[str, FloatArray],
     scattered: Mapping[str, Scatter],
 ) -> dict[str, list[tuple[str, float, float]]]:
-    """Return each output number with one input at its 5 % and 95 % quantile; skip numbers
+    """Return each output number with each input alone at its 5 % and 95 % quantile; skip numbers
     proportional to others.
     """
     swings: dict[str, list[tuple[str, float, float]]] = {}
@@ -415,7 +421,7 @@ def _rows(result: UncertaintyResult) -> list[Sequence[Any]]:
 
 
 def _npz(arrays: Mapping[str, Any]) -> bytes:
-    """Return arrays as the bytes of a file of NumPy."""
+    """Return arrays as the bytes of an npz file."""
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     return buffer.getvalue()

@@ -1,9 +1,9 @@
 """Error against run time, of settings of a recipe and of variants of single steps.
 
-A point is a setting, with the time of a cold run and the errors of the outputs. A variant is the
-step as used, in another precision, with another allowed error, with a smaller window of the PSF, or
-left out. If the reference takes too long, all variants are measured on the middle of the pictures
-and on fewer bands.
+A point is a setting of the recipe, with the time of a cold run and the errors of the outputs. A
+variant of a step is the step as used, in another precision, with another allowed error, with a
+smaller window of the PSF, or left out. If the reference takes too long, all variants are measured
+on the middle of the pictures and on fewer bands.
 """
 
 from __future__ import annotations
@@ -44,18 +44,16 @@ from neusee.workflows.tolerance.error_norm import error_of
 # outputs.
 
 
-TIMES = 3  #: cold runs of a point; the median of their times counts
+TIMES = 3  #: cold runs of a point, of which the median time is used
 _QUICK_SECONDS = 5.0  #: s; a recipe that takes longer is run once
 _STORED_AS = {"step": "study accuracy"}
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A setting to measure, as a changed recipe or as the reason why the setting is not
-    possible.
-    """
+    """A setting to measure: a changed recipe, or the reason why the setting is impossible."""
 
-    line: str  #: the parameter that is set
+    line: str  #: the parameter that is varied
     label: str
     recipe: Recipe | None
     refused: str = ""
@@ -64,7 +62,7 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Return the parameter and its setting as text."""
+        """Return the parameter and its value as text."""
         return f"{self.line} {self.label}".strip()
 
 
@@ -74,9 +72,9 @@ class PointMeasurement:
 
     errors: dict[str, list[float]] = field(default_factory=dict)  #: by output, one for each seed
     seconds: list[float] = field(default_factory=list)  #: of the engine, one for each cold run
-    computing: float = 0.0  #: s in the steps of the first cold run
+    computing: float = 0.0  #: s, time within the steps of the first cold run
     load: float = 0.0  #: runnable processes for each core before the run, this process included
-    #: largest error that the run states for its outputs; None if one is unknown
+    #: largest error that the engine states for the outputs; None if one is unknown
     bound: float | None = None
     steps: dict[str, float] = field(default_factory=dict)  #: s by step, in the first cold run
     refused: str = ""
@@ -84,9 +82,7 @@ class PointMeasurement:
 
 @dataclass(frozen=True)
 class WorkPrecisionPoint:
-    """A point of a diagram of error against run time: a setting of the recipe and its
-    measurement.
-    """
+    """A point in a diagram of error against run time: a setting and its measurement."""
 
     trial: Trial
     found: PointMeasurement
@@ -102,12 +98,12 @@ class WorkPrecisionPoint:
 
     @property
     def error(self) -> float:
-        """Return the largest error over all outputs, as the median over the random seeds."""
+        """Return the largest error over all outputs, the median over the random seeds."""
         return median(self.by_seed) if self.by_seed else float("inf")
 
     @property
     def most(self) -> float:
-        """Return the largest error over all outputs and random seeds, which must be within the
+        """Return the largest error over all outputs and random seeds; this one must be within the
         tolerance.
         """
         return max(self.by_seed, default=float("inf"))
@@ -119,9 +115,7 @@ class WorkPrecisionPoint:
 
 
 class PointCache:
-    """A cache of measured points: a recipe that was once compared with the reference is not run
-    again.
-    """
+    """A cache of measured points: a recipe is compared with the reference only once."""
 
     def __init__(self, reference: Recipe, store: Store, seeds: int, device: str = "cpu") -> None:
         """Prepare measurements against ``reference``, with ``seeds`` seeds of the noise (one
@@ -137,9 +131,7 @@ class PointCache:
         self._warm = False
 
     def point(self, trial: Trial) -> WorkPrecisionPoint:
-        """Return the errors and run times of a setting; measure the setting if the store has no
-        measurement of it.
-        """
+        """Return the errors and run times of a setting, from the store or measured now."""
         recipe = trial.recipe
         if recipe is None:
             return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
@@ -150,8 +142,8 @@ class PointCache:
         return WorkPrecisionPoint(trial, measurement)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
-        """Return a measurement with the time of cold run ``number`` added, or unchanged if the
-        first run was slow.
+        """Return a measurement with the time of cold run ``number`` added; unchanged if the first
+        run was slow.
         """
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK_SECONDS:
@@ -181,21 +173,23 @@ class PointCache:
         )
 
     def truth(self, seed: int) -> dict[str, Any]:
-        """Return the outputs of the reference with the noise of ``seed``, from the store or
+        """Return the outputs of the reference for the noise seed ``seed``, from the store or
         computed now.
         """
         if seed not in self._truth:
             recipe = replace(self.reference, seed=self.reference.seed + seed)
             result = run(recipe, self.store, device=self.device)
             self._truth[seed] = result.values
-            # a process that has computed most of the steps has imported their libraries
+            # after computing most of the steps, the process has imported their libraries
             self._warm |= (
                 sum(done.state == "run" for done in result.done.values()) > len(result.done) / 2
             )
         return self._truth[seed]
 
     def _measure(self, recipe: Recipe) -> PointMeasurement:
-        """Run a recipe cold and compare its outputs with the reference; return errors and times."""
+        """Run a recipe cold, compare its outputs with the reference, and return errors
+        and times.
+        """
         load_per_core = (
             os.getloadavg()[0] / (os.cpu_count() or 1) if hasattr(os, "getloadavg") else 0.0
         )
@@ -224,12 +218,12 @@ class PointCache:
         )
 
     def _warm_up(self, recipe: Recipe) -> None:
-        """Run the recipe once without timing, because the first run of a process imports
-        libraries and reads code.
+        """Run the recipe once untimed, because the first run of a process imports libraries and
+        reads code.
         """
         self.truth(0)
         for step in with_substitutions(recipe, recipe.outputs).steps.values():
-            # digests of the code are kept in the store, and then not timed
+            # store the digests of the code beforehand, so that they are not timed
             self._code.digest(step.node.fn.__module__)
         self._code.save()
         if not self._warm:
@@ -239,8 +233,8 @@ class PointCache:
     def _errors(
         self, recipe: Recipe, values: Mapping[str, Any], store: Store
     ) -> dict[str, list[float]]:
-        """Return the errors of each output for all seeds, without outputs whose shape differs
-        from the reference.
+        """Return the errors of each output for all seeds; outputs with another shape than the
+        reference are omitted.
         """
         # the same noise in recipe and reference
         by_output = compare_outputs(values, self.truth(0))
@@ -252,8 +246,8 @@ class PointCache:
 
 
 def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Return the error of each output by name, without outputs whose shape differs from the
-    reference.
+    """Return the error of each output by name; outputs with another shape than the reference are
+    omitted.
     """
     errors: dict[str, list[float]] = {}
     for name, value in values.items():
@@ -265,7 +259,7 @@ def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict
 
 # --- pareto line ----------------------------------------------------------------------------------
 
-# The Pareto front of error and run time, and the engine's choices compared with the quickest
+# The Pareto front of error and run time, and the engine's choices compared with the fastest
 # settings.
 
 
@@ -274,7 +268,7 @@ Points = Sequence[WorkPrecisionPoint]
 
 @dataclass(frozen=True)
 class ToleranceChoice:
-    """The engine's choice for a tolerance, and the quickest measured setting within the
+    """The engine's choice for a tolerance, and the fastest measured setting within the
     tolerance.
     """
 
@@ -289,34 +283,32 @@ class ToleranceChoice:
 
     @property
     def ratio(self) -> float | None:
-        """Return the run time of the engine's choice divided by the run time of the quickest
+        """Return the ratio of the run time of the engine's choice to that of the fastest
         setting.
         """
         return None if self.cheapest is None else self.chosen.seconds / self.cheapest.seconds
 
 
 def pareto_front(points: Points) -> list[WorkPrecisionPoint]:
-    """Return the Pareto front: settings that no other setting beats in both run time and error,
-    the quickest first.
+    """Return the Pareto front: settings that no other setting beats in both run time and error, the
+    fastest first.
     """
     front: list[WorkPrecisionPoint] = []
     for point in sorted(points, key=lambda p: (p.seconds, p.most)):
-        # quickest first, so that a point has to be more accurate than all before it
+        # sorted by run time: a point on the front is more accurate than all before it
         if not front or point.most < front[-1].most:
             front.append(point)
     return front
 
 
 def cheapest(points: Points, tolerance: float) -> WorkPrecisionPoint | None:
-    """Return the quickest setting whose largest error is within ``tolerance``, or None if there
-    is no such setting.
-    """
+    """Return the fastest setting whose largest error is within ``tolerance``, or None."""
     return min((p for p in points if p.most <= tolerance), key=lambda p: p.seconds, default=None)
 
 
 def median_ratio(choices: Iterable[ToleranceChoice]) -> float | None:
-    """Return the median over all tolerances of the engine's run time divided by the quickest run
-    time.
+    """Return the median over all tolerances of the ratio of the engine's run time to the fastest
+    run time.
     """
     ratios = [choice.ratio for choice in choices if choice.ratio is not None]
     return median(ratios) if ratios else None
@@ -327,17 +319,17 @@ def median_ratio(choices: Iterable[ToleranceChoice]) -> float | None:
 # Run time and error of variants of single steps, compared with a reference.
 
 
-Cut = tuple[int, int]  #: the longest side and the largest number of bands; 0 for no limit
-SHARE = 0.01  #: least share of the run time of a step that is measured
+Cut = tuple[int, int]  #: (longest side in pixels, largest number of bands); 0 for no limit
+SHARE = 0.01  #: steps with a smaller share of the run time are not measured
 _ITEM = re.compile(r"\[.*?\]")
 _CUTS: Sequence[Cut] = ((32, 2), (64, 2), (128, 3), (256, 3), (512, 3), (1024, 3), (0, 3), (0, 0))
-#: expected growth of the reference's time from cut to cut, as for a direct convolution
+#: expected growth of the reference's run time from one cut to the next, as for a direct convolution
 _GROWTH = 16.0
 USED, _PRECISION = "as used", "precision"
 _WINDOWS = (0.75, 0.5, 0.25)  #: shares of the side of a PSF
 #: factors on the allowed error ``within`` of a step
 _ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)
-#: seconds and calls; a variant is called again until one of the two is reached
+#: a variant is called until this total time in s, or this number of calls, is reached
 _LONG_ENOUGH, _CALLS = 0.5, 5
 
 
@@ -364,13 +356,13 @@ class StepMeasurement:
 
 @dataclass(frozen=True)
 class StepTried:
-    """A step with a large share of the run time, and its measurement or the reason why it was
-    not measured.
+    """A step with a large share of the run time, and its measurement or the reason why there is
+    none.
     """
 
-    step: str  #: the slowest item of the step
+    step: str  #: the slowest repetition of the step
     node: str
-    share: float  #: share of the run time that all items of the step take together
+    share: float  #: share of the run time of all repetitions of the step together
     found: StepMeasurement
 
     @property
@@ -379,13 +371,13 @@ class StepTried:
 
 
 def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Return (slowest repetition, share of the run time) of each step that takes more than
-    `SHARE` of the run time.
+    """Return (slowest repetition, share of run time) of each step with more than `SHARE` of the run
+    time.
     """
     items_of_step: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
-            # names without their item in brackets
+            # group by names without their repetition in brackets
             items_of_step[_ITEM.sub("", name)].append(name)
     total = sum(seconds.values()) or 1.0
     shares = [
@@ -399,8 +391,8 @@ def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tupl
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """Measure variants of a step on inputs so small that the reference takes at most about
-    ``patience`` seconds.
+    """Measure the variants of a step on inputs so small that the reference takes at most about
+    ``patience`` s.
     """
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
@@ -419,7 +411,7 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
 
 
 def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
-    """Return the store key of the measurement of a step: its inputs, its code, patience and
+    """Return the store key of a step's measurement, from its inputs, its code, ``patience`` and the
     machine.
     """
     keys: dict[str, str] = {}
@@ -436,7 +428,7 @@ def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
 
 
 def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
-    """Return errors and run times of the variants of a step, or why they cannot be measured."""
+    """Return errors and run times of a step's variants, or why they cannot be measured."""
     try:
         input_values = run(replace(recipe, exact=True), store, step.sources).values
     except RunError as error:
@@ -453,7 +445,7 @@ def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepM
         variants = [
             asdict(variant) for variant in _variants(step, small_inputs, truth, recipe.seed)
         ]
-    # without any cut: nothing is said of parts of the inputs
+    # True if no input was cut
     complete = all(
         whole_tensor.shape == cut_tensor.shape
         for whole_tensor, cut_tensor in zip(
@@ -464,19 +456,21 @@ def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepM
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
-    """Return the input of a wire: one result, a list of results, or None without a wire."""
+    """Return the value at an input: one result, a list of results, or None if it is not
+    connected.
+    """
     return wire and (values[wire] if isinstance(wire, str) else [values[name] for name in wire])
 
 
 def _largest(
     step: Step, inputs: list[Any], seed: int, patience: float
 ) -> tuple[Cut, Any, float] | None:
-    """Return the largest input size for which the reference takes about ``patience`` s, the
-    result and the time.
+    """Return the largest input size for which the reference takes at most about ``patience`` s,
+    with the result and the time.
     """
     largest_measured: tuple[Cut, Any, float] | None = None
     for size in _CUTS:
-        # the next cut would take too long: best is (size, result, seconds)
+        # stop if the next cut would take too long; an entry is (size, result, seconds)
         if largest_measured is not None and largest_measured[2] * _GROWTH > patience:
             break
         small_inputs = cut_inputs(step.node, inputs, size)
@@ -491,13 +485,12 @@ def _largest(
 
 
 def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Variant]:
-    """Yield each variant of the step, except variants that fail or whose result has another
-    shape than ``truth``.
+    """Yield each variant of a step; variants that fail or whose result has another shape than
+    ``truth`` are omitted.
     """
     for (line, label), compute in _calls(step, inputs, seed).items():
-        # another shape, or a dtype that the variant does not take
+        # raised for another shape, or for a dtype that the variant does not accept
         with suppress(ValueError, RuntimeError):
-            # errors are those of tensors that can be compared
             result, seconds = _median_time(compute)
             yield Variant(
                 line, label, error_of(_compared_value(result), _compared_value(truth)), seconds
@@ -505,7 +498,7 @@ def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[
 
 
 def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
-    """Return functions that compute variants of a step, by (changed property, new value)."""
+    """Return functions that compute the variants of a step, by (changed property, new value)."""
     node = step.node
     calls: dict[tuple[str, str], Callable[[], Any]] = {
         (USED, ""): partial(_call, step, node, inputs, seed)
@@ -528,7 +521,9 @@ def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Ca
 
 
 def _other_precisions(step: Step) -> list[str]:
-    """Return the words for a precision that a step does not have; none without this parameter."""
+    """Return the precisions that a step could have instead of its own; empty without this
+    parameter.
+    """
     own_precision = step.params.get("precision")
     return (
         []
@@ -542,7 +537,9 @@ def _is_single(x: Tensor) -> bool:
 
 
 def _smaller_windows(inputs: list[Any]) -> Iterator[tuple[float, list[Any]]]:
-    """Yield the inputs with smaller windows of their PSFs, and the share; none without a PSF."""
+    """Yield (share, inputs) with each PSF cropped to a share of its window; nothing
+    without a PSF.
+    """
     if any(isinstance(value, Psf) for value in inputs):
         for share in _WINDOWS:
             yield (
@@ -552,7 +549,7 @@ def _smaller_windows(inputs: list[Any]) -> Iterator[tuple[float, list[Any]]]:
 
 
 def _inner(psf: Psf, share: float) -> Psf:
-    """Return a PSF cropped to ``share`` of each side; the centre stays at index N // 2."""
+    """Return a PSF cropped to ``share`` of each side; its centre stays at index N // 2."""
     intensity = psf.intensity
     for axis in (-2, -1):
         intensity = _centred(intensity, axis, max(1, round(share * intensity.shape[axis])))
@@ -573,8 +570,8 @@ def _compared_value(value: Any) -> Any:
 
 
 def _call(step: Step, function: Any, inputs: list[Any], seed: int, **other: Any) -> Any:
-    """Return ``function`` of the inputs with the parameters of a step, of which ``other`` replaces
-    some; a random step gets the random numbers that it has in a run.
+    """Call ``function`` with the inputs and parameters of a step, some replaced by ``other``; a
+    random step gets the same random numbers as in a run.
     """
     rng = (
         {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))}
@@ -591,11 +588,11 @@ def _time_once(compute: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
-    """Call a function several times; return the result and the median run time, without a short
+    """Call a function several times; return its result and the median run time, without a short
     first call.
     """
     value, seconds = _time_once(compute)
-    # a short first call may import or compile: it does not count
+    # ignore a short first call, which may import or compile
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _CALLS and sum(times) < _LONG_ENOUGH:
         times.append(_time_once(compute)[1])
@@ -618,17 +615,19 @@ def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
 
 
 def _cut_text(node: Node, size: Cut) -> str:
-    """Return which part of the inputs is used, such as ``the middle 64 x 64 and 3 bands``."""
+    """Return as text which part of the inputs is used, such as ``the middle 64 x 64 and 3
+    bands``.
+    """
     side, bands = size
     takes_bands = bands and (node.bands or {}).keys() - {"return"}
-    # a factor of False leaves a part out
+    # a list times False is empty
     parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(takes_bands)
     return " and ".join(parts)
 
 
 def _middle(x: Tensor, side: int) -> Tensor:
-    """Return the middle of a picture, of ``side`` pixels; other tensors and smaller
-    ones unchanged.
+    """Return the central ``side`` x ``side`` pixels of a picture; smaller and other tensors
+    unchanged.
     """
     for axis in (-2, -1) if x.ndim >= 2 and min(x.shape[-2:]) > side else ():
         x = _centred(x, axis, side)
@@ -641,7 +640,7 @@ def _fewer_bands(value: Any, axis: int, bands: int) -> Any:
         count = value.shape[axis]
         if count <= bands:
             return value
-        # middles of equal parts of the bands
+        # the central band of each of ``bands`` equal parts
         indices = value.new_tensor(
             [round((number + 0.5) * count / bands - 0.5) for number in range(bands)]
         ).long()

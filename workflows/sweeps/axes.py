@@ -23,23 +23,23 @@ from neusee.workflows.recipe.text.overrides import Override, overrides_of, read_
 
 # Lists and ranges that are written as text, such as ``1,2,3`` and ``linspace(450 nm, 650 nm, 5)``.
 #
-# Commas in quotes or brackets do not separate values, so that ``[1, 2]`` is one value. Numbers of a
-# range are computed exactly: ``range(0, 1, 0.1)`` has the value 0.3, not 0.30000000000000004.
+# Commas in quotes or brackets do not separate values, so that ``[1, 2]`` is one value. The numbers
+# of a range are computed exactly: ``range(0, 1, 0.1)`` contains 0.3, not 0.30000000000000004.
 
 
-MOST = 100_000  #: values of one axis, and points of one sweep
+MOST = 100_000  #: largest number of values of an axis, and of points of a sweep
 
 _QUOTED = r"""(?:^|(?<=[\s,:(\[{]))(?:"(?:[^"\\]|\\.)*"|'(?:[^']|'')*')"""
 _TOKEN = re.compile(rf"{_QUOTED}|.", re.DOTALL)
 _PAIRS = {"(": ")", "[": "]", "{": "}"}
 _CALL = re.compile(r"\s*([A-Za-z]\w*)\s*\((.*)\)\s*", re.DOTALL)
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.].*)?")
-_EXACT = 10**15  #: smaller whole numbers are written without a decimal point
+_EXACT = 10**15  #: whole numbers below this are written without a decimal point
 
 
 def split(text: str) -> list[str]:
-    """Split a text at the commas outside of quotes and brackets; raise `ValueError` for an
-    unclosed bracket.
+    """Split a text at commas outside of quotes and brackets; raise `ValueError` for an unclosed
+    bracket.
     """
     pieces, closing_brackets = [""], list[str]()
     for token in _TOKEN.findall(text):
@@ -57,8 +57,8 @@ def split(text: str) -> list[str]:
 
 
 def values_of(text: str) -> list[str]:
-    """Return the values of a list or a range as YAML texts; raise `ValueError` if the text is
-    malformed.
+    """Return the values of a list or range as YAML texts; raise `ValueError` for a
+    malformed text.
     """
     pieces = split(text)
     if len(pieces) > 1 and not all(piece.strip() for piece in pieces):
@@ -70,14 +70,12 @@ def values_of(text: str) -> list[str]:
 
 
 def spans(text: str) -> bool:
-    """Return True if a text is a range, such as ``range(4)``."""
+    """Return True if the text is a range, such as ``range(4)``."""
     return _function(text) is not None
 
 
 def _spanned(text: str) -> list[str]:
-    """Return the values of a range such as ``range(4)``, or else the text itself as the only
-    value.
-    """
+    """Return the values of a range such as ``range(4)``; any other text is its own single value."""
     function = _function(text)
     if function is None:
         return [text.strip()]
@@ -91,14 +89,13 @@ def _spanned(text: str) -> list[str]:
 
 
 def _function(text: str) -> tuple[str, str] | None:
-    """Return the name and the arguments of a range such as ``range(4)``, or None if the text is not
-    a range.
+    """Return name and arguments of a range such as ``range(4)``; None if the text is not a range.
 
     Raises `ValueError` if the name is misspelt.
     """
     match = _CALL.fullmatch(text)
     if match is None or match[1] in _FUNCTIONS:
-        # None for a text that is no call
+        # None if there is no match
         return match and (match[1], match[2])
     similar_names = difflib.get_close_matches(match[1].lower(), _FUNCTIONS, 1, 0.7)
     if similar_names:
@@ -107,7 +104,7 @@ def _function(text: str) -> tuple[str, str] | None:
 
 
 def _range(arguments: list[str]) -> list[str]:
-    """Return the values of ``range(start, stop, step)``, as for Python's range, but with a unit."""
+    """Return the values of ``range(start, stop, step)``, as Python's range but with a unit."""
     if not 1 <= len(arguments) <= 3:
         raise ValueError("write range(stop), range(start, stop) or range(start, stop, step)")
     numbers, unit = _numbers(arguments)
@@ -120,7 +117,7 @@ def _range(arguments: list[str]) -> list[str]:
 
 
 def _linspace(arguments: list[str]) -> list[str]:
-    """Return equally spaced values; both ends are among them."""
+    """Return equally spaced values, including both ends."""
     (start, stop), unit, count = _ends(arguments, "linspace(450 nm, 650 nm, 5)")
     # a single value needs no step
     step = (stop - start) / max(count - 1, 1)
@@ -128,11 +125,11 @@ def _linspace(arguments: list[str]) -> list[str]:
 
 
 def _logspace(arguments: list[str]) -> list[str]:
-    """Return values with equal ratios; both ends are among them, exactly."""
+    """Return values in a geometric series, including both ends exactly."""
     (start, stop), unit, count = _ends(arguments, "logspace(1e2, 1e6, 5)")
     if start <= 0 or stop <= 0:
         raise ValueError("the first and the last value of a logarithmic range must be positive")
-    # 50 digits, so that the values are right to the last digit of a float
+    # 50 digits, so that the values are correct to the last digit of a float
     with localcontext(prec=50):
         first_value, last_value = (
             Decimal(x.numerator) / Decimal(x.denominator) for x in (start, stop)
@@ -147,9 +144,7 @@ _FUNCTIONS = {"range": _range, "linspace": _linspace, "logspace": _logspace}
 
 
 def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]:
-    """Return the first and the last value of a range, their common unit, and the number of
-    values.
-    """
+    """Return first and last value of a range, their common unit, and the number of values."""
     if len(arguments) != 3:
         raise ValueError(
             f"write the first value, the last value and the number of values: {example}"
@@ -164,7 +159,7 @@ def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]
 
 
 def _count(count: int) -> int:
-    """Return a number of values that an axis can have; raise `ValueError` for any other number."""
+    """Return a valid number of values of an axis; raise `ValueError` for any other number."""
     if count < 1:
         raise ValueError(
             "the range is empty: change its first value, its last value or the number of values"
@@ -192,12 +187,12 @@ def _number(text: str) -> tuple[Fraction, str]:
     match = _NUMBER.fullmatch(text)
     if match is None or not math.isfinite(float(match[1])):
         raise ValueError(f"{text or 'nothing'} is not a number")
-    # as written: 0.1 is 1/10, not the nearest float
+    # exact: 0.1 is 1/10, not the nearest float
     return Fraction(repr(float(match[1]))), (match[2] or "").strip()
 
 
 def _written(number: Fraction, unit: str) -> str:
-    """Return a number with its unit as a user writes it."""
+    """Return a number with its unit as in the notation of the user."""
     value = float(number)
     is_whole = value.is_integer() and abs(value) < _EXACT
     return f"{int(value) if is_whole else value!r} {unit}".strip()
@@ -205,24 +200,22 @@ def _written(number: Fraction, unit: str) -> str:
 
 # --- axes -----------------------------------------------------------------------------------------
 
-# Axes of a parameter sweep, written as in Hydra such as ``a=1,2,3``, and the combinations of their
+# Axes of a parameter sweep, in Hydra notation such as ``a=1,2,3``, and the combinations of their
 # values.
 
 
 @dataclass(frozen=True, slots=True)
 class Coordinate:
-    """One value on an axis of a sweep, with the changes of the recipe that set this value."""
+    """One value on an axis of a sweep, with the recipe changes that set it."""
 
-    shown: str  #: the value as a user writes it
-    value: Any  #: the value as YAML reads it
+    shown: str  #: the value in the notation of the user
+    value: Any  #: the value as parsed by YAML
     overrides: tuple[Override, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis of a sweep: a parameter or a group of a recipe, with the list of values for the
-    sweep.
-    """
+    """An axis of a sweep: a parameter or group of the recipe, with the list of its values."""
 
     name: str
     coordinates: tuple[Coordinate, ...]
@@ -235,17 +228,17 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A point of a sweep: one combination of values, with one value from each axis."""
+    """A point of a sweep: a combination of one value from each axis."""
 
-    number: int  #: counts from 1, where the last axis varies fastest
+    number: int  #: number from 1; the last axis varies fastest
     place: tuple[int, ...]  #: index of the value on each axis
     coordinates: tuple[Coordinate, ...]  #: one for each axis
-    overrides: tuple[Override, ...]  #: every change of the recipe, in the order of the arguments
+    overrides: tuple[Override, ...]  #: all changes of the recipe, in the order
     axes: tuple[str, ...]  #: the names of the axes
 
     @property
     def shown(self) -> str:
-        """Return the point of a sweep as text, such as ``sensor.read_noise=5 e-, doe=axicon``."""
+        """Return the point as text, such as ``sensor.read_noise=5 e-, doe=axicon``."""
         return ", ".join(
             f"{name}={coordinate.shown}"
             for name, coordinate in zip(self.axes, self.coordinates, strict=True)
@@ -253,9 +246,9 @@ class Point:
 
 
 def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
-    """Read the axes of a sweep and the fixed changes of its recipe from command-line arguments.
+    """Parse the axes of a sweep and the fixed changes of its recipe from command-line arguments.
 
-    Raises `RecipeError` with the mistakes of all arguments.
+    Raises `RecipeError` with the errors of all arguments.
 
     Messages number the arguments from ``first``.
     """
@@ -265,15 +258,15 @@ def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) ->
 
 
 def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Argument]:
-    """Read the axes of a sweep, whose values are either Python lists or texts in the notation of
-    the command line.
+    """Parse the axes of a sweep; their values are Python lists or texts in command-line
+    notation.
     """
     return _every(partial(_read_axis, name, values, folder) for name, values in axes.items())
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
-    """Return the points of a sweep: all combinations of values, or, if ``paired``, the n-th values
-    of all axes.
+    """Return the points of a sweep: all combinations of values or, if ``paired``, the n-th values
+    of all axes together.
 
     The last axis varies fastest.
     """
@@ -292,8 +285,8 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
 
 
 def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
-    """Call each function and return the results; raise one `RecipeError` that lists the mistakes
-    from all calls.
+    """Call each function and return the results; raise one `RecipeError` with the errors of all
+    calls.
     """
     results: list[_T] = []
     diagnostics: list[Diagnostic] = []
@@ -308,8 +301,8 @@ def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
 
 
 def _read_word(word: str | Override, number: int, folder: Path) -> Argument:
-    """Read one argument of the command line: a change of the recipe, or an axis if it has
-    several values.
+    """Parse one command-line argument: an axis if it has several values, else a change of the
+    recipe.
     """
     if isinstance(word, Override):
         return word
@@ -328,13 +321,13 @@ def _read_word(word: str | Override, number: int, folder: Path) -> Argument:
 
 
 def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
-    """Read an axis from a list of values, or from a text as on the command line."""
+    """Parse an axis from a list of values, or from a text in command-line notation."""
     mark = Location(f"axis {name}", folder=str(folder))
     if name.startswith(("+", "~")):
         raise RecipeError([Diagnostic(mark, name, "write the name of an axis without + or ~")])
     if isinstance(values, str):
         return _axis(name, _values(values, f"{name}={values}", mark), mark)
-    # an array of NumPy has this method
+    # NumPy arrays have this method
     listed = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
         raise RecipeError(
@@ -353,7 +346,7 @@ def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
 
 
 def _values(text: str, path: str, mark: Location) -> list[str]:
-    """Return the values in a text; raise `RecipeError` if the text is malformed."""
+    """Return the values in a text; raise `RecipeError` if it is malformed."""
     try:
         return values_of(text)
     except ValueError as error:
@@ -361,7 +354,7 @@ def _values(text: str, path: str, mark: Location) -> list[str]:
 
 
 def _coordinate(name: str, value: Any, folder: Path) -> Coordinate:
-    """Return one value of an axis with its changes of the recipe."""
+    """Return one value of an axis with the recipe changes that set it."""
     changes = tuple(overrides_of({name: value}, folder))
     # a mapping may change several values at once
     single_change = (
@@ -376,7 +369,7 @@ def _coordinate(name: str, value: Any, folder: Path) -> Coordinate:
 
 
 def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
-    """Return an axis with values that are written as texts."""
+    """Return an axis from values that are texts."""
     coordinates = []
     for text, override in zip(
         values,
@@ -397,8 +390,8 @@ def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
 
 
 def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
-    """Yield the mistakes in the axes of a sweep, such as a repeated name, a repeated value or
-    too many points.
+    """Yield the errors in the axes of a sweep, such as a repeated name, a repeated value or too
+    many points.
     """
     if not axes:
         yield Diagnostic(
@@ -408,7 +401,7 @@ def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
         )
     axis_of_name: dict[str, Axis] = {}
     for axis in axes:
-        # an axis of this name came before
+        # this name occurred before
         if axis_of_name.setdefault(axis.name, axis) is not axis:
             yield Diagnostic(
                 axis.mark,
@@ -428,7 +421,7 @@ def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
 
 
 def _repeated(axis: Axis) -> Iterator[Diagnostic]:
-    """Yield the first value that an axis has twice."""
+    """Yield an error for the first repeated value of an axis."""
     counts = Counter(coordinate.shown for coordinate in axis.coordinates)
     repeated_values = [value for value, count in counts.items() if count > 1]
     if repeated_values:
@@ -440,7 +433,9 @@ def _repeated(axis: Axis) -> Iterator[Diagnostic]:
 
 
 def _unequal(axis: Axis, first: Axis) -> Iterator[Diagnostic]:
-    """Yield that an axis has another number of values than the first of paired axes, if it has."""
+    """Yield an error if an axis of a paired sweep has another number of values than the
+    first axis.
+    """
     expected, count = len(first.coordinates), len(axis.coordinates)
     if expected != count:
         text = f"has {count} values, and {first.name} ({first.mark}) has {expected}"
@@ -452,12 +447,12 @@ def _unequal(axis: Axis, first: Axis) -> Iterator[Diagnostic]:
 def _point(
     number: int, place: tuple[int, ...], arguments: Sequence[Argument], axes: Sequence[Axis]
 ) -> Point:
-    """Return one point: its number, the index on each axis, and all changes of the recipe in the
-    order of the arguments.
+    """Return one point: its number, its index on each axis, and all recipe changes in the order of
+    the arguments.
     """
     coordinates = tuple(axis.coordinates[i] for axis, i in zip(axes, place, strict=True))
     next_coordinate = iter(coordinates)
-    # the arguments that are axes come in the order of the axes
+    # axes among the arguments are in the order of ``axes``
     changes = (
         next(next_coordinate).overrides if isinstance(argument, Axis) else (argument,)
         for argument in arguments

@@ -1,8 +1,8 @@
-"""The points of a sweep: all are checked first, and then run, in an order that shares results.
+"""The points of a sweep: all are checked first, then run in an order that shares results.
 
-Two points share the result of a step if the step has the same key at both points. An axis that
-changes costly steps varies slowly, and only one axis changes from point to point: a costly result
-is computed once and released early.
+Two points share the result of a step if the step has the same key at both. An axis that affects
+costly steps varies slowly, and only one axis changes from point to point: a costly result is
+computed once and freed early.
 """
 
 from __future__ import annotations
@@ -36,44 +36,40 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 # --- order of the points --------------------------------------------------------------------------
 
-# The order in which the points run, the results that points share, and the computing time of each.
+# The order of the points, the results that they share, and their computing times.
 
 
 @dataclass(frozen=True, slots=True)
 class PointJob:
-    """The steps that one point of a sweep needs, with the cache key and the input steps of each
-    step.
-    """
+    """The steps needed by one point of a sweep, with the cache key and the inputs of each step."""
 
     place: tuple[int, ...]  #: index of the value on each axis
     keys: Mapping[str, Key]  #: cache key of every step that the outputs need
-    sources: Mapping[str, tuple[str, ...]]  #: by step, the steps that it reads
+    sources: Mapping[str, tuple[str, ...]]  #: input steps of each step
     outputs: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Sharing:
-    """The number of results that the points of a sweep share, and the computing time that
-    sharing saves.
-    """
+    """The number of results that points share, and the computing time that sharing saves."""
 
     points: int
-    distinct: Mapping[str, int]  #: number of different results of each step
+    distinct: Mapping[str, int]  #: number of distinct results of each step
     steps: int  #: number of steps of all points together
-    made: int  #: number of different results of all steps
-    #: work of all points without sharing, in seconds, or in steps if no step has run before
+    made: int  #: number of distinct results of all steps
+    #: work of all points without sharing: in seconds, or in steps if no step has run before
     alone: float
-    together: float  #: work of the different results, each computed once
+    together: float  #: work of the distinct results, each computed once
 
     @property
     def saved(self) -> float:
-        """Return the fraction of the computing time that shared results save, in [0, 1]."""
+        """Return the fraction of the computing time, from 0 to 1, that sharing saves."""
         return 1 - self.together / self.alone if self.alone else 0.0
 
 
 def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]:
-    """Return the computing time of each step; a step of unknown time gets the median of the
-    known times, or 1.
+    """Return the computing time of each step; an unknown time is replaced by the median of the
+    known times, or by 1.
     """
     steps = list(steps)
     times = [costs[step] for step in steps if step in costs]
@@ -84,8 +80,8 @@ def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]
 def best_order(
     jobs: Sequence[PointJob], costs: Mapping[str, float], paired: bool = False
 ) -> list[int]:
-    """Return the order of the points of a sweep in which costly shared steps run once and few
-    results stay in memory.
+    """Return the order of the points in which costly shared steps run once and few results stay in
+    memory.
 
     The order is a list of indices of ``jobs``.
 
@@ -106,12 +102,12 @@ def best_order(
 
 
 def _steps(jobs: Iterable[PointJob]) -> set[str]:
-    """Return the names of all steps of jobs."""
+    """Return the names of all steps of the jobs."""
     return set[str]().union(*(job.keys for job in jobs))
 
 
 def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
-    """Count the different results of every step in a sweep, and sum the computing time with and
+    """Count the distinct results of every step in a sweep, and sum the computing time with and
     without sharing.
     """
     weights = filled(costs, _steps(jobs))
@@ -119,7 +115,7 @@ def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
     work_apart, steps = 0.0, 0
     for job in jobs:
         weight_of_key = {key: weights[step] for step, key in job.keys.items()}
-        # results that points share count once
+        # shared results count once
         weight_of_result |= weight_of_key
         work_apart, steps = work_apart + sum(weight_of_key.values()), steps + len(weight_of_key)
     pairs = set[tuple[str, Key]]().union(*(job.keys.items() for job in jobs))
@@ -137,8 +133,8 @@ def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
 def work_left(
     jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Callable[[Key], bool]
 ) -> list[float]:
-    """Return the computing time of each point of a sweep, without results that are stored or
-    computed earlier.
+    """Return the computing time of each point, without results that are stored or computed for
+    earlier points.
     """
     computed: set[Key] = set()
     in_store = cache(stored)
@@ -159,10 +155,10 @@ def work_left(
 def _reach(
     jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequence[int], axis: int
 ) -> float:
-    """Return the mean computing time of the steps that must run again after a change to the next
-    value of ``axis``.
+    """Return the mean computing time of the steps that must run again after moving to the next
+    value on ``axis``.
     """
-    # jobs are in the order of the product: so far lies the previous value of the axis
+    # jobs are in product order: distance to the job with the previous value on the axis
     distance = math.prod(sizes[axis + 1 :])
     times = [
         sum(
@@ -171,21 +167,21 @@ def _reach(
             if jobs[i - distance].keys.get(step) != key
         )
         for i, job in enumerate(jobs)
-        # the first value has no previous one
+        # skip the first value
         if job.place[axis]
     ]
     return sum(times) / len(times) if times else 0.0
 
 
 def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return all points of a sweep as index tuples in serpentine order: successive points differ
-    by 1 in one index.
+    """Return all points as index tuples in serpentine order: successive points differ by 1 in one
+    index.
     """
     rows: list[list[int]] = [[0] * len(sizes)]
     for axis in slowest_first:
         longer_rows = []
         for row_number, row in enumerate(rows):
-            # each second row backwards
+            # every second row is reversed
             indices = range(sizes[axis]) if row_number % 2 == 0 else reversed(range(sizes[axis]))
             longer_rows += [[*row[:axis], i, *row[axis + 1 :]] for i in indices]
         rows = longer_rows
@@ -193,19 +189,19 @@ def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[
 
 
 def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int]:
-    """Return the indices of the points of a sweep, sorted so that points that share costly
-    results are neighbours.
+    """Return the indices of the points, sorted so that points sharing costly results are
+    adjacent.
     """
     first_job_of_key: dict[str, dict[Key, int]] = defaultdict(dict)
     for i, job in enumerate(jobs):
         for step, key in job.keys.items():
             first_job_of_key[step].setdefault(key, i)
-    # steps with one result for all points, or another for each, put nothing together
+    # ignore steps with one result for all points, or with a different one for each
     shared_steps = [step for step, keys in first_job_of_key.items() if 1 < len(keys) < len(jobs)]
     shared_steps.sort(key=lambda step: -weights[step])
     return sorted(
         range(len(jobs)),
-        # the costliest step first: points with equal results of it are neighbours
+        # sort by the costliest step first: points with equal results of it are adjacent
         key=lambda i: [
             first_job_of_key[step].get(jobs[i].keys.get(step, ""), -1) for step in shared_steps
         ],
@@ -214,12 +210,12 @@ def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int
 
 # --- kept recipes ---------------------------------------------------------------------------------
 
-# Recipes of the points of a sweep, each kept as its differences from the recipe of the first point.
+# Recipes of the points of a sweep, each stored as differences from the recipe of the first point.
 
 
 @dataclass(frozen=True, slots=True)
 class Same:
-    """The newest step and value of each name that was equal to that of the first recipe, though
+    """For each name, the latest step or value that was equal to that of the first recipe but
     another object.
     """
 
@@ -229,20 +225,21 @@ class Same:
 
 @dataclass(frozen=True, slots=True)
 class KeptRecipe:
-    """A checked recipe in little memory: the steps, values and fields that differ from those of
-    another recipe.
+    """A checked recipe in little memory: only the steps, values and fields that differ from another
+    recipe.
     """
 
     first: Recipe
     steps: Mapping[str, Any]
     values: Mapping[str, Any]
-    others: Mapping[str, Any]  #: by field of `Recipe`
+    others: Mapping[str, Any]  #: other differing fields of `Recipe`
 
     @classmethod
     def of(cls, recipe: Recipe, first: Recipe, same: Same | None = None) -> KeptRecipe:
-        """Keep ``recipe`` beside ``first``, with which it shares what is equal in both.
+        """Store ``recipe`` as differences from ``first``.
 
-        ``same`` is given to each call for one ``first``: values found equal are not compared again.
+        Pass the same ``same`` to all calls for one ``first``: values found equal are not compared
+        again.
         """
         same = same or Same()
         names = (f.name for f in fields(Recipe))
@@ -253,7 +250,7 @@ class KeptRecipe:
         }
         steps = _changed(recipe.steps, first.steps, same.steps)
         values = _changed(recipe.config.settings, first.config.settings, same.values)
-        # kept by its differences alone
+        # stored as differences
         if steps is not None:
             other_fields.pop("steps", None)
         if values is not None:
@@ -262,7 +259,7 @@ class KeptRecipe:
 
     @property
     def recipe(self) -> Recipe:
-        """Return the recipe, equal to the one that was kept."""
+        """Return a recipe equal to the stored one."""
         first_recipe = self.first
         steps, values = (
             {**first_recipe.steps, **self.steps},
@@ -274,10 +271,9 @@ class KeptRecipe:
 def _changed(
     mapping: Mapping[str, Any], first: Mapping[str, Any], same: dict[str, Any]
 ) -> dict[str, Any] | None:
-    """Return the entries of a mapping that are not equal to those of ``first``, or None if the keys
-    differ.
+    """Return the entries of a mapping that differ from those of ``first``; None if the keys differ.
 
-    The entries ``same`` are known to be equal, and those found equal are added.
+    Entries in ``same`` are known to be equal; newly found equal entries are added to it.
     """
     if list(mapping) != list(first):
         return None
@@ -293,21 +289,21 @@ def _changed(
 
 
 def _equal(left: Any, right: Any) -> bool:
-    """Return True for equal values that are also written alike, unlike 0.0 and -0.0, or 1, 1.0
+    """Return True for values that are equal and have the same text, unlike 0.0 and -0.0, or 1, 1.0
     and True.
     """
-    with suppress(Exception):  # values such as arrays, whose comparison has no single answer
+    with suppress(Exception):  # for values such as arrays, whose comparison is not a single boolean
         return bool(left == right) and repr(left) == repr(right)
     return False
 
 
 # --- sweep points ---------------------------------------------------------------------------------
 
-# The runs of a sweep: all points are checked first, and then run, in worker processes or one after
+# The runs of a sweep: all points are checked first, then run in worker processes or one after
 # another.
 #
-# Every point is composed and checked before the first point runs. A point keeps what differs from
-# the first point.
+# Every point is composed and checked before the first one runs. Only the differences from the first
+# point are stored.
 
 
 PointState = Literal["run", "cached", "failed"]
@@ -318,7 +314,7 @@ ResultNumber = tuple[str, str, int | str, float]
 
 @dataclass(frozen=True, slots=True)
 class CheckedPoint:
-    """A point of a sweep that passed all checks, with the steps that the point needs."""
+    """A point of a sweep that passed all checks, with the steps that it needs."""
 
     point: Point
     kept: KeptRecipe
@@ -327,33 +323,29 @@ class CheckedPoint:
 
 @dataclass(frozen=True, slots=True)
 class PointOutcome:
-    """The outcome of one point of a sweep: the resulting numbers, or the error that stopped the
-    run.
-    """
+    """The outcome of one point: its numbers, or the error that stopped it."""
 
     point: Point
     state: PointState  #: ``cached``: no step had to run
     seconds: float
     numbers: tuple[ResultNumber, ...] = ()
     step: str = ""  #: the step that failed
-    message: str = ""  #: why the step failed, with the location of the step in the recipe
-    left: float = 0.0  #: predicted seconds of all later points
+    message: str = ""  #: error message, with the location of the step in the recipe
+    left: float = 0.0  #: s, predicted time for all later points
 
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """The checked points of a sweep, in the order in which they run, with the known computing
-    times.
-    """
+    """The checked points of a sweep in run order, with the known computing times."""
 
     recipe: Recipe  #: the recipe of the first point
     checked: tuple[CheckedPoint, ...]
-    costs: dict[str, float]  #: seconds by step, of steps that ran before
-    #: work of each point without stored results, in seconds, or in steps if no step ran before
+    costs: dict[str, float]  #: s, by step, for steps that ran before
+    #: work of each point without stored results: in seconds, or in steps if no step ran before
     work: tuple[float, ...]
     notes: tuple[str, ...]
-    device: str  #: of all points; a key depends on it
-    series: RunSeries  #: with the digests of the code of all nodes, the same for all points
+    device: str  #: device of all points; keys depend on it
+    series: RunSeries  #: shared by all points; has the code digests of all nodes
 
     @property
     def jobs(self) -> list[PointJob]:
@@ -368,9 +360,9 @@ def plan_sweep(
     paired: bool = False,
     device: str = "cpu",
 ) -> SweepPlan:
-    """Check all points of a sweep and choose the order in which the points run.
+    """Check all points of a sweep and choose their order.
 
-    Raises `RecipeError` with the mistakes of all points.
+    Raises `RecipeError` with the errors of all points.
     """
     checker = _Checker(recipe, folder, store, device)
     checked_points = list(checker.every(points))
@@ -404,11 +396,11 @@ def outcomes(
     watch: Callable[[Event], None] | None = None,
     workers: int = 1,
 ) -> Generator[PointOutcome, None, None]:
-    """Run the points of a sweep, and yield the outcome of each point as it ends.
+    """Run the points of a sweep, and yield each outcome as its point ends.
 
-    Several ``workers`` are processes with one thread each, and one worker is this process. A point
-    that fails in a worker runs again here. With ``on_error="stop"``, the first error is raised
-    after the outcome of its point is yielded.
+    Several ``workers`` are processes with one thread each; a single worker is this process. A point
+    that fails in a worker is repeated in this process. With ``on_error="stop"``, the first error is
+    raised after the outcome of its point is yielded.
     """
     clock = _Clock(plan.work)
     memory = partial(memory_limit, None, workers)
@@ -419,7 +411,7 @@ def outcomes(
     with closing(shared(alone, range(len(plan.checked)), workers, apart=True)) as ended:
         for number, returned in ended:
             checked, began = plan.checked[number], time.perf_counter()
-            # this process runs the point: no worker finished it
+            # None: no worker finished the point, so this process runs it
             if returned is None:
                 started(checked.point)
             try:
@@ -438,9 +430,7 @@ def outcomes(
 
 
 class _Found(NamedTuple):
-    """What the run of one point of a sweep gave, and the warning of a store that cannot be
-    written.
-    """
+    """The result of running one point, with the warning of a store that cannot be written."""
 
     state: PointState
     seconds: float
@@ -480,7 +470,7 @@ def _failed(point: Point, error: Exception, seconds: float, left: float) -> Poin
 
 
 def _costs(store: Store) -> dict[str, float]:
-    """Return the median time (s) of each step, as the journal of a store has it."""
+    """Return the median time (s) of each step from the journal of a store."""
     times: dict[str, list[float]] = defaultdict(list)
     for row in store.journal.latest():
         if row["step"] and row["seconds"] is not None:
@@ -489,13 +479,13 @@ def _costs(store: Store) -> dict[str, float]:
 
 
 class _Clock:
-    """Prediction of the remaining time of a sweep from the time that its finished points took,
-    however many at once.
+    """Prediction of the remaining time of a sweep from the time of its finished points, for any
+    number of workers.
     """
 
     def __init__(self, work: Sequence[float]) -> None:
-        # reading the numbers of a stored point also takes time
-        # a hundredth of the mean work of a point; 1 where all is stored
+        # least work of a point, because reading stored numbers takes time too: a hundredth of the
+        # mean work, or 1 if everything is stored
         shortest = sum(work) / 100 / len(work) or 1.0
         self.work = [max(seconds, shortest) for seconds in work]
         # work left, work done, points left
@@ -503,13 +493,11 @@ class _Clock:
         self.began = time.perf_counter()
 
     def left(self, number: int) -> float:
-        """Record that a point of a sweep has ended, and return the predicted seconds of all
-        remaining points.
-        """
+        """Record the end of a point, and return the predicted seconds for all remaining points."""
         work_of_point, self.points = self.work[number], self.points - 1
         self.todo, self.done = self.todo - work_of_point, self.done + work_of_point
         return (
-            # work left, at the pace of the work done; rounding may leave less than 0
+            # remaining work at the pace of the finished work; rounding may make it negative
             max(self.todo, 0.0) * (time.perf_counter() - self.began) / self.done
             if self.points
             else 0.0
@@ -517,7 +505,7 @@ class _Clock:
 
 
 class _Checker:
-    """A checker of the points of a sweep, which collects the mistakes of all points."""
+    """Checks the points of a sweep, and collects the errors of all points."""
 
     def __init__(self, recipe: str, folder: Path, store: Store, device: str) -> None:
         self.recipe, self.folder, self.device = recipe, folder, device
@@ -525,11 +513,11 @@ class _Checker:
         self.diagnostics: list[Diagnostic] = []
         self.notes: dict[str, None] = {}
         self.first: Recipe | None = None
-        self._same: dict[Any, Any] = {}  # one object for equal keys and graphs
+        self._same: dict[Any, Any] = {}  # one shared object for equal keys and graphs
         self._equal = Same()
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
-        """Yield each point that passes all checks, and add the mistakes of the other points to
+        """Yield each point that passes all checks; add the errors of the others to
         ``diagnostics``.
         """
         composer = Composer(self.recipe, self.folder)
@@ -545,8 +533,8 @@ class _Checker:
         self.series.known_keys.code.save()
 
     def _job(self, point: Point, recipe: Recipe) -> PointJob:
-        """Return the steps that a point needs with their keys; raise `RecipeError` where a key
-        cannot be found.
+        """Return the steps that a point needs with their keys; raise `RecipeError` if a key cannot
+        be computed.
         """
         self.notes.update(dict.fromkeys(recipe.notes))
         keys: dict[str, Key] = {}
@@ -561,12 +549,12 @@ class _Checker:
             except (OSError, LookupError, TypeError) as error:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)
-        # one object for all points with the same graph
+        # one shared object for all points with the same graph
         graph = self._same.setdefault(sources, dict(sources))
         return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
-        """Return the same string object for equal cache keys, which saves memory because points
-        share most keys.
+        """Return the same string object for equal keys, which saves memory because points share
+        most keys.
         """
         return str(self._same.setdefault(key, key))

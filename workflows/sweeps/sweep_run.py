@@ -4,8 +4,8 @@ one table.
     sweep("first_light", {"sensor.read_noise": ["5 e-", "10 e-"], "doe": ["axicon", "vortex"]})
 
 Results are stored by key: a stopped sweep continues when the same sweep runs again, and results
-that points share are computed once. The results are rows of a file, a table for each point in a
-line, or an `xarray.Dataset`.
+that points share are computed once. The output is a CSV file, a text table with a line for each
+point, or an `xarray.Dataset`.
 """
 
 from __future__ import annotations
@@ -58,20 +58,20 @@ AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "mess
 
 @dataclass(frozen=True, slots=True)
 class AxisColumn:
-    """Table column of one axis of a sweep; its header has a unit if all values have the same
-    physical dimension.
+    """Table column for one axis of a sweep; its header has a unit if all values have the same
+    dimension.
     """
 
     name: str
     header: str
     cells: tuple[Any, ...]  #: the values of the axis, in order
     si: tuple[Any, ...]
-    unit: str  #: of ``si``; empty for pure numbers and for words
+    unit: str  #: unit of ``si``; empty for pure numbers and for words
 
 
 def column(axis: Axis) -> AxisColumn:
-    """Return the table column of an axis of a sweep: numbers in their common unit, or in SI units
-    if units differ.
+    """Return the table column of an axis: numbers in their common unit, or in SI units if units
+    differ.
 
     Words are unchanged.
     """
@@ -87,14 +87,16 @@ def column(axis: Axis) -> AxisColumn:
 
 
 def _alike(values: Sequence[Any]) -> list[_Quantity]:
-    """Return the values as quantities if all are quantities of one SI unit, and else none."""
+    """Return the values as quantities if all have the same SI unit; else an empty list."""
     quantities = [quantity for quantity in map(_quantity, values) if quantity is not None]
     one_unit = len({quantity.si_unit for quantity in quantities}) == 1
     return quantities if one_unit and len(quantities) == len(values) else []
 
 
 def _of_quantities(name: str, header: str, quantities: Sequence[_Quantity]) -> AxisColumn:
-    """Return the column of quantities of one SI unit, in their own unit if all have the same."""
+    """Return the column of quantities with one SI unit, in their original unit if all have the
+    same.
+    """
     si_values, unit = tuple(quantity.si for quantity in quantities), quantities[0].si_unit
     if len({quantity.unit for quantity in quantities}) > 1:
         return AxisColumn(name, f"{header} ({unit})", si_values, si_values, unit)
@@ -111,7 +113,7 @@ class _Quantity:
 
 
 def _quantity(value: Any) -> _Quantity | None:
-    """Return a text such as ``450 nm`` as a quantity; None for anything else."""
+    """Parse a text such as ``450 nm`` as a quantity; return None for anything else."""
     match = units._NUMBER.fullmatch(value.strip()) if isinstance(value, str) else None
     for si_unit, scale in units.SCALES.items():
         if match and match[2].strip() in scale:
@@ -125,27 +127,25 @@ def _quantity(value: Any) -> _Quantity | None:
 
 
 def header(columns: Sequence[AxisColumn]) -> list[str]:
-    """Return the names of all columns of ``sweep.csv``."""
+    """Return the column names of ``sweep.csv``."""
     return ["point", *(c.header for c in columns), *AFTER]
 
 
 def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[list[Any]]:
-    """Yield the table rows of one point of a sweep: one row for each number, or a single row
-    without a number.
+    """Yield the table rows of one point: one for each number, or a single row without a number.
 
-    A point has no numbers if it failed or if its results have none.
+    A point has no numbers if it failed or if its results contain none.
     """
     point_columns = [outcome.point.number, *point_cells(outcome.point, columns)]
     status = "failed" if outcome.state == "failed" else "ok"
     last_columns = [round(outcome.seconds, 6), outcome.state == "cached", outcome.message]
-    # without numbers, one row with the step that failed
+    # without numbers: one row with the failed step
     for number in outcome.numbers or ((outcome.step, "", "", ""),):
         yield [*point_columns, status, *number, *last_columns]
 
 
 def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
-    """Return each result of one point of a sweep as text: a single number, or the range of the
-    numbers of an array.
+    """Return each result of one point as text: a single number, or the range of an array.
 
     Single numbers come first.
     """
@@ -154,15 +154,13 @@ def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
         results.setdefault(f"{step}.{quantity}".rstrip("."), []).append(value)
     return {
         name: _range_of(values)
-        # False before True: single numbers first
+        # False sorts before True, so that single numbers come first
         for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)
     }
 
 
 def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> list[list[str]]:
-    """Return the rows of a text table of a sweep: a header, then one row for each point with its
-    results.
-    """
+    """Return the rows of a text table: a header, then one row for each point with its results."""
     results = [headline(outcome.numbers) for outcome in outcomes]
     names = list(dict.fromkeys(itertools.chain.from_iterable(results)))
     rows = [["point", *(axis_column.header for axis_column in columns), *names, "state", "seconds"]]
@@ -176,12 +174,12 @@ def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> lis
 
 
 def point_cells(point: Point, columns: Sequence[AxisColumn]) -> list[Any]:
-    """Return the axis values of one point of a sweep as they appear in the table."""
+    """Return the axis values of one point as table cells."""
     return [axis_column.cells[i] for axis_column, i in zip(columns, point.place, strict=True)]
 
 
 def _range_of(values: Sequence[float]) -> str:
-    """Return a single number as text, or the range of several."""
+    """Return a single number, or the range of several, as text."""
     return f"{values[0]:.4g}" if len(values) == 1 else f"{min(values):.3g} … {max(values):.3g}"
 
 
@@ -212,12 +210,12 @@ def dataset(
     paired: bool,
     about: Mapping[str, str],
 ) -> Any:
-    """Return the results of a sweep as an `xarray.Dataset` whose dimensions are the axes, with
+    """Return the results of a sweep as an `xarray.Dataset` with the axes as dimensions and
     coordinates in SI units.
 
-    Paired axes give the one dimension ``point``. A result of several numbers has the further
-    dimension ``<result> index``. A point that failed or did not run is NaN; ``ran`` is true at
-    points that have numbers.
+    Paired axes share the single dimension ``point``. An array result has the further dimension
+    ``<result> index``. A point that failed or did not run is NaN; ``ran`` is true at points with
+    numbers.
     """
     import numpy
     import xarray
@@ -229,14 +227,14 @@ def dataset(
     taken_names = {"ran", "seconds", *coords}
     lengths = _lengths(outcomes, taken_names)
     for outcome in outcomes:
-        # paired axes have one index
+        # paired axes share one index
         indices = outcome.point.place[:1] if paired else outcome.point.place
         seconds[indices], has_run[indices] = outcome.seconds, outcome.state != "failed"
         for name, index, value in _named(outcome, taken_names):
             if name not in arrays:
                 array_shape = (*shape, lengths[name]) if name in lengths else shape
                 arrays[name] = numpy.full(array_shape, numpy.nan)
-            # an empty index is that of a single number
+            # a single number has an empty index
             arrays[name][(*indices, index or 0) if name in lengths else indices] = value
     results = {name: (_dims(name, axis_names, lengths), array) for name, array in arrays.items()}
     own_variables = {"ran": (axis_names, has_run), "seconds": (axis_names, seconds, {"units": "s"})}
@@ -244,7 +242,7 @@ def dataset(
 
 
 def _shape(columns: Sequence[AxisColumn], paired: bool) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the sizes and the names of the dimensions of the axes."""
+    """Return sizes and names of the axis dimensions."""
     if paired:
         return (len(columns[0].si),), ("point",)
     return tuple(len(axis_column.si) for axis_column in columns), tuple(
@@ -253,24 +251,24 @@ def _shape(columns: Sequence[AxisColumn], paired: bool) -> tuple[tuple[int, ...]
 
 
 def _named(outcome: PointOutcome, taken: Collection[str]) -> Iterator[tuple[str, int | str, float]]:
-    """Yield name, index and value of each number of a point."""
+    """Yield (name, index, value) for each number of a point."""
     for step, quantity, index, value in outcome.numbers:
         yield _variable(step, quantity, taken), index, value
 
 
 def _coordinate(column: AxisColumn, paired: bool) -> tuple[str, list[Any], dict[str, str]]:
-    """Return the coordinate of an axis along its dimension."""
+    """Return the coordinate variable of an axis."""
     units = {"units": column.unit} if column.unit else {}
     return "point" if paired else column.name, list(column.si), units
 
 
 def _dims(name: str, dims: tuple[str, ...], long: Container[str]) -> tuple[str, ...]:
-    """Return the dimensions of a result: those of the axes, and one of several numbers."""
+    """Return the dimensions of a result: those of the axes, and one more for an array."""
     return (*dims, f"{name} index") if name in long else dims
 
 
 def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
-    """Return the largest length of each result that is an array, over all points of the sweep."""
+    """Return the largest length of each array result over all points."""
     lengths: dict[str, int] = {}
     for outcome in outcomes:
         for name, index, _ in _named(outcome, taken):
@@ -280,9 +278,7 @@ def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[s
 
 
 def _variable(step: str, field: str, taken: Collection[str]) -> str:
-    """Return the name of a result in the `xarray.Dataset`, different from the names of all
-    coordinates.
-    """
+    """Return the name of a result in the `xarray.Dataset`, distinct from all coordinate names."""
     name = f"{step}.{field}".rstrip(".").replace("/", "_")
     return f"{name} (result)" if name in taken else name
 
@@ -297,8 +293,8 @@ SweepState = Literal["complete", "stopped", "interrupted"]
 
 @dataclass(frozen=True)
 class Sweep:
-    """Result of a sweep: the outcomes of the points that ran, in the order of the axes, the last
-    axis fastest.
+    """Result of a sweep: the outcomes of the points that ran, in the order of the axes (last axis
+    fastest).
     """
 
     recipe: str
@@ -312,14 +308,12 @@ class Sweep:
 
     @property
     def failed(self) -> tuple[PointOutcome, ...]:
-        """Return the outcomes of the points of the sweep that failed."""
+        """Return the outcomes of the failed points."""
         return tuple(outcome for outcome in self.outcomes if outcome.state == "failed")
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return the results of the sweep in long format, with one table row for each number of
-        each point.
-        """
+        """Return the results in long format, with one row for each number of each point."""
         names = header(self.columns)
         rows: list[dict[str, Any]] = []
         for outcome in self.outcomes:
@@ -328,12 +322,11 @@ class Sweep:
         return rows
 
     def table(self) -> str:
-        """Return the results of the sweep as a text table, with one line for each point."""
+        """Return the results as a text table, with one line for each point."""
         return "\n".join(indented(wide(self.outcomes, self.columns)))
 
     def to_xarray(self) -> Any:
-        """Return the results of the sweep as an `xarray.Dataset` in SI units, whose dimensions are
-        the axes.
+        """Return the results as an `xarray.Dataset` in SI units, with the axes as dimensions.
 
         The results of failed points are NaN.
 
@@ -361,16 +354,17 @@ class Sweep:
 
 @dataclass(frozen=True)
 class SweepOptions:
-    """How the points of a sweep are made of the axes, and how they run."""
+    """How the points of a sweep follow from the axes, and how they run."""
 
-    paired: bool = False  #: True for the n-th values of all axes together, not every combination
-    #: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each in its row
+    paired: bool = False  #: True: combine the n-th values of all axes; False: every combination
+    #: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each error in
+    #: its row
     on_error: OnError = "stop"
     device: str = "cpu"
-    #: processes that run points at the same time; 0 means one for each processor that other work
-    #: leaves free, and none beside threads of others, as in a notebook
+    #: number of worker processes; 0 means one for each free processor, and none if the process has
+    #: other threads, as in a notebook
     workers: int = 0
-    folder: str | os.PathLike[str] = "."  #: to which relative paths refer
+    folder: str | os.PathLike[str] = "."  #: base of relative paths
 
 
 _USUAL_OPTIONS = SweepOptions()
@@ -431,13 +425,13 @@ class Sweeping:
         self.sharing = sharing(self.plan.jobs, self.plan.costs)
 
     def workers(self, asked: int) -> int:
-        """Return how many processes run the points, of which ``asked`` is a wish and 0 none; one
-        beside a GPU.
+        """Return the number of processes that run the points: ``asked``, or for 0 one for each free
+        processor; 1 with a GPU.
         """
         return workers_for(len(self.plan.checked), asked) if self.device == "cpu" else 1
 
     def sweep(self, outcomes: Sequence[PointOutcome], state: SweepState) -> Sweep:
-        """Return the result of the sweep, with the outcomes sorted by the number of the point."""
+        """Return the result of the sweep, with the outcomes sorted by point number."""
         recipe, sorted_outcomes = (
             self.plan.recipe,
             sorted(outcomes, key=lambda outcome: outcome.point.number),
@@ -458,14 +452,14 @@ class Sweeping:
 def write_sweep(
     work: Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float
 ) -> Path:
-    """Write the result folder of a sweep and return its path; the name of an unfinished sweep
+    """Write the result folder of a sweep and return its path; the name of an unfinished one
     contains ``partial``.
     """
     name = f"{result.recipe}{'' if result.state == 'complete' else '_partial'}"
     keys: list[str] = []
     for checked in work.plan.checked:
         keys += [checked.job.keys[output] for output in checked.job.outputs]
-    # the folder is named by all results of the sweep
+    # the name of the folder depends on all results of the sweep
     key = digest(keys)
     with new_run(out / "sweeps", name, key) as folder:
         folder.write_rows(
@@ -481,7 +475,7 @@ def write_sweep(
 
 
 def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float) -> dict[str, Any]:
-    """Return what the file of a sweep says of it, with the command that repeats it."""
+    """Return the entries of ``sweep.yaml``, with the command that repeats the sweep."""
     return {
         "recipe": result.recipe,
         "state": result.state,
@@ -503,8 +497,8 @@ def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float
 
 
 def counted(result: Sweep) -> str:
-    """Return the number of points of a sweep in each state, such as ``12 points: 8 run, 3
-    cached, 1 failed``.
+    """Return the number of points in each state as text, such as ``12 points: 8 run, 3 cached, 1
+    failed``.
     """
     states = [outcome.state for outcome in result.outcomes]
     state_texts = [

@@ -1,9 +1,8 @@
-"""The camera of a training as it is, which differs for each picture from what the restorer is told
-of it.
+"""The actual camera of a training, which differs for each picture from the camera that the restorer
+assumes.
 
-The true values are drawn about those of the recipe. The steps before the frame compute with the
-truth; the restorer reads copies of the steps that tell it optics and lasers, and the copies keep
-the values of the recipe.
+The true values are drawn around those of the recipe. The steps up to the frame use the true values;
+the restorer reads copies of the optics and laser steps, which keep the values of the recipe.
 """
 
 from __future__ import annotations
@@ -31,24 +30,25 @@ from neusee.workflows.recipe.distributions.law_text import ANGLE, Difference
 from neusee.workflows.recipe.distributions.shapes import draw_laws
 from neusee.workflows.recipe.uncertain_inputs import Index, Inputs, put_at
 
-_FARTHEST_DRAW = 4.5  #: standard deviations up to which the drawn values must be valid
+_FARTHEST_DRAW = 4.5  #: drawn values must be valid up to this many standard deviations
 _AXES = ("y", "x")
-_STREAM = (5, 4)  #: of the draws of a picture
+_STREAM = (5, 4)  #: stream of random numbers for the draws of a picture
 
 
 @dataclass(frozen=True)
 class CameraMismatch:
-    """The differences between camera and recipe of a training, and the parameters that have
-    them; empty for none.
+    """The differences between actual camera and recipe, with the affected parameters; empty for
+    none.
     """
 
-    differences: Mapping[str, Difference]  #: by path; y and x of a direction are two
-    moved: Mapping[str, tuple[tuple[Index, str], ...]]  #: by ``step.parameter``, indices and paths
-    probes: Mapping[str, Any]  #: values of these parameters that differ from those of the recipe
+    differences: Mapping[str, Difference]  #: by path; y and x of a direction are separate
+    moved: Mapping[str, tuple[tuple[Index, str], ...]]  #: (index, path) pairs by ``step.parameter``
+    #: test values of these parameters that differ from those of the recipe
+    probes: Mapping[str, Any]
 
     @classmethod
     def of(cls, recipe: Recipe, settings: Training) -> CameraMismatch:
-        """Find the parameters of the camera that a recipe's ``train.mismatch`` changes.
+        """Find the camera parameters that ``train.mismatch`` of a recipe changes.
 
         Raises: `RecipeError` for a value that no step before the frame reads, or that has draws
                 which are not valid.
@@ -62,7 +62,7 @@ class CameraMismatch:
             path: difference for path, difference in mismatch.items() if path not in directions
         }
         moved, probes = _moved_and_probes(_inputs(recipe, differences))
-        # a direction is no law of the recipe itself: its two angles have one each
+        # the recipe has no law for a direction: each of its two angles gets one
         for path in directions:
             axis_paths = _by_axis(path)
             readers = _towards(recipe, mismatch, path)
@@ -73,17 +73,17 @@ class CameraMismatch:
         return cls(differences, moved, probes)
 
     def camera(self, recipe: Recipe, outputs: Sequence[str], psf: str) -> tuple[Recipe, str]:
-        """Return the recipe with copies of what the makers of the ``outputs`` are told, and the
-        copy of the PSF step.
+        """Return the recipe with copies of the steps whose results the restorer of the ``outputs``
+        assumes, and the name of the assumed PSF step.
 
-        Until they are drawn, the true values are the probes, so that no step counts as one without
-        effect.
+        Until they are drawn, the true values are the probes, so that no step is taken for one
+        without effect.
         """
         changed_names = {name for name in self.moved if _has_parameter(recipe, name)}
         if not changed_names:
             return recipe, psf
         camera_steps = set(needed(recipe, [FRAME]))
-        # steps beyond the frame that are told something of the camera
+        # steps after the frame that read something of the camera
         restorer_steps = knowers(
             recipe, [name for name in needed(recipe, outputs) if name not in camera_steps]
         )
@@ -100,7 +100,7 @@ class CameraMismatch:
         return replace(copied_recipe, steps=steps), (TOLD if psf in steps_to_copy else "") + psf
 
     def drawn(self, seed: Sequence[int]) -> dict[str, float]:
-        """Draw the differences of one picture, in SI, by path."""
+        """Draw the differences for one picture, in SI units, by path."""
         if not self.differences:
             return {}
         laws = {path: difference.law for path, difference in self.differences.items()}
@@ -108,8 +108,8 @@ class CameraMismatch:
         return {path: column[0] for path, column in draw_laws(laws, 1, [*seed, *_STREAM]).items()}
 
     def truth(self, theta: Mapping[str, Any], drawn: Mapping[str, float]) -> dict[str, Any]:
-        """Return the true values of those parameters of ``theta``, by ``step.parameter``, that
-        differ from belief.
+        """Return the true values of the parameters in ``theta``, by ``step.parameter``, that differ
+        from the assumed ones.
         """
         values = {}
         for reader, inputs in self.moved.items():
@@ -124,12 +124,12 @@ class CameraMismatch:
 
 
 def _by_axis(path: str) -> tuple[tuple[Index, str], ...]:
-    """Return index and path of y and of x of a direction."""
+    """Return (index, path) for y and for x of a direction."""
     return tuple(((i,), f"{path} {axis}") for i, axis in enumerate(_AXES))
 
 
 def _refuse_no_frame(recipe: Recipe, mismatch: Mapping[str, Difference]) -> None:
-    """Raise `RecipeError` at the first difference if the recipe has no frame of a camera."""
+    """Raise `RecipeError` at the first difference if the recipe has no camera frame."""
     if FRAME not in recipe.steps:
         raise _mistake(
             mismatch,
@@ -141,7 +141,9 @@ def _refuse_no_frame(recipe: Recipe, mismatch: Mapping[str, Difference]) -> None
 def _moved_and_probes(
     inputs: Inputs | None,
 ) -> tuple[dict[str, tuple[tuple[Index, str], ...]], dict[str, Any]]:
-    """Return the parameters that read uncertain values, and values of them that differ."""
+    """Return the parameters that read uncertain values, and test values that differ from the
+    recipe's.
+    """
     if inputs is None:
         return {}, {}
     return dict(inputs.readers), inputs.theta(_probes(inputs))
@@ -152,7 +154,7 @@ def _refuse_learnt(
     mismatch: Mapping[str, Difference],
     learn: str | None,
 ) -> None:
-    """Raise `RecipeError` for a difference in a parameter of the step that is trained."""
+    """Raise `RecipeError` for a difference in a parameter of the trained step."""
     for name, inputs in moved.items():
         if name.rpartition(".")[0] == learn:
             path = inputs[0][1]
@@ -162,16 +164,14 @@ def _refuse_learnt(
 
 
 def _inputs(recipe: Recipe, mismatch: Mapping[str, Difference]) -> Inputs | None:
-    """Return the values of the camera that differ, with the parameters before the frame that
-    read them.
-    """
+    """Return the differing camera values, with the parameters up to the frame that read them."""
     if not mismatch:
         return None
     assert recipe.uncertain is not None
     laws = {path: difference.truth for path, difference in mismatch.items()}
     all_laws = replace(recipe, uncertain=replace(recipe.uncertain, laws=laws, joint=None))
     for path in mismatch:
-        # each law alone first, so that a mistake names its path
+        # check each law alone first, so that an error names its path
         one_law = replace(recipe.uncertain, laws={path: laws[path]}, joint=None)
         try:
             Inputs.of(replace(recipe, uncertain=one_law), [FRAME], negligible=None)
@@ -196,7 +196,7 @@ def _inputs(recipe: Recipe, mismatch: Mapping[str, Difference]) -> Inputs | None
 
 
 def _probes(inputs: Inputs) -> dict[str, float]:
-    """Return a value of each law that differs from that of the recipe."""
+    """Return a test value for each law that differs from the value of the recipe."""
     assert inputs.recipe.uncertain is not None
     recipe_values = {
         path: difference.own for path, difference in inputs.recipe.uncertain.mismatch.items()
@@ -207,9 +207,7 @@ def _probes(inputs: Inputs) -> dict[str, float]:
 
 
 def _towards(recipe: Recipe, mismatch: Mapping[str, Difference], path: str) -> list[str]:
-    """Return the parameters before the frame that turn the light of the laser whose direction
-    has the path.
-    """
+    """Return the parameters up to the frame that set the direction of the laser in ``path``."""
     laser = path.removeprefix("lasers.").removesuffix(f".{ANGLE}")
     direction_input, steps_before_frame = f"direction[{laser}]", needed(recipe, [FRAME])
     turned_steps = [
@@ -224,9 +222,9 @@ def _towards(recipe: Recipe, mismatch: Mapping[str, Difference], path: str) -> l
 
 
 def _mistake(mismatch: Mapping[str, Difference], path: str, message: str) -> RecipeError:
-    """Return the error for a difference of the block.
+    """Return the error for one difference in the block.
 
-    Of a path with an axis, such as ``lasers.red.angle y``, only the part before the space stands in
+    For a path with an axis, such as ``lasers.red.angle y``, only the part before the space is in
     the recipe.
     """
     path = path.rpartition(" ")[0] or path

@@ -62,13 +62,13 @@ from neusee.workflows.training.resumable_loop import Progress, StateFile, Traini
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
-#: files of the program that decide the loss and the steps of the optimisers
+#: program files that determine the loss and the optimiser steps
 _PROGRAM_FILES = (
     "design_terms",
     "mask_optimisers",
     "design_run",
 )
-MASK = 0  #: the number of the stage that designs the mask, before stage 1
+MASK = 0  #: number of the stage that designs the mask, before stage 1
 _LEARNT_WITH = {
     callable_object.__module__
     for callable_object in (
@@ -148,7 +148,7 @@ def design_in(folder: Path, recipe: Recipe, training: Training, session: Trainin
 
 @dataclass(frozen=True)
 class DesignedMask:
-    """A designed mask, with its height map on the pupil grid of the recipe, and its figures of
+    """A designed mask, with its height map on the pupil grid of the recipe and its figures of
     merit.
     """
 
@@ -167,8 +167,8 @@ class DesignedMask:
         progress: Progress,
         device: str,
     ) -> DesignedMask:
-        """Optimise a mask, or continue from the checkpoint ``state``, and compute the figures of
-        merit of the mask.
+        """Optimise a mask, or continue from the checkpoint ``state``, and compute its figures of
+        merit.
         """
         design_terms = Terms(_during_design(recipe, settings), settings, store, device)
         progress(f"fabrication: {Fabrication.of(recipe, settings)}")
@@ -176,7 +176,7 @@ class DesignedMask:
         learnt = optimise(design_terms, state, progress)
         full_terms = _full(design_terms, learnt, recipe, settings, store, device)
         with torch.no_grad():
-            # on the pupil grid of the recipe itself, not on that of the design
+            # on the pupil grid of the recipe, which may differ from that of the design
             height = learnt.height(full_terms.stop).detach().to("cpu", torch.float32).contiguous()
             figures = mask_figures(full_terms, height.to(full_terms.device))
         progress(summary_line(figures))
@@ -187,8 +187,8 @@ class DesignedMask:
         return cls(full_terms, learnt, height, figures)
 
     def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
-        """Write the files of a designed mask; the last file, ``mask.json``, marks a complete
-        design.
+        """Write the files of a designed mask; the last one, ``mask.json``, marks a
+        complete design.
         """
         learnt, recipe, settings = self.learnt, self.terms.recipe, self.terms.settings
         provenance = {
@@ -217,7 +217,7 @@ class DesignedMask:
     def _report(self, shown: Sequence[str]) -> StudyReport:
         """Return page, pictures, tables and files of a designed mask.
 
-        `shown` are the keys of the provenance that the page shows.
+        ``shown`` are the keys of the provenance that appear on the page.
         """
         from safetensors.torch import save
 
@@ -248,7 +248,7 @@ def _full(
     store: Store | None,
     device: str,
 ) -> Terms:
-    """Return the terms of the recipe itself, with the stop that was learnt."""
+    """Return the terms for the recipe itself, with the learnt stop."""
     if learnt.diameter is not None and learning.shade is not None:
         recipe = stopped(recipe, learning.shade.step, learnt.diameter)
     return (
@@ -259,8 +259,8 @@ def _full(
 
 
 def _during_design(recipe: Recipe, settings: MaskTraining) -> Recipe:
-    """Return the recipe with the parameters that apply only during a mask optimisation, such as
-    coarser sampling.
+    """Return the recipe with the parameters that apply only during a mask design, such as coarser
+    sampling.
     """
     if not settings.at:
         return recipe
@@ -273,15 +273,15 @@ def _during_design(recipe: Recipe, settings: MaskTraining) -> Recipe:
 
 
 def design_inputs(recipe: Recipe, settings: MaskTraining, code: Code) -> RecordedInputs:
-    """Return everything that can change a designed mask: steps with their files and code,
-    settings and own code.
+    """Return everything that determines a designed mask: steps with their files and code, settings,
+    and program code.
     """
     colour_steps = (settings.illuminant, settings.responses) if settings.weights.coloured else ()
     read_steps = (settings.psf, settings.plain, settings.height, *colour_steps)
     outputs = [name for name in read_steps if name in recipe.steps]
     camera = CameraInputs.of(recipe, outputs, code)
     if settings.at:
-        # values under `at` give the design a second recipe
+        # values in `at` define a second recipe for the design
         camera = camera.joined(
             CameraInputs.of(_during_design(recipe, settings), outputs, code).named(
                 "in the design: "
@@ -358,12 +358,13 @@ def summary_line(figures: Mapping[str, Any]) -> str:
 
 # --- peak limit -----------------------------------------------------------------------------------
 
-# A designed mask behind a peak limit, against its rival: the best round stop with a grey filter at
-# the same limit.
+# A designed mask under a peak limit, compared with the best round stop with a grey filter under the
+# same limit.
 
 
-_SCENE_LIGHTS = (10.0, 30.0, 100.0, 300.0, 1000.0)  #: e- in a pixel, beside that of the design
-# the figures are natural logarithms of ratios of powers
+#: e- per pixel, in addition to the light of the design
+_SCENE_LIGHTS = (10.0, 30.0, 100.0, 300.0, 1000.0)
+# dB per unit of the natural logarithm of a power ratio
 _DECIBELS = 10 / math.log(10)
 _STOP_COLUMNS = (
     "light (e-)",
@@ -379,22 +380,22 @@ _STOP_COLUMNS = (
 
 
 def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
-    """Return error and information of a mask behind the peak limit, and those of the best stop, by
-    light of the scene.
+    """Return error and information of a mask under the peak limit and of the best stop, by scene
+    light.
 
-    The result is empty if the loss has no such term.
+    The result is empty if the loss does not use a peak limit.
     """
     if not terms.settings.weights.protected:
         return {}
     with torch.no_grad():
         psf, exposure = terms.psf(height), terms.exposure()
-        # the first state is the nominal one
+        # peaks in all states; the first state is nominal
         peaks = [
             float(metrics.lsr(terms.psf(height, None, state)).max())
             for state, _ in terms.laws.points()
         ]
         peak_limit, highest_peak = exposure["limit"], max(peaks)
-        # lowered so that the limit holds in the worst state too
+        # lower limit, so that the peak stays below the limit in the worst state too
         mask_exposure = {
             **terms.passed(),
             "limit": None if peak_limit is None else peak_limit * peaks[0] / highest_peak,
@@ -404,7 +405,7 @@ def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
             _against_best_stop(terms, psf, {**exposure, "light": light}, mask_exposure)
             for light in lights
         ]
-    # a pupil without a shade has no stop of its own
+    # without a shade, the stop is the lens itself
     stop = 1.0 if terms.shade is None else terms.recipe.steps[terms.shade.step].params["diameter"]
     return {
         "limit": peak_limit,
@@ -418,10 +419,10 @@ def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
 def _against_best_stop(
     terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]
 ) -> dict[str, float]:
-    """Return error and information of a mask, and of the best stop, at one light of the scene.
+    """Return error and information of a mask, and of the best stop, at one scene light.
 
-    `own` has the parameters of the mask: its transmittance, and a limit lowered by what is
-    uncertain.
+    ``own`` has the parameters of the mask: its transmittance, and the limit lowered for the
+    uncertainties.
     """
     light_and_responses, row = terms.seen(), {"light": exposure["light"]}
     for name in ("filtered_error", "information"):
@@ -435,9 +436,7 @@ def _against_best_stop(
 
 
 def stop_section(facts: dict[str, Any]) -> Section:
-    """Return the section of the report page that compares a mask with the best stop at the same
-    peak limit.
-    """
+    """Return the section that compares a mask with the best stop under the same peak limit."""
     limit = (
         "no peak limit"
         if facts["limit"] is None
@@ -467,7 +466,7 @@ def stop_section(facts: dict[str, Any]) -> Section:
 
 
 def stop_line(facts: dict[str, Any]) -> str:
-    """Return the gain of a mask over the best stop by light of the scene as a line of text."""
+    """Return a line of text with the gain of a mask over the best stop, by scene light."""
     gains = ", ".join(
         f"{_DECIBELS * (row['filtered_error of the stop'] - row['filtered_error']):+.2f} dB at"
         f" {row['light']:g} e-"
@@ -493,7 +492,7 @@ _DESIGN_COLUMNS = (
     "at most",
 )
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, BLACK, "#CC79A7", "#56B4E9", "#777777")
-_STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
+_STYLES = ("-", "--", ":", "-.")  #: line styles; the next one is used once all colours are used
 _TERM_NAMES = (
     "lsr",
     "energy_floor",
@@ -506,8 +505,8 @@ _TERM_NAMES = (
 
 
 def design_pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, bytes]:
-    """Draw the height map, PSF, laser suppression and losses of a designed mask, and return the
-    PNG files by name.
+    """Return the pictures of a designed mask by name, as PNG bytes: height map, PSF, suppression
+    and losses.
     """
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
     pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
@@ -524,8 +523,8 @@ def design_pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[st
 
 @drawn
 def history_figure(rows: Sequence[Mapping[str, float]]) -> Any:
-    """Draw the loss of a mask design and the loss terms over the iterations, with a curve for
-    each optimisation.
+    """Draw the loss of a mask design and its terms against the iterations, with a curve for each
+    start.
     """
     columns = dict.fromkeys(itertools.chain.from_iterable(rows))
     names = [name for name in columns if name not in ("start", "iteration")]
@@ -551,7 +550,7 @@ def history_figure(rows: Sequence[Mapping[str, float]]) -> Any:
 def _draw_term(
     ax: Any, rows: Sequence[Mapping[str, float]], name: str, look: tuple[str, str], label: str
 ) -> None:
-    """Draw a term of the loss of one optimisation over its iterations."""
+    """Draw one loss term of one optimisation against its iterations."""
     style, colour = look
     ax.plot(
         [row["iteration"] for row in rows],
@@ -566,8 +565,8 @@ def _draw_term(
 def design_sections(
     figures: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]
 ) -> list[Section]:
-    """Return the sections of the report page of a designed mask: pictures, figures of merit and
-    fabrication limits.
+    """Return the sections of a designed mask's page: pictures, figures of merit and fabrication
+    limits.
     """
     bands = figures["bands"]
     columns = [

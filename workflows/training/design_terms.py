@@ -20,13 +20,13 @@ from neusee.workflows.store.result_store import Store
 
 # --- camera laws ----------------------------------------------------------------------------------
 
-# What a mask design does not know for certain: laws of defocus, wavelength and direction, and how
-# they are drawn.
+# Uncertainties of the camera in a mask design: distributions of defocus, wavelength and direction,
+# and their sampling.
 
 
-# a prime above any number of iterations keeps the seeds of all draws apart
+# a prime larger than any number of iterations, so that the seeds of all draws differ
 _PRIME = 1_000_003
-_OUTER_POINT = 3**0.5  #: standard deviations at which the outer points of a law lie
+_OUTER_POINT = 3**0.5  #: distance of the outer quadrature points of a law, in standard deviations
 
 #: defocus, wavelength, direction on y and on x, in standard deviations
 State = tuple[float, float, float, float]
@@ -35,8 +35,8 @@ NOMINAL: State = (0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class CameraLaws:
-    """Normal laws of defocus, wavelength and direction around the values of the recipe, each
-    independent.
+    """Independent normal distributions of defocus, wavelength and direction around the values of
+    the recipe.
     """
 
     spreads: State  #: standard deviations in waves, m, rad and rad
@@ -47,7 +47,7 @@ class CameraLaws:
 
     @classmethod
     def of(cls, recipe: Recipe, settings: MaskTraining) -> CameraLaws:
-        """Read the laws of the settings, and the parameters of the recipe that they move.
+        """Return the laws of the settings, with the recipe parameters that they vary.
 
         Raises: `DesignError` if the PSF has no defocus or no direction that could be moved.
         """
@@ -73,17 +73,17 @@ class CameraLaws:
 
     @property
     def certain(self) -> bool:
-        """Return True if nothing is uncertain."""
+        """Return True if no parameter is uncertain."""
         return not any(self.spreads)
 
     @property
     def free(self) -> tuple[str, ...]:
-        """Return the parameters of the recipe that the laws move."""
+        """Return the recipe parameters that the laws vary."""
         return (*self.defocus, *self.angle)
 
     def values(self, state: State) -> dict[str, Any]:
-        """Return the parameters of the recipe in a state."""
-        # the second number moves the bands (`moved`)
+        """Return the values of the varied recipe parameters in a state."""
+        # element 1 is the wavelength, which shifts the bands in `moved`
         defocus_change, _, *angle_changes = (
             spread * x for spread, x in zip(self.spreads, state, strict=True)
         )
@@ -98,19 +98,19 @@ class CameraLaws:
         }
 
     def moved(self, bands: Bands, state: State) -> Bands:
-        """Return the bands with all their wavelengths moved together."""
+        """Return the bands with all wavelengths shifted as in ``state``."""
         return bands._replace(centres=bands.centres + self.spreads[1] * state[1])
 
     def drawn(self, number: int) -> State:
         """Draw the state of the iteration ``number``."""
-        # counts down, so that no seed is one of the bands (`Terms.drawn`)
+        # downward, so that seeds differ from those of `Terms.drawn`
         rng = torch.Generator().manual_seed(self.seed * _PRIME - number - 1)
         defocus, wavelength, y, x = torch.randn(4, generator=rng, dtype=torch.float64).tolist()
         return defocus, wavelength, y, x
 
     def points(self) -> list[tuple[State, float]]:
-        """Return 2 d + 1 states with their weights, for d uncertain numbers: exact for polynomials
-        of degree 3.
+        """Return 2 d + 1 states with their weights, a quadrature for d uncertain numbers that is
+        exact for polynomials of degree 3.
 
         For d = 1 these are the points of Gauss-Hermite quadrature.
         """
@@ -127,15 +127,13 @@ class CameraLaws:
 
 # --- learnt shade ---------------------------------------------------------------------------------
 
-# The shade in front of a mask during its design: what it lets through, and a stop that is learnt
-# with the mask.
+# The shade in front of a mask during its design: its transmittance, and a stop that is trained with
+# the mask.
 
 
 @dataclass(frozen=True)
 class LearntShade:
-    """The step of a shade, its result as the recipe has it, and that with the stop of the shade
-    fully open.
-    """
+    """The shade step of a recipe, with its result as in the recipe and with its stop fully open."""
 
     step: str
     own: Shade
@@ -146,7 +144,7 @@ class LearntShade:
     def of(
         cls, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str
     ) -> LearntShade | None:
-        """Return the shade in the pupil of the mask, or None for a pupil without one.
+        """Return the shade in the pupil of the mask, or None if the pupil has none.
 
         Raises: `DesignError` if a stop is to be learnt and the pupil has no shade of `doe.shade`.
         """
@@ -165,22 +163,22 @@ class LearntShade:
         return cls(name, own_shade, open_shade, settings.learn_stop)
 
     def behind(self, stop: Tensor | None) -> Shade:
-        """Return the shade with the amplitude of a stop in place of its own stop, or as it is
-        for None.
+        """Return the shade with the amplitude ``stop`` in place of its own stop; unchanged for
+        None.
         """
         return (
             self.own if stop is None else self.wide._replace(amplitude=self.wide.amplitude * stop)
         )
 
     def passed(self, stop: Tensor | None) -> Tensor:
-        """Return the share of the light that the shade lets through, away from its notches."""
+        """Return the transmittance of the shade outside its notches."""
         passed_light = self.behind(stop).amplitude.double().square().sum()
         # over the number of samples in the fully open shade
         return passed_light / torch.count_nonzero(self.wide.amplitude)
 
 
 def stopped(recipe: Recipe, shade: str, diameter: float) -> Recipe:
-    """Return the recipe with another diameter of the stop in a shade."""
+    """Return the recipe with another stop diameter in its shade."""
     step = recipe.steps[shade]
     changed = replace(step, params={**step.params, "diameter": diameter})
     return replace(recipe, steps={**recipe.steps, shade: changed})
@@ -195,16 +193,16 @@ _FREE = "not limited"
 
 @dataclass(frozen=True)
 class Fabrication:
-    """The fabrication limits of a designed mask, such as its greatest height, by name; None
-    stands for no limit.
+    """The fabrication limits of a designed mask by name, such as its greatest height; None for no
+    limit.
     """
 
     values: Mapping[str, Any]
 
     @classmethod
     def of(cls, recipe: Recipe, settings: MaskTraining) -> Fabrication:
-        """Return the fabrication limits of a mask from the `doe.fabricate` step of the recipe
-        and from the settings.
+        """Return the fabrication limits from the `doe.fabricate` step of the recipe and from the
+        settings.
         """
         steps = (recipe.steps[name] for name in needed(recipe, [settings.psf]))
         params = next((step.params for step in steps if step.node.path == "doe.fabricate"), {})
@@ -212,7 +210,7 @@ class Fabrication:
         return cls({**limits, "feature": settings.feature})
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return the name and the value of each fabrication limit of a mask as text."""
+        """Return the name and the value of each fabrication limit as text."""
         labels = {
             "levels": "levels",
             "max_height": "greatest height",
@@ -234,8 +232,8 @@ class Fabrication:
 
 
 class Terms:
-    """The loss function of a mask design and its terms, for all spectral bands of a recipe or
-    for chosen bands.
+    """The loss function of a mask design and its terms, for all or selected spectral bands of a
+    recipe.
     """
 
     def __init__(
@@ -244,7 +242,7 @@ class Terms:
         need_steps(recipe.steps, settings)
         self.settings = settings
         self.fabrication = Fabrication.of(recipe, settings)
-        # because the error bound of a cheaper step has no gradient
+        # exact, because cheaper steps with error bounds have no gradient
         self.recipe = replace(recipe, exact=True)
         self._bands = _bands_step(self.recipe, settings.psf)
         self.laws = CameraLaws.of(self.recipe, settings)
@@ -278,7 +276,7 @@ class Terms:
 
     @property
     def stop(self) -> Stop:
-        """Return the aperture stop with the pupil grid on which the mask is computed."""
+        """Return the aperture stop on the pupil grid on which the mask is computed."""
         if self._stop is None:
             raise DesignError(
                 f"height: the step {self.settings.height} has no input `stop`: name the step of a"
@@ -296,8 +294,8 @@ class Terms:
         """Return the PSF of a mask from its height map, for the spectral bands ``indices`` or for
         all bands.
 
-        ``state`` moves what is uncertain, in standard deviations. ``stop`` is the amplitude of a
-        learnt stop.
+        ``state`` shifts the uncertain parameters, in standard deviations. ``stop`` is the amplitude
+        of a trained stop.
         """
         bands = self.laws.moved(_some(self.bands, indices), state)
         values: dict[str, Any] = {
@@ -340,9 +338,9 @@ class Terms:
         """Return the terms of the mask loss that have a weight above 0, by name, each as a mean
         over spectral bands.
 
-        What is uncertain is drawn for the iteration ``number``; for None the terms are means over
-        its laws, by a quadrature of 2 d + 1 points for d uncertain numbers. ``stop`` is the
-        amplitude of a learnt stop.
+        The uncertain parameters are drawn for iteration ``number``; for None the terms are
+        expectations, by a quadrature with 2 d + 1 points for d uncertain numbers. ``stop`` is the
+        amplitude of a trained stop.
         """
         points = self.laws.points() if number is None else [(self.laws.drawn(number), 1.0)]
         if self.laws.certain:
@@ -358,9 +356,9 @@ class Terms:
     def _parts(
         self, height: Tensor, indices: Sequence[int] | None, state: State, stop: Tensor | None
     ) -> dict[str, Tensor]:
-        """Return the terms that have a weight above 0, by name, in one state.
+        """Return the terms with a weight above 0, by name, in one state.
 
-        Each is a mean over the bands.
+        Each term is a mean over the bands.
         """
         settings, weights, psf = (
             self.settings,
@@ -391,14 +389,12 @@ class Terms:
         return terms
 
     def passed(self, stop: Tensor | None = None) -> dict[str, Any]:
-        """Return the share of the light that a shade in front of the mask lets through, as a
-        parameter of a loss.
-        """
+        """Return the transmittance of a shade in front of the mask, as a parameter for a loss."""
         return {} if self.shade is None else {"transmittance": self.shade.passed(stop)}
 
     def exposure(self) -> dict[str, Any]:
-        """Return the parameters that `losses.filtered_error`, `losses.information` and
-        `losses.ProtectedPicture` share.
+        """Return the common parameters of `losses.filtered_error`, `losses.information` and
+        `losses.ProtectedPicture`.
         """
         settings = self.settings
         return {
@@ -411,15 +407,13 @@ class Terms:
         }
 
     def seen(self, indices: Sequence[int] | None = None) -> tuple[Tensor, Tensor, Bands]:
-        """Return illuminant, responses and bands, for the spectral bands ``indices`` or for all
-        bands.
-        """
+        """Return illuminant, responses and bands, for the spectral bands ``indices`` or for all."""
         light, responses = (x if indices is None else x[..., list(indices)] for x in self._seen)
         return light, responses, _some(self.bands, indices)
 
     def _suppression(self, psf: Psf) -> Tensor:
-        """Return the laser suppression loss summed over bands, which is constant below the
-        setting ``enough``.
+        """Return the laser suppression loss summed over bands, limited from below by the setting
+        ``enough``.
         """
         settings, count = self.settings, len(psf.intensity)
         loss: Tensor = losses.suppression_loss(psf, power=settings.power, log=settings.log)
@@ -430,20 +424,20 @@ class Terms:
         )
 
     def total(self, parts: dict[str, Tensor]) -> Tensor:
-        """Return the loss of a mask, which is the weighted sum of its terms."""
+        """Return the loss of a mask: the weighted sum of its terms."""
         return torch.stack(
             [getattr(self.settings.weights, name) * term for name, term in parts.items()]
         ).sum()
 
     def drawn(self, number: int) -> list[int] | None:
-        """Sample the spectral bands of an iteration, one in each equal part of the spectrum;
-        None stands for all.
+        """Return the random spectral bands of an iteration, one in each equal part of the spectrum;
+        None for all.
         """
         count, all_bands = self.settings.bands, len(self.bands.centres)
         if count is None or count >= all_bands:
             return None
         rng = torch.Generator().manual_seed(self.settings.seed * _PRIME + number)
-        # one random place in each of `count` equal parts
+        # one random position in each of `count` equal parts
         band_positions = (torch.arange(count) + torch.rand(count, generator=rng)) * (
             all_bands / count
         )
@@ -458,7 +452,7 @@ class Terms:
 
 
 def _bands_step(recipe: Recipe, psf: str) -> str:
-    """Return the name of the only step of bands on which the PSF depends."""
+    """Return the name of the only `spectra.bands` step upstream of the PSF."""
     names = [
         name for name in needed(recipe, [psf]) if recipe.steps[name].node.path == "spectra.bands"
     ]
@@ -472,9 +466,7 @@ def _bands_step(recipe: Recipe, psf: str) -> str:
 
 
 def _some(value: Any, indices: Sequence[int] | None) -> Any:
-    """Return the part of a PSF or other spectral value at the bands ``indices``, or the whole
-    value if None.
-    """
+    """Return a PSF or another spectral value at the bands ``indices``; unchanged for None."""
     if indices is None:
         return value
     band_numbers = torch.tensor(list(indices))

@@ -1,5 +1,5 @@
-"""Photographs that a training never sees, and how well the network restores them while it is
-trained.
+"""Photographs that a training never uses, and the quality of the network on them during the
+training.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from neusee.workflows.training.process_mesh import Mesh
 from neusee.workflows.training.resumable_loop import Losses
 from neusee.workflows.training.training_pictures import HELD_OUT, Sample, Samples, Shared
 
-CONFIDENCE = 0.9  #: of the interval of a mean over photographs
+CONFIDENCE = 0.9  #: confidence level of the interval of a mean over photographs
 _METRICS = ("PSNR", "L1", "SSIM")
-_SCORE = "held_out_PSNR"  #: the number by which the best state is chosen
-#: columns of the loss table: network, input of the network, and the PSNR that the network adds to
+_SCORE = "held_out_PSNR"  #: the value that selects the best state
+#: columns of the loss table: network, input of the network, and gain in PSNR of the network over
 #: its input
 COLUMNS = (
     *(f"held_out_{metric}{end}" for metric, end in product(_METRICS, ("", "_low", "_high"))),
@@ -40,11 +40,11 @@ _OF_PICTURE = tuple(f"{who}_{metric}" for who, metric in product(("held_out", "i
 
 @dataclass(frozen=True)
 class Split:
-    """The photographs of a training, and the photographs that are held out."""
+    """The photographs for training, and the held-out photographs."""
 
     trained: Photographs
-    held_out: tuple[Path, ...] = ()  #: all of them, in the order of their digests
-    judged: tuple[Path, ...] = ()  #: the first of them, which the validation restores
+    held_out: tuple[Path, ...] = ()  #: all held-out photographs, in the order of their digests
+    judged: tuple[Path, ...] = ()  #: the first of these, which the validation restores
 
     def __str__(self) -> str:
         if not self.held_out:
@@ -61,8 +61,8 @@ class Split:
 
 
 def split(recipe: Recipe, settings: Training, photographs: Photographs) -> Split:
-    """Set photographs aside by their content, so that every process, stage and later start has the
-    same split.
+    """Hold photographs out by the digest of their content, so that every process, stage and restart
+    has the same split.
 
     Equal files stay together, whatever their names. Without a folder of photographs nothing is held
     out.
@@ -105,8 +105,8 @@ def _without(photographs: Photographs, away: Collection[Path]) -> Photographs:
 
 
 def by_content(photographs: Photographs) -> Photographs:
-    """Return the photographs in the order of their digests, so that the pictures drawn depend on
-    no name.
+    """Return the photographs sorted by digest, so that random pictures do not depend on
+    file names.
     """
     return replace(
         photographs,
@@ -115,14 +115,12 @@ def by_content(photographs: Photographs) -> Photographs:
 
 
 def holds_out(settings: Training) -> bool:
-    """Return True if a training has a folder of photographs and holds some of them out."""
+    """Return True if a training has a folder of photographs and holds out some of them."""
     return settings.photographs is not None and bool(settings.held_out)
 
 
 def _readable(path: Path, photographs: Photographs) -> bool:
-    """Return True if a photograph can be decoded; note the reason in ``photographs`` if it
-    cannot.
-    """
+    """Return True if a photograph can be decoded; else record the reason in ``photographs``."""
     try:
         # decodes the whole file, whatever the size of the crop
         Photographs((path,)).crop((1, 1), 0, 0)
@@ -133,7 +131,7 @@ def _readable(path: Path, photographs: Photographs) -> bool:
 
 
 def _too_few(recipe: Recipe, settings: Training, count: int) -> str:
-    """Return the message for a folder with fewer than two different photographs."""
+    """Return the error message for a folder with fewer than two different photographs."""
     setting = recipe.config.settings.get(f"{KEY}.photographs")
     folder_content = "1 photograph" if count == 1 else f"{count} photographs, all equal"
     return (
@@ -159,7 +157,7 @@ class Validation:
         """Return means over the held-out photographs with their intervals, by column of the loss
         table.
 
-        Pictures behind a ``fixed`` mask are computed once and kept in the memory of the processor.
+        Pictures behind a ``fixed`` mask are computed once and kept in main memory.
         """
         was_training = net.training
         net.eval()
@@ -168,8 +166,7 @@ class Validation:
             picture = sample.picture.to(self.device)
             truth = sample.truth.to(self.device)
             for source, estimate in (("held_out", net(picture, *sample.given)), ("input", picture)):
-                # as `means_by_photograph` and `summary` read it: the number of the picture, a
-                # space, the column
+                # name format for `means_by_photograph` and `summary`: picture number, space, column
                 numbers |= {
                     f"{i} {source}_{name}": x for name, x in _quality(estimate, truth).items()
                 }
@@ -185,7 +182,7 @@ class Validation:
     ) -> Iterator[tuple[int, Sample]]:
         """Yield number and sample of each held-out picture of this process.
 
-        Behind a fixed mask they are the same every time, and are kept from the first time on.
+        Behind a fixed mask the pictures never change, and are kept after the first time.
         """
         # empty in a process without a picture, which must not wait for others
         if fixed and self._kept is not None:
@@ -204,8 +201,8 @@ class Validation:
 
 
 def means_by_photograph(numbers: Mapping[str, float], repeats: int) -> dict[str, float]:
-    """Return the means over the ``repeats`` pictures of a photograph, from numbers named such as
-    ``0 held_out_PSNR``.
+    """Return the means over the ``repeats`` pictures of each photograph; names are such as ``0
+    held_out_PSNR``.
     """
     means: dict[str, float] = {}
     for name, value in numbers.items():
@@ -216,9 +213,7 @@ def means_by_photograph(numbers: Mapping[str, float], repeats: int) -> dict[str,
 
 
 def _quality(estimate: Tensor, truth: Tensor) -> dict[str, float]:
-    """Return PSNR, L1 and SSIM of the pictures (n, 3, y, x) of one photograph, each a mean over
-    the pictures.
-    """
+    """Return PSNR, L1 and SSIM, each a mean over the pictures (n, 3, y, x) of one photograph."""
     qualities = [
         metrics.quality(estimated.float(), true.float())
         for estimated, true in zip(estimate, truth, strict=True)
@@ -230,7 +225,7 @@ def _quality(estimate: Tensor, truth: Tensor) -> dict[str, float]:
 
 
 def summary(numbers: Mapping[str, float], count: int) -> Losses:
-    """Return means and intervals over ``count`` photographs from numbers named such as ``0
+    """Return means and intervals over ``count`` photographs; names are such as ``0
     held_out_PSNR``.
     """
     values_by_column = {
@@ -252,8 +247,8 @@ def summary(numbers: Mapping[str, float], count: int) -> Losses:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean of independent numbers, and its 90 % interval from Student's t
-    distribution (NaN for one).
+    """Return the mean of independent numbers and its 90 % interval by Student's t distribution; NaN
+    for a single number.
     """
     x = np.asarray(values, dtype=np.float64)
     if len(x) < 2:
@@ -275,12 +270,12 @@ class Best:
     """The best state of a stage so far, by the mean PSNR of the held-out pictures."""
 
     score: float = -math.inf
-    iterations: int = 0  #: iterations of the stage before this state
-    since: int = 0  #: validations after this state
+    iterations: int = 0  #: number of iterations of the stage up to this state
+    since: int = 0  #: number of validations after this state
 
     @classmethod
     def of(cls, rows: Sequence[Mapping[str, str]], stage: int) -> Best:
-        """Return the best state of a stage that a table of losses knows."""
+        """Return the best state of a stage from the rows of the loss table."""
         best = cls()
         for row in rows:
             if row["stage"] == str(stage) and row.get(_SCORE):
@@ -296,7 +291,7 @@ class Best:
 
 
 def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None) -> dict[str, Any]:
-    """Return what `training.json` says of the held-out photographs, the best state and the end
+    """Return the entries of `training.json` on the held-out photographs, the best state and the end
     of stage 2.
     """
     held_out_facts = {
@@ -318,9 +313,7 @@ def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None)
 
 
 def score_of(losses: Losses) -> float:
-    """Return the number by which the best state is chosen, with the digits that the loss table
-    keeps.
-    """
+    """Return the value that selects the best state, rounded as in the loss table."""
     return float(f"{losses[_SCORE]:.6g}")
 
 

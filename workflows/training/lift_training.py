@@ -60,8 +60,8 @@ from neusee.workflows.training.training_pictures import require_steps
 
 
 class Pairs:
-    """Numbered training pairs, each of a picture (3, y, x) and the true spectra of its pixels
-    (31, y, x).
+    """Numbered training pairs of an RGB picture (3, y, x) and the true spectra of its pixels (31,
+    y, x).
     """
 
     def __init__(self, recipe: Recipe, settings: LiftTraining, store: Store, device: str) -> None:
@@ -91,7 +91,7 @@ class Pairs:
         )
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
-        """Return the training picture with the given number and the true spectra of its pixels.
+        """Return the training picture with the given number, and the true spectra of its pixels.
 
         The same number always gives the same picture.
         """
@@ -100,15 +100,13 @@ class Pairs:
         return picture.float(), cube.float()
 
     def batch(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return a batch of training pictures and a batch of their true spectra, each as one
-        tensor.
-        """
+        """Return a batch of training pictures and of their true spectra, each as one tensor."""
         pictures, cubes = zip(*map(self, numbers), strict=True)
         return torch.stack(pictures), torch.stack(cubes)
 
 
 class LiftLearner:
-    """The network that estimates spectra from RGB, its optimiser and the moving average of its
+    """The network that estimates spectra from RGB, with its optimiser and the moving average of its
     weights.
     """
 
@@ -126,7 +124,7 @@ class LiftLearner:
         self.best: nn.Module = self.average.module if self.average else self.net
 
     def parts(self) -> dict[str, Any]:
-        """Return by name the objects whose state a checkpoint must contain."""
+        """Return the objects whose state a checkpoint must contain, by name."""
         members = {"net": self.net, "optimiser": self.optimiser, "average": self.average}
         return {name: member for name, member in members.items() if member}
 
@@ -139,7 +137,7 @@ class LiftLearner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
-        # each iteration has new pictures, numbered on and on
+        # each iteration has new pictures, numbered consecutively
         picture, cube = self.pairs.batch(range(iteration * batch, (iteration + 1) * batch))
         estimate = lift_pictures(self.net, picture)
         loss = losses.mrae(estimate, cube, floor=self.settings.floor)
@@ -160,8 +158,8 @@ class LiftLearner:
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
-        """Return the mean errors of the network and of a linear estimate, for pictures that are
-        not in the training.
+        """Return the mean errors of the network and of a linear estimate on pictures outside the
+        training.
         """
         means, picture_count = dict[str, Losses](), self.settings.validation_batches
         for number in range(picture_count):
@@ -179,7 +177,7 @@ class LiftLearner:
         return means
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
-        """Estimate the spectra of an RGB picture twice: with the network, and with a linear
+        """Return the spectra of an RGB picture, estimated by the network and by a linear
         reconstruction.
         """
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
@@ -195,8 +193,8 @@ def _rmse(estimate: Tensor, truth: Tensor) -> float:
 
 # --- lift figures ---------------------------------------------------------------------------------
 
-# Figures of the training of a network that estimates spectra from RGB: error curves, estimated and
-# true spectra.
+# Figures of the training of a network that estimates spectra from RGB: error curves, and estimated
+# and true spectra.
 
 
 _SHOWN = ("MRAE", "RMSE", "rate")
@@ -205,7 +203,7 @@ _LINE_LOOKS = {"mst_plus_plus": {"color": BLUE}, "linear": {"color": ORANGE, "li
 
 @drawn
 def lift_curves(rows: Sequence[Mapping[str, str]]) -> Any:
-    """Draw each training error and its running median over the iterations of the training."""
+    """Draw each training error and its running median against the iterations."""
     figure, axes = canvas(11.0, 3.0, 1, len(_SHOWN))
     for ax, name in zip(axes.flat, _SHOWN, strict=True):
         values = [float(row[name]) for row in rows]
@@ -221,16 +219,15 @@ def lift_curves(rows: Sequence[Mapping[str, str]]) -> Any:
 def lifted_spectra(
     shown: Tensor, truth: Tensor, estimates: Mapping[str, Tensor], centres: Tensor
 ) -> Any:
-    """Draw a picture, and the true spectra (black) and the estimated spectra of five pixels of
-    the picture.
-    """
+    """Draw a picture, and the true (black) and estimated spectra of five of its pixels."""
     figure, axes = canvas(13.0, 2.6, 1, 6)
     y, x = shown.shape[-2:]
-    # five pixels at the heights 1/10, 3/10 ... 9/10, at widths in another order
+    # five pixels at the heights 1/10, 3/10 ... 9/10, and at the same fractions of the width in
+    # another order
     pixels = [(y * (2 * i + 1) // 10, x * (2 * ((3 * i) % 5) + 1) // 10) for i in range(5)]
     picture(axes[0, 0], encoded(shown), "picture")
     axes[0, 0].plot(
-        # a picture has its columns along x
+        # x is the column
         [c for _, c in pixels],
         [r for r, _ in pixels],
         "o",
@@ -273,7 +270,7 @@ def lifted_spectra(
 
 
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
-#: files of the program that decide the pairs and the steps of the optimiser
+#: program files that determine the pairs and the optimiser steps
 _PROGRAM_FILES = {
     "neusee/workflows/training/lift_training.py": __file__,
     "neusee/workflows/training/resumable_loop.py": resumable_loop.__file__,

@@ -32,12 +32,12 @@ from neusee.workflows.training.resumable_loop import Progress, StateFile
 
 # --- learnt mask ----------------------------------------------------------------------------------
 
-# The mask that an optimisation found, as both optimisers return it.
+# The mask found by an optimisation, in the form that both optimisers return.
 
 
 @dataclass
 class LearntMask:
-    """The best mask that an optimisation found, with its parameters, and the losses at all
+    """The best mask found by an optimisation, with its parameters and the losses at all
     iterations.
     """
 
@@ -45,7 +45,7 @@ class LearntMask:
     loss: float
     numbers: dict[str, Any]  #: the parameters, if the mask has few parameters
     history: list[dict[str, float]]
-    diameter: float | None = None  #: of a learnt stop, as a share of that of the lens
+    diameter: float | None = None  #: diameter of a learnt stop relative to the lens
 
 
 # --- gradient descent -----------------------------------------------------------------------------
@@ -57,7 +57,7 @@ _APART = 7919  #: difference of the seeds of successive starts
 
 
 def shape_of(terms: Terms, start: int) -> nn.Module:
-    """Return a trainable mask with the random initial parameters of the optimisation number
+    """Return a trainable mask with the random initial parameters of optimisation number
     ``start``.
     """
     settings = terms.settings
@@ -68,7 +68,7 @@ def shape_of(terms: Terms, start: int) -> nn.Module:
 
 
 class Stopped(nn.Module):
-    """A trainable mask in a round stop whose diameter is learnt too."""
+    """A trainable mask in a round stop whose diameter is trained too."""
 
     def __init__(self, shape: nn.Module) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class Stopped(nn.Module):
 
 
 def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
-    """Return a trainable mask of the kind of the settings, with random initial parameters."""
+    """Return a trainable mask of the kind in the settings, with random initial parameters."""
     settings, step = terms.settings, terms.mask_step
     if settings.kind == "recipe_mask":
         if step.node.path not in PARAMETRISATIONS:
@@ -111,12 +111,12 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
 
 
 def _start(settings: MaskTraining) -> Tensor | None:
-    """Read the height map from which the optimisation of a pixelwise mask begins, or return None
-    if no file is set.
+    """Return the height map from which the optimisation of a pixelwise mask starts, or None if no
+    file is set.
     """
     if settings.start is None:
         return None
-    # a file in grey levels is scaled to max_height; one in metres may still be deeper
+    # a file with grey levels is scaled to max_height; one in metres may be deeper
     height = read_height_map(settings.start, settings.max_height)
     if (deepest := float(height.max())) > settings.max_height:
         raise DesignError(
@@ -130,14 +130,15 @@ def rate(settings: MaskTraining, number: int) -> float:
     """Return the learning rate of a mask optimisation at iteration ``number``, counted from 0."""
     progress_share = number / settings.iterations
     if settings.schedule == "step":
-        # halved at each fifth of the iterations
+        # halved after each fifth of the iterations
         return settings.rate * 0.5 ** math.floor(5 * progress_share)
     return settings.rate * half_cosine(math.pi * progress_share)
 
 
 def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
-    # the checkpoint: number of the present start, history, best mask so far
-    # Optimise a mask by gradient descent from several starts; the best on all bands counts.
+    # Optimise a mask by gradient descent from several starts, and return the one with the lowest
+    # loss on all bands. The checkpoint contains the number of the present start, the history, and
+    # the best mask so far.
     state, settings = (
         file.read(strict=False) or {"start": 0, "history": [], "best": None},
         terms.settings,
@@ -146,7 +147,7 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
         progress(
             f"continues from start {state['start'] + 1}, iteration {state.get('iteration', 0)}"
         )
-    # each start from other random parameters; the best on all bands counts
+    # each start has other random parameters
     for start in range(state["start"], settings.starts):
         shape = shape_of(terms, start).to(terms.device)
         _one_start(terms, shape, start, state, file, progress)
@@ -160,7 +161,7 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
             )
         if state["best"] is None or loss < state["best"]["loss"]:
             state["best"] = {"loss": loss, "start": start, "shape": deepcopy(shape.state_dict())}
-        # what belongs to this start alone
+        # remove the entries of this start
         for name in ("shape", "adam", "iteration"):
             state.pop(name, None)
         state["start"] = start + 1
@@ -186,7 +187,7 @@ def _one_start(
     """
     settings = terms.settings
     adam = torch.optim.Adam(shape.parameters(), lr=settings.rate)
-    # an interrupted start goes on
+    # continue an interrupted start
     if "shape" in state:
         shape.load_state_dict(state["shape"])
         adam.load_state_dict(state["adam"])
@@ -208,7 +209,7 @@ def _one_start(
 def _step(
     terms: Terms, shape: nn.Module, adam: torch.optim.Adam, start: int, number: int
 ) -> dict[str, float]:
-    """Compute the loss of one iteration and move the mask; return the row of the history."""
+    """Compute the loss of one iteration, update the mask, and return the row of the history."""
     adam.zero_grad()
     terms_by_name = _parts(terms, shape, terms.drawn(number), number)
     loss = terms.total(terms_by_name)
@@ -231,7 +232,7 @@ def _step(
 def _parts(
     terms: Terms, shape: nn.Module, bands: Sequence[int] | None = None, number: int | None = None
 ) -> dict[str, Tensor]:
-    """Return the terms of the loss of a trainable mask, in its stop if this is learnt."""
+    """Return the loss terms of a trainable mask, with its stop if the stop is trained."""
     stop = shape.round(terms.stop) if isinstance(shape, Stopped) else None
     return terms.parts(shape(terms.stop), bands, number, stop)
 
@@ -243,8 +244,8 @@ def _losses_line(row: dict[str, float]) -> str:
 
 
 def _parameters_by_name(shape: nn.Module) -> dict[str, Any]:
-    """Return the parameters of a mask as lists by name, without matrices and vectors of more
-    than 1000 numbers.
+    """Return the parameters of a mask as lists by name, except matrices and vectors of more than
+    1000 numbers.
     """
     innermost: Any = shape
     while isinstance(innermost, (Stopped, Written)):
@@ -264,11 +265,11 @@ _USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)
 
 
 def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
-    """Return a function that computes the height map of a mask of half-rings from a vector of
-    its parameters.
+    """Return the function that computes the height map of a mask of half-rings from its parameter
+    vector ``genes``.
     """
     *slopes, side, orientation = (float(gene) for gene in genes)
-    # a continuous gene stands for a choice of two
+    # a continuous parameter encodes a choice of two
     ring_parameters = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": orientation}
 
     def height(stop: Stop) -> Tensor:
@@ -283,7 +284,8 @@ def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Ten
 class _LossOfGenes:
     """The loss of a mask of half-rings as a function of its parameter vector (genes).
 
-    When an interrupted optimisation continues, the stored losses are returned without computation.
+    When an interrupted optimisation continues, stored losses are returned without computing them
+    again.
     """
 
     def __init__(self, terms: Terms, state: StateFile, progress: Progress) -> None:
@@ -294,7 +296,7 @@ class _LossOfGenes:
             progress(f"continues after {len(self.known)} masks")
 
     def __call__(self, genes: Any) -> float:
-        # the optimiser asks again for what an interrupted run has computed
+        # a continued optimiser first requests the losses that the interrupted run has computed
         if self.asked == len(self.known):
             with torch.no_grad():
                 height = half_ring_height(genes, self.terms.settings)(self.terms.stop)
@@ -314,8 +316,8 @@ class _LossOfGenes:
 
 
 def evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
-    # Optimise a mask of five half-rings by differential evolution; loss and parameters of the best
-    # start count.
+    # Optimise a mask of five half-rings by differential evolution from several starts, and return
+    # the one with the lowest loss.
     import numpy as np
 
     settings = terms.settings
@@ -346,10 +348,10 @@ def evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 def _population(
     loss: _LossOfGenes, bounds: Any, start: int, history: list[dict[str, float]], progress: Progress
 ) -> tuple[float, Any]:
-    """Optimise a mask of half-rings by differential evolution; return the lowest loss and the best
-    parameter vector.
+    """Optimise a mask of half-rings by differential evolution, and return the lowest loss and the
+    best parameter vector.
 
-    ``history`` gets a row for each generation.
+    A row for each generation is appended to ``history``.
     """
     import numpy as np
     from scipy.optimize import differential_evolution, minimize
@@ -390,9 +392,10 @@ def _population(
             callback=note_generation,
             x0=_USUAL if _holds_usual(settings) else None,
         )
-        if settings.polish:  # on all bands, because a tenth of a wave changes the peak
+        # on all bands, because a slope change of a tenth of a wave changes the peak
+        if settings.polish:
             loss.chosen = None
-            # the optimum, and from it a hundredth of the range along each axis
+            # initial simplex: the optimum, and steps of a hundredth of the range along each axis
             simplex = optimum.x + np.concatenate(
                 [np.zeros((1, len(low_bounds))), 0.01 * np.diag(high_bounds - low_bounds)]
             )
@@ -409,19 +412,17 @@ def _population(
 
 
 def _steepest(terms: Terms) -> float:
-    """Return the steepest mask slope that the pupil grid can sample (Nyquist limit), in waves at
-    the rim.
+    """Return the steepest mask slope in waves at the rim that the pupil grid can sample (Nyquist
+    limit).
     """
     material, wavelength = terms.settings.material, terms.settings.wavelength
     phase_ratio = wave_height(material, wavelength) / wave_height(
         material, float(terms.bands.centres.min())
     )
-    # at most half a wave from sample to sample, for the shortest wavelength
+    # at most half a wave between samples at the shortest wavelength
     return float(terms.stop.diameter / (4 * terms.stop.pitch * phase_ratio))
 
 
 def _holds_usual(settings: MaskTraining) -> bool:
-    """Return True if the allowed range of mask slopes includes the slopes of the hand-designed
-    mask.
-    """
+    """Return True if the allowed range of slopes includes those of the hand-designed mask."""
     return settings.slopes[0] <= min(_USUAL[:5]) and settings.slopes[1] >= max(_USUAL[:5])

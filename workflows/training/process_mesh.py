@@ -1,4 +1,4 @@
-"""The processes that `torchrun` starts for one training, and their messages."""
+"""The processes that `torchrun` starts for one training, and their communication."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torch import nn
 
 # The processes that `torchrun` starts for one training.
 #
-# Every process has pictures of its own. Gradients are added over all processes, so that networks,
-# optimisers and state stay equal in all processes. A single process sends no messages.
+# Every process has its own pictures. Gradients are summed over all processes, so that networks,
+# optimisers and state stay equal. A single process does not communicate.
 
 
 class MeshError(ValueError):
@@ -24,14 +24,14 @@ class MeshError(ValueError):
 
 @dataclass(frozen=True)
 class Mesh:
-    """The place of one training process among the ``size`` processes of its training."""
+    """The rank of one training process among the ``size`` processes of its training."""
 
     size: int = 1
     rank: int = 0
 
     @property
     def first(self) -> bool:
-        """Return True if this is process 0, the only process that writes files."""
+        """Return True for process 0, the only process that writes files."""
         return self.rank == 0
 
     def __str__(self) -> str:
@@ -43,8 +43,8 @@ class Mesh:
             dist.barrier()
 
     def agree(self, about: str) -> None:
-        """Raise MeshError unless all processes pass the same text, which states folder, stage
-        and iteration.
+        """Raise MeshError unless all processes pass the same text, with folder, stage and
+        iteration.
         """
         if self.size == 1:
             return
@@ -60,8 +60,8 @@ class Mesh:
     def numbers(
         self, own: Mapping[str, float], names: Sequence[str], device: str
     ) -> dict[str, float]:
-        """Sum the numbers with the given names, such as losses, over all processes, and return
-        the sums by name.
+        """Return the sums over all processes of the numbers with the given ``names``, such as
+        losses.
         """
         if self.size == 1:
             return dict(own)
@@ -72,15 +72,15 @@ class Mesh:
         return dict(zip(names, total.tolist(), strict=True))
 
     def share_buffers(self, net: nn.Module) -> None:
-        """Copy the buffers of a network, such as the running means of a batch norm, from the
-        first process to all.
+        """Copy the buffers of a network, such as running means of batch norm, from process 0 to all
+        others.
         """
         if self.size > 1:
             for buffer in net.buffers():
                 dist.broadcast(buffer, 0)
 
     def add_gradients(self, parts: Iterable[nn.Module]) -> None:
-        """Replace the gradient of each module parameter by its sum over all processes."""
+        """Replace the gradient of each parameter by its sum over all processes."""
         if self.size == 1:
             return
         parameters: list[nn.Parameter] = []
@@ -91,12 +91,12 @@ class Mesh:
 
 
 def _add(own: Sequence[nn.Parameter]) -> None:
-    """Sum the gradients of parameters over all processes; a gradient that is None in every
-    process stays None.
+    """Sum the gradients of parameters over all processes; a gradient that is None everywhere stays
+    None.
     """
     has_gradient = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
     grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
-    # the gradients in one vector, and after them one flag for each parameter
+    # one vector: all gradients, then a flag for each parameter
     all_numbers = torch.cat([*(g.reshape(-1) for g in grads), has_gradient])
     dist.all_reduce(all_numbers)
     *sums, counts = torch.split(all_numbers, [*(p.numel() for p in own), len(own)])
@@ -108,23 +108,23 @@ ALONE = Mesh()
 
 
 def processes() -> tuple[int, int]:
-    """Return index and number of the processes that `torchrun` started, from the variables RANK
-    and WORLD_SIZE.
+    """Return rank and number of the processes started by `torchrun`, from the variables RANK and
+    WORLD_SIZE.
     """
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def device_here(device: str) -> str:
-    """Return the name of this process's device, such as ``cuda:1`` for the second process on a
-    machine.
-    """
+    """Return the device of this process, such as ``cuda:1`` for the second process on a machine."""
     local = os.environ.get("LOCAL_RANK", "0")
     return f"cuda:{local}" if device == "cuda" and processes()[1] > 1 else device
 
 
 @contextmanager
 def joined(device: str) -> Iterator[Mesh]:
-    """Return a context in which this process belongs to the processes of `torchrun`."""
+    """Context in which this process belongs to the process group of `torchrun`; yields
+    its `Mesh`.
+    """
     rank, process_count = processes()
     if process_count == 1:
         yield ALONE
@@ -135,5 +135,5 @@ def joined(device: str) -> Iterator[Mesh]:
     else:
         dist.init_process_group("gloo")
     yield Mesh(process_count, rank)
-    # not after an error, because this process would wait for processes that have ended
+    # not after an error, because it would wait for processes that have already ended
     dist.destroy_process_group()

@@ -1,4 +1,6 @@
-"""What decides a training, as its folder keeps it, and what changed since an earlier one."""
+"""The inputs that determine a training, as recorded in its folder, and their changes since an
+earlier training.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +25,24 @@ from neusee.workflows.training.resumable_loop import write_whole
 
 # --- recorded inputs ------------------------------------------------------------------------------
 
-# What decides a training: content of files, code and settings, as a folder of results keeps them.
+# The inputs that determine a training: content of files, code and settings, as recorded in a result
+# folder.
 #
-# No name of a file, no path and no time counts, so that a training with files that were renamed or
-# moved is the same, and one with other content is another. The names are kept beside the digests,
-# for the words that say what changed.
+# Names, paths and times of files are ignored: a training with renamed or moved files is the same,
+# and one with other file contents is another. The names are recorded next to the digests, for
+# messages on what changed.
 
 
-FILE = "inputs.json"  #: in the folder of a training
-_FORMAT = 1  #: of this file; a file of another format counts as absent
-_ANY_DEVICE = "any device"  #: a training goes on on another device
-_WORDS_ONLY = frozenset({"text", "mark"})  #: fields of a law that say how and where it is written
+FILE = "inputs.json"  #: file in the folder of a training
+_FORMAT = 1  #: format of this file; a file in another format counts as absent
+_ANY_DEVICE = "any device"  #: a training may continue on another device
+#: fields of a law for its text and its place in the recipe
+_WORDS_ONLY = frozenset({"text", "mark"})
 
 
 @dataclass(frozen=True)
 class RecordedFile:
-    """The digest of the content of a file, and the name that the file had."""
+    """The digest of a file's content, and the name that the file had."""
 
     name: str
     content: str
@@ -51,30 +55,30 @@ class RecordedFile:
 
 @dataclass(frozen=True)
 class RecordedInputs:
-    """Everything that decides a training, as JSON values and digests."""
+    """Everything that determines a training, as JSON values and digests."""
 
     kind: str  #: training, lift or mask
-    recipe: str  #: its name, which decides nothing
+    recipe: str  #: name of the recipe; it does not enter the digest
     settings: Mapping[str, Any] = field(default_factory=dict)  #: by path
     #: node, code, parameters and inputs by step
     steps: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    #: by path: how it is written, and what decides its draws
+    #: by path: its text, and the values that determine its draws
     laws: Mapping[str, Any] = field(default_factory=dict)
-    code: Mapping[str, str] = field(default_factory=dict)  #: digests by what the code is
-    #: by the setting that names the file
+    code: Mapping[str, str] = field(default_factory=dict)  #: digests by a description of the code
+    #: by the setting that refers to the file
     files: Mapping[str, RecordedFile] = field(default_factory=dict)
-    photographs: Sequence[RecordedFile] = ()  #: that are trained on
+    photographs: Sequence[RecordedFile] = ()  #: photographs used for training
     held_out: Sequence[RecordedFile] = ()
 
     @cached_property
     def digest(self) -> str:
-        """Return the digest of all that counts."""
+        """Return the digest of all inputs that count."""
         return digest(
             _FORMAT,
             self.kind,
             dict(self.settings),
             {name: dict(step) for name, step in self.steps.items()},
-            # in order, because each takes its own column
+            # in order, because each law uses its own column of random numbers
             [[path, law["draws"]] for path, law in self.laws.items()],
             dict(self.code),
             {setting: file.content for setting, file in self.files.items()},
@@ -84,11 +88,11 @@ class RecordedInputs:
 
     @property
     def key(self) -> str:
-        """Return the part of the digest that stands in the name of a folder."""
+        """Return the part of the digest used in folder names."""
         return self.digest[:8]
 
     def write(self, folder: Path) -> None:
-        """Write the inputs into the folder of a training, unless they stand there already."""
+        """Write the inputs into the folder of a training, unless they are there already."""
         text = json.dumps(
             {"format": _FORMAT, "digest": self.digest, **asdict(self)}, indent=1, ensure_ascii=False
         )
@@ -97,8 +101,8 @@ class RecordedInputs:
 
     @classmethod
     def read(cls, folder: Path) -> RecordedInputs | None:
-        """Return the inputs that the folder of a training keeps, or None for a folder without
-        them.
+        """Return the inputs recorded in the folder of a training, or None without a valid
+        record.
         """
         try:
             content = json.loads(text_of(folder / FILE))
@@ -117,7 +121,7 @@ class RecordedInputs:
 
 
 def folder_of(runs: Path, stem: str, inputs: RecordedInputs) -> Path:
-    """Return the folder of a training: one with equal inputs, whatever its recipe was called, or
+    """Return the folder of a training: an existing one with equal inputs, under any recipe name, or
     a new one.
     """
     own_folder = runs / f"{stem}_{inputs.key}"
@@ -136,7 +140,7 @@ def _digest_in(folder: Path) -> str:
 
 @dataclass(frozen=True)
 class CameraInputs:
-    """What a recipe contributes to the inputs of a training: values, steps and laws."""
+    """The part of a training's inputs that comes from one recipe: values, steps and laws."""
 
     settings: Mapping[str, Any]
     steps: Mapping[str, Mapping[str, Any]]
@@ -146,11 +150,10 @@ class CameraInputs:
     def of(
         cls, recipe: Recipe, outputs: Iterable[str], code: Code, computed: Sequence[str] = ()
     ) -> CameraInputs:
-        """Return what decides the ``outputs`` of a recipe; the steps ``computed`` by the
-        caller do not count.
+        """Return the inputs that determine the ``outputs`` of a recipe, except the steps
+        ``computed`` by the caller.
 
-        Raises ValueError with place and fix for code of the user that reads what cannot be
-        followed.
+        Raises ValueError with place and fix for user code with dependencies that cannot be tracked.
         """
         order = [name for name in needed(recipe, outputs) if name not in computed]
         steps = {name: _origin(recipe.steps[name], recipe.seed, code) for name in order}
@@ -158,7 +161,9 @@ class CameraInputs:
         return cls(values, steps, _laws(recipe))
 
     def named(self, prefix: str) -> CameraInputs:
-        """Return the same with a prefix before each name, such as that of another camera."""
+        """Return the same inputs with a prefix before each name, such as the number of another
+        camera.
+        """
         return CameraInputs(
             *(
                 {f"{prefix}{name}": x for name, x in vars(self)[f.name].items()}
@@ -167,13 +172,13 @@ class CameraInputs:
         )
 
     def joined(self, other: CameraInputs) -> CameraInputs:
-        """Return the inputs of two cameras, whose names differ."""
+        """Return the inputs of two cameras together; their names must differ."""
         return CameraInputs(*({**vars(self)[f.name], **vars(other)[f.name]} for f in fields(self)))
 
 
 def _origin(step: Step, seed: int, code: Code) -> dict[str, Any]:
-    """Return what decides a step but for the results that it reads, as `keys.cache_key.key_of`
-    does.
+    """Return the values that determine a step's result apart from its input results, as in
+    `keys.cache_key.key_of`.
     """
     try:
         code_digest = code_of(step, code)
@@ -191,7 +196,7 @@ def _origin(step: Step, seed: int, code: Code) -> dict[str, Any]:
 
 
 def _laws(recipe: Recipe) -> dict[str, Any]:
-    """Return the laws of a recipe: how each is written, and what decides its draws."""
+    """Return the laws of a recipe: the text of each, and the values that determine its draws."""
     uncertain = recipe.uncertain
     if uncertain is None:
         return {}
@@ -212,8 +217,8 @@ def _laws(recipe: Recipe) -> dict[str, Any]:
 
 
 def identity(value: Any) -> Any:
-    """Return JSON values that are equal for equal values: an array is its digest, a file that of
-    its content.
+    """Return JSON values that are equal for equal values; an array becomes a digest, a file the
+    digest of its content.
     """
     if isinstance(value, np.ndarray):
         content = np.ascontiguousarray(value)
@@ -235,20 +240,20 @@ def identity(value: Any) -> Any:
 
 # --- changed inputs -------------------------------------------------------------------------------
 
-# What changed since an earlier training of a recipe, in words: the reason why a training begins
-# anew.
+# The changes since an earlier training of a recipe, as text: the reason why a training starts anew.
 
 
-_SHOWN = 12  #: changes that are listed
-#: changes above which a training of a recipe with another name is no earlier version of this one
+_SHOWN = 12  #: largest number of listed changes
+#: largest number of changes for which a training under another recipe name counts as an earlier
+#: version
 _FAR = 40
-_CHECKPOINTS = ("state.pt", "mask.state", "mask.json")  #: files of a training that has begun
-CAMERA = "camera "  #: first letters of the names of what a further camera contributes
+_CHECKPOINTS = ("state.pt", "mask.state", "mask.json")  #: files that mark a training that has begun
+CAMERA = "camera "  #: prefix of the names of inputs from a further camera
 
 
 @dataclass(frozen=True)
 class EarlierTraining:
-    """The folder of an earlier training, and the differences of its inputs in words."""
+    """The folder of an earlier training, and its input differences as text."""
 
     folder: Path
     changes: Sequence[str]
@@ -271,13 +276,13 @@ def prepare_folder(
     store: Store,
     progress: Callable[[str], None],
 ) -> None:
-    """Make the folder of a training with its inputs; say why a training begins anew although
-    there are earlier ones.
+    """Create the folder of a training with its inputs; report why the training starts anew although
+    earlier ones exist.
     """
     if any((folder / name).is_file() for name in _CHECKPOINTS):
         record = RecordedInputs.read(folder)
         if record is not None and record.digest == inputs.digest:
-            inputs.write(folder)  # with the names that the files have now
+            inputs.write(folder)  # updates the names of the files
         return
     reason = why_anew(folder, inputs, recipe, store)
     if reason is not None:
@@ -289,14 +294,15 @@ def prepare_folder(
 def why_anew(
     folder: Path, inputs: RecordedInputs, recipe: Recipe, store: Store
 ) -> EarlierTraining | str | None:
-    """Return the earlier training whose inputs differ least, or None if there is no earlier one.
+    """Return the earlier training with the fewest input differences, or None if there is none.
 
-    An earlier training without inputs, as earlier versions wrote it, gives a line of text.
+    An earlier training without recorded inputs, as written by earlier versions, gives a line of
+    text.
     """
     runs, stem = folder.parent, folder.name.rpartition("_")[0]
     trainings = list(_earlier(runs, stem, inputs, recipe, store))
     if trainings:
-        # fewest changes; among equals the youngest
+        # fewest changes, then the most recent
         return min(
             trainings, key=lambda training: (len(training.changes), -_began(training.folder))
         )
@@ -313,9 +319,9 @@ def why_anew(
 def _earlier(
     runs: Path, stem: str, inputs: RecordedInputs, recipe: Recipe, store: Store
 ) -> Iterator[EarlierTraining]:
-    """Yield the earlier trainings of the same kind with other inputs.
+    """Yield the earlier trainings of the same kind with different inputs.
 
-    One with another name counts only if few inputs differ.
+    A training under another name is yielded only if few inputs differ.
     """
     for file in sorted(runs.glob(f"*/{FILE}")):
         has_begun = any((file.parent / name).is_file() for name in _CHECKPOINTS)
@@ -334,7 +340,7 @@ def _began(folder: Path) -> float:
 def changes_since(
     old: RecordedInputs, new: RecordedInputs, recipe: Recipe, store: Store
 ) -> list[str]:
-    """Return a clause for each input that differs between two trainings."""
+    """Return a phrase for each input that differs between two trainings."""
     clauses = [
         *_values(old.settings, new.settings),
         *_changed_laws(old.laws, new.laws),
@@ -347,12 +353,12 @@ def changes_since(
 
 
 def _differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the names at which two mappings differ; those of `new` come first."""
+    """Yield the keys at which two mappings differ; those of ``new`` come first."""
     return (name for name in dict.fromkeys([*new, *old]) if old.get(name) != new.get(name))
 
 
 def _values(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a clause for each setting that was set, removed or changed."""
+    """Yield a phrase for each setting that was added, removed or changed."""
     for name in _differing(old, new):
         if name not in old or name not in new:
             yield f"{name} is {'set now' if name in new else 'no longer set'}"
@@ -367,9 +373,9 @@ def _shown(value: Any) -> str:
 
 
 def _changed_laws(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a clause for each law with other draws, and one for another order of the laws.
+    """Yield a phrase for each law with other draws, and one if the order of the laws changed.
 
-    The order counts, because each law draws from its own column.
+    The order matters, because each law uses its own column of random numbers.
     """
     if old.keys() == new.keys() and list(old) != list(new):
         yield f"the laws stand in another order: {', '.join(new)}"
@@ -389,7 +395,7 @@ def _draws(laws: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _files(old: Mapping[str, RecordedFile], new: Mapping[str, RecordedFile]) -> Iterator[str]:
-    """Yield a clause for each file that was added, removed or has another content."""
+    """Yield a phrase for each file that was added, removed or changed."""
     for setting in _differing(_contents(old), _contents(new)):
         if setting not in old or setting not in new:
             yield f"{setting} is {'given now' if setting in new else 'no longer given'}"
@@ -402,7 +408,7 @@ def _contents(files: Mapping[str, RecordedFile]) -> dict[str, str]:
 
 
 def _photographs(old: RecordedInputs, new: RecordedInputs) -> Iterator[str]:
-    """Yield a clause for each photograph that came, went or changed; a new name of an equal file
+    """Yield a phrase for each photograph that was added, removed or changed; renaming an equal file
     is no change.
     """
     files_before, files_after = [*old.photographs, *old.held_out], [*new.photographs, *new.held_out]
@@ -415,7 +421,7 @@ def _photographs(old: RecordedInputs, new: RecordedInputs) -> Iterator[str]:
 
 
 def _came_and_went(came: Sequence[str], went: Sequence[str]) -> Iterator[str]:
-    """Yield a clause for each name of a photograph; one that came and went has another content."""
+    """Yield a phrase for each name; a name both added and removed belongs to a changed file."""
     changed = set(came) & set(went)
     yield from (f"photograph {name}: other content" for name in sorted(changed))
     yield from (f"photograph {name} is new" for name in came if name not in changed)
@@ -423,9 +429,7 @@ def _came_and_went(came: Sequence[str], went: Sequence[str]) -> Iterator[str]:
 
 
 def _unmatched(files: Sequence[RecordedFile], others: Sequence[RecordedFile]) -> list[RecordedFile]:
-    """Return the files whose content the others do not have, each as often as it is missing
-    there.
-    """
+    """Return the files whose content is missing from ``others``, with multiplicity."""
     counts = Counter(file.content for file in others)
     unmatched_files = []
     for file in files:
@@ -441,9 +445,9 @@ def _steps(
     recipe: Recipe,
     store: Store,
 ) -> Iterator[str]:
-    """Yield clauses for each step that was added, removed or changed.
+    """Yield phrases for each step that was added, removed or changed.
 
-    A label has the camera in front of the step, if it is not the first camera.
+    Steps of further cameras have the camera as a prefix.
     """
     for label in _differing(old, new):
         camera, step = _camera_of(label)
@@ -453,22 +457,23 @@ def _steps(
             continue
         comparison = Comparison(store, _recipe_of(camera, recipe))
         clauses = comparison.own(step, old[label], new[label])
-        # the step itself is the same, so that it reads other results
+        # the step itself is unchanged, so its inputs must differ
         if not clauses:
             clauses = [f"step {step} reads {_read(new[label])}, not {_read(old[label])}"]
         yield from (f"{prefix}{clause}" for clause in clauses)
 
 
 def _camera_of(label: str) -> tuple[str, str]:
-    """Return the camera and the step in a name such as ``camera 2: psf[mask]``; the first camera
-    has no name.
+    """Split a name such as ``camera 2: psf[mask]`` into camera and step; the camera is empty for
+    the first one.
     """
     camera, colon, step = label.partition(": ")
     return (camera, step) if colon else ("", label)
 
 
 def _recipe_of(camera: str, recipe: Recipe) -> Recipe:
-    """Return the recipe of a camera such as ``camera 2``; the first camera has no name.
+    """Return the recipe of a camera such as ``camera 2``; any other name gives the recipe of the
+    first camera.
 
     Any other name belongs to the recipe itself.
     """
@@ -488,9 +493,9 @@ def _read(origin: Mapping[str, Any]) -> str:
 
 
 def _code(old: Mapping[str, str], new: Mapping[str, str], store: Store) -> Iterator[str]:
-    """Yield a clause for each edit of a module.
+    """Yield a phrase for each change of a module's code.
 
-    A module whose old code is not stored has one clause in all.
+    A module whose old code is not stored gets a single phrase.
     """
     for module in _differing(old, new):
         changes = edits(store.root, old.get(module, ""), new.get(module, ""))

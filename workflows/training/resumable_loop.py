@@ -1,4 +1,6 @@
-"""The loop of every training; a stopped one continues bit by bit from its checkpoint."""
+"""The loop of every training; a stopped training continues from its checkpoint with bit-identical
+results.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +33,10 @@ from neusee.workflows.training.process_mesh import ALONE, Mesh
 # The files of a training: its checkpoint, its table of losses, and its trained weights.
 
 
-_FORMAT = 1  #: format of a state; a state of another format is refused
-_BYTES_OF_TABLE = 24.0  #: bytes in memory for each byte of a table of losses
-_PRESENT_NAMES = {"relief": "mask"}  #: names in a state of version 0.1, with the present names
+_FORMAT = 1  #: format of a checkpoint; one in another format is refused
+_BYTES_OF_TABLE = 24.0  #: bytes in memory per byte of a loss table
+#: names in a checkpoint of version 0.1, and their present names
+_PRESENT_NAMES = {"relief": "mask"}
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -52,29 +55,28 @@ def write_whole(path: Path, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class StateFile:
-    """The checkpoint file of a training, which is always complete because it is replaced
-    atomically.
+    """The checkpoint file of a training; it is replaced atomically, so that it is always
+    complete.
     """
 
     path: Path
 
     def write(self, state: Mapping[str, Any]) -> None:
-        """Write a training state to the checkpoint file, in place of the old state."""
+        """Replace the checkpoint file by a new training state."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         memory = io.BytesIO()
         torch.save({"edition": _FORMAT, **state}, memory)
         write_whole(self.path, memory.getvalue())
 
     def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
-        """Return the training state from the checkpoint file, or an empty dictionary if there is no
-        file.
+        """Return the training state from the checkpoint file; empty if there is no file.
 
         Raises ValueError for a file that cannot be read, or that needs more memory than is left; if
         not ``strict``, an unreadable file counts as absent.
         """
         if not self.path.exists():
             return {}
-        archive_needs(self.path, 1.0)  # a state without room in memory is not absent
+        archive_needs(self.path, 1.0)  # too little memory raises an error: the state is not absent
         try:
             state: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
             if state.get("edition", _FORMAT) != _FORMAT:
@@ -110,9 +112,7 @@ class Rows:
         self._kept = 0
 
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
-        """Read the loss table from its file, and discard the rows of the given iteration and of
-        later iterations.
-        """
+        """Read the loss table from its file, and discard the rows from the given iteration on."""
         if self._path.exists():
             lines = csv.DictReader(lines_of(self._path, _BYTES_OF_TABLE))
             self.rows = [row for row in lines if _place(row) < (stage, iteration)]
@@ -121,8 +121,8 @@ class Rows:
             self.keep()
 
     def add(self, stage: int, iteration: int, losses: Mapping[str, float]) -> None:
-        """Append the losses of an iteration to the loss table in memory; the method `keep`
-        writes the table to disk.
+        """Append the losses of an iteration to the loss table in memory; `keep` writes it
+        to disk.
         """
         row = {
             "stage": stage,
@@ -132,8 +132,8 @@ class Rows:
         self.rows.append({name: str(row.get(name, "")) for name in self._columns})
 
     def keep(self) -> None:
-        """Append the new rows of the loss table to its file; the first call writes the whole
-        file.
+        """Append the new rows to the file of the loss table; the first call writes the
+        whole file.
         """
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, self._columns)
@@ -149,7 +149,7 @@ class Rows:
 
 
 def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
-    """Return stage and iteration of a row of the loss table for sorting; an incomplete row comes
+    """Return (stage, iteration) of a row of the loss table as a sort key; incomplete rows come
     last.
     """
     with suppress(ValueError, TypeError, KeyError):
@@ -178,30 +178,30 @@ def export(
 
 
 Losses = dict[str, float]
-Progress = Callable[[str], None]  #: takes one line of text about the progress of a training
-#: takes the stage, its iterations so far, and the losses
+Progress = Callable[[str], None]  #: function of one line of text on the progress
+#: function of the stage, its iterations so far, and the losses
 Watch = Callable[[int, int, Mapping[str, float]], None]
 DOCUMENT = "training.json"  #: the file that a training writes last
 
 
 @dataclass(frozen=True)
 class TrainingSession:
-    """One start of a training: where it computes and writes, and whom it tells of its progress.
+    """One call of a training: where it computes and writes, and how it reports progress.
 
-    Nothing in it changes a trained network, but for rounding.
+    It does not change the trained network except by rounding.
     """
 
     store: Store
     runs: Path  #: folder in which each training has a folder of its own
     progress: Progress
-    command: Sequence[str] = ()  #: that started it, for the document of the training
+    command: Sequence[str] = ()  #: command line, for the document of the training
     device: str = "cpu"
     watch: Watch | None = None
     mesh: Mesh = ALONE
 
     @property
     def writes(self) -> bool:
-        """Return True in the only process that writes files and tells of the progress."""
+        """Return True in the only process that writes files and reports progress."""
         return self.mesh.first
 
 
@@ -220,8 +220,8 @@ L = TypeVar("L", bound=Learns)
 
 
 class ResumableLoop(ABC, Generic[L]):
-    """A training loop that writes a checkpoint, a table of losses, pictures and a final document
-    into a folder.
+    """A training loop that writes a checkpoint, a loss table, pictures and a final document into a
+    folder.
 
     Among several processes, only the first writes files. A training without stages is in stage 0.
     """
@@ -240,7 +240,7 @@ class ResumableLoop(ABC, Generic[L]):
         self.keep_every, self.show_every = settings.keep, settings.show
         self.rows, self.state = Rows(folder / "losses.csv", columns), StateFile(folder / "state.pt")
         self.stage, self.iteration, self.batch, self.began = 0, 0, 1, timestamp()
-        self.inputs = inputs  #: digest of all that decides the training
+        self.inputs = inputs  #: digest of all inputs of the training
 
     @abstractmethod
     def iterate(self) -> Losses:
@@ -253,13 +253,11 @@ class ResumableLoop(ABC, Generic[L]):
 
     @abstractmethod
     def show(self) -> None:
-        """Write a picture that shows the output of the networks at the present iteration of the
-        training.
-        """
+        """Write a picture that shows the output of the networks at the present iteration."""
 
     def validate(self, iterations: int) -> Losses:
         """Return further numbers for the loss table after a number of iterations of the stage;
-        most have none.
+        empty by default.
         """
         return {}
 
@@ -269,21 +267,17 @@ class ResumableLoop(ABC, Generic[L]):
         return False
 
     def facts(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps beside stage, iteration, inputs and the learner; most
-        trainings have none.
-        """
+        """Return further entries for the checkpoint; empty by default."""
         return {}
 
     def recall(self, facts: Mapping[str, Any]) -> None:
-        """Take from a checkpoint what `facts` gave."""
+        """Restore the entries of `facts` from a checkpoint."""
 
     def begin_stage(self) -> None:
         """Prepare networks and optimisers for the present stage of the training."""
 
     def resume(self) -> None:
-        """Continue a training from its checkpoint file, or begin at the first iteration if there
-        is no checkpoint.
-        """
+        """Continue from the checkpoint file, or start at the first iteration if there is none."""
         state = self.state.read(self.device)
         if state and state.get("inputs", self.inputs) != self.inputs:
             text = (
@@ -292,7 +286,7 @@ class ResumableLoop(ABC, Generic[L]):
             )
             raise ValueError(f"{self.state.path} {text}: remove the folder to start again")
         self.stage, self.iteration = state.get("stage", self.stage), state.get("iteration", 0)
-        # first, because it makes the optimisers that the checkpoint fills
+        # first create the optimisers that the checkpoint fills
         self.begin_stage()
         if state:
             self.recall(state)
@@ -305,8 +299,8 @@ class ResumableLoop(ABC, Generic[L]):
             )
 
     def run(self, iterations: int, batch: int) -> None:
-        """Compute the remaining iterations of the present training stage; the caller saves the
-        state at the end.
+        """Compute the remaining iterations of the present stage; the caller saves the state at the
+        end.
         """
         self.batch = batch
         if self.writes and self.iteration < iterations:
@@ -324,7 +318,7 @@ class ResumableLoop(ABC, Generic[L]):
             self.show()
 
     def _next_row(self) -> Losses:
-        """Compute one iteration, and add its losses and its time to the loss table."""
+        """Compute one iteration, and add its losses and run time to the loss table."""
         began = time.perf_counter()
         try:
             losses = self.iterate()
@@ -337,15 +331,15 @@ class ResumableLoop(ABC, Generic[L]):
         return losses
 
     def note(self, losses: Losses) -> None:
-        """Pass the losses of the last training iteration to the callback function ``watch``."""
+        """Pass the losses of the last iteration to the callback ``watch``."""
         if self.session.watch is not None:
             self.session.watch(self.stage, self.iteration, losses)
 
     def keep(self) -> None:
-        """Write the loss table of a training to disk, and then the checkpoint.
+        """Write the loss table and then the checkpoint to disk.
 
-        In this order a killed process can leave surplus rows, which `resume` removes, but no
-        missing rows.
+        In this order a killed process can leave surplus rows, which `resume` removes, but never
+        missing ones.
         """
         if self.writes:
             self.rows.keep()
@@ -357,9 +351,7 @@ class ResumableLoop(ABC, Generic[L]):
         write_whole(self.folder / "pictures" / f"{name}.png", picture)
 
     def close(self, curves: bytes, recipe: str, **facts: Any) -> None:
-        """Write the loss curves, and then the document with the settings and the results of the
-        training.
-        """
+        """Write the loss curves, and then the document with settings and results."""
         remove_crate(self.folder)
         write_whole(self.folder / "curves.png", curves)
         seconds = sum(float(row["seconds"]) for row in self.rows.rows)
@@ -375,9 +367,10 @@ class ResumableLoop(ABC, Generic[L]):
         write_crate(self.folder, self.folder.name, document | {"began": self.began})
 
     def _packed(self, **about: Any) -> dict[str, Any]:
-        """Return the content of a checkpoint, with `about` in addition.
+        """Return the content of a checkpoint, with the further entries ``about``.
 
-        It has stage, iteration, inputs, facts, and by name the state of each part of the learner.
+        It contains stage, iteration, inputs, facts, and by name the state of each part of the
+        learner.
         """
         member_states = {name: member.state_dict() for name, member in self.learner.parts().items()}
         return {
@@ -390,8 +383,8 @@ class ResumableLoop(ABC, Generic[L]):
         }
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
-        """Write the weights and the picture numbers that led to a NaN or infinite loss, and
-        return the error.
+        """Write the weights and the picture numbers that led to a NaN or infinite loss, and return
+        the error to raise.
         """
         stage_and_iteration = [self.stage, self.iteration] if self.stage else [self.iteration]
         dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, stage_and_iteration))}.pt")
@@ -413,17 +406,13 @@ class ResumableLoop(ABC, Generic[L]):
 
 
 def require_finite(numbers: Mapping[str, float]) -> None:
-    """Raise `NotFinite` if a loss or another named number is NaN or infinite; the message gives
-    its name.
-    """
+    """Raise `NotFinite` with the names of all numbers that are NaN or infinite."""
     wrong_names = [name for name, x in numbers.items() if not abs(x) < float("inf")]
     if wrong_names:
         raise NotFinite(f"these numbers are NaN or infinite: {', '.join(wrong_names)}")
 
 
 def averaged(net: nn.Module, decay: float) -> AveragedModel | None:
-    """Return an exponential moving average of the weights of a network, or None if ``decay`` is
-    0.
-    """
+    """Return an exponential moving average of a network's weights, or None if ``decay`` is 0."""
     average_function = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
     return AveragedModel(net, multi_avg_fn=average_function) if decay else None

@@ -1,4 +1,6 @@
-"""The training of a mask and of the network behind it, in two stages, with its inputs and files."""
+"""The training of a mask and of the restoration network behind it, in two stages, with its inputs
+and files.
+"""
 
 from __future__ import annotations
 
@@ -49,11 +51,10 @@ from neusee.workflows.training.training_pictures import PictureSource, require_a
 
 # --- run training ---------------------------------------------------------------------------------
 
-# The training of a mask and of the network that restores the pictures behind the mask, in two
-# stages.
+# The training of a mask and of the network that restores the pictures behind it, in two stages.
 
 
-MASK_FILE = "mask.safetensors"  #: of a folder of results: the mask that was learnt or designed
+MASK_FILE = "mask.safetensors"  #: file with the trained or designed mask in a result folder
 _COLUMNS = (
     "stage",
     "iteration",
@@ -112,7 +113,7 @@ def train(recipe: Recipe, session: TrainingSession, stages: Sequence[int] = (1, 
 
 @dataclass(frozen=True)
 class BegunTraining:
-    """What a training is before its first iteration: its photographs, first weights, inputs and
+    """The state of a training before its first iteration: photographs, initial weights, inputs and
     folder.
     """
 
@@ -125,8 +126,8 @@ class BegunTraining:
     def of(
         cls, recipe: Recipe, settings: Training, store: Store, runs: Path, pictures: bool = True
     ) -> BegunTraining:
-        """Find the inputs of a training, and the folder of results with equal inputs, or a new
-        one.
+        """Return the inputs of a training, and the result folder with equal inputs, or a
+        new one.
         """
         photograph_split = held_out.split(
             recipe, settings, _photographs(recipe, settings, pictures)
@@ -153,7 +154,7 @@ def _require_fitting_mesh(
 
 
 def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> None:
-    """Raise `MeshError` for a batch that does not divide equally among the processes."""
+    """Raise `MeshError` for a batch that cannot be divided equally among the processes."""
     for number, stage in settings.stages.items():
         if stage.batch % mesh.size:
             path = f"{KEY}.stages.{number}.batch"
@@ -166,9 +167,10 @@ def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> Non
 
 
 def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photographs:
-    """Return the photographs of a training: its folder, or the single file of the scene step.
+    """Return the photographs of a training: those of its folder, or the single file of the scene
+    step.
 
-    Without either it raises ValueError if pictures are `needed`.
+    Raises ValueError if there is neither and pictures are ``needed``.
     """
     if settings.photographs is not None:
         return Photographs.under(settings.photographs)
@@ -205,7 +207,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.read_again = UnchangedFiles.of(
             [*photograph_split.trained.paths, *photograph_split.judged]
         )
-        self.mask_content = ""  #: digest of the mask behind which stage 2 trains
+        self.mask_content = ""  #: digest of the mask used in stage 2
         progress(str(photograph_split))
         if settings.augment.pooled != "none":
             progress(
@@ -215,7 +217,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         if warm_start is not None and not self.state.path.exists():
             progress(f"begins with the weights of {warm_start.file}")
         self.resume()
-        # all processes must have read the same checkpoint
+        # check that all processes have read the same checkpoint
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
         self.board = (
             open_board(folder, self._iterations_of_all_stages)
@@ -224,15 +226,13 @@ class _TrainingLoop(ResumableLoop[Learner]):
         )
 
     def begin_stage(self) -> None:
-        """Prepare new optimisers for the present stage of the training."""
+        """Create new optimisers for the present stage of the training."""
         self.learner.begin(
             self.settings.stages.get(self.stage, Stage(iterations=0)), self.stage == 1
         )
 
     def run_stages(self, stages: Sequence[int]) -> None:
-        """Run the given stages of the training (1: mask and network, 2: network alone), and
-        write the results.
-        """
+        """Run the given stages (1: mask and network, 2: network only), and write the results."""
         if self.designed and 1 in stages:
             raise ValueError(
                 f"the mask in {self.folder} was designed without images: continue with --stage 2"
@@ -259,7 +259,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
     @property
     def _iterations_of_all_stages(self) -> int:
-        """Return the number of iterations so far, those of all earlier stages included."""
+        """Return the number of iterations so far, including those of earlier stages."""
         return self.iteration + sum(
             s.iterations for number, s in self.settings.stages.items() if number < self.stage
         )
@@ -270,8 +270,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
         return self.settings.stages[self.stage].iterations
 
     def _run_stage(self) -> None:
-        """Train to the end of the present stage, and write the checkpoint with which the next
-        stage begins.
+        """Train to the end of the present stage, and write the checkpoint from which the next stage
+        starts.
         """
         fixed_recipe = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
         if fixed_recipe is not None:
@@ -287,7 +287,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
             )
         if self.writes:
             self._export()
-        # the checkpoint below is the first of the next stage
+        # the checkpoint written below is the first of the next stage
         self.stage, self.iteration = self.stage + 1, 0
         self.begin_stage()
         if self.stage == 2 and self.writes:
@@ -296,7 +296,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mesh.wait()  # until the first process has written the mask
 
     def _require_same_mask(self) -> None:
-        """Note the learnt mask behind which stage 2 trains; raise ValueError if it is not that
+        """Record the digest of the mask used in stage 2; raise ValueError if it differs from that
         of the checkpoint.
         """
         if self.settings.learn is None:
@@ -311,18 +311,16 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mask_content = content
 
     def facts(self) -> dict[str, Any]:
-        """Return what the checkpoint keeps beside the learner: the digest of the mask of stage
-        2.
-        """
+        """Return further entries for the checkpoint: the digest of the mask used in stage 2."""
         return {"mask": self.mask_content}
 
     def recall(self, facts: Mapping[str, Any]) -> None:
-        """Take from a checkpoint what `facts` gave."""
+        """Restore the entries of `facts` from a checkpoint."""
         self.mask_content = str(facts.get("mask", ""))
 
     def iterate(self) -> Losses:
-        """Train on one batch of pictures; return the losses, and the learning rate relative to
-        its initial value.
+        """Train on one batch; return the losses and the learning rate relative to its initial
+        value.
         """
         rate = self.learner.set_rates(self.iteration)
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
@@ -330,10 +328,10 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
     def validate(self, iterations: int) -> Losses:
         """Restore the held-out pictures at intervals and at the end of a stage, and write the
-        network if it is best.
+        network if it is the best so far.
 
-        In stage 1 no state is the best, because the PSNR does not measure the suppression of the
-        laser: a flat mask has the best pictures.
+        No state of stage 1 counts as the best, because the PSNR does not measure laser suppression:
+        a flat mask has the best pictures.
         """
         if not self.split.judged or (
             iterations % self.settings.validate_every and iterations != self._length
@@ -357,13 +355,13 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
     @property
     def stops_early(self) -> bool:
-        """Return True if stage 2 has had ``train.patience`` validations without a better state."""
+        """Return True in stage 2 after ``train.patience`` validations without improvement."""
         patience = self.settings.patience
         return self.stage == 2 and patience is not None and self.best.since >= patience
 
     def note(self, losses: Losses) -> None:
-        """Write the losses of the last training iteration to TensorBoard, and pass them to the
-        callback ``watch``.
+        """Write the losses of the last iteration to TensorBoard, and pass them to the callback
+        ``watch``.
         """
         if self.board:
             for name, value in losses.items():
@@ -373,8 +371,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
     def keep(self) -> None:
         """Write TensorBoard events, loss table and checkpoint of a training to disk.
 
-        Raises ValueError if a photograph has changed, so that no checkpoint is of other photographs
-        than it says.
+        Raises ValueError if a photograph has changed, so that a checkpoint always belongs to the
+        recorded photographs.
         """
         self.read_again.require()
         if self.board:
@@ -382,8 +380,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
         super().keep()
 
     def show(self) -> None:
-        """Write a PNG file with a picture of the last batch, its restoration and the true
-        picture side by side.
+        """Write a PNG file with a picture of the last batch, its restoration and the true picture,
+        side by side.
         """
         sample = self.seen[0]
         self.learner.net.eval()
@@ -401,9 +399,9 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.write_picture(f"stage{self.stage}_{self.iteration:06d}", png(picture_strip))
 
     def _export(self) -> None:
-        """Write the mask after stage 1, and the network.
+        """Write the network, and after stage 1 the mask.
 
-        The averaged weights count where there is an average.
+        The averaged weights are written if there is an average.
         """
         if self.stage == 1:
             with torch.no_grad():
@@ -415,7 +413,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
     @property
     def _mask_source(self) -> str:
-        """Return where the mask comes from, in words."""
+        """Return the origin of the mask as text."""
         if self.settings.learn is None:
             return "the recipe's own"
         return "designed without images" if self.designed else "learnt in stage 1"
@@ -443,9 +441,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
-    """Return the recipe with the trained mask from the file ``mask.safetensors`` as a fixed
-    mask.
-    """
+    """Return the recipe with the trained mask from ``mask.safetensors`` as a fixed mask."""
     if settings.learn is None:
         return recipe
     file = folder / MASK_FILE
@@ -454,7 +450,7 @@ def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
             f"{file} does not exist: run --stage 1 or --stage mask first to write this file"
         )
     step = recipe.steps[settings.learn]
-    # depth and scale change nothing where the file has heights in m
+    # depth and scale have no effect on a file with heights in m
     params, wires = {"file": file, "depth": 1e-6, "scale": 0.1}, {"stop": step.wires["stop"]}
     learnt = replace(step, node=doe.pixelwise, params=params, wires=wires)
     return replace(recipe, steps={**recipe.steps, settings.learn: learnt})
@@ -462,14 +458,14 @@ def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
 
 # --- inputs ---------------------------------------------------------------------------------------
 
-# Photographs, files, code and settings, whose digest is a part of the name of the folder.
+# Photographs, files, code and settings; their digest is part of the folder's name.
 
-#: settings that change no weight
+#: settings that do not change the weights
 _WITHOUT_EFFECT = {"tensorboard", "keep_pool", "export", "keep", "show"}
-#: recorded by what they name
+#: settings that are recorded by the content of what they refer to
 _BY_CONTENT = {"photographs", "start", "cameras", "mismatch", "network", "mask"}
 _OF_VALIDATION = {"held_out", "held_out_pictures", "validate_every", "patience"}
-#: nodes that an iteration calls itself
+#: node families that an iteration calls directly
 _COMPUTE = ("losses", "metrics", "restore", "doe", "scene", "resampling")
 _LOOPS = (
     "training_iteration",
@@ -477,7 +473,7 @@ _LOOPS = (
     "camera_mismatch",
     "held_out",
     "resumable_loop",
-)  #: files of the program that decide the pictures and the steps of the optimisers
+)  #: program files that determine the pictures and the optimiser steps
 
 
 def inputs_of(
@@ -485,7 +481,7 @@ def inputs_of(
 ) -> RecordedInputs:
     """Return everything that can change a trained network or mask.
 
-    Raises ValueError with place and fix for code of the user that reads what cannot be followed.
+    Raises ValueError with place and fix for user code with dependencies that cannot be tracked.
     """
     camera = _cameras(recipe, settings, code)
     design = design_inputs(recipe, settings.design, code) if settings.learn is not None else None
@@ -510,12 +506,12 @@ def inputs_of(
 
 
 def recorded(paths: Sequence[Path]) -> tuple[RecordedFile, ...]:
-    """Return names and digests of files; a file is read once in a process."""
+    """Return names and digests of files; each file is read only once per process."""
     return tuple(map(RecordedFile.of, paths))
 
 
 def _cameras(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
-    """Return what the camera of a training and its further cameras contribute."""
+    """Return the inputs that come from the camera of a training and from its further cameras."""
     joined = _camera(recipe, settings, code)
     for number, camera in enumerate(recipe.cameras, 2):
         joined = joined.joined(_camera(camera, settings, code).named(f"{CAMERA}{number}: "))
@@ -523,9 +519,9 @@ def _cameras(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
 
 
 def _camera(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
-    """Return what a camera contributes.
+    """Return the inputs that come from one camera.
 
-    The scene step does not count, because the training itself makes the scenes; its shape does.
+    The scene step is excluded, because the training makes the scenes itself; its shape is included.
     """
     read_steps = (settings.picture, settings.truth, settings.psf, settings.light, settings.learn)
     outputs = [name for name in read_steps if name is not None and name in recipe.steps]
@@ -538,7 +534,7 @@ def _camera(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
 
 
 def _settings(settings: Training, parts: Split) -> dict[str, Any]:
-    """Return the settings of the block by path, without those of files and of the mask design."""
+    """Return the settings of the block by path, except those of files and of the mask design."""
     excluded = _WITHOUT_EFFECT | _BY_CONTENT | (set() if parts.held_out else _OF_VALIDATION)
     train_settings = settings.model_dump(mode="json", exclude=excluded)
     train_settings["network"] = network_settings(settings.network)
@@ -546,7 +542,7 @@ def _settings(settings: Training, parts: Split) -> dict[str, Any]:
 
 
 def network_settings(network: Network) -> dict[str, Any]:
-    """Return the settings of a network; a class of the user is its name, with its arguments."""
+    """Return the settings of a network; for a user's class its name and arguments."""
     if network.architecture is None:
         return {"kind": network.kind, "width": network.width, **network.options}
     return {
@@ -556,9 +552,9 @@ def network_settings(network: Network) -> dict[str, Any]:
 
 
 def _flat(block: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
-    """Return the single values of a nested mapping, each with its path.
+    """Return the leaf values of a nested mapping, each with its path.
 
-    An empty mapping counts as a value.
+    An empty mapping counts as a leaf.
     """
     flat_settings: list[tuple[str, Any]] = []
     for name, value in block.items():
@@ -570,8 +566,8 @@ def _flat(block: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
 
 
 def _code(network: Network, code: Code) -> dict[str, str]:
-    """Return digests of the code that no step of the recipe names: losses, networks, and the
-    loop itself.
+    """Return digests of the code that is in no step of the recipe: losses, networks, and the
+    training loop.
     """
     digests = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in _COMPUTE}
     folder = Path(__file__).parent
@@ -585,8 +581,8 @@ def _code(network: Network, code: Code) -> dict[str, str]:
 
 
 def code_of_class(architecture: Architecture, code: Code) -> str:
-    """Return the digest of the code of a network class and of what it imports; refuse what
-    cannot be followed.
+    """Return the digest of the code of a network class and its imports; raise ValueError for
+    dependencies that cannot be tracked.
     """
     network = architecture.network
     try:
@@ -597,30 +593,29 @@ def code_of_class(architecture: Architecture, code: Code) -> str:
 
 # --- unchanged files ------------------------------------------------------------------------------
 
-# Files that must stay as they are while a training runs: its photographs, which are read again and
-# again.
+# Files that must not change during a training: its photographs, which are read repeatedly.
 
 
 @dataclass
 class UnchangedFiles:
-    """Files with the digests that their training recorded before its first iteration."""
+    """Files with the digests recorded before the first iteration of their training."""
 
     contents: Mapping[Path, str]
     _stamps: dict[Path, Stamp] = field(default_factory=dict)
 
     @classmethod
     def of(cls, paths: Iterable[Path]) -> UnchangedFiles:
-        """Note the content of files."""
+        """Record the digests of files."""
         return cls({path: file_digest(path) for path in paths})
 
     def require(self) -> None:
-        """Raise ValueError if a file is gone or has another content; a file that was only
-        touched is the same.
+        """Raise ValueError if a file is missing or its content has changed; a new time stamp alone
+        is accepted.
         """
         for path, content in self.contents.items():
             try:
                 stamp = file_stamps(path)[0]
-                # size and time are as at the last look, so that the file is not read again
+                # same size and time as at the last check: no need to read the file again
                 if self._stamps.get(path) == stamp:
                     continue
                 is_same = file_digest(path) == content
@@ -634,7 +629,7 @@ class UnchangedFiles:
 
     @staticmethod
     def _said(path: Path, change: str) -> str:
-        """Return the message of an error: which photograph has changed, and what to do."""
+        """Return the error message: which photograph has changed, and how to continue."""
         return (
             f"the photograph {path} {change}, after this training began with it; the checkpoint"
             " before is kept: put the file back and give the command again to go on, or give the"
@@ -648,8 +643,8 @@ class UnchangedFiles:
 
 
 def open_board(folder: Path, first: int) -> Any:
-    """Return a TensorBoard writer for a training, which hides older events from iteration ``first``
-    on.
+    """Return a TensorBoard writer for a training; older events from iteration ``first`` on are
+    hidden.
 
     Raises ValueError if TensorBoard is not installed.
     """
@@ -666,12 +661,12 @@ def open_board(folder: Path, first: int) -> Any:
 
 # --- exported files -------------------------------------------------------------------------------
 
-# The trained network as a file that other programs run, beside its weights.
+# The trained network as a file for other programs, in addition to its weights.
 
 
 def require_exports(net: Restorer, settings: Training) -> None:
-    """Raise ValueError before a training whose network cannot be exported as ``train.export``
-    asks.
+    """Raise ValueError if the network cannot be exported in the formats of ``train.export``; called
+    before the training.
     """
     for kind in settings.export:
         try:
@@ -681,8 +676,8 @@ def require_exports(net: Restorer, settings: Training) -> None:
 
 
 def write_exports(folder: Path, net: Restorer, settings: Training) -> None:
-    """Write the best network of a training, or the last one if no state is the best, as
-    ``train.export`` asks.
+    """Export the best network of a training, or the last one if there is no best, in the formats of
+    ``train.export``.
     """
     if not settings.export:
         return

@@ -1,4 +1,4 @@
-"""One iteration of a training: mask, network and critics, and the weights they begin with."""
+"""One iteration of a training (mask, network and critics), and the initial weights."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ from neusee.workflows.training.training_pictures import Sample, Samples, Shared
 
 # --- picture batches ------------------------------------------------------------------------------
 
-# Pictures of a training batch that go through the network together, and their results one by one.
+# Pictures of a training batch that pass the network together, and their separate results.
 
 
 def together(
     pictures: Iterable[tuple[int, Sample]], by_shape: bool
 ) -> Iterator[tuple[list[int], Sample]]:
-    """Yield the pictures of a batch with their numbers: each alone, or if ``by_shape`` those of one
-    size as one sample.
+    """Yield the pictures of a batch with their numbers: each alone or, with ``by_shape``, those of
+    equal size as one sample.
 
-    A small picture leaves most of a GPU idle, so that sixteen take little longer there than one. On
-    a processor each picture goes alone, so that one picture is in memory at a time.
+    A small picture uses little of a GPU, so that sixteen take hardly longer than one. On a CPU each
+    picture is processed alone, so that only one is in memory.
     """
     if not by_shape:
         yield from (([number], sample) for number, sample in pictures)
@@ -67,7 +67,7 @@ def together(
     for number, sample in pictures:
         filter_facts = sample.given[0] if sample.given else None
         has_free_size = filter_facts is None or isinstance(filter_facts, FilterFacts)
-        # a Wiener problem is of one picture, so that its number keeps it alone
+        # a Wiener problem belongs to one picture: its number keeps it alone
         group_key = (
             tuple((name, x.shape) for name, x in sample.tensors.items())
             if has_free_size
@@ -79,9 +79,7 @@ def together(
 
 
 def joined(samples: list[Sample]) -> Sample:
-    """Return pictures of one size as one sample, whose maps beside the pictures have one axis
-    more, the first.
-    """
+    """Return pictures of equal size as one sample; further maps get a leading batch axis."""
     first_sample = samples[0]
     if len(samples) == 1:
         return first_sample
@@ -106,7 +104,7 @@ def joined(samples: list[Sample]) -> Sample:
 def noted(
     pictures: Iterable[tuple[int, Sample]], record: list[Sample]
 ) -> Iterator[tuple[int, Sample]]:
-    """Yield numbered pictures as they come, and add each to ``record``."""
+    """Yield numbered pictures unchanged, and append each to ``record``."""
     for number, sample in pictures:
         record.append(sample)
         yield number, sample
@@ -114,11 +112,10 @@ def noted(
 
 # --- warm start -----------------------------------------------------------------------------------
 
-# The weights with which the network of a new training begins: those of an earlier training, in
-# place of drawn ones.
+# The initial weights of the network: those of an earlier training in place of random ones.
 
 
-#: of a folder of results, the first that is there
+#: weight files in a result folder; the first that exists is used
 _FILES = ("best.safetensors", "network.safetensors")
 
 
@@ -128,12 +125,12 @@ class WarmStart:
 
     file: Path
     digest: str
-    source: str  #: place in the recipe that names the file
+    source: str  #: place in the recipe of the file's name
 
     @classmethod
     def of(cls, recipe: Recipe, settings: Training) -> WarmStart | None:
-        """Return the file of weights that ``train.start`` names, or None; raise ValueError if
-        there is no such file.
+        """Return the weight file in ``train.start``, or None if not set; raise ValueError if there
+        is no such file.
         """
         if settings.start is None:
             return None
@@ -155,7 +152,7 @@ class WarmStart:
         )
 
     def load_into(self, net: Restorer) -> None:
-        """Give the weights to a network; raise ValueError with the name of the first layer that
+        """Load the weights into a network; raise ValueError with the name of the first layer that
         does not fit.
         """
         from safetensors.torch import load_file
@@ -170,7 +167,7 @@ class WarmStart:
 
     @property
     def facts(self) -> dict[str, str]:
-        """Return what `training.json` says of the start."""
+        """Return the entries on the initial weights for `training.json`."""
         return {"file": str(self.file), "sha256": self.digest}
 
 
@@ -188,9 +185,7 @@ class Scales(NamedTuple):
 
 
 class Learner:
-    """The mask, the networks and the optimisers of a training, with equal values in all
-    processes.
-    """
+    """The mask, networks and optimisers of a training, with equal values in all processes."""
 
     def __init__(
         self,
@@ -217,8 +212,8 @@ class Learner:
         self.begin(Stage(iterations=0), learns=True)
 
     def _network(self, network: Network) -> Restorer:
-        """Return the network with its initial weights; that of a user's class passes one call on
-        this device first.
+        """Return the network with its initial weights; a user's class is first tested with one call
+        on this device.
         """
         if network.architecture is None:
             return start_network(lambda: _network_of(network), self._rng("network")).to(
@@ -234,7 +229,7 @@ class Learner:
         return user_network.train()
 
     def _start(self, recipe: Recipe, learn: str) -> nn.Module:
-        """Return the mask of the recipe step ``learn`` as a PyTorch module with trainable
+        """Return the mask of recipe step ``learn`` as a PyTorch module with trainable
         parameters.
         """
         step = recipe.steps[learn]
@@ -265,9 +260,9 @@ class Learner:
         )
 
     def begin(self, stage: Stage, learns: bool) -> None:
-        """Begin a stage of the training with new optimisers and the initial learning rates.
+        """Start a stage with new optimisers and the initial learning rates.
 
-        If ``learns``, the mask is trained together with the network.
+        With ``learns``, the mask is trained together with the network.
         """
         rates, self.stage, self.learns = self.settings.rates, stage, learns
         groups = parameter_groups(self.net, rates.weights, rates.biases)
@@ -284,20 +279,20 @@ class Learner:
         ]
 
     def set_rates(self, iteration: int) -> float:
-        """Set the learning rates of a training iteration, and return the factor on the initial
-        learning rates.
+        """Set the learning rates of an iteration, and return their factor relative to the initial
+        rates.
         """
         factor = self.settings.rates.share(iteration)
         for optimiser, first_rates in zip(
             (self.generator_optimizer, self.critic_optimizer), self._first, strict=True
         ):
             for group, rate in zip(optimiser.param_groups, first_rates, strict=True):
-                # never below the least rate, but a rate that begins below it is not raised
+                # not below the least rate; a rate that starts below it is not raised
                 group["lr"] = max(rate * factor, min(rate, self.settings.rates.least))
         return factor
 
     def parts(self) -> dict[str, Any]:
-        """Return by name the objects whose state a checkpoint must contain."""
+        """Return the objects whose state a checkpoint must contain, by name."""
         members = {
             "mask": self.mask,
             "net": self.net,
@@ -331,16 +326,18 @@ class Learner:
         pictures = noted(
             samples.batch(shared, stage, iteration * batch_size, batch_size), batch_samples
         )
-        # each picture, or on a GPU all of one size at once, is restored and propagated back
+        # forward and backward pass for each picture, or on a GPU for all pictures of one size at
+        # once
         for numbers, sample in together(pictures, self._batch_goes_whole):
             terms, truth, estimate = self._restoration_terms(sample)
             truth_and_estimate |= pictures_by_number(numbers, truth, estimate)
             batch_share = len(numbers) / batch_size
             _backward([weight * term * batch_share for weight, term in terms.values() if weight])
             _add_terms(loss_sums, terms, batch_share)
-        # gradients of all pictures at once, through the steps that depend on the mask alone
+        # propagate the summed gradients of all pictures through the steps that depend only on the
+        # mask
         shared.back()
-        # sums over all processes; each added its share of the batch
+        # sum over all processes
         loss_sums = self.mesh.numbers(loss_sums, self._names(), self.device)
         loss_sums["slope"] = self._move(
             self.generator_optimizer,
@@ -359,11 +356,11 @@ class Learner:
 
     @property
     def _batch_goes_whole(self) -> bool:
-        """Return True where the pictures of a batch go through the network together: on a GPU,
-        behind a fixed mask.
+        """Return True if pictures of a batch pass the network together: on a GPU, behind a fixed
+        mask.
 
-        A class of the user has random numbers of its own for each picture, and sums over pixels are
-        of one picture.
+        Not with a user's class, which has its own random numbers for each picture, and not with
+        losses summed over pixels, which are per picture.
         """
         can_batch = device_kind(self.device) != "cpu" and not self.learns and not self.stage.bsr
         return (
@@ -378,8 +375,8 @@ class Learner:
         return samples.begin(self.height()) if samples.shared else Shared.of({})
 
     def _names(self) -> list[str]:
-        """Return the names of the losses in the present training stage, in the same order in
-        every process.
+        """Return the names of the losses in the present stage, in the same order in every
+        process.
         """
         weights = {
             "BSR": self.stage.bsr,
@@ -397,7 +394,8 @@ class Learner:
         """Backpropagate the laser suppression loss band by band to save memory, and return the mean
         suppression ratio.
 
-        Every process has all bands, with smaller weights, so that each band counts once.
+        Every process computes all bands with a weight of 1 / number of processes, so that the sum
+        counts each band once.
         """
         psf: Psf = shared.values[samples.psf]
         process_count = self.mesh.size
@@ -414,7 +412,7 @@ class Learner:
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
         """Return the laser suppression loss of one band.
 
-        `intensity` (band, y, x) is the PSF and `clear` (band,) its peak without a mask.
+        ``intensity`` (band, y, x) is the PSF, and ``clear`` (band,) its peak without a mask.
         """
         psf = Psf(intensity[band : band + 1], clear[band : band + 1])
         loss: Tensor = losses.suppression_loss(psf, log=self.settings.logarithm)
@@ -423,8 +421,8 @@ class Learner:
     def _restoration_terms(
         self, sample: Sample
     ) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
-        """Restore a training picture; return its weighted loss terms, true picture and detached
-        restored picture.
+        """Restore a training picture; return its weighted loss terms, the true picture and the
+        detached restored picture.
         """
         lower_precision = torch.autocast(
             device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16"
@@ -434,13 +432,13 @@ class Learner:
             coarse, fine = self.net.pyramid(picture, *sample.given)
         estimate = Scales(coarse.to(self.settings.dtype), fine.to(self.settings.dtype))
         y, x = sample.truth.shape[-2:]
-        # half the size, rounded up, as the network halves a picture
+        # half the size, rounded up, as in the network
         truth = Scales(resize(sample.truth.detach(), -(-y // 2), -(-x // 2)), sample.truth.detach())
         zero = torch.zeros((), device=fine.device)
-        # L1 has no weight: it is written to the table alone
+        # L1 has weight 0: it is only written to the table
         terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
         if self.stage.bsr:
-            # the BSR loss: the light of the scene over what the mask keeps
+            # BSR loss: inverse of the share of the scene's light that the mask keeps
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
         if self.stage.reconstruction:
             terms["reconstruction"] = (
@@ -459,7 +457,7 @@ class Learner:
 
     @contextmanager
     def _seeded(self, sample: Sample) -> Iterator[None]:
-        """Seed the random numbers of a user's network, such as those of dropout, by picture and
+        """Seed the random numbers of a user's network, such as dropout, by picture and
         iteration.
         """
         if not isinstance(self.net, OwnNetwork):
@@ -472,9 +470,8 @@ class Learner:
             yield
 
     def _errors(self, estimate: Scales, truth: Scales) -> Iterator[Tensor]:
-        """Yield the reconstruction error at half and at full resolution.
-
-        Each is an error of pixels and one of frequencies.
+        """Yield the reconstruction error at half and at full resolution, each the sum of an error
+        of pixels and one of frequencies.
         """
         options = (
             {} if self.settings.reduction == "mean" else {"reduction": self.settings.reduction}
@@ -487,15 +484,15 @@ class Learner:
     def _train_critics(
         self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator
     ) -> Losses:
-        """Train the critics to distinguish true from restored pictures, with equal random
-        numbers in all processes.
+        """Train the critics to distinguish true from restored pictures, with equal random numbers
+        in all processes.
         """
         self.critic_optimizer.zero_grad(set_to_none=True)
         critic_losses, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
-                    # the picture of another process takes its random numbers too
+                    # skip the random numbers that another process uses for its picture
                     skip_critic_draws(rng, self.settings.patches if self.settings.patch else 1)
                 continue
             for critic, truth_scale, estimate_scale in zip(self.critics, *pairs[i], strict=True):
@@ -542,7 +539,7 @@ class Learner:
 def _add_terms(
     sums: dict[str, float], terms: Mapping[str, tuple[float, Tensor]], share: float
 ) -> None:
-    """Add a share of each term of a loss to the sum of its name."""
+    """Add ``share`` times each loss term to the sum of the same name."""
     for name, (_, term) in terms.items():
         sums[name] = sums.get(name, 0.0) + float(term.detach()) * share
 
@@ -550,9 +547,7 @@ def _add_terms(
 def pictures_by_number(
     numbers: Sequence[int], truth: Scales, estimate: Scales
 ) -> dict[int, tuple[Scales, Scales]]:
-    """Return the true and the restored picture of each number, of pictures that went through the
-    network together.
-    """
+    """Return the true and the restored picture of each number, split from a batch."""
     chunks = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
     return {
         number: (Scales(*(x[i] for x in chunks[0])), Scales(*(x[i] for x in chunks[1])))
@@ -561,13 +556,13 @@ def pictures_by_number(
 
 
 def _backward(terms: Sequence[Tensor]) -> None:
-    """Propagate the gradients of the sum of terms; a stage without weights has none."""
+    """Backpropagate the sum of terms; nothing if there is none."""
     if terms:
         sum(terms[1:], terms[0]).backward()  # type: ignore[no-untyped-call]
 
 
 def _network_of(network: Network) -> Restorer:
-    """Return the packaged network that the settings name, with random weights."""
+    """Return the built-in network of the settings, with random weights."""
     if network.kind == "fft_mamba":
         return FFTMamba(network.width, **network.options)
     if network.kind == "unrolled":

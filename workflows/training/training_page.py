@@ -58,9 +58,7 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
 def _draw_loss(
     ax: Any, rows: Sequence[Mapping[str, str]], name: str, stage: int, first: int, colour: str
 ) -> None:
-    """Draw a loss and its running median over the iterations of a stage that begins after
-    ``first`` iterations.
-    """
+    """Draw a loss and its running median over a stage that starts after ``first`` iterations."""
     rows_of_stage = [row for row in rows if row["stage"] == str(stage) and row[name]]
     iterations = [int(row["iteration"]) + first for row in rows_of_stage]
     values = [float(row[name]) for row in rows_of_stage]
@@ -70,11 +68,10 @@ def _draw_loss(
 
 @drawn
 def held_out_curves(rows: Sequence[Mapping[str, str]], best: int) -> Any:
-    """Draw training loss and held-out PSNR over the iterations of both stages, with the level of
-    the network's input.
+    """Draw training loss and held-out PSNR over the iterations of both stages, with the PSNR of the
+    network's input.
 
-    ``best`` is the number of iterations of stage 2 before the best state, or 0 if no state is the
-    best.
+    ``best`` is the number of stage-2 iterations up to the best state, or 0 without a best state.
     """
     figure, axes = canvas(9.0, 6.4, 2, 1, sharex=True)
     length_of_first_stage = sum(row["stage"] == "1" for row in rows)
@@ -107,7 +104,7 @@ def held_out_curves(rows: Sequence[Mapping[str, str]], best: int) -> Any:
 def _draw_training(ax: Any, rows: Sequence[Mapping[str, str]], first: int) -> None:
     """Draw the training loss and its running median over the iterations.
 
-    `first` is the number of iterations of stage 1.
+    ``first`` is the number of iterations of stage 1.
     """
     name = "reconstruction" if any(row["reconstruction"] for row in rows) else "L1"
     loss = [(float(_iterations_so_far(row, first)), float(row[name])) for row in rows if row[name]]
@@ -119,9 +116,10 @@ def _draw_training(ax: Any, rows: Sequence[Mapping[str, str]], first: int) -> No
 
 
 def _draw_held_out(ax: Any, judged: Sequence[Mapping[str, str]], first: int) -> None:
-    """Draw the PSNR of the held-out pictures and of the input, with the interval of the former.
+    """Draw the PSNR of the restored held-out pictures with its interval, and of the network's
+    input.
 
-    `judged` are the rows of the loss table with a validation.
+    ``judged`` are the rows of the loss table with a validation.
     """
     iterations = [_iterations_so_far(row, first) for row in judged]
     for source, colour, curve_label in (
@@ -156,14 +154,12 @@ def _draw_held_out(ax: Any, judged: Sequence[Mapping[str, str]], first: int) -> 
 
 
 def _iterations_so_far(row: Mapping[str, str], first: int) -> int:
-    """Return the number of iterations of both stages after the iteration of a row."""
+    """Return the number of iterations of both stages up to and including that of a row."""
     return int(row["iteration"]) + 1 + first * (row["stage"] == "2")
 
 
 def running_median(values: Sequence[float]) -> list[float]:
-    """Return the running median of a sequence of numbers, in a window of about 1/20 of the
-    sequence length.
-    """
+    """Return the running median in a window of about 1/20 of the sequence length."""
     half_window = max(1, len(values) // 40)
     return [
         statistics.median(values[max(0, i - half_window) : i + half_window + 1])
@@ -193,8 +189,7 @@ def png(codes: Any) -> bytes:
 
 # --- training page --------------------------------------------------------------------------------
 
-# The page of a training: losses, held-out pictures and the best state, as one file that loads no
-# other file.
+# The page of a training as one self-contained file: losses, held-out pictures and the best state.
 
 
 PAGE = "training.html"
@@ -235,7 +230,7 @@ def write_page(
 
 
 def _lead(judged: Sequence[Mapping[str, str]], facts: Any) -> str:
-    """Return the opening of the page: the PSNR of the best network, and its gain over the input."""
+    """Return the opening of the page: the PSNR of the best network and its gain over the input."""
     if not judged:
         return (
             "No photograph is held out, so that nothing here says how the network restores pictures"
@@ -267,7 +262,7 @@ def _lead(judged: Sequence[Mapping[str, str]], facts: Any) -> str:
 
 
 def _meaning(facts: Any) -> str:
-    """Return what the curves of held-out pictures show and do not show."""
+    """Return a text on what the held-out curves show."""
     text = (
         f"{len(facts['held_out'])} photographs are held out; {facts['judged']} of them are"
         " restored, each with the same scene, laser and noise at every validation. The input is"
@@ -281,9 +276,7 @@ def _meaning(facts: Any) -> str:
 
 
 def _table(judged: Sequence[Mapping[str, str]], facts: Any) -> Section:
-    """Return the table of the best and the last state, with the numbers of the input beside
-    them.
-    """
+    """Return the table of the best and the last state, next to the numbers of the input."""
     best = facts.get("best")
     states = ([("best", best)] if best else []) + [("last", judged[-1])]
     rows = []
@@ -311,5 +304,5 @@ def _table(judged: Sequence[Mapping[str, str]], facts: Any) -> Section:
 
 
 def _four_digits(number: str | float | None) -> str | None:
-    """Return a number of the loss table with four digits, or None where the table has none."""
+    """Return a number of the loss table with four digits, or None if it is empty."""
     return f"{float(number):.4g}" if number else None

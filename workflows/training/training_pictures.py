@@ -33,13 +33,13 @@ from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
 
 # --- training recipe ------------------------------------------------------------------------------
 
-# What a training asks of a recipe: steps that exist, a scene of stated size, and float64 where it
-# is wanted.
+# Requirements of a training on its recipe: existing steps, a scene of known size, and float64 if
+# requested.
 
 
 def in_precision(recipe: Recipe, dtype: torch.dtype) -> Recipe:
-    """Return the recipe with steps in float64 if ``dtype`` is float64: steps with a choice of
-    precision are double.
+    """Return the recipe with ``precision: double`` in all steps that have this parameter, if
+    ``dtype`` is float64.
     """
     if dtype != torch.float64:
         return recipe
@@ -56,7 +56,7 @@ def _precise(step: Step) -> Step:
 
 def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
     """Raise ValueError unless the recipe has all steps ``names``, which the settings block
-    ``block`` names.
+    ``block`` refers to.
     """
     for name in names:
         if name not in recipe.steps:
@@ -66,8 +66,8 @@ def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
 
 
 def frame_of(recipe: Recipe, scene: str) -> tuple[int, int]:
-    """Return the sides of the scene in pixels (y, x); raise ValueError if the step ``scene``
-    does not state them.
+    """Return the size of the scene in pixels (y, x); raise ValueError if the step ``scene`` has no
+    shape.
     """
     shape = recipe.steps[scene].params.get("shape")
     if shape is None:
@@ -79,7 +79,7 @@ def frame_of(recipe: Recipe, scene: str) -> tuple[int, int]:
 
 # --- posed pictures -------------------------------------------------------------------------------
 
-# Training pictures of a network that needs what the Wiener filter knows: the filter is solved once
+# Training pictures of a network that needs the data of the Wiener filter: the filter is solved once
 # for each picture.
 #
 # The networks `unrolled` and `informed` need the PSF, the glare, the clipped pixels and the noise
@@ -90,7 +90,7 @@ def frame_of(recipe: Recipe, scene: str) -> tuple[int, int]:
 
 
 Posed = WienerProblem | FilterFacts
-#: nothing, or what the filter poses and knows, and the colour matrix
+#: empty, or the filter's problem or data, and the colour matrix
 Given = tuple[()] | tuple[Posed, Tensor]
 _FILTERS = ("restore.wiener", "restore.unrolled", "restore.informed")
 _KNOWN: dict[str, Any] = {"unrolled": restore.wiener_problem, "informed": restore.filter_facts}
@@ -99,19 +99,19 @@ _PARAMETERS = ("balance", "doubt", "least_doubt", "read_noise")
 
 @dataclass(frozen=True)
 class PosedPictures:
-    """The steps of a recipe that pose the problem of a picture, and that compute the colour
+    """The recipe steps that set up the filter problem of a picture, and that compute the colour
     matrix.
     """
 
     filter: str
     matrix: str
-    kind: str = "unrolled"  #: of the network
+    kind: str = "unrolled"  #: kind of the network
 
     @classmethod
     def of(cls, recipe: Recipe, settings: Training) -> PosedPictures | None:
-        """Return the steps of a training of such a network, or None for every other network.
+        """Return these steps for a training of such a network, or None for every other network.
 
-        Raises ValueError if the picture of the training is not that of the Wiener filter.
+        Raises ValueError if the training picture is not the result of the Wiener filter.
         """
         kind = settings.network.kind
         if settings.network.architecture is not None or kind not in POSED:
@@ -134,21 +134,23 @@ class PosedPictures:
 
     @property
     def steps(self) -> tuple[str, str]:
-        """Return the steps from which `read` makes the input of the network."""
+        """Return the steps from which `read` builds the input of the network."""
         return (self.filter, self.matrix)
 
     def within(self, recipe: Recipe) -> Recipe:
-        """Return the recipe whose filter poses the problem and solves it."""
+        """Return the recipe with the filter's node replaced by one that also returns the filter
+        problem.
+        """
         step = recipe.steps[self.filter]
         params = {name: value for name, value in step.params.items() if name in _PARAMETERS}
         posing_step = replace(step, node=_KNOWN[self.kind], params=params)
         return replace(recipe, steps={**recipe.steps, self.filter: posing_step})
 
     def read(self, values: Mapping[str, Any], dtype: torch.dtype) -> tuple[Tensor, Given]:
-        """Return the picture of the filter (3, y, x), and what the network needs beside it in the
-        given precision.
+        """Return the filtered picture (3, y, x), and the further inputs of the network in the given
+        precision.
 
-        The filter solves small pictures in float64; the steps of a training take half the time in
+        The filter solves small pictures in float64; the training steps take half the time in
         float32.
         """
         posed, matrix = values[self.filter], values[self.matrix]
@@ -157,7 +159,7 @@ class PosedPictures:
 
 
 def tensors_of(beside: Given) -> dict[str, Tensor]:
-    """Return the tensors by name of what a network needs beside a picture."""
+    """Return the further inputs of a network as tensors by name."""
     if not beside:
         return {}
     posed, matrix = beside
@@ -165,7 +167,7 @@ def tensors_of(beside: Given) -> dict[str, Tensor]:
 
 
 def given_of(tensors: Mapping[str, Tensor]) -> Given:
-    """Return what a network needs beside a picture, from its tensors by name."""
+    """Return the further inputs of a network from their tensors by name."""
     if "given.matrix" not in tensors:
         return ()
     kind = FilterFacts if "given.maps" in tensors else WienerProblem
@@ -176,8 +178,8 @@ def given_of(tensors: Mapping[str, Tensor]) -> Given:
 
 
 def turned(beside: Given, seed: tuple[int, ...]) -> Given:
-    """Turn the maps that a network sees beside a picture, as `scene.symmetry` turns the picture
-    with the same seed.
+    """Transform the maps that a network gets in addition to a picture, as `scene.symmetry`
+    transforms the picture with the same seed.
     """
     filter_facts = beside[0] if beside else None
     if not beside or not isinstance(filter_facts, FilterFacts):
@@ -191,12 +193,11 @@ def turned(beside: Given, seed: tuple[int, ...]) -> Given:
 
 # --- stored pool ----------------------------------------------------------------------------------
 
-# Simulated training pictures in the store, so that a later training with the same pictures begins
+# Simulated training pictures in the store, so that a later training with the same pictures starts
 # at once.
 #
-# The key of a picture is made of the keys of its steps with the values that were drawn for it, of
-# the scene itself and of the noise. So a picture of another optics, sensor, laser, distribution or
-# code has another key.
+# The key of a picture combines the keys of its steps with the drawn values, the scene and the noise
+# seed. A change of optics, sensor, laser, distribution or code therefore changes the key.
 
 
 _ABOUT = {"step": "training picture"}
@@ -204,7 +205,7 @@ _CODE = ("training.training_pictures", "training.training_pictures")
 
 
 class StoredPool:
-    """The pictures of a pool behind a fixed mask, each in the store under a key of its own."""
+    """The pictures of a pool behind a fixed mask, each stored under its own key."""
 
     def __init__(
         self, recipe: Recipe, settings: Training, outputs: Sequence[str], store: Store, device: str
@@ -214,7 +215,7 @@ class StoredPool:
         self._order = [name for name in needed(recipe, self._outputs) if name != settings.scene]
         self._code = Code(store.code_memo)
         self._resize = self._code.digest("neusee.nodes.resampling")
-        #: pictures that came from the store, and pictures that were simulated
+        #: number of pictures read from the store, and of pictures simulated
         self.read, self.computed = 0, 0
 
     def picture(
@@ -224,9 +225,7 @@ class StoredPool:
         noise: int,
         compute: Callable[[], dict[str, Tensor]],
     ) -> dict[str, Tensor]:
-        """Return the tensors of a picture from the store, or compute and store them before the
-        next picture.
-        """
+        """Return the tensors of a picture from the store, or compute and store them now."""
         key = self._key(scene, drawn, noise)
         computed: list[bool] = []
 
@@ -244,10 +243,10 @@ class StoredPool:
         return {name: x.to(self.device) for name, x in tensors.items()}
 
     def _key(self, scene: Tensor, changed: Mapping[str, Any], noise: int) -> str:
-        """Return the key of a picture, from all that decides it.
+        """Return the key of a picture, from everything that determines it.
 
-        That is the scene, the changed parameters, the noise seed and how the picture is cut. A step
-        that reads something private gives a private key, which is not stored.
+        These are the scene, the changed parameters, the noise seed and the cropping. A step that
+        reads something private gives a private key, which is not stored.
         """
         settings, recipe = self.settings, self.recipe
         scene_pixels = scene.detach().cpu().contiguous()
@@ -256,7 +255,7 @@ class StoredPool:
         for reader, value in changed.items():
             step_name, _, param = reader.rpartition(".")
             changed_params.setdefault(step_name, {})[param] = value
-        # the keys of all steps with the drawn parameters, as a run has them
+        # keys of all steps with the drawn parameters, as in a run
         for name in self._order:
             step = recipe.steps[name]
             step = replace(step, params={**step.params, **changed_params.get(name, {})})
@@ -266,7 +265,7 @@ class StoredPool:
         output_keys = [key_of_step[name] for name in self._outputs]
         if private_key := next(filter(is_private, output_keys), None):
             return private_key
-        # what is done with the picture after the camera
+        # processing of the picture after the camera
         cut_settings = [
             settings.size,
             settings.patch,
@@ -295,31 +294,28 @@ class StoredPool:
 # pictures, so that one picture is in memory at a time.
 
 
-#: the node of a laser, and the parameter that is 0 without a laser
+#: node of a laser, and its parameter that is set to 0 for no laser
 _LASER = ("optics.laser_irradiance", "strength")
 # noise seeds and picture numbers lie below this
 _SEEDS = 2**31
-#: in place of the number of a stage: the pictures of held-out photographs, the same in both stages
+#: stage number of held-out photographs, whose pictures are the same in both stages
 HELD_OUT = 3
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One training picture and the true picture, or patches of both."""
+    """One training picture with the true picture, or patches of both."""
 
     picture: Tensor  #: (n, 3, y, x), the developed picture of the camera
     truth: Tensor  #: (n, 3, y, x), the true picture
-    #: (band,), the fraction of the light of the scene that the mask keeps; empty where no loss
-    #: reads it
+    #: (band,), fraction of the scene's light that the mask keeps; empty if no loss reads it
     light: Tensor
     drawn: Mapping[str, Any]  #: the values that were sampled for the picture
-    given: Given = ()  #: what the network needs beside the picture
+    given: Given = ()  #: further inputs of the network
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Return picture, true picture, light, and what the network needs beside the picture, by
-        name.
-        """
+        """Return picture, true picture, light, and the further inputs of the network, by name."""
         return {
             "picture": self.picture,
             "truth": self.truth,
@@ -329,13 +325,13 @@ class Sample:
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], drawn: Mapping[str, Any]) -> Sample:
-        """Return the training picture whose tensors `tensors` named."""
+        """Return the training picture from its ``tensors`` by name."""
         return cls(tensors["picture"], tensors["truth"], tensors["light"], drawn, given_of(tensors))
 
 
 @dataclass(frozen=True)
 class Shared:
-    """Results that depend on the mask but on no picture, with detached copies that add up
+    """Results that depend on the mask but on no picture, with detached copies that accumulate the
     gradients of all pictures.
     """
 
@@ -344,7 +340,7 @@ class Shared:
 
     @classmethod
     def of(cls, made: Mapping[str, Any]) -> Shared:
-        """Detach results from the autograd graph."""
+        """Detach results from their autograd graph."""
         return cls(made, each_tensor(_leaf, dict(made)))  # two results may be one tensor
 
     def back(self) -> None:
@@ -368,21 +364,21 @@ def _leaf(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PictureSource:
-    """From what the pictures of a training are computed, and where."""
+    """The photographs, store and device from which the pictures of a training are computed."""
 
     photographs: Photographs
     store: Store
     device: str = "cpu"
     mesh: Mesh = ALONE
-    held_out: Sequence[Path] = ()  #: photographs that only the validation sees
+    held_out: Sequence[Path] = ()  #: photographs only for the validation
 
 
 class TrainingStream:
-    """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask
-    of ``frozen``.
+    """The training pictures of a recipe, behind a trainable mask or behind the fixed mask of
+    ``frozen``.
     """
 
-    repeats = 1  #: pictures of each held-out photograph
+    repeats = 1  #: number of pictures of each held-out photograph
 
     def __init__(
         self,
@@ -403,13 +399,13 @@ class TrainingStream:
         self._inputs = _uncertain_inputs(recipe, outputs)
         self._mismatch = CameraMismatch.of(recipe, settings)
         self.shape = frame_of(recipe, settings.scene)
-        # what the restorer is told of the camera
+        # the camera as the restorer assumes it
         believed = in_precision(frozen or recipe, settings.dtype)
         self._posed = PosedPictures.of(recipe, settings)
         if self._posed:
             believed = self._posed.within(believed)
         self._made = self._outputs(2 if frozen else 1)
-        # the camera that takes the pictures may differ from it
+        # the actual camera may differ from the assumed one
         recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
         outputs = (*self._made, self.psf)
         recipe = with_substitutions(replace(recipe, estimates=False), outputs, learnt_steps)
@@ -421,21 +417,21 @@ class TrainingStream:
         noise_steps, picture_steps = self._changing(recipe, order)
         steps_behind_mask = dependents(recipe, learnt_steps, order)
         read_by_pictures = _sources(recipe, picture_steps) | {self.psf}
-        # steps behind the mask that no picture changes but that the steps of pictures read
+        # results that depend on the mask only, and that steps for each picture read
         shared_outputs = [
             name for name in order if name in (steps_behind_mask - picture_steps) & read_by_pictures
         ]
         self._divide(recipe, learn, shared_outputs, noise_steps, source.store)
 
     def _stored_pool(self, recipe: Recipe, store: Store) -> StoredPool | None:
-        """Return the pictures of a pool in the store, or None if there is no pool to keep."""
+        """Return the stored pool of pictures, or None if no pool is to be stored."""
         if not self._pool or not self.settings.keep_pool:
             return None
         return StoredPool(recipe, self.settings, self._made, store, self.device)
 
     def _changing(self, recipe: Recipe, order: Sequence[str]) -> tuple[set[str], set[str]]:
-        """Return the steps that draw noise for each picture, and all steps that change with each
-        picture.
+        """Return the steps that draw noise for each picture, and all steps that differ between
+        pictures.
         """
         # random effects in the PSF, such as dirt, are constant
         psf_steps = set(needed(recipe, [self.psf]))
@@ -452,8 +448,8 @@ class TrainingStream:
         return noise_steps, picture_steps
 
     def _outputs(self, number: int) -> tuple[str, ...]:
-        """Return the steps that make a picture of a stage: what a network sees, the truth, light
-        if a loss reads it.
+        """Return the steps that a picture of a stage needs: network input, true picture, and the
+        light if a loss reads it.
         """
         stage = self.settings.stages.get(number)
         light = (self.settings.light,) if stage is not None and stage.bsr else ()
@@ -461,10 +457,9 @@ class TrainingStream:
         return (*input_steps, self.settings.truth, *light)
 
     def _read(self, believed: Recipe, order: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters that change with each picture, with the values that the recipe
-        states.
+        """Return the parameters that differ between pictures, with their values in the recipe.
 
-        What is drawn for the camera is told to the restorer too, but for the differences of
+        The restorer is given the values drawn for the camera, except the differences of
         ``train.mismatch``.
         """
         drawn_names = dict.fromkeys(
@@ -486,8 +481,8 @@ class TrainingStream:
         noise: set[str],
         store: Store,
     ) -> None:
-        """Divide the recipe into steps that depend on the mask alone, up to ``border``, and
-        steps for each picture.
+        """Split the recipe into steps that depend on the mask alone, with the results ``border``,
+        and steps for each picture.
         """
         options: dict[str, Any] = {"store": store, "device": self.device}
         self.shared = as_function(recipe, learn, outputs=border, **options) if learn else None
@@ -498,7 +493,7 @@ class TrainingStream:
 
     @property
     def pool_counts(self) -> dict[str, int]:
-        """Return how many pictures of the pool this process read from the store, and how many it
+        """Return the numbers of pool pictures that this process read from the store and
         simulated.
         """
         return (
@@ -508,27 +503,23 @@ class TrainingStream:
         )
 
     def begin(self, height: Tensor) -> Shared:
-        """Compute the steps that depend on the mask alone, once for all pictures of a training
-        iteration.
-        """
+        """Compute the steps that depend on the mask alone, once per training iteration."""
         results = self.shared({str(self.settings.learn): height}) if self.shared else {}
         return Shared.of(results)
 
     def batch(
         self, shared: Shared, stage: int, first: int, count: int
     ) -> Iterator[tuple[int, Sample]]:
-        """Yield index and picture for each picture of a training batch that this process simulates.
+        """Yield index and picture for each picture of a batch that this process simulates.
 
-        The batch has ``count`` pictures and begins with the picture number ``first``.
+        The batch has ``count`` pictures, starting with picture number ``first``.
         """
         for i in range(self.mesh.rank, count, self.mesh.size):
             sample = self(shared.values, stage, first + i)
             yield i, self.turned(sample, stage, first + i)
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        """Return the training picture with the given number, which does not depend on order or
-        process.
-        """
+        """Return the training picture with the given number, independent of order and process."""
         number = self._number(stage, number)
         if self._pool is None or stage == HELD_OUT:
             return self._alone(shared, stage, number)
@@ -537,23 +528,23 @@ class TrainingStream:
         return self._kept[stage, number]
 
     def _number(self, stage: int, number: int) -> int:
-        """Return the number of a picture within its pool; held-out pictures have no pool."""
+        """Return the number of a picture within its pool; unchanged for held-out pictures."""
         return number % (self._pool or _SEEDS) if stage != HELD_OUT else number
 
     def turned(self, sample: Sample, stage: int, number: int) -> Sample:
-        """Turn a pooled picture and the true picture together, each time otherwise: as behind a
-        mask that is turned.
+        """Transform a pooled picture and the true picture by a random symmetry, as if the mask were
+        turned; each time another one.
         """
         if self._pool is None or stage == HELD_OUT or self.settings.augment.pooled == "none":
             return sample
-        # the last number keeps apart the random streams of a picture: 1 values, 2 patches, 3 scene,
-        # 4 turn
+        # the last number separates the random streams of a picture: 1 values, 2 patches, 3 scene, 4
+        # turn
         seed = (self.seed, stage, number, 4)
         picture, truth = symmetry(sample.picture, seed), symmetry(sample.truth, seed)
         return replace(sample, picture=picture, truth=truth, given=turned(sample.given, seed))
 
     def _scene(self, stage: int, number: int) -> Tensor:
-        """Return the scene of a picture (3, y, x), with the changes of ``train.augment``."""
+        """Return the scene of a picture (3, y, x), with the random changes of ``train.augment``."""
         if stage == HELD_OUT:
             return Photographs((self.held_out[number],)).crop(
                 self.shape, self.seed, (stage, number)
@@ -571,7 +562,7 @@ class TrainingStream:
         )
 
     def _alone(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        """Return the picture with this number, from the store where it may be there."""
+        """Return the picture with this number, from the store if possible."""
         theta, noise, drawn_values = self._drawn(stage, number)
         values = {**shared, **theta}
         free_values = {name: values[name] for name in self._simulate.free}
@@ -588,17 +579,18 @@ class TrainingStream:
         return Sample.of(tensors, drawn_values)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
-        """Sample the random inputs of a training picture; return the inputs, the noise seed, and
-        all values by name.
+        """Draw the random inputs of a training picture; return the inputs, the noise seed, and all
+        values by name.
         """
         rng = np.random.default_rng((self.seed, stage, number, 1))
-        # by step and parameter, the values of the recipe to begin with; by name, what is drawn
+        # start from the recipe's values by step and parameter; ``drawn_values`` are the drawn ones
+        # by name
         theta, drawn_values = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
             values = self._inputs.at(rng.standard_normal((1, len(self._inputs.names))))[0]
             drawn_values = dict(zip(self._inputs.names, map(float, values), strict=True))
             theta |= self._inputs.theta(drawn_values)
-        # the restorer is told the drawn values, before the camera differs from them
+        # the restorer gets the drawn values, before the camera deviates from them
         theta |= {name: theta[name.removeprefix(TOLD)] for name in theta if name.startswith(TOLD)}
         differences = self._mismatch.drawn((self.seed, stage, number))
         theta |= self._mismatch.truth(theta, differences)
@@ -613,8 +605,8 @@ class TrainingStream:
         return theta, noise_seed, {**drawn_values, "noise": noise_seed, "number": number}
 
     def _sample(self, values: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
-        """Resize a training picture and the true picture to ``train.size``, and cut both into
-        patches.
+        """Resize a training picture and the true picture to ``train.size``, and cut patches from
+        both.
 
         Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the
         finest stripes keep a contrast of 0.69 with kornia, and of 0.09 with `resize`.
@@ -633,7 +625,7 @@ class TrainingStream:
         return Sample(picture, truth, light, drawn, network_inputs)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
-        """Cut patches from a training picture and the true picture at the same positions, as a
+        """Cut patches from a training picture and the true picture at the same positions; return a
         tensor (2, n, 3, y, x).
 
         A slice gives the same pixels as `kornia.geometry.transform.crop_by_indices` in a tenth of
@@ -653,53 +645,52 @@ class TrainingStream:
             [int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)]
             for _ in range(count)
         ]
-        # axis 1 counts the patches, axis 0 has picture and truth
+        # axis 0: picture and truth; axis 1: patches
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in corners], 1)
 
 
 def _uncertain_inputs(recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
-    """Return the uncertain inputs of a recipe, or None for a recipe without any."""
+    """Return the uncertain inputs of a recipe, or None if it has none."""
     if recipe.uncertain and recipe.uncertain.names:
         return Inputs.of(recipe, outputs)
     return None
 
 
 def _parameters_of_lasers(recipe: Recipe, order: Sequence[str]) -> list[str]:
-    """Return the parameter of each laser that changes with each picture."""
+    """Return the strength parameter of each laser, which differs between pictures."""
     lasers = [name for name in order if recipe.steps[name].node.path == _LASER[0]]
     return [f"{name}.{_LASER[1]}" for name in lasers]
 
 
 def _parameter(recipe: Recipe, name: str) -> Any:
-    """Return the value of a parameter, from a name such as ``psf[mask].angle``."""
+    """Return the value of a parameter with a name such as ``psf[mask].angle``."""
     step, _, param = name.rpartition(".")
     return recipe.steps[step].params[param]
 
 
 def _sources(recipe: Recipe, readers: Iterable[str]) -> set[str]:
-    """Return the steps whose results the readers read."""
+    """Return the steps whose results the steps ``readers`` read."""
     return set(chain.from_iterable(recipe.steps[reader].sources for reader in readers))
 
 
 # --- several cameras ------------------------------------------------------------------------------
 
-# Training pictures of several cameras in turn, so that one network learns to restore the pictures
-# of all of them.
+# Training pictures of several cameras in turn, so that one network learns to restore all of them.
 
 
 class SeveralCameras:
-    """The pictures of a training with the camera of its recipe and with each of ``train.cameras``.
+    """The training pictures of the recipe's camera and of each camera in ``train.cameras``.
 
-    The picture with the number n, or its number n in the pool, is of camera n modulo their count. A
-    held-out photograph is seen by every camera.
+    Picture n (its number within the pool) is taken by camera n modulo the number of cameras. A
+    held-out photograph is taken by every camera.
     """
 
-    shared = None  #: no mask is trained, so that no result depends on one
+    shared = None  #: None: no mask is trained
 
     def __init__(self, recipe: Recipe, settings: Training, source: PictureSource) -> None:
         recipes = (recipe, *recipe.cameras)
         self.repeats, self._pool = len(recipes), settings.pool
-        # each held-out photograph once for each camera
+        # repeat each held-out photograph for each camera
         repeated_photographs: list[Path] = []
         for path in source.held_out:
             repeated_photographs += [path] * len(recipes)
@@ -711,20 +702,20 @@ class SeveralCameras:
 
     @property
     def pool_counts(self) -> dict[str, int]:
-        """Return how many pictures of the pool came from the store, and how many were simulated."""
+        """Return the numbers of pool pictures read from the store and simulated."""
         counts = [stream.pool_counts for stream in self._streams]
         return {
             name: sum(counts_of_camera[name] for counts_of_camera in counts) for name in counts[0]
         }
 
     def begin(self, height: Any) -> Shared:
-        """Return no results: none depends on a mask that is trained."""
+        """Return no shared results, because no mask is trained."""
         return Shared.of({})
 
     def batch(
         self, shared: Shared, stage: int, first: int, count: int
     ) -> Iterator[tuple[int, Sample]]:
-        """Yield index and picture of each of the ``count`` pictures of a batch, from the picture
+        """Yield index and picture for the ``count`` pictures of a batch, starting with picture
         number ``first``.
         """
         for i in range(count):
@@ -740,14 +731,14 @@ Samples = TrainingStream | SeveralCameras
 def samples_of(
     recipe: Recipe, settings: Training, source: PictureSource, frozen: Recipe | None
 ) -> Samples:
-    """Return the pictures of a training, of one camera or of several in turn."""
+    """Return the pictures of a training, from one camera or from several in turn."""
     if frozen is not None and frozen.cameras:
         return SeveralCameras(frozen, settings, source)
     return TrainingStream(recipe, settings, source, frozen)
 
 
 def require_alone(recipe: Recipe, mesh: Mesh) -> None:
-    """Raise an error for a training with several cameras in several processes."""
+    """Raise `MeshError` for a training with several cameras in several processes."""
     if recipe.cameras and mesh.size > 1:
         raise MeshError(
             f"{KEY}.cameras: a training with several cameras runs in a single process, without"
