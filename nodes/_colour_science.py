@@ -1,5 +1,5 @@
-"""The package colour-science, imported without what it changes: how NumPy prints every number of
-the process.
+"""Import of the package colour-science that restores NumPy's print options, which it changes for
+the whole process.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-__depends__ = ("unaffected:state",)  # how numbers are printed decides no result
+__depends__ = ("unaffected:state",)  # print options affect no result
 
 
 @functools.cache
 def colour_science() -> Any:
-    """Return the module ``colour``."""
+    """Return the module ``colour``, and keep NumPy's print options as they are."""
     options_before = np.get_printoptions()
     import colour
 

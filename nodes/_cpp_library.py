@@ -1,11 +1,11 @@
-"""C++ sources compiled for the processor of this machine on first use and then reused.
+"""C++ sources, compiled on first use for the processor of the machine and then reused.
 
 The sources need only a compiler, no headers of torch or Python. They compile in seconds, and a
 library works with any version of both. A library is compiled in a temporary folder and moved by an
-atomic rename: two processes that compile at once both get a valid library, and a process that is
-killed leaves no lock behind. The variable ``CXX`` names the compiler. Its options come last and so
-win: ``CXX="g++ -march=x86-64-v3"`` compiles for AVX2, and a name that is no program leaves the work
-to torch.
+atomic rename: two processes that compile at the same time both get a valid library, and a killed
+process leaves no lock behind. The variable ``CXX`` names the compiler. Its options come last and
+take precedence: ``CXX="g++ -march=x86-64-v3"`` compiles for AVX2. If it names no program, torch
+does the computation.
 """
 
 import ctypes
@@ -19,8 +19,8 @@ import tempfile
 import warnings
 from pathlib import Path
 
-#: the processor's FMA changes a result within rounding where a source allows it; each module
-#: declares its own sources
+#: fused multiply-add (FMA) changes a result only within rounding, and only where a source allows
+#: it; each module declares its own sources
 __depends__ = (
     "_vector.h",
     "unaffected:file",
@@ -35,15 +35,15 @@ FLAGS = (
     *("-std=c++17", "-O3", "-march=native", "-fopenmp", "-fPIC", "-shared", "-w"),
     *("-fno-math-errno", "-fno-trapping-math"),
 )
-#: compilers fuse a product and a sum where they like, which rounds once instead of twice
+#: with FUSED, compilers may fuse a product and a sum, which rounds once instead of twice
 FUSED, UNFUSED = "-ffp-contract=fast", "-ffp-contract=off"
-#: the header of all sources, with the width of a vector
+#: header file of all sources, which sets the width of a vector
 VECTOR = Path(__file__).with_name("_vector.h")
 
 
 class NoCompilerError(RuntimeError):
-    """The error of a machine on which a C++ source cannot be compiled; the message gives the
-    reason in one line.
+    """Raised if a C++ source cannot be compiled on this machine; the message gives the reason in
+    one line.
     """
 
 
@@ -51,15 +51,15 @@ def folder() -> Path:
     """Return the folder of the compiled libraries: ``$XDG_CACHE_HOME/neusee/build``, else
     ``~/.cache/neusee/build``.
 
-    The folder must outlive the process, or each process would compile. No result is kept there or
-    depends on it.
+    The folder must outlive the process, so that libraries are reused. It holds no results, and no
+    result depends on it.
     """
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neusee" / "build"
 
 
 def _processor() -> str:
-    """Return a text that identifies the processor, because different machines may share a home
-    folder.
+    """Return a text that identifies the processor; it is part of the name of a library, since
+    different machines may share a home folder.
     """
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
@@ -70,7 +70,7 @@ def _processor() -> str:
 
 
 def _first_line(lines: list[str], word: str) -> str:
-    """Return the first line that begins with a word, or an empty text."""
+    """Return the first of the lines that begins with ``word``, or an empty text."""
     return next((line for line in lines if line.startswith(word)), "")
 
 
@@ -88,7 +88,7 @@ def _compiler() -> str:
 
 
 def _first_error(process: subprocess.CompletedProcess[str]) -> str:
-    """Return the first line of a compiler that names an error, or its exit status."""
+    """Return the first line of a compiler's output that contains "error", or its exit status."""
     for line in process.stderr.splitlines():
         if "error" in line:
             return line.strip()
@@ -118,7 +118,7 @@ def _compile(code: Path, rounding: str, where: Path) -> None:
             )
             if process.returncode:
                 raise NoCompilerError(f"{compiler} failed: {_first_error(process)}")
-            # atomic, so that another process never reads half a library
+            # atomic, so that another process never reads an incomplete library
             os.replace(library, where)
     except (OSError, subprocess.SubprocessError) as error:
         raise NoCompilerError(f"{compiler} could not be run: {error}") from error
@@ -128,8 +128,8 @@ def _compile(code: Path, rounding: str, where: Path) -> None:
 def _library(
     sources: tuple[Path, ...], rounding: str, build: Path, compiler: str | None
 ) -> ctypes.CDLL | NoCompilerError:
-    """Return the compiled library, or the error of the single attempt to compile for this folder
-    and compiler.
+    """Return the compiled library, or the error if compilation failed; for each folder and compiler
+    it is tried only once.
     """
     texts = [source.read_text(encoding="utf-8") for source in (*sources, VECTOR)]
     words = [*texts, *FLAGS, rounding, compiler or "", _processor()]
@@ -146,12 +146,12 @@ def _library(
 
 
 def load(*sources: Path, rounding: str = FUSED) -> ctypes.CDLL:
-    """Return the library of the first source, compiled if needed, with the other sources as its
-    headers.
+    """Return the library of the first source, compiled if necessary; the other sources are headers
+    that it includes.
 
-    With the rounding `UNFUSED`, the result of a source whose vector lanes never meet has the same
-    bits for every width of a vector and every compiler. Raises `NoCompilerError` if the source
-    cannot be compiled.
+    With the rounding `UNFUSED`, a source without operations across vector lanes gives bit-identical
+    results for every vector width and every compiler. Raises `NoCompilerError` if the source cannot
+    be compiled.
     """
     library = _library(sources, rounding, folder(), os.environ.get("CXX"))
     if isinstance(library, NoCompilerError):
@@ -160,8 +160,8 @@ def load(*sources: Path, rounding: str = FUSED) -> ctypes.CDLL:
 
 
 def compiled(task: str, *sources: Path, rounding: str = FUSED) -> bool:
-    """Return True if the library of ``task`` is available, compiled if needed; otherwise warn
-    once and return False.
+    """Return True if the library of ``task`` is available, after compilation if necessary;
+    otherwise warn once and return False.
     """
     try:
         load(*sources, rounding=rounding)
@@ -173,6 +173,8 @@ def compiled(task: str, *sources: Path, rounding: str = FUSED) -> bool:
 
 @functools.cache
 def _say_once(task: str, why: str) -> None:
-    """Warn once that a C++ source is not compiled, so that torch is slower."""
+    """Warn once for each task that its C++ source is not compiled and torch is used, which is
+    slower.
+    """
     text = f"the C++ of the {task} is not compiled and torch computes the {task} more slowly: {why}"
     warnings.warn(text, stacklevel=5)

@@ -1,4 +1,4 @@
-"""Nodes: functions for one step of a recipe, with error bounds, checks and other hooks."""
+"""Nodes: functions that compute one step of a recipe, with error bounds, checks and other hooks."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ if TYPE_CHECKING:
 
 # --- error bound ----------------------------------------------------------------------------------
 
-# Statistics and error bounds of tensors, which an engine reads in place of the tensors.
+# Statistics and error bounds of tensors, which an engine uses instead of the tensors.
 
 
-_FEW_ELEMENTS = 64  #: up to this many elements, a loop in Python is faster than five calls of torch
-_PART_ELEMENTS = 1 << 17  #: elements that are measured at once
-_ROW_ELEMENTS = 1 << 10  #: elements that are summed in the precision of the tensor
-#: relative round-off of a sum, which float32 rows of 1024 elements keep far below
+#: up to this number of elements, a Python loop is faster than five calls of torch
+_FEW_ELEMENTS = 64
+_PART_ELEMENTS = 1 << 17  #: elements processed at once
+_ROW_ELEMENTS = 1 << 10  #: elements of a row, which is summed in the precision of the tensor
+#: bound of the relative round-off of a sum; float32 rows of 1024 elements stay far below it
 _SUM_ROUND_OFF = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class TensorStats:
-    """Statistics of a tensor, such as range and sum, which are stored so that the tensor need
-    not be loaded.
+    """Statistics of a tensor, such as range and sum; they are stored so that the tensor need not be
+    loaded.
     """
 
     shape: tuple[int, ...]
@@ -44,15 +45,15 @@ class TensorStats:
     min: float
     max: float
     sum: float
-    support: int  #: elements that are not zero
+    support: int  #: number of nonzero elements
     finite: bool
 
     @classmethod
     def of(cls, value: Any) -> TensorStats | None:
-        """Return the statistics of a tensor, or of the first tensor in a named tuple; return
-        None for other values.
+        """Return the statistics of a tensor, or of the first element of a tuple or list; None for
+        other values.
         """
-        # here, so that a command that computes nothing need not import torch
+        # imported here, so that a command without computation need not import torch
         from torch import Tensor
 
         if isinstance(value, tuple | list) and value:
@@ -65,7 +66,8 @@ class TensorStats:
             return cls(shape, dtype, math.nan, math.nan, 0.0, 0, True)
         tensor = tensor.abs() if tensor.is_complex() else tensor
         few_elements = tensor.reshape(-1).tolist() if tensor.numel() <= _FEW_ELEMENTS else []
-        # a sum in Python is exact enough, and an overflow goes the long way below
+        # a Python sum is accurate enough; overflows and values that are not finite are handled
+        # below
         if few_elements and math.isfinite(total := float(sum(few_elements))):
             return cls(
                 shape,
@@ -82,17 +84,18 @@ class TensorStats:
 
     @property
     def largest_rms(self) -> float:
-        """Return the largest root mean square that a tensor of this count, minimum, maximum and sum
-        can have.
+        """Return the largest possible root mean square of a tensor with this number of elements,
+        minimum, maximum and sum.
 
-        The squares are largest where all elements but one are at an end of the range. Without a
-        finite sum, every element may be at the farther end.
+        The sum of squares is largest if all elements but one are at an end of the range. If the sum
+        is not finite, all elements may be at the end of larger magnitude.
         """
         lowest, highest, count = self.min, self.max, math.prod(self.shape)
         largest_absolute = max(abs(lowest), abs(highest))
         if count == 0 or highest <= lowest or not math.isfinite(self.sum):
             return largest_absolute
-        # squares are largest with all elements but one at either end, for the given sum
+        # for a given sum, the sum of squares is largest with all elements but one at an end of the
+        # range
         count_at_top = min(max((self.sum - count * lowest) / (highest - lowest), 0.0), count)
         middle_value = lowest + (count_at_top - math.floor(count_at_top)) * (highest - lowest)
         count_at_bottom = max(count - math.floor(count_at_top) - 1, 0)
@@ -103,12 +106,12 @@ class TensorStats:
 
 
 def _measure(flat: Tensor) -> tuple[float, float, float, int]:
-    """Return minimum, maximum, sum and number of nonzero elements of a flat tensor, in parts for
-    the CPU cache.
+    """Return minimum, maximum, sum and number of nonzero elements of a flat tensor, computed in
+    parts that fit into the CPU cache.
     """
     import torch
 
-    # truth values and half precision are measured in float32
+    # booleans and half precision are converted to float32
     is_small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
     part_statistics = [
         _measure_piece(piece, is_small) for piece in torch.split(flat, _PART_ELEMENTS)
@@ -117,7 +120,7 @@ def _measure(flat: Tensor) -> tuple[float, float, float, int]:
         torch.stack(values) for values in zip(*part_statistics, strict=True)
     )
     lowest, highest, total = (float(x) for x in (minima.min(), maxima.max(), sums.sum()))
-    # the sum of a row overflowed
+    # if the sum of a row overflowed, sum in float64
     if math.isinf(total) and math.isfinite(lowest) and math.isfinite(highest):
         total = float(
             sum(piece.sum(dtype=torch.float64) for piece in torch.split(flat, _PART_ELEMENTS))
@@ -126,8 +129,8 @@ def _measure(flat: Tensor) -> tuple[float, float, float, int]:
 
 
 def _measure_piece(piece: Tensor, small: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return minimum, maximum, sum and number of nonzero elements of a piece, in float32 if its
-    type is ``small``.
+    """Return minimum, maximum, sum and number of nonzero elements of a piece; with ``small`` it is
+    converted to float32.
     """
     import torch
 
@@ -139,31 +142,29 @@ def _measure_piece(piece: Tensor, small: bool) -> tuple[Tensor, Tensor, Tensor, 
 
 @dataclass(frozen=True, slots=True)
 class ErrorBound:
-    """A bound, or an estimate, of the error of an input of a node, with the statistics of this
+    """A bound, or an estimate, of the error of a node's input, with the statistics of this
     input.
     """
 
     rms: float  #: bound of the root mean square error over the elements, in the unit of the input
     stats: TensorStats | None = None
-    #: bound of the error of the largest element, as a share of this element; None if it is unknown
+    #: bound of the relative error of the largest element; None if unknown
     peak: float | None = None
-    #: True if the error counts an estimate; else it is a proved upper bound
+    #: True if the error includes an estimate; else it is a proved upper bound
     estimated: bool = False
-    #: part of `rms` that changes from element to element like noise; the other part is like the
-    #: light itself
+    #: part of `rms` that varies from element to element like noise; the other part is as smooth as
+    #: the light itself
     scattered: float = 0.0
 
     @property
     def top(self) -> float:
-        """Return the largest absolute element of the input, or 0 if nothing is known of the
-        input.
-        """
+        """Return the largest absolute value of the input, or 0 if its statistics are unknown."""
         return max(abs(self.stats.min), abs(self.stats.max)) if self.stats else 0.0
 
     @property
     def share(self) -> float:
-        """Return the bound of the rms error of a node input, relative to the largest absolute
-        element of the input.
+        """Return the bound of the rms error of the input, relative to its largest absolute
+        value.
         """
         if self.rms == 0.0:
             return 0.0
@@ -171,8 +172,8 @@ class ErrorBound:
 
     @property
     def largest(self) -> float:
-        """Return the bound of the relative error of the largest element of a node input, or inf
-        if unknown.
+        """Return the bound of the relative error of the largest element of the input; inf if
+        unknown.
         """
         if self.rms == 0.0:
             return 0.0
@@ -187,7 +188,7 @@ class ErrorBound:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding about the result of a node, such as ``Check("phase step 0.31 turn < 0.5",
+    """The outcome of one check of a node's result, such as ``Check("phase step 0.31 turn < 0.5",
     True)``.
     """
 
@@ -197,28 +198,27 @@ class Check:
 
 @dataclass(slots=True)
 class Hooks:
-    """The functions attached to a node (hooks), such as ``check``, which ``@digitize.check``
-    attaches.
+    """The functions attached to a node (hooks), such as ``check``, attached by
+    ``@digitize.check``.
     """
 
-    #: slow float64 form: same arguments, same result within ``rtol``
+    #: slow reference in float64: same arguments, same result within ``rtol``
     reference: Callable[..., Any] | None = None
     #: (`TensorStats` of each input, *, parameters): bound of ``max |with - without| / max |with|``
     #: if the step is left out and its first input is used instead; for a random node, in root mean
     #: square over the noise
     skip_bound: Callable[..., float] | None = None
     #: (`TensorStats` of the first input, *, parameters): the factor by which the root mean square
-    #: of one draw of the noise exceeds `skip_bound` in one of 10 000 draws
+    #: error of a single draw of the noise exceeds `skip_bound` in only one of 10 000 draws
     skip_draw: Callable[..., float] | None = None
-    #: True if `skip_bound` is an estimate and no bound, for which a recipe with ``estimates:
-    #: false`` omits nothing
+    #: True if `skip_bound` is an estimate and not a bound; a recipe with ``estimates: false`` does
+    #: not use it to omit a step
     skip_estimated: bool = False
     #: (`TensorStats` of the first input, *, parameters): the scale of `skip_bound`, such as the
-    #: full well, because a later step cuts off larger values
+    #: full well, if a later step clips larger values
     skip_scale: Callable[..., float] | None = None
-    #: (`TensorStats` of each input, None for an absent input, *, parameters): bound of the result's
-    #: largest element; where the bound is 0, the step and the steps that only feed this step are
-    #: left out
+    #: (`TensorStats` of each input, None for an absent input, *, parameters): bound of the largest
+    #: element of the result; if it is 0, the step and the steps that only it uses are omitted
     zero_bound: Callable[..., float] | None = None
     #: (`ErrorBound` of each input, *, result: TensorStats, parameters): the error that errors of
     #: the inputs cause in the result; both errors are upper bounds in root mean square; a list
@@ -226,56 +226,57 @@ class Hooks:
     #: error of the largest element; without this hook the inputs must satisfy the tolerance
     #: themselves, because the error of the result is not known
     propagate_error: Callable[..., float | ErrorBound] | None = None
-    #: (the same arguments): the error that one of 10 000 draws of the noise exceeds, where
-    #: `propagate_error` gives that of all draws; a run states it and does not hold it to the
+    #: (the same arguments): the error that only one of 10 000 draws of the noise exceeds, whereas
+    #: `propagate_error` is over all draws; a run reports it and does not compare it with the
     #: tolerance
     propagate_draw: Callable[..., float] | None = None
-    #: (the same arguments): the error of the result from errors like noise (`ErrorBound.scattered`,
-    #: here as ``rms``); without this hook `propagate_error` holds for these errors too
+    #: (the same arguments): the error of the result from noise-like errors of the inputs
+    #: (`ErrorBound.scattered`, passed here as ``rms``); without this hook `propagate_error` is used
+    #: for these errors too
     propagate_scattered: Callable[..., float] | None = None
     #: (rms error of the result as `propagate_error` gives it, *, result: TensorStats, parameters):
-    #: the rms error with what rounding to whole numbers adds; an estimate, which a run states and
-    #: does not hold to the tolerance
+    #: the rms error including rounding to whole numbers; an estimate, which a run reports and does
+    #: not compare with the tolerance
     rounding_error: Callable[..., float] | None = None
-    #: True if `propagate_error` or `approximation_error` gives an estimate and no bound, which a
-    #: recipe with ``estimates: false`` does not use
+    #: True if `propagate_error` or `approximation_error` is an estimate and not a bound; a recipe
+    #: with ``estimates: false`` does not use it
     estimated: bool = False
-    #: (result): the error of a cheaper form relative to its largest element, in root mean square
-    #: and for the largest element alone; both include the cheaper forms of the inputs, and not what
-    #: was left out of the inputs
+    #: (result): the error of a cheaper form relative to its largest element, as root mean square
+    #: and for the largest element; both include the errors by cheaper forms of the inputs, but not
+    #: those by omitted steps
     approximation_error: Callable[[Any], tuple[float, float]] | None = None
     #: (parameters): True if the result is the same for every band
     band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
-    #: (*, parameters): notes for the user, before anything runs; may raise `ParameterError`; an
-    #: argument with the name of an input receives what is known of that input before the run, as
-    #: ``shape`` gives it, else None
+    #: (*, parameters): notes for the user before the run; may raise `ParameterError`; an argument
+    #: with the name of an input receives the input as far as it is known before the run (see
+    #: ``shape``), else None
     preflight: Callable[..., Sequence[str]] | None = None
-    #: (result, *inputs, **parameters): findings, once after computing
+    #: (result, *inputs, **parameters): checks of a computed result
     check: Callable[..., Sequence[Check]] | None = None
-    #: (what is known of each input, None where nothing is, **parameters): what is known of the
-    #: result before the run: tensors on the device ``meta``, which have a shape and a type but no
-    #: values; a tensor of few numbers may have values. A rule that fails, such as one that needs an
-    #: unknown input, leaves the result unknown
+    #: (each input as far as known before the run, else None, **parameters): the result as far as
+    #: known before the run: tensors on the device ``meta``, which have shape and type but no
+    #: values; a tensor of few numbers may have values. If the rule fails, such as for an unknown
+    #: input, the result is unknown
     shape: Callable[..., Any] | None = None
-    #: (`TensorStats` of each input, *, parameters): least and largest element of the result as a
-    #: plan expects them before the run, no bound; an input of which nothing is known raises
-    #: LookupError where it is read
+    #: (`TensorStats` of each input, *, parameters): expected smallest and largest element of the
+    #: result, for planning, not a bound; reading an unknown input raises LookupError
     expected_range: Callable[..., tuple[float, float]] | None = None
-    #: (): the arguments of one small call by name, on which `neusee check` tries the node
+    #: (): the arguments, by name, of a small call with which `neusee check` tests the node
     example: Callable[[], Mapping[str, Any]] | None = None
-    #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run beside
-    #: inputs and result, and number of operations, both up to a constant factor, which is measured
+    #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run in
+    #: addition to inputs and result, and number of operations, both up to a constant factor, which
+    #: is measured
     work: Callable[..., tuple[float, float]] | None = None
 
 
 # --- node -----------------------------------------------------------------------------------------
 
-# Nodes: functions that compute one step of a recipe, with typed parameters and attached functions
-# (hooks).
+# A node is a function that computes one step of a recipe, with typed parameters and attached
+# functions (hooks).
 #
 # The signature defines the node. Arguments before ``*`` are data from other steps. Arguments after
-# ``*`` are parameters from the recipe, and the engine gives the random generator for a parameter
-# named ``rng``.
+# ``*`` are parameters from the recipe; for a parameter ``rng`` the engine passes a random
+# generator.
 #
 #     @node(rtol=0.0)
 #     def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
@@ -297,13 +298,12 @@ class Hooks:
 
 Device = Literal["any", "cpu", "gpu"]
 Fn = TypeVar("Fn", bound=Callable[..., Any])
-#: every node of this process, the newest of each module and name
+#: every node defined in this process, by module and name; a redefinition replaces the older node
 _registered: dict[tuple[str, str], Node] = {}
 
 
 class ParameterError(ValueError):
-    """The error that the ``preflight`` of a node raises for a wrong parameter, before any step
-    runs.
+    """Raised by the ``preflight`` of a node for an invalid parameter, before any step runs.
 
     Args: the name of the parameter, and one sentence with the value and the fix. The name
             ``direction.angle`` means the parameter ``angle`` of the step that computes the input
@@ -316,7 +316,7 @@ class ParameterError(ValueError):
 
 
 def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
-    """Return the decorator that attaches a function to a node as the hook with the given name."""
+    """Return the decorator that attaches a function to a node as the hook with this name."""
 
     def attach(to: Node, fn: Fn) -> Fn:
         setattr(to.hooks, hook, fn)
@@ -328,21 +328,25 @@ def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
 
 @dataclass(frozen=True, slots=True)
 class NodeTraits:
-    """What an engine must know of a node beside its function; `node` explains each field."""
+    """The properties of a node that an engine needs in addition to its function; `node` explains
+    each field.
+    """
 
     device: Device = "any"  #: where the node may run
-    rtol: float = 1e-5  #: error that the node may have, relative to its reference
-    #: axis of the bands in inputs and in "return", for a node that treats each band by itself
+    rtol: float = 1e-5  #: largest relative error of the node against its reference
+    #: axis of the bands in inputs and in "return", for a node that processes each band
+    #: independently
     bands: Mapping[str, int] | None = None
     accepts_channel_sums: Sequence[str] = ()  #: inputs that may be weighted sums over the bands
-    #: inputs that are the same in every band where another is a weighted sum over the bands
+    #: inputs that must be the same in every band if another input is a weighted sum over the bands
     needs_band_invariant: Sequence[str] = ()
     accepts_low_rank: Sequence[str] = ()  #: inputs that may be low-rank cubes
-    #: groups of inputs, the first of which is light that is only added: an entry that is 0 is left
-    #: out, with the entry of the same number in the rest of the group
+    #: groups of inputs whose first input is light that is only added: if one of its entries is 0,
+    #: this entry is omitted in all inputs of the group
     additive_inputs: Sequence[tuple[str, ...]] = ()
-    before_run: bool = False  #: True for a node without inputs that is computed before the plan
-    #: what the function reads beside its arguments, such as "table.csv" or "env:X"
+    #: True for a node without inputs whose result is computed before planning
+    before_run: bool = False
+    #: what the function reads in addition to its arguments, such as "table.csv" or "env:X"
     depends: Sequence[str] = ()
 
 
@@ -356,7 +360,7 @@ class Node:
     """
 
     def __init__(self, fn: Callable[..., Any], traits: NodeTraits | None = None) -> None:
-        """Describe a node by its function and by what an engine must know of it."""
+        """Create a node from its function and its traits."""
         traits = traits or NodeTraits()
         functools.update_wrapper(self, fn)
         self.fn, self.device, self.rtol = fn, traits.device, traits.rtol
@@ -372,14 +376,15 @@ class Node:
         self.before_run = traits.before_run
         self._require_texts(traits.depends)
         self.depends = tuple(traits.depends)
-        #: the declared variables of the environment at the import, which a module may read only
-        #: then
+        #: declared environment variables with their values at import, when a module may read them
         self.environment = {name: os.environ.get(name) for name in _environment_names(self.depends)}
         self._refuse_inputs_before_run()
         _registered[fn.__module__, fn.__name__] = self
 
     def _read_signature(self) -> None:
-        """Read inputs, optional inputs, random numbers and parameters from the function."""
+        """Determine inputs, optional inputs, use of random numbers and parameters from the
+        signature.
+        """
         arguments = inspect.signature(self.fn).parameters.values()
         input_arguments = [
             argument for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD
@@ -396,7 +401,7 @@ class Node:
         ]
 
     def _require_texts(self, depends: Sequence[str]) -> None:
-        """Raise ValueError for declared dependencies that are no list of texts."""
+        """Raise ValueError unless declared dependencies are a list of texts that are not empty."""
         if isinstance(depends, str) or not all(
             isinstance(entry, str) and entry for entry in depends
         ):
@@ -406,7 +411,9 @@ class Node:
             )
 
     def _refuse_inputs_before_run(self) -> None:
-        """Raise ValueError for a node that a run computes first although it needs something."""
+        """Raise ValueError for a node with ``before_run`` that has inputs or needs random
+        numbers.
+        """
         if self.before_run and (self.inputs or self.random):
             raise ValueError(
                 f"{self.path}: before_run needs a node without inputs and without rng: omit"
@@ -414,10 +421,10 @@ class Node:
             )
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
-        """Call the function of the node directly, with gradients, without parameter validation and
-        without cache.
+        """Call the function of the node directly: gradients are kept, parameters are not validated,
+        and no cache is used.
 
-        A text for a parameter that is a file is a path, as in a recipe.
+        For a file parameter, a text is taken as a path, as in a recipe.
         """
         texts = [name for name, value in params.items() if isinstance(value, str | list)]
         if texts:
@@ -429,11 +436,11 @@ class Node:
         return f"<node {self.path}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a node as module and name, so that the process that unpickles the node imports the
-        code.
+        """Pickle a node by module and name; the process that unpickles it imports the code.
 
-        Files of the user that this process has imported are named too: a result of their nodes may
-        be an input. So is the name in a recipe, whose family a recipe may choose.
+        The pickle also names the user's files that this process has imported, since results of
+        their nodes may be inputs, and the name of the node in the recipe, since a recipe may choose
+        its family.
         """
         return _imported, (self.fn.__module__, self.fn.__name__, own_files(), self.path)
 
@@ -448,8 +455,8 @@ class Node:
         return ".".join([*public_names, self.fn.__name__])
 
     def _checked_bands(self, bands: Mapping[str, int]) -> Mapping[str, int]:
-        """Return the axes of the bands, unchangeable; raise ValueError unless they name inputs and
-        "return".
+        """Return the axes of the bands as a read-only mapping; raise ValueError unless they name
+        "return" and at least one input.
         """
         unknown_names = sorted(bands.keys() - {*self.inputs, "return"})
         if unknown_names or "return" not in bands or len(bands) < 2:
@@ -466,16 +473,14 @@ class Node:
 
     @functools.cached_property
     def hints(self) -> dict[str, Any]:
-        """Return the type annotation of each argument and of the result of the node, with
-        ``Annotated`` metadata.
+        """Return the type annotations of the arguments and of the result, with ``Annotated``
+        metadata.
         """
         return get_type_hints(self.fn, include_extras=True)
 
     @functools.cached_property
     def params(self) -> type[BaseModel]:
-        """Return the pydantic model that validates the parameters of the node and rejects
-        unknown parameters.
-        """
+        """Return the pydantic model that validates the parameters and rejects unknown ones."""
         fields = {
             argument.name: (
                 self.hints[argument.name],
@@ -509,9 +514,7 @@ class Node:
 
     @property
     def preflight_inputs(self) -> tuple[str, ...]:
-        """Return the names of those inputs of the node that the hook ``preflight`` receives
-        before the run.
-        """
+        """Return the names of the inputs that the hook ``preflight`` takes as arguments."""
         hook = self.hooks.preflight
         return tuple(name for name in _arguments(hook) if name in self.inputs) if hook else ()
 
@@ -523,19 +526,17 @@ def _arguments(hook: Callable[..., Any]) -> tuple[str, ...]:
 
 
 def registered_nodes() -> tuple[Node, ...]:
-    """Return every node that this process has defined or imported, the newest of each module and
-    name.
-    """
+    """Return all nodes defined or imported in this process; of redefined nodes, only the newest."""
     return tuple(_registered.values())
 
 
 def _environment_names(depends: Sequence[str]) -> list[str]:
-    """Return the names of the variables of the environment among declared dependencies."""
+    """Return the names of the environment variables among declared dependencies."""
     return [entry.removeprefix("env:") for entry in depends if entry.startswith("env:")]
 
 
 def _imported(module: str, name: str, files: tuple[str, ...] = (), path: str = "") -> Node:
-    """Return a node of a module that is imported here, with the name ``path`` that a recipe gave to
+    """Import a module and return one of its nodes, with the name ``path`` that a recipe has given
     it.
     """
     import_missing(files, module)

@@ -1,4 +1,4 @@
-"""Bytes that arrays and pictures take in memory, from the headers of their files."""
+"""Memory needed for arrays and pictures, determined from the headers of their files."""
 
 import json
 import math
@@ -18,16 +18,15 @@ from neusee.nodes.input_files import SMALL, in_bytes, needs, opened
 
 # --- array bytes ----------------------------------------------------------------------------------
 
-# Bytes that arrays take in memory, from the headers of .npy, .npz, .mat, .safetensors, .pt and HDF5
-# files.
+# Memory needed for arrays, from the headers of .npy, .npz, .mat, .safetensors, .pt and HDF5 files.
 
 
-__depends__ = ["unaffected:file"]  #: the size of an open file
-_MAT_MATRIX, _MAT_COMPRESSED, _MAT_INT32 = 14, 15, 5  #: types of elements
+__depends__ = ["unaffected:file"]  #: only the size of an open file is read
+_MAT_MATRIX, _MAT_COMPRESSED, _MAT_INT32 = 14, 15, 5  #: types of data elements in a .mat file
 _MAT_COMPLEX = 0x0800
-#: bytes of a value by the class of an array; a cell, a struct or a sparse array has none
+#: bytes per value, by array class; cell, struct and sparse arrays are not listed
 _MAT_CLASSES = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
-#: errors of a damaged archive, or of a file that is no archive; its reader says what is wrong
+#: errors for a damaged archive or a file that is no archive; the reader of the file reports them
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile,
     ValueError,
@@ -38,22 +37,22 @@ _ARCHIVE_ERRORS = (
     RuntimeError,
     zlib.error,
 )
-_CHUNK_BYTES = 1 << 18  #: bytes that are decompressed at once to count them
-#: bytes of the header of a .safetensors file, at most, as its library has it
+_CHUNK_BYTES = 1 << 18  #: bytes decompressed at once to count them
+#: largest header of a .safetensors file in bytes, the limit of its library
 _HEADER_BYTES = 100_000_000
 
 
 def npy_needs(file: Path | str, copies: float, beside: float = 0.0) -> None:
-    """Ask for the memory of a .npy file: ``copies`` of its numbers, and ``beside`` bytes for each
-    of them.
+    """Check that memory suffices to read a .npy file: ``copies`` of its values, plus ``beside``
+    bytes per value.
 
-    Raises ParameterError for a file that is shorter than its header says.
+    Raises ParameterError for a file that is shorter than its header states.
     """
     with opened(file) as open_file:
         try:
             shape, dtype = _npy_header(open_file)
         except (ValueError, EOFError, SyntaxError, TypeError):
-            return  # NumPy says what a damaged file lacks
+            return  # NumPy reports what is wrong with a damaged file
         bytes_after = os.fstat(open_file.fileno()).st_size - open_file.tell()
     count = math.prod(map(int, shape))
     if not dtype.hasobject and count * dtype.itemsize > bytes_after:
@@ -66,12 +65,12 @@ def npy_needs(file: Path | str, copies: float, beside: float = 0.0) -> None:
 
 
 def _numbers(shape: tuple[int, ...], dtype: Any) -> str:
-    """Return shape and type of an array as a text for messages."""
+    """Return shape and data type of an array as text for messages."""
     return f"{' x '.join(map(str, shape)) or 'one'} numbers of type {dtype}"
 
 
 def _npy_header(raw: Any) -> tuple[tuple[int, ...], "np.dtype[Any]"]:
-    """Return shape and type of the array in an open .npy file."""
+    """Return shape and data type of the array in an open .npy file, from its header."""
     version = np.lib.format.read_magic(raw)
     read_header = (
         np.lib.format.read_array_header_1_0
@@ -88,9 +87,9 @@ def _npy_header(raw: Any) -> tuple[tuple[int, ...], "np.dtype[Any]"]:
 def npz_needs(
     file: Path | str, copies: float, beside: float = 0.0, parameter: str = "file"
 ) -> None:
-    """Ask for the memory of all arrays in a .npz file, as `npy_needs` does.
+    """Check that memory suffices to read all arrays of a .npz file, as `npy_needs` does.
 
-    Raises ParameterError for an array of more bytes than the archive states for it.
+    Raises ParameterError for an array that needs more bytes than the archive has for it.
     """
     archive_needs(file, copies, parameter)
     total, array_count = 0.0, 0
@@ -108,7 +107,7 @@ def npz_needs(
 def _npz_headers(
     file: Path | str, parameter: str
 ) -> list[tuple[str, int, tuple[int, ...], "np.dtype[Any]"]]:
-    """Return name, stated bytes, shape and type of each array in a .npz file, as far as its
+    """Return name, stated bytes, shape and data type of each array in a .npz file, as far as its
     headers can be read.
     """
     headers = []
@@ -124,11 +123,11 @@ def _npz_headers(
 
 
 def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> None:
-    """Ask for the memory of all that a zip archive holds when it is decompressed, such as a .pt,
-    .pt2 or .npz file.
+    """Check that memory suffices for the decompressed content of a zip archive, such as a .pt, .pt2
+    or .npz file.
 
-    Readers of archives stop at the size that the archive states for each file. Any other file
-    counts as it is.
+    Readers of archives stop at the size that the archive states for each member. For a file that is
+    no archive, its own size counts.
     """
     sizes = list[int]()
     with opened(file, parameter) as open_file:
@@ -144,7 +143,7 @@ def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> N
 
 
 def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "file") -> None:
-    """Ask for the memory of all tensors in a .safetensors file, and of its header.
+    """Check that memory suffices for all tensors of a .safetensors file and for its header.
 
     Raises ParameterError for a file whose header states more bytes than the file has.
     """
@@ -154,7 +153,7 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
         if len(length_bytes) < 8 or length > min(size - 8, _HEADER_BYTES):
             text = f"{in_bytes(length)} of header, and the file has {in_bytes(size)}"
             raise _error_of_header(file, text, parameter)
-        # 16 bytes in memory for each one of the header, when it is parsed
+        # a parsed header needs about 16 bytes of memory per byte
         needs(16.0 * length + copies * size, file, f"tensors of {in_bytes(size)}", parameter)
         end_of_tensors = _end_of_tensors(open_file.read(length))
     if end_of_tensors > size - 8 - length:
@@ -163,7 +162,9 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
 
 
 def _error_of_header(file: Path | str, why: str, parameter: str) -> ParameterError:
-    """Return the error of a .safetensors file whose header ``why`` says does not fit the file."""
+    """Return the error for a .safetensors file whose header does not fit the file; ``why`` says
+    what it states.
+    """
     text = (
         f"{Path(file).name} is not a safetensors file and cannot be read: its header states {why}"
     )
@@ -171,7 +172,9 @@ def _error_of_header(file: Path | str, why: str, parameter: str) -> ParameterErr
 
 
 def _end_of_tensors(header: bytes) -> int:
-    """Return the byte at which the tensors end, or 0 for a header that the library refuses."""
+    """Return the offset at which the tensors end, in bytes after the header, or 0 for a header that
+    the library refuses.
+    """
     try:
         return max(
             (int(entry["data_offsets"][1]) for entry in _tensor_entries(json.loads(header))),
@@ -182,7 +185,7 @@ def _end_of_tensors(header: bytes) -> int:
 
 
 def _tensor_entries(header: Any) -> Iterator[Any]:
-    """Return what a header says of each tensor."""
+    """Return the header entry of each tensor."""
     return (entry for name, entry in header.items() if name != "__metadata__")
 
 
@@ -192,11 +195,12 @@ def _tensor_entries(header: Any) -> Iterator[Any]:
 def mat_needs(
     file: Path | str, copies: float = 2.0, together: bool = False, parameter: str = "file"
 ) -> None:
-    """Ask for the memory of the largest variable in a .mat file, or of all variables ``together``.
+    """Check that memory suffices for the largest variable in a .mat file, or for all variables if
+    ``together``.
 
-    There are ``copies`` of the numbers as they are stored or as they are read, whichever are more.
-    Compressed variables are decompressed in small parts to be counted, because a part of one can
-    state more than the variable does.
+    ``copies`` of the values are counted, in the stored or the loaded type, whichever is larger.
+    Compressed variables are decompressed in small parts to count their bytes, because their content
+    may be larger than their header states.
     """
     with opened(file, parameter) as open_file:
         size = os.fstat(open_file.fileno()).st_size
@@ -204,7 +208,7 @@ def mat_needs(
         for begins_variable, size_of_part in _mat_variable_bytes(open_file, size):
             total = total + size_of_part if together or not begins_variable else size_of_part
             largest = max(largest, total)
-            # ask again only where it grew by `SMALL`, because each question takes time
+            # check again only after a growth by `SMALL`, because each check takes time
             if copies * largest > asked_bytes:
                 needs(
                     copies * largest, file, f"variables of {in_bytes(largest)} or more", parameter
@@ -214,12 +218,13 @@ def mat_needs(
 
 
 def _mat_variable_bytes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
-    """Yield the bytes of each variable of a file of version 5 or older, compressed ones in parts.
+    """Yield the bytes of each variable of a .mat file of version 5 or older, in parts for
+    compressed variables.
 
     The first value is True where a variable begins.
     """
     header = raw.read(128)
-    # the last two bytes of the header say the order of bytes
+    # the last two bytes of the header give the byte order
     byte_order = {b"IM": "<", b"MI": ">"}.get(header[126:128])
     if byte_order is None:
         yield True, size  # version 4 has no compression
@@ -232,7 +237,7 @@ def _mat_variable_bytes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
             for piece in _inflated(raw, length):
                 stated_bytes = stated_bytes or _mat_stated_bytes(piece[8:], byte_order)
                 bytes_before, inflated_bytes = inflated_bytes, inflated_bytes + len(piece)
-                # what is stated at first, then what exceeds it
+                # first the stated bytes, then the bytes beyond them
                 yield (
                     bytes_before == 0,
                     max(inflated_bytes, stated_bytes)
@@ -249,12 +254,12 @@ def _mat_variable_bytes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
 
 
 def _mat_stated_bytes(piece: bytes, order: str) -> int:
-    """Return the bytes of the numbers of a variable as they are read, from its flags and
-    dimensions; 0 if unknown.
+    """Return the bytes of the loaded values of a variable, from its flags and dimensions; 0 if
+    unknown.
     """
     if len(piece) < 24:
         return 0
-    # tag and flags of 16 bytes, then the tag of the dimensions
+    # 16 bytes of tag and flags, then the tag of the dimensions
     flags, _, kind, length = struct.unpack(f"{order}8x4I", piece[:24])
     bytes_per_value = _MAT_CLASSES.get(flags & 0xFF, 0) * (2 if flags & _MAT_COMPLEX else 1)
     if kind != _MAT_INT32 or not bytes_per_value or length > len(piece) - 24:
@@ -265,7 +270,7 @@ def _mat_stated_bytes(piece: bytes, order: str) -> int:
 
 
 def _inflated(raw: BinaryIO, length: int) -> Iterator[bytes]:
-    """Yield each part of a compressed variable of ``length`` bytes."""
+    """Yield the decompressed parts of a variable of ``length`` compressed bytes."""
     decompressor, bytes_left, compressed = zlib.decompressobj(), length, b""
     with suppress(zlib.error):  # scipy says what is damaged
         while not decompressor.eof:
@@ -281,8 +286,8 @@ def _inflated(raw: BinaryIO, length: int) -> Iterator[bytes]:
 
 
 def fits_needs(file: Path | str, shape: tuple[int, ...], bits: int) -> None:
-    """Ask for the memory of an image of a FITS file: its numbers, scaled to float64, and the
-    copy of the caller.
+    """Check that memory suffices for an image of a FITS file: stored values, values scaled to
+    float64, and a copy of the caller.
     """
     number_count = math.prod(map(int, shape))
     needs(
@@ -294,12 +299,12 @@ def fits_needs(file: Path | str, shape: tuple[int, ...], bits: int) -> None:
 
 
 def refuse_packed(file: Path | str) -> None:
-    """Raise ParameterError for a file that is compressed as a whole, which a library would
-    unpack without a limit.
+    """Raise ParameterError for a file that is compressed as a whole, which its library would
+    decompress without a limit of size.
     """
     with opened(file) as open_file:
         magic_bytes = open_file.read(6)
-    # gzip, bzip2, zip, xz and compress
+    # magic bytes of gzip, bzip2, zip, xz and compress
     if magic_bytes.startswith((b"\x1f\x8b", b"BZh", b"PK\x03\x04", b"\xfd7zXZ", b"\x1f\x9d")):
         raise ParameterError(
             "file", f"{file} is compressed as a whole: unpack it, such as by gunzip"
@@ -307,8 +312,8 @@ def refuse_packed(file: Path | str) -> None:
 
 
 def hdf5_needs(file: Path | str, groups: Any) -> None:
-    """Ask for the memory of all data in the opened ``groups`` of an HDF5 file, from their shapes
-    and types.
+    """Check that memory suffices for all data in the open ``groups`` of an HDF5 file, from their
+    shapes and data types.
     """
     total = 0.0
     for group in groups:
@@ -320,24 +325,24 @@ def hdf5_needs(file: Path | str, groups: Any) -> None:
 
 # --- picture bytes --------------------------------------------------------------------------------
 
-# Bytes that pictures take in memory, from the headers of PNG, JPEG, TIFF and OpenEXR files.
+# Memory needed for pictures, from the headers of PNG, JPEG, TIFF and OpenEXR files.
 
 
-#: bytes of a pixel of Pillow
+#: bytes per pixel, by Pillow mode
 _BYTES_OF_PIXEL = {"1": 1, "L": 1, "P": 1, "LA": 4, "I;16": 2, "I;16B": 2, "I;16L": 2}
-_JPEG_BYTES = 6  #: bytes of a pixel of a JPEG that is stored in several scans
+_JPEG_BYTES = 6  #: additional bytes per pixel of a JPEG stored in several scans
 _WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH = 256, 257, 258, 277, 322, 323
 _TIFF_TAGS = frozenset((_WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH))
-#: of the types of a TIFF tag that are whole numbers
+#: `struct` format of each integer type of a TIFF tag
 _TIFF_SIZES = {1: "B", 3: "H", 4: "I", 16: "Q"}
-_EXR_SIZES = {0: 4, 1: 2, 2: 4}  #: bytes of a number, by the type of the channel
+_EXR_SIZES = {0: 4, 1: 2, 2: 4}  #: bytes per value, by type of the channel
 _MULTIPART, _DEEP = 1 << 12, 1 << 11
-_CHANNEL_LIST_BYTES = 1 << 20  #: bytes of a list of channels, at most
+_CHANNEL_LIST_BYTES = 1 << 20  #: largest list of channels in bytes
 
 
 def picture_needs(file: Path, image: Any, beside: float) -> None:
-    """Ask for the memory of the first picture that Pillow has opened, with ``beside`` bytes for
-    each of its pixels.
+    """Check that memory suffices for the first picture of a file that Pillow has opened, plus
+    ``beside`` bytes per pixel.
     """
     bytes_a_pixel = _BYTES_OF_PIXEL.get(image.mode, 4) + beside
     bytes_a_pixel += _JPEG_BYTES if image.format in ("JPEG", "MPO") else 0
@@ -347,9 +352,9 @@ def picture_needs(file: Path, image: Any, beside: float) -> None:
 
 
 def pages_need(file: Path, image: Any, copies: float, beside: float = 0.0) -> None:
-    """Ask for the memory of all pages of a file that Pillow has opened.
+    """Check that memory suffices for all pages of a file that Pillow has opened.
 
-    There are ``copies`` of the numbers of each page, and ``beside`` bytes for each of its pixels.
+    For each page, ``copies`` of its values and ``beside`` bytes per pixel are counted.
     """
     if image.format == "TIFF":
         tiff_needs(file, copies, beside)
@@ -371,7 +376,7 @@ class Page(NamedTuple):
 
     width: int
     height: int
-    sample: int  #: bits of a sample
+    sample: int  #: bits per sample
     samples: int  #: of a pixel
     tile: int  #: pixels of a tile; 0 for strips
 
@@ -381,11 +386,11 @@ class Page(NamedTuple):
 
 
 def tiff_needs(file: Path, copies: float, beside: float = 0.0, first: bool = False) -> None:
-    """Ask for the memory of all pages of a TIFF file, or of the ``first`` one, as `pages_need`
-    does.
+    """Check that memory suffices for all pages of a TIFF file, or only for the ``first`` one, as
+    `pages_need` does.
     """
     count, total, page = 0, 0.0, Page(0, 0, 8, 1, 0)
-    # the reader says what a damaged file lacks
+    # the reader reports what is wrong with a damaged file
     with opened(file) as open_file, suppress(struct.error):
         for page in tiff_pages(open_file):
             count += 1
@@ -396,14 +401,12 @@ def tiff_needs(file: Path, copies: float, beside: float = 0.0, first: bool = Fal
 
 
 def tiff_pages(raw: BinaryIO) -> Iterator[Page]:
-    """Yield the size of each page of an open TIFF file, in its order; end where a page was there
-    before.
-    """
+    """Yield the size of each page of an open TIFF file, in order; stop if a directory repeats."""
     header = raw.read(16)
     byte_order = {b"II": "<", b"MM": ">"}.get(header[:2])
     if byte_order is None:
         return
-    # the version is 42, or 43 for files with addresses of 64 bits
+    # the version is 42, or 43 for BigTIFF with 64-bit addresses
     is_big_tiff = struct.unpack(f"{byte_order}H", header[2:4])[0] == 43
     (directory_start,) = (
         struct.unpack(f"{byte_order}Q", header[8:16])
@@ -418,7 +421,9 @@ def tiff_pages(raw: BinaryIO) -> Iterator[Page]:
 
 
 def _tiff_page(raw: BinaryIO, place: int, order: str, big: bool) -> tuple[Page, int]:
-    """Return the page whose directory begins at ``place``, and the place of the next directory."""
+    """Return the page whose directory begins at the offset ``place``, and the offset of the next
+    directory.
+    """
     count_format, entry_format, address_format = ("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")
     raw.seek(place)
     count_struct, entry_struct, address_struct = (
@@ -445,7 +450,9 @@ def _tiff_page(raw: BinaryIO, place: int, order: str, big: bool) -> tuple[Page, 
 
 
 def _tiff_number(raw: BinaryIO, order: str, kind: str, length: int, value: bytes) -> int:
-    """Return the first number of a tag, which stands in the entry or where the entry says."""
+    """Return the first value of a tag, stored in its entry or at the offset that the entry
+    gives.
+    """
     value_size = struct.calcsize(f"{order}{kind}")
     if value_size * length > len(value):
         position = raw.tell()
@@ -459,11 +466,11 @@ def _tiff_number(raw: BinaryIO, order: str, kind: str, length: int, value: bytes
 
 
 class ExrPart(NamedTuple):
-    """What the header of a part of an OpenEXR file says of its size."""
+    """The size of a part of an OpenEXR file, from its header."""
 
     width: int
     height: int
-    channels: Mapping[str, int]  #: bytes of a pixel by name
+    channels: Mapping[str, int]  #: bytes per pixel, by name of the channel
     deep: bool
 
     @property
@@ -472,17 +479,17 @@ class ExrPart(NamedTuple):
 
 
 def exr_needs(file: Path | str, beside: float = 8.0) -> None:
-    """Ask for the memory of an OpenEXR file: all channels of all parts, which the library reads at
-    once.
+    """Check that memory suffices for an OpenEXR file: all channels of all parts, which the library
+    reads at once.
 
-    ``beside`` are the bytes for each value of the largest part that the caller makes of them. A
-    part with deep samples is refused, because its header does not say how many there are.
+    ``beside`` is the number of bytes that the caller needs per value of the largest part. A part
+    with deep samples is refused, because its header does not state their number.
     """
     with opened(file) as open_file:
         try:
             part_sizes = list(exr_part_sizes(open_file))
         except (struct.error, ValueError):
-            return  # the library says what a damaged file lacks
+            return  # the library reports what is wrong with a damaged file
     if any(exr_part.deep for exr_part in part_sizes):
         raise ParameterError(
             "file", f"{file} has deep samples, several a pixel: flatten the picture"
@@ -498,8 +505,8 @@ def exr_needs(file: Path | str, beside: float = 8.0) -> None:
 
 
 def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
-    """Yield the size of each part of an open OpenEXR file, from its headers; nothing for another
-    file.
+    """Yield the size of each part of an open OpenEXR file, from its headers; nothing for a file of
+    another format.
     """
     magic_number, version = struct.unpack("<iI", raw.read(8))
     if magic_number != 20000630:
@@ -509,7 +516,7 @@ def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
         attributes = _exr_attributes(raw, file_size)
         if not attributes:
             return
-        # the window of a part holds both of its ends
+        # the data window includes both of its ends
         left, top, right, bottom = struct.unpack("<4i", attributes.get("dataWindow", b""))
         channels = dict(_exr_channels(attributes.get("channels", b"")))
         deep = bool(version & _DEEP) or attributes.get("type", b"").startswith(b"deep")
@@ -519,7 +526,9 @@ def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
 
 
 def _exr_attributes(raw: BinaryIO, end: int) -> dict[str, bytes]:
-    """Return the attributes of a header that say its size; nothing at the end of the headers."""
+    """Return the attributes of a header that determine its size; empty at the end of the
+    headers.
+    """
     attributes: dict[str, bytes] = {}
     while name := _exr_text(raw):
         _exr_text(raw)  # the type
@@ -534,7 +543,7 @@ def _exr_attributes(raw: BinaryIO, end: int) -> dict[str, bytes]:
 
 
 def _exr_text(raw: BinaryIO) -> str:
-    """Read a name that ends with a zero; raise ValueError where no zero ends it in time."""
+    """Read a zero-terminated name; raise ValueError if it is longer than 255 bytes."""
     letters = bytearray()
     while (letter := raw.read(1)) != b"\0":
         letters += letter
@@ -544,7 +553,7 @@ def _exr_text(raw: BinaryIO) -> str:
 
 
 def _exr_channels(data: bytes) -> Iterator[tuple[str, int]]:
-    """Yield the name of each channel in an attribute, and the bytes of a pixel of it."""
+    """Yield name and bytes per pixel of each channel in a channel list."""
     position = 0
     while position < len(data) and data[position]:
         name_end = data.index(b"\0", position)

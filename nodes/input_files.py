@@ -1,4 +1,4 @@
-"""Limits of input files: the memory that reading needs, and checks before the run."""
+"""Limits of input files: memory needed to read them, and checks before the run."""
 
 import csv
 import functools
@@ -16,20 +16,20 @@ from neusee.nodes import ParameterError
 
 # --- input size -----------------------------------------------------------------------------------
 
-# Bytes that a reader of a file would need, compared with the memory that is left before anything is
-# allocated.
+# Comparison of the memory that a reader of a file would need with the available memory, before
+# anything is allocated.
 #
-# A reader finds the bytes in the header alone and asks `needs`. Files are opened without waiting: a
-# pipe, a device or a socket in the place of a file is refused, because it never ends, or never
-# begins.
+# A reader computes the bytes from the header only and calls `needs`. Files are opened in
+# non-blocking mode: a pipe, a device or a socket is refused, because it may never deliver data or
+# never end.
 
 
-#: what is free decides whether a file is read, and no result; the files are those of the system, or
-#: of an argument
+#: available memory decides only whether a file is read, and affects no result; the files read are
+#: those of the system, or arguments
 __depends__ = ["unaffected:file", "unaffected:resource", "unaffected:_measures", "unaffected:time"]
-SMALL = 16 << 20  #: bytes that every reader may take without asking
-TEXT = 64 << 20  #: bytes of a text that is read as a whole, at most
-LINE = 1_000_000  #: characters of a line of a table, at most
+SMALL = 16 << 20  #: bytes that a reader may use without a check
+TEXT = 64 << 20  #: largest size in bytes of a text that is read as a whole
+LINE = 1_000_000  #: largest number of characters in a line of a table
 _CONTROL_GROUP = Path("/sys/fs/cgroup")
 _KINDS_OF_FILE = (
     (stat.S_ISFIFO, "a pipe"),
@@ -41,21 +41,20 @@ _KINDS_OF_FILE = (
 
 
 class Room(NamedTuple):
-    """Memory that this process may still use, and its limit if one was set, in bytes."""
+    """The memory that this process may still use, and the limit if one was set, in bytes."""
 
     free: float
     limit: float | None = None
 
 
 class BeyondMemory(ParameterError):
-    """Error of a reader whose file needs more memory than is left."""
+    """Raised if reading a file needs more memory than is available."""
 
 
 def needs(count: float, file: Path | str, content: str, parameter: str = "file") -> None:
-    """Raise `BeyondMemory` if a reader would need more than the memory that is left: ``count``
-    bytes.
+    """Raise `BeyondMemory` if reading a file needs ``count`` bytes and less memory is available.
 
-    ``content`` says what the bytes are, such as ``30 pages of 4000 x 3000 pixels``.
+    ``content`` describes the content of the file, such as ``30 pages of 4000 x 3000 pixels``.
     """
     if count <= SMALL:
         return
@@ -77,13 +76,15 @@ def needs(count: float, file: Path | str, content: str, parameter: str = "file")
 
 
 def measured_by(measure: Callable[[], Room]) -> None:
-    """Let ``measure`` say from now on what memory is left, as the program does that has a limit."""
+    """Use the function ``measure`` from now on to determine the available memory; a program with a
+    memory limit calls this.
+    """
     _measures[1:] = [measure]
 
 
 def free_memory() -> Room:
-    """Return the memory that is free on this machine, in its control group, and below the limit
-    of addresses.
+    """Return the available memory: the least of that of the machine, of the control group, and of
+    the limit of the address space.
     """
     rooms = [float("inf")]
     with suppress(OSError, ValueError, StopIteration):
@@ -101,20 +102,20 @@ def free_memory() -> Room:
             float(
                 limit
                 - int((_CONTROL_GROUP / "memory.current").read_text())
-                # cached files, which the system gives back when memory is short
+                # cached files, which the system frees when memory is short
                 + int(statistics["inactive_file"])
             )
         )
     addresses = resource.getrlimit(resource.RLIMIT_AS)[0]
     if addresses != resource.RLIM_INFINITY:
         with suppress(OSError, ValueError):
-            # pages of the address space in use
+            # size of the address space in use, in pages
             pages = int(Path("/proc/self/statm").read_text().split()[0])
             rooms.append(float(addresses - pages * resource.getpagesize()))
     return Room(min(rooms))
 
 
-_measures: list[Callable[[], Room]] = [free_memory]  #: the last one counts
+_measures: list[Callable[[], Room]] = [free_memory]  #: the last one is used
 
 
 def in_bytes(count: float) -> str:
@@ -129,17 +130,15 @@ def in_bytes(count: float) -> str:
 
 
 def kind_of(mode: int) -> str:
-    """Return what stands in the place of a file, such as ``a pipe``, or an empty text for a
-    regular file.
-    """
+    """Return the kind of a file from its mode, such as ``a pipe``; empty for a regular file."""
     if stat.S_ISREG(mode):
         return ""
     return next((kind for fits, kind in _KINDS_OF_FILE if fits(mode)), "no file")
 
 
 def refuse_other_than_file(file: Path | str, parameter: str = "file") -> None:
-    """Raise ParameterError for a pipe, a device, a socket or a folder; a file that is missing
-    passes.
+    """Raise ParameterError for a pipe, a device, a socket or a folder; a missing file is no error
+    here.
     """
     try:
         mode = os.stat(file).st_mode
@@ -149,7 +148,7 @@ def refuse_other_than_file(file: Path | str, parameter: str = "file") -> None:
 
 
 def _refuse(file: Path | str, mode: int, parameter: str) -> None:
-    """Raise ParameterError for the mode of a file that is no regular file."""
+    """Raise ParameterError unless ``mode`` is that of a regular file."""
     if kind := kind_of(mode):
         raise ParameterError(
             parameter, f"{file} is not a regular file but {kind}: give the path of a file"
@@ -157,10 +156,11 @@ def _refuse(file: Path | str, mode: int, parameter: str) -> None:
 
 
 def opened(file: Path | str, parameter: str = "file") -> BufferedReader:
-    """Open a regular file to read its bytes, without waiting for a pipe; raise ParameterError
-    for anything else.
+    """Open a regular file for reading bytes, in non-blocking mode; raise ParameterError for
+    anything else.
     """
-    refuse_other_than_file(file, parameter)  # some devices do something when they are opened
+    # checked before, since opening some devices has side effects
+    refuse_other_than_file(file, parameter)
     descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         _refuse(file, os.fstat(descriptor).st_mode, parameter)
@@ -171,13 +171,15 @@ def opened(file: Path | str, parameter: str = "file") -> BufferedReader:
 
 
 def head_of(file: Path | str, count: int) -> bytes:
-    """Return the first bytes of a file."""
+    """Return the first ``count`` bytes of a file."""
     with opened(file) as bytes_in:
         return bytes_in.read(count)
 
 
 def bytes_of(file: Path | str, copies: float = 1.0, parameter: str = "file") -> bytes:
-    """Return all bytes of a file, of which the caller makes ``copies``, the first one included."""
+    """Return all bytes of a file, after a check of memory for ``copies`` of them, including this
+    one.
+    """
     with opened(file, parameter) as bytes_in:
         size = os.fstat(bytes_in.fileno()).st_size
         needs(copies * size, file, f"a file of {in_bytes(size)}", parameter)
@@ -187,8 +189,8 @@ def bytes_of(file: Path | str, copies: float = 1.0, parameter: str = "file") -> 
 def text_of(
     file: Path | str, encoding: str = "utf-8", errors: str = "strict", max_bytes: int = TEXT
 ) -> str:
-    """Return the text of a file of at most ``max_bytes`` bytes, with ``\\n`` at the end of each
-    line.
+    """Return the text of a file of at most ``max_bytes`` bytes, with line ends converted to
+    ``\\n``.
     """
     with opened(file) as bytes_in:
         size = os.fstat(bytes_in.fileno()).st_size
@@ -207,10 +209,10 @@ def text_of(
 
 
 def lines_of(file: Path, copies: float = 1.0) -> Iterator[str]:
-    """Yield the lines of a table in UTF-8, each with its end; refuse a line that is too long to be
-    one of a table.
+    """Yield the lines of a UTF-8 table with their line ends; raise ParameterError for a line of
+    more than `LINE` characters.
 
-    ``copies`` are bytes that the caller keeps for each byte of the file.
+    ``copies`` is the number of bytes that the caller keeps per byte of the file.
     """
     with opened(file) as bytes_in:
         size = os.fstat(bytes_in.fileno()).st_size
@@ -229,16 +231,18 @@ def lines_of(file: Path, copies: float = 1.0) -> Iterator[str]:
 
 # --- input files ----------------------------------------------------------------------------------
 
-# Limits of input files, and checks that read the content of a file once, before the run.
+# Limits of input files, and checks before the run that read the content of a file only once.
 
 
-#: of a picture, at most; a PNG of this size takes 1.3 GB of memory to decode and convert
+#: largest number of pixels of a picture; a PNG of this size needs 1.3 GB of memory to decode and
+#: convert
 PIXELS = 64_000_000
-VALUES = 1_000_000_000  #: numbers in a cube, a height map or a frame, at most; 4 GB as float32
-ROWS = 1_000_000  #: lines of a table, at most
-#: ns after a change of a file in which a second change may not change its times
+#: largest number of values in a cube, a height map or a frame; 4 GB as float32
+VALUES = 1_000_000_000
+ROWS = 1_000_000  #: largest number of lines of a table
+#: ns after a change of a file during which a second change may leave its times the same
 _SETTLED = 2_000_000_000
-#: bytes in memory for each byte of a table, in texts of cells of several digits
+#: bytes of memory per byte of a table, whose cells are texts of several digits
 _BYTES_OF_CELLS = 8.0
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
 
@@ -274,12 +278,12 @@ def refuse_large_array(file: Path, shape: Sequence[int]) -> None:
 
 
 def file_version(file: Path) -> tuple[int, ...] | None:
-    """Return numbers that differ for each version of a file, or None for a file that has just been
-    changed.
+    """Return numbers that identify the version of a file, or None for a file changed less than two
+    seconds ago.
 
-    The numbers are device, inode, size, and the times of the last change of content and of the
-    entry, which no program can set. A second change within a tick of the clock leaves them as they
-    are, so that a file younger than two seconds has no version yet.
+    The numbers are device, inode, size, and the times of the last change of the content (mtime) and
+    of the inode (ctime); no program can set the latter. A second change within a tick of the clock
+    would not change them, so that a file changed less than two seconds ago has no version yet.
     """
     status = file.stat()
     changed = max(status.st_mtime_ns, status.st_ctime_ns)
@@ -290,8 +294,8 @@ def file_version(file: Path) -> tuple[int, ...] | None:
 
 
 def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
-    """Return a function that remembers the results of ``check`` until the file, its first
-    argument, changes.
+    """Return a function that caches the results of ``check`` until the file, its first argument,
+    changes.
     """
 
     @functools.lru_cache(maxsize=256)
@@ -309,8 +313,8 @@ def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
 
 
 def not_finite(file: Path, count: int) -> str:
-    """Return the message for a file with values that are NaN or infinite, or an empty text for a
-    count of 0.
+    """Return the error message for a file with ``count`` values that are NaN or infinite; empty for
+    0.
     """
     if not count:
         return ""
@@ -319,14 +323,14 @@ def not_finite(file: Path, count: int) -> str:
 
 
 def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of the line and the cells of each row of a CSV file that is not empty.
+    """Yield line number and cells of each row of a CSV file that is not empty.
 
-    A line that begins with ``#`` is a comment, such as the source of the table.
+    Lines that begin with ``#`` are comments, such as the source of the table.
 
     Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more
     rows than the limit.
     """
-    # an empty line in place of a comment keeps the numbers of the lines
+    # comments become empty lines, so that line numbers stay correct
     reader = csv.reader(
         "" if line.startswith("#") else line for line in lines_of(file, _BYTES_OF_CELLS)
     )
@@ -348,7 +352,7 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _refuse_separator(file: Path, header: list[str]) -> None:
-    """Raise ValueError for a header whose columns another mark than a comma separates."""
+    """Raise ValueError for a header whose columns are not separated by commas."""
     separator = next(
         (name for mark, name in _SEPARATORS.items() if len(header) == 1 and mark in header[0]), None
     )

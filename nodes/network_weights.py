@@ -13,20 +13,20 @@ from neusee.nodes.file_headers import safetensors_need
 from neusee.nodes.input_files import once_per_version
 
 Net = TypeVar("Net", bound=nn.Module)
-#: metadata key of the options of a network, which the tensors may not show
+#: metadata key of a network's options, which the tensors alone may not show
 OPTIONS = "neusee.options"
 
 
 def empty(make: Callable[[], Net]) -> Net:
-    """Build a network on the meta device, without memory for the tensors and without use of
-    random numbers.
+    """Build a network on the meta device, which needs no memory for tensors and no random
+    numbers.
     """
     with torch.device("meta"):
         return make()
 
 
 def loaded(make: Callable[[], Net], weights: Path) -> Net:
-    """Return a network in single precision, with the weights of a file."""
+    """Return a network in single precision, with weights from a file."""
     from safetensors.torch import load_file
 
     safetensors_need(weights, parameter="weights")
@@ -36,16 +36,16 @@ def loaded(make: Callable[[], Net], weights: Path) -> Net:
 
 
 def file_metadata(net: nn.Module) -> dict[str, str]:
-    """Return the metadata for the weights file of a network: the ``options`` of the network as
-    JSON, or nothing.
+    """Return the metadata for a network's weights file: its ``options`` as JSON; empty if it has
+    none.
     """
     options = getattr(net, "options", None)
     return {} if options is None else {OPTIONS: json.dumps(options, sort_keys=True)}
 
 
 def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> None:
-    """Raise ParameterError unless a weights file fits a network: names, shapes, options, and
-    finite numbers.
+    """Raise ParameterError unless a weights file fits a network in names, shapes and options, and
+    all values are finite.
     """
     net = empty(make)
     fits(net, weights, f"this network (width {width})", getattr(net, "options", {}))
@@ -54,8 +54,8 @@ def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> Non
 def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any]) -> None:
     """Raise ParameterError unless a weights file fits a module, which messages name ``called``.
 
-    ``options`` are those of the network, with which the options in the metadata of the file must
-    agree.
+    ``options`` are the options of the network; those in the metadata of the file must agree with
+    them.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -81,8 +81,8 @@ def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any])
 
 @once_per_version
 def _not_finite(weights: Path) -> str:
-    """Return a message for the first tensor in a weights file with values that are not finite,
-    or an empty text.
+    """Return an error message for the first tensor of a weights file with values that are not
+    finite, else an empty text.
     """
     from safetensors import safe_open
 
@@ -93,8 +93,8 @@ def _not_finite(weights: Path) -> str:
 
 
 def wrong_weights(weights: Path, name: str, tensor: Tensor) -> str:
-    """Return a message for a tensor of network weights with values that are not finite, or an
-    empty text.
+    """Return an error message for a tensor of network weights with values that are not finite, else
+    an empty text.
     """
     count = int((~torch.isfinite(tensor)).sum())
     fix = "train the network again, or give an earlier file"
@@ -106,8 +106,8 @@ def wrong_weights(weights: Path, name: str, tensor: Tensor) -> str:
 
 
 def _stored_options(text: str, weights: Path) -> Mapping[str, Any]:
-    """Return the options in the metadata of a file; raise ParameterError for a text that holds no
-    options.
+    """Return the options in the metadata text of a file; raise ParameterError for an invalid
+    text.
     """
     try:
         options = json.loads(text)
@@ -123,10 +123,9 @@ def _stored_options(text: str, weights: Path) -> Mapping[str, Any]:
 def _refuse_other_options(
     trained: Mapping[str, Any], options: Mapping[str, Any], weights: Path
 ) -> None:
-    """Raise ParameterError if the options in a weights file differ from the options of the network
-    to load.
+    """Raise ParameterError if the options in a weights file differ from those of the network.
 
-    The tensor names and shapes can be equal all the same, and the network would compute other
+    Names and shapes of the tensors may agree nevertheless, and the network would compute other
     results.
     """
     for name in options:

@@ -1,4 +1,4 @@
-"""Import of the files and folders of a user, and the network classes in them."""
+"""Import of a user's files and folders, and the network classes in them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ if TYPE_CHECKING:
 
 # --- own modules ----------------------------------------------------------------------------------
 
-# Import of files and folders with nodes of a user, under the names that the files have.
+# Import of files and folders with user-defined nodes, as modules with the names of the files.
 #
-# Such a module is an ordinary module of the process: its folder is searched by ``import``, so that
-# it can import helpers beside it. A process that receives one of its nodes imports the same file.
+# Such a module is an ordinary module of the process. Its folder is added to ``sys.path``, so that
+# it can import helper modules beside it. A process that receives one of its nodes imports the same
+# file.
 
 
-#: file of each module that was imported here, by name, in the order of the imports; None for one
-#: imported by its name
+#: file of each module with user-defined nodes, by module name, in the order of import; None for a
+#: module that was imported by its name
 _files: dict[str, Path | None] = {}
 
 
@@ -70,37 +71,40 @@ def import_file(
 
 
 def _forget_modules(name: str, before: Collection[str]) -> None:
-    """Forget a module and the modules inside it, but for those that were imported before."""
+    """Remove a module and its submodules from ``sys.modules``, except those that were imported
+    before.
+    """
     for module in list(sys.modules):
         if module not in before and f"{module}.".startswith(f"{name}."):
             del sys.modules[module]
 
 
 def note_module(name: str) -> None:
-    """Note a module with nodes of a user that was imported by its name."""
+    """Record a module with user-defined nodes that was imported by its name."""
     _files.setdefault(name, None)
 
 
 def own_modules() -> tuple[str, ...]:
-    """Return the names of the modules with nodes of a user that this process has imported, in
-    their order.
+    """Return the names of the modules with user-defined nodes that this process has imported, in
+    the order of import.
     """
     return tuple(name for name in _files if name in sys.modules)
 
 
 def own_files() -> tuple[str, ...]:
-    """Return the files and folders that this process has imported as modules of nodes, and the
-    names of others.
+    """Return the files and folders of the imported modules with user-defined nodes; for a module
+    imported by its name, the name.
     """
     return tuple(str(file or name) for name, file in _files.items())
 
 
 def import_missing(files: tuple[str, ...], needed: str) -> None:
-    """Import the modules of another process that this process lacks.
+    """Import the modules with user-defined nodes that another process has imported and this one has
+    not.
 
     The other process may have imported files that no longer exist, or that this process cannot
-    import. Only what the module ``needed`` raises is raised: `ImportError` for a missing file, and
-    whatever its code raises.
+    import. Only errors of the module ``needed`` are raised: `ImportError` for a missing file, and
+    any exception of its code.
     """
     for file in files:
         try:
@@ -120,21 +124,19 @@ def _import_if_missing(file: str) -> None:
 
 
 def _top_name(file: str) -> str:
-    """Return the first part of the name of the module in a file or folder, or of a module that
-    is given by its name.
-    """
+    """Return the first part of the name of a module, given as a file or folder or by its name."""
     return Path(file).stem if os.path.isabs(file) else file.partition(".")[0]
 
 
 def _refuse_taken(name: str, file: Path) -> None:
-    """Raise `ImportError` if ``import name`` does not mean ``file``."""
+    """Raise `ImportError` if ``import name`` would not load ``file``."""
     loaded_module = sys.modules.get(name)
     file_of_name = (
         getattr(loaded_module, "__file__", None)
         if loaded_module is not None
         else _file_of_import(name)
     )
-    # a module of Python itself has no file
+    # a built-in module of Python has no file
     if loaded_module is not None and file_of_name is None:
         raise ImportError(f"the name {name} is that of a module of Python: rename {file}")
     if file_of_name is not None and Path(file_of_name).resolve() != file.resolve():
@@ -176,20 +178,21 @@ def _imported_tops(file: Path) -> Iterator[str]:
 
 # --- network classes ------------------------------------------------------------------------------
 
-# Network classes of a user, which recipes name by family and class, such as ``mynet.SmallUNet``.
+# User-defined network classes, which recipes name by family (module) and class, such as
+# ``mynet.SmallUNet``.
 
 
-#: the module of a class that is unpickled, which a key covers
+#: the module of an unpickled class, which is part of a cache key
 __depends__ = ["unaffected:importlib.import_module"]
-#: key of the pydantic context: a function that returns the module of a family, or raises
-#: LookupError
+#: key of the pydantic context; its value is a function that returns the module of a family, or
+#: raises LookupError
 FAMILY = "family"
 _NAME_FORM = "must be the name of a network class in a family of your own, such as mynet.SmallUNet"
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """A network class of a user and its name in a recipe, such as ``mynet.SmallUNet``."""
+    """A user-defined network class with its name in a recipe, such as ``mynet.SmallUNet``."""
 
     name: str
     network: type[Any]  #: a class of `torch.nn.Module`
@@ -198,9 +201,7 @@ class Architecture:
         return self.name
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a class as module and name, with the files that the process that unpickles the
-        class must import.
-        """
+        """Pickle a class by module and name, with the files to import when it is unpickled."""
         return _imported, (
             self.name,
             self.network.__module__,
@@ -209,7 +210,7 @@ class Architecture:
         )
 
     def arguments(self, parameters: dict[str, Any] | None) -> dict[str, Any]:
-        """Return the arguments of the class by name, those of ``parameters`` and the defaults of
+        """Return the arguments of the class by name: ``parameters``, completed by the defaults of
         the class.
 
         Raises ValueError for an argument that the class does not take, or that is missing.
@@ -239,8 +240,8 @@ class Architecture:
 
 
 def _network_class_of(value: Any, info: ValidationInfo) -> Architecture:
-    """Return the network class that a recipe or a caller names; raise ValueError with the most
-    similar name.
+    """Return the network class for a value in a recipe or in a call; a ValueError names the most
+    similar class.
     """
     from torch import nn
 
@@ -266,7 +267,7 @@ def _network_class_of(value: Any, info: ValidationInfo) -> Architecture:
 
 
 def _module_of_family(family: str, info: ValidationInfo) -> ModuleType:
-    """Return the module of a family; raise ValueError where no recipe says which module it is."""
+    """Return the module of a family; raise ValueError if no recipe assigns a module to it."""
     module_of: Callable[[str], ModuleType] | None = (info.context or {}).get(FAMILY)
     if module_of is None:
         raise ValueError(
@@ -289,7 +290,7 @@ NetworkClass = Annotated[
 
 
 def network_classes(module: ModuleType) -> dict[str, type[nn.Module]]:
-    """Return the classes of `torch.nn.Module` that a module or package of a user defines, by
+    """Return the subclasses of `torch.nn.Module` that a user's module or package defines, by
     name.
     """
     values = vars(module).items()
@@ -297,7 +298,9 @@ def network_classes(module: ModuleType) -> dict[str, type[nn.Module]]:
 
 
 def _is_network_of(module: ModuleType, value: object) -> bool:
-    """Return True for a concrete class of networks that a module, or one inside it, defines."""
+    """Return True for a concrete subclass of `torch.nn.Module` defined in a module or one of its
+    submodules.
+    """
     from torch import nn
 
     if not isinstance(value, type) or not issubclass(value, nn.Module):
@@ -307,7 +310,9 @@ def _is_network_of(module: ModuleType, value: object) -> bool:
 
 
 def _hint(name: str, candidates: Any) -> str:
-    """Return a hint with the most similar of the known names, or with all of them."""
+    """Return a hint for error messages with the most similar known name, or with all known
+    names.
+    """
     close = difflib.get_close_matches(name, list(candidates), 1)
     if close:
         return f"did you mean {close[0]}?"
@@ -315,7 +320,7 @@ def _hint(name: str, candidates: Any) -> str:
 
 
 def _imported(name: str, module: str, qualname: str, files: tuple[str, ...]) -> Architecture:
-    """Return the network class of a module that is imported here, by its qualified name."""
+    """Import a module and return one of its network classes, by its qualified name."""
     import_missing(files, module)
     attribute_value: Any = importlib.import_module(module)
     for attribute in qualname.split("."):

@@ -1,4 +1,4 @@
-"""Parameters of nodes: the model that checks their values, and those that are files."""
+"""Parameters of nodes: the model that validates their values, and file parameters."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from neusee.nodes.units import IsFile, files_of
 
 # --- parameter model ------------------------------------------------------------------------------
 
-# The model that checks parameters from a recipe: unknown names, numbers that are not finite, true
-# in place of 1.
+# The model that validates parameters from a recipe and refuses unknown names, numbers that are not
+# finite, and booleans in place of numbers.
 
 
 class ParameterModel(BaseModel):
-    """Base class of models that check values of a recipe.
+    """Base class of the models that validate values in a recipe.
 
-    An unknown name is a mistake, and so are a number that is infinite or NaN, and true or false in
-    place of a number.
+    It refuses unknown names, numbers that are infinite or NaN, and true or false in place of a
+    number.
     """
 
     model_config = ConfigDict(
@@ -30,8 +30,8 @@ class ParameterModel(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _is_no_truth_value(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse true and false where the type of the field has no truth value: 1 and 0 are
-        other statements.
+        """Refuse true and false unless the type of the field allows them; pydantic would convert
+        them to 1 and 0.
         """
         field = cls.model_fields[str(info.field_name)]
         truth = _first_truth(value)
@@ -41,16 +41,16 @@ class ParameterModel(BaseModel):
 
 
 def _takes_truth(hint: Any) -> bool:
-    """Return True if a type may hold true or false at any depth, or anything at all."""
+    """Return True if a type allows a boolean at any depth, or any value."""
     if hint in (bool, Any, object) or isinstance(hint, bool):
         return True
     if isinstance(hint, type) and issubclass(hint, BaseModel):
-        return True  # a model checks its own values
+        return True  # a nested model validates its own values
     return any(_takes_truth(argument) for argument in get_args(hint))
 
 
 def _first_truth(value: Any) -> bool | None:
-    """Return the first true or false in a value or in its lists and mappings, or None."""
+    """Return the first boolean in a value, or in its lists and mappings, or None."""
     if isinstance(value, bool):
         return value
     if isinstance(value, dict):
@@ -62,8 +62,7 @@ def _first_truth(value: Any) -> bool | None:
 
 # --- file parameters ------------------------------------------------------------------------------
 
-# Parameters of nodes that are files: which they are, and the paths that a caller in Python writes
-# as texts.
+# File parameters of nodes: their recognition, and the conversion of texts to paths in Python calls.
 
 
 def is_file(hint: Any) -> bool:
@@ -75,14 +74,17 @@ def is_file(hint: Any) -> bool:
 
 
 def texts_of(hint: Any) -> list[Any]:
-    """Return the texts that a parameter takes beside a path, such as the names of known cameras."""
+    """Return the texts that a parameter accepts other than paths, such as names of known
+    cameras.
+    """
     if get_origin(hint) is Literal:
         return list(get_args(hint))
     return list(chain.from_iterable(texts_of(argument) for argument in get_args(hint)))
 
 
 def as_paths(hint: Any, value: Any) -> Any:
-    """Return a path or paths for a text or a list of texts, and every other value as it is.
+    """Convert a text to a path, or a text or list to a tuple of paths; return other values
+    unchanged.
 
     Args: hint: the annotation of a parameter that `is_file`; a text that the annotation names stays
             a text.
@@ -95,5 +97,5 @@ def as_paths(hint: Any, value: Any) -> Any:
 
 
 def _is_several(hint: Any) -> bool:
-    """Return True if a parameter takes a tuple of paths."""
+    """Return True if a parameter's type is a tuple of paths."""
     return get_origin(hint) is tuple or any(map(_is_several, get_args(hint)))

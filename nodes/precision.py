@@ -1,7 +1,6 @@
-"""Precision of tensors: half precision is refused, and convolutions never use TF32.
+"""Precision of tensors: half precision is converted or refused, and convolutions do not use TF32.
 
-Beside it what nodes need under `torch.func`: whether one of its transforms is at work, and `vmap`
-by repeated calls.
+Also support for `torch.func`: a test for active transforms, and `vmap` by repeated calls.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def single(x: Tensor) -> Tensor:
 
 
 def refuse_half(**lengths: Tensor) -> None:
-    """Raise ValueError for lengths in half precision: 1 µm is only 17 times the smallest
+    """Raise ValueError for lengths in half precision: 1 µm in m is only 17 times the smallest
     positive float16 number.
     """
     for name, x in lengths.items():
@@ -45,8 +44,8 @@ def refuse_half(**lengths: Tensor) -> None:
 
 
 def refuse_not_finite(why: str, **values: Tensor | float) -> None:
-    """Raise ValueError if a value or a sum of values is NaN or infinite; ``why`` tells the user
-    the consequence.
+    """Raise ValueError if a value is NaN or infinite; ``why`` states the consequence in the
+    message.
     """
     for name, x in values.items():
         if not bool(torch.as_tensor(x).isfinite().all()):
@@ -55,11 +54,11 @@ def refuse_not_finite(why: str, **values: Tensor | float) -> None:
 
 # --- exact convolution ----------------------------------------------------------------------------
 
-# Convolutions on CUDA in full float32: cuDNN may round to TF32, and its setting belongs to the
-# process, not a thread.
+# Convolutions on CUDA in full float32: cuDNN may round to TF32, and its setting applies to the
+# process, not to a thread.
 #
-# One thread at a time changes the setting. Otherwise two threads could each restore what the other
-# had set, and the setting would stay changed: with other digits on CUDA, and with other cache keys
+# A lock lets only one thread change the setting at a time. Otherwise two threads could each restore
+# the other's temporary setting, which would remain: with other digits on CUDA, and other cache keys
 # everywhere.
 
 
@@ -68,10 +67,10 @@ _TF32_LOCK = threading.RLock()
 
 @contextmanager
 def exact_convolutions(picture: Tensor, deterministic: bool = False) -> Iterator[None]:
-    """Convolve without TF32 during a ``with`` block if ``picture`` is on CUDA; the CPU has no such
-    setting.
+    """Context manager: convolutions in the ``with`` block do not use TF32 if ``picture`` is on
+    CUDA; on the CPU it does nothing.
 
-    ``deterministic``: use only algorithms of cuDNN that give the same bits each time.
+    ``deterministic``: use only cuDNN algorithms with bit-reproducible results.
     """
     if not picture.is_cuda:
         yield
@@ -90,14 +89,14 @@ def tf32_setting() -> bool:
 
 
 def transformed() -> bool:
-    """Return True inside a transform of `torch.func`, which follows tensors whose
-    `requires_grad` is False.
+    """Return True inside a transform of `torch.func`, which tracks tensors even if `requires_grad`
+    is False.
     """
     return torch._C._are_functorch_transforms_active()
 
 
 def plain(constant: Tensor) -> Tensor:
-    """Return a constant without the wrapper that a transform of `torch.func` gives to every new
+    """Return a constant without the wrapper that transforms of `torch.func` add to every new
     tensor.
     """
     while torch._C._functorch.is_functorch_wrapped_tensor(constant):
@@ -108,8 +107,8 @@ def plain(constant: Tensor) -> Tensor:
 def one_by_one(
     call: Callable[..., Any], count: int, in_dims: Sequence[int | None], inputs: Sequence[Any]
 ) -> Any:
-    """Call a function ``count`` times with parts of the batched inputs; return the stacked results
-    and their dimension.
+    """Call a function ``count`` times, once for each index of the batched dimension; return the
+    stacked results and their batched dimension.
 
     ``in_dims`` has the batched dimension of each input, or None for an input that is the same in
     every call.

@@ -1,4 +1,4 @@
-"""Padding of a picture with its mirror image, and bicubic resampling."""
+"""Mirror padding and bicubic resampling of pictures."""
 
 import functools
 
@@ -10,12 +10,12 @@ from neusee.nodes.precision import single
 
 # --- mirror padding -------------------------------------------------------------------------------
 
-# Padding of a picture with its mirror image.
+# Mirror padding of pictures.
 
 
 def mirrored(x: Tensor, down: int, right: int) -> Tensor:
-    """Pad a picture with its mirror image below and to the right; wide padding mirrors the
-    picture repeatedly.
+    """Pad a picture below and to the right with its mirror image, repeatedly if the padding is
+    wide.
     """
     if down == right == 0:
         return x
@@ -27,10 +27,8 @@ def mirrored(x: Tensor, down: int, right: int) -> Tensor:
 
 
 def _mirrored_indices(size: int, padded: int, device: torch.device) -> Tensor:
-    """Return the index of the sample that each of ``padded`` places shows, mirrored at both
-    ends.
-    """
-    # forth and back, without the ends a second time
+    """Return the sample index for each of ``padded`` positions, with mirroring at both ends."""
+    # forwards and backwards, without repeating the end samples
     period = max(2 * size - 2, 1)
     index = torch.arange(padded, device=device) % period
     return torch.minimum(index, period - index).clamp_max(size - 1)

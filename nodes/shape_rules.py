@@ -1,8 +1,8 @@
-"""Rules for the shape and type of a result, and tensors on the device ``meta``, which have no
+"""Rules for the shape and data type of results, with tensors on the device ``meta``, which have no
 values.
 
-A rule has the arguments of its node; an input of which nothing is known is None, and a rule that
-needs it fails. Files ``_result_shapes.py`` attach the rules to the nodes.
+A rule has the arguments of its node; an unknown input is None, and a rule that needs it fails.
+Files ``_result_shapes.py`` attach the rules to the nodes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-#: bytes of a tensor; more than any machine has, and torch cannot count much further
+#: largest size of a tensor in bytes; beyond any machine, and near the limit of torch's counters
 _LARGEST_TENSOR = 2**60
 
 
@@ -36,8 +36,8 @@ def double(*shape: int) -> Tensor:
 
 
 def at_least_single(*tensors: Tensor) -> torch.dtype:
-    """Return the type of a result that is computed in float32, or in the widest type of
-    ``tensors`` if wider.
+    """Return the data type of a result that is computed in float32, or in the widest type of
+    ``tensors`` if that is wider.
     """
     dtype = torch.float32
     for x in tensors:
@@ -46,25 +46,25 @@ def at_least_single(*tensors: Tensor) -> torch.dtype:
 
 
 def like_first(first: Tensor, *inputs: Any, **params: Any) -> Tensor:
-    """Return the shape of the first input, in float32 or in the type of the first input if it is
-    wider.
+    """Return a tensor without values in the shape of the first input, in float32 or a wider type of
+    it.
     """
     return blank(*first.shape, dtype=at_least_single(first))
 
 
 def scalars(kind: type) -> Callable[..., Any]:
-    """Return the rule of a node whose result is a named tuple ``kind`` of float64 scalars."""
+    """Return the rule for results that are a named tuple ``kind`` of float64 scalars."""
     return lambda *inputs, **params: kind(*(double() for _ in getattr(kind, "_fields", ())))
 
 
 def transform_operations(*sizes: int) -> float:
-    """Return the number of operations of a fast Fourier transform of an array with the given
-    sizes, N log2 N.
+    """Return the approximate number of operations of a fast Fourier transform of an array with
+    these sizes: N log2 N.
     """
     count = math.prod(sizes)
     return count * math.log2(count + 1)
 
 
 def known(x: Tensor) -> bool:
-    """Return True if a tensor has values."""
+    """Return True if a tensor has values, so that it is not on the device ``meta``."""
     return x.device.type != "meta"

@@ -5,9 +5,9 @@ micrometres for nanometres. Inside the program every quantity is in SI units, e-
 A gain is K of EMVA 1288 inside the program, DN/e-; a recipe may also give the reciprocal, ``0.37
 e-/DN``.
 
-Every type of a number states its least and its greatest value: what physics allows, or what no
-camera, laser or optic comes near. A value beyond is a mistake of the recipe, such as a unit that
-slipped, and is refused before any work.
+Every type of number states its least and greatest value: a limit of physics, or one far beyond any
+camera, laser or optic. A value outside is taken as a mistake in the recipe, such as a wrong unit,
+and is refused before the run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-#: by SI unit, the units that a recipe may write and the size of each in it
+#: by SI unit: the units that a recipe may use, and the factor from each to the SI unit
 SCALES: dict[str, dict[str, float]] = {
     "m": {
         "m": 1.0,
@@ -48,7 +48,7 @@ SCALES: dict[str, dict[str, float]] = {
     "waves": {"waves": 1.0, "wave": 1.0},
     "DN/e-": {"DN/e-": 1.0, "e-/DN": 1.0},
 }
-KNOWN_UNITS = tuple(SCALES)  #: SI units of the values of a recipe
+KNOWN_UNITS = tuple(SCALES)  #: SI units of values in a recipe
 _USUAL_UNITS = {
     "m": "um",
     "s": "ms",
@@ -56,8 +56,8 @@ _USUAL_UNITS = {
     "W": "mW",
     "J": "uJ",
     "Hz": "kHz",
-}  #: the unit that messages suggest for an SI unit
-_RECIPROCAL = {"e-/DN"}  #: units of the reciprocal of the quantity
+}  #: the unit that error messages suggest, by SI unit
+_RECIPROCAL = {"e-/DN"}  #: units that state the reciprocal of the quantity
 _NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
 
@@ -88,7 +88,9 @@ def _with_unit(number: str, si: str) -> str:
 
 
 def _in_si(number: float, si: str, unit: str) -> float:
-    """Return a number of a unit in the SI unit ``si``; a reciprocal unit inverts it."""
+    """Convert a number from a unit to the SI unit ``si``; a number with a reciprocal unit is
+    inverted.
+    """
     if unit not in _RECIPROCAL:
         return number * SCALES[si][unit]
     if number == 0:
@@ -97,8 +99,8 @@ def _in_si(number: float, si: str, unit: str) -> float:
 
 
 def read_any(text: Any) -> tuple[float, str]:
-    """Convert a text such as ``"550 nm"`` or ``0.56`` to a finite number and its SI unit, "" for no
-    unit.
+    """Convert a text such as ``"550 nm"`` or ``0.56`` to a finite number and its SI unit (""
+    without unit).
 
     Raises ValueError for other text.
     """
@@ -107,8 +109,8 @@ def read_any(text: Any) -> tuple[float, str]:
 
 
 def read_written(text: Any) -> tuple[float, str, bool]:
-    """Return the number in a text, the SI unit, and True if the number has a reciprocal unit such
-    as e-/DN.
+    """Return the number in a text, its SI unit, and True if the unit is a reciprocal one such as
+    e-/DN.
 
     A number with a reciprocal unit is not converted, because the reciprocal of a normal
     distribution, such as that of 0.37 e-/DN, is not normal.
@@ -141,8 +143,8 @@ def _reader(si: str) -> BeforeValidator:
 
 
 def in_words(number: float, si: str) -> str:
-    """Return a quantity as text in the unit that a reader would use, such as ``10 mm`` for 0.01
-    m; "" has no unit.
+    """Return a quantity as text in a convenient unit, such as ``10 mm`` for 0.01 m; the unit "" is
+    omitted.
     """
     units = {
         unit: scale
@@ -156,17 +158,17 @@ def in_words(number: float, si: str) -> str:
     return f"{number / units.get(unit, 1.0):.6g} {unit}".strip()
 
 
-_LARGEST_DARK_CURRENT = 1e12  #: electrons of one exposure, or of a second
+_LARGEST_DARK_CURRENT = 1e12  #: electrons per exposure, or per second
 
 
 class ElectronsPerSecond(NamedTuple):
-    """A dark current by time; a dark current of one exposure is a plain number of electrons."""
+    """A dark current per second; a dark current per exposure is a plain number of electrons."""
 
     rate: float  #: e-/s
 
 
 def _read_dark_current(value: Any) -> float | ElectronsPerSecond:
-    """Return a dark current in e- of one exposure, or in e-/s if the text has such a unit."""
+    """Return a dark current in e- per exposure, or in e-/s if the text has this unit."""
     quantity_text, unit = str(value).strip(), "e-/s"
     is_by_time = not isinstance(value, bool) and quantity_text.endswith(tuple(SCALES[unit]))
     current = read_quantity(value, unit) if is_by_time else read_quantity(value, "e-")
@@ -200,7 +202,7 @@ FocalLength = Annotated[float, Field(ge=1e-6, le=1e4), _reader("m")]
 Diameter = Annotated[float, Field(ge=1e-6, le=100), _reader("m")]
 #: no beam is narrower than its light
 BeamRadius = Annotated[float, Field(ge=10e-9, le=100), _reader("m")]
-#: in which a file of heights counts
+#: unit of the heights in a file
 LengthUnit = Annotated[float, Field(ge=1e-15, le=1), _reader("m")]
 #: pixels of sensors have 0.5 µm to 1 mm
 PixelPitch = Annotated[float, Field(ge=100e-9, le=10e-3), _reader("m")]
@@ -258,7 +260,7 @@ Shape = tuple[Pixels, Pixels]  #: (y, x) in pixels
 
 @dataclass(frozen=True)
 class NumberRange:
-    """Least and greatest value that a number may have; None where nothing is stated."""
+    """The least and the greatest allowed value of a number; None if not stated."""
 
     least: float | None
     greatest: float | None
@@ -268,8 +270,7 @@ class NumberRange:
 def number_ranges(hint: Any) -> Iterator[NumberRange]:
     """Yield the range of each number that a type annotation of a parameter contains.
 
-    A number of a tuple, a list, a mapping or a union counts by itself; True and False are no
-    numbers.
+    Each number in a tuple, a list, a mapping or a union has its own range; booleans are skipped.
     """
     yield from _ranges(hint, ())
 
@@ -291,7 +292,7 @@ _CONTAINERS = (tuple, list, dict)
 
 
 def _stated(metadata: tuple[Any, ...], *limits: str) -> list[Any]:
-    """Return the values of the named limits that constraints state."""
+    """Return the values of the limits with these names among constraints."""
     values = []
     for constraint in metadata:
         values += [getattr(constraint, name) for name in limits if hasattr(constraint, name)]
@@ -305,7 +306,7 @@ def _constraints(hint: Any) -> Iterator[Any]:
 
 
 def _unit_of(metadata: tuple[Any, ...]) -> str:
-    """Return the SI unit that a reader among constraints gives, or an empty text."""
+    """Return the SI unit of the quantity reader among constraints, or an empty text."""
     readers = [
         constraint.func for constraint in metadata if isinstance(constraint, BeforeValidator)
     ]
@@ -313,16 +314,14 @@ def _unit_of(metadata: tuple[Any, ...]) -> str:
 
 
 class IsFile:
-    """The annotation of a file parameter, which makes the content of the file part of the cache
-    key.
-    """
+    """Annotation of a file parameter; it makes the content of the file part of the cache key."""
 
 
 def existing_file(path: Path) -> Path:
     """Return the path of a regular file; raise ValueError for anything else."""
     try:
         is_folder = path.is_dir()
-    except OSError as error:  # such as a path that is too long
+    except OSError as error:  # for example a path that is too long
         raise ValueError(f"{str(path)[:40]}… cannot be read: {error.strerror}") from None
     if is_folder:
         raise ValueError(f"{path} is a folder, not a file: give a file in this folder")

@@ -35,19 +35,17 @@ class Stop(NamedTuple):
 
 
 class Dirt(NamedTuple):
-    """The effect of dirt on the camera window, as transmission and optical path in the plane of
-    the pupil.
-    """
+    """Dirt on the camera window: transmission and optical path in the plane of the pupil."""
 
     amplitude: Tensor  #: (v, u) transmission of the field in [0, 1]
     path: Tensor  #: (v, u) added optical path, m
 
 
 class Wavefront(NamedTuple):
-    """The light of a laser across the pupil, which is uneven and curved if the laser is near or its
-    beam narrow.
+    """The wavefront of a laser in the pupil: tapered if its beam is narrow, and curved if the laser
+    is near.
 
-    A laser that fills the pupil evenly from a great distance has the value 0 in both fields.
+    For a distant laser that fills the pupil evenly, both fields are 0.
     """
 
     #: () float64, 1/m2; the amplitude falls as exp(-taper r^2) with the distance r from the axis
@@ -57,8 +55,8 @@ class Wavefront(NamedTuple):
 
 
 class LaserLight(NamedTuple):
-    """The light of a laser in absolute units, mean over one exposure; 0 for a laser that is
-    given by its strength.
+    """The light of a laser in absolute units, averaged over one exposure; all fields are 0 for a
+    laser that is stated by its strength.
     """
 
     even_peak: (
@@ -76,9 +74,7 @@ class LaserLight(NamedTuple):
 
 
 class Shade(NamedTuple):
-    """The light that a grey filter, a smaller stop and notch filters in the pupil of one arm let
-    through.
-    """
+    """The transmission of a grey filter, a smaller stop and notch filters in the pupil."""
 
     amplitude: Tensor  #: (v, u) transmission of the field in [0, 1], the same at every wavelength
     #: (notch, 3) float64: centre in m, full width at half maximum in m, depth in [0, 1]
@@ -101,9 +97,9 @@ class Pupil(NamedTuple):
     #: (band,) float64, refractive index of the mask minus the index of air
     wavelengths: Tensor  #: (band,) float64, m
     pitch: Tensor  #: () float64, m between samples, both axes
-    #: (notch, 3) of `Shade`; no row: no notch filter
+    #: (notch, 3), `Shade.notches`; no rows without a notch filter
     notches: Tensor = torch.zeros(0, 3, dtype=torch.float64)
-    #: () float64, m, of the clear aperture; 0: not known
+    #: () float64, m, diameter of the clear aperture; 0 if not known
     diameter: Tensor = torch.zeros((), dtype=torch.float64)
 
 
@@ -113,13 +109,14 @@ class Psf(NamedTuple):
     """
 
     intensity: Tensor  #: (band, y, x); the sum over an infinite plane is the transmitted share
-    #: (band,) float64: pixel on the axis for the same lens without mask, dirt and aberrations
+    #: (band,) float64: intensity of the pixel on the axis for the same lens without mask, dirt and
+    #: aberrations
     clear_peak: Tensor
     #: (band,) float64, highest spatial frequency that the clear aperture passes, cycles per pixel;
     #: empty: not known
     cut_off: Tensor = torch.zeros(0, dtype=torch.float64)
-    #: (band,) float64, side in pixels of the square over which each pixel averages; 0: points;
-    #: empty: points
+    #: (band,) float64, side in pixels of the square over which each pixel averages; 0 or empty: the
+    #: PSF is sampled at points
     averaged: Tensor = torch.zeros(0, dtype=torch.float64)
 
 
@@ -130,11 +127,12 @@ class LowRankCube(NamedTuple):
 
     planes: Tensor  #: (k, y, x), the strongest plane first
     basis: Tensor  #: (band, k) float64
-    #: (k + 1, band) float64: bound of |band b minus the first r planes|, r = 0 to k
+    #: (k + 1, band) float64: row r bounds |band b - its approximation by the first r planes|, r = 0
+    #: to k
     residual_max: Tensor
-    #: root mean square of this difference, or empty
+    #: (k + 1, band): root mean square of this difference, or empty
     residual_rms: Tensor = torch.zeros(0, 0, dtype=torch.float64)
-    #: (y, x) bound of |band minus all planes| in any band, or empty
+    #: (y, x) bound of |band - its approximation by all planes| over all bands, or empty
     residual_map: Tensor = torch.zeros(0, 0)
 
 
@@ -145,21 +143,21 @@ class Channels(NamedTuple):
     rows: Tensor  #: (row, band) float64
     #: () float64, upper bound of the root mean square error over max |plane|, for the worst row
     bound: Tensor
-    #: counts of planes, kernels, bands, PSF rows and PSF columns
+    #: numbers of kept planes, kernels, bands, PSF rows and PSF columns
     kept: Tensor = torch.zeros(5, dtype=torch.int64)
     #: upper bound of the relative error of max |plane|
     largest: Tensor = torch.tensor(torch.inf, dtype=torch.float64)
-    #: estimates, beside `bound` and `largest`, by `FewBands`
+    #: estimated errors by `FewBands`, in addition to `bound` and `largest`
     estimated: Tensor = torch.zeros(2, dtype=torch.float64)
 
 
 class FewBands(NamedTuple):
-    """A choice of few bands whose PSFs represent all: the PSF of band b is ``sum_j share[b, j]``
-    times that of j.
+    """A few bands whose PSFs represent all: the PSF of band b is about ``sum_j share[b, j]
+    PSF(used[j])``.
     """
 
     share: Tensor  #: (band, j) float64; each row sums to 1
-    used: Tensor  #: (j,) int64, which bands, rising
+    used: Tensor  #: (j,) int64, indices of the chosen bands, rising
     #: () float64, estimate of the root mean square error of the image over its brightest pixel
     error: Tensor
     largest: Tensor  #: () float64, estimate of the relative error of the brightest pixel
@@ -169,8 +167,8 @@ class Levels(NamedTuple):
     """Statistics of flat-field frames at several illuminances, from which sensor parameters are
     fitted.
 
-    A level with clipped or coarsely quantised numbers also has a histogram: a cell counts how often
-    one number occurs in one level.
+    A level with clipped or coarsely quantised numbers also has a histogram; a cell is the count of
+    one digital number in one level.
     """
 
     photons: Tensor  #: (level,) float64, mean photons per pixel and exposure; 0 in the dark
@@ -186,54 +184,61 @@ class Levels(NamedTuple):
 
 
 class FoundLasers(NamedTuple):
-    """Lasers that were found in a frame, the most certain first; a row beyond ``number`` is 0
-    and no laser.
+    """Lasers found in a frame, the most certain first; rows from index ``number`` on are 0 and
+    unused.
     """
 
-    number: Tensor  #: () int64, of lasers
+    number: Tensor  #: () int64, number of lasers
     direction: Tensor  #: (laser, 2) float64, rad, (n_y, n_x)
     wavelength: Tensor  #: (laser,) float64, m
-    fwhm: Tensor  #: (laser,) float64, m, width of the line, the best of those that were tried
-    #: (laser, channel) float64, electrons over all of the pattern behind a clean and clear pupil
+    #: (laser,) float64, m, full width at half maximum of the line, the best of the tried values
+    fwhm: Tensor
+    #: (laser, channel) float64, electrons of the whole pattern behind a clean and clear pupil
     strength: Tensor
     #: (laser, 2, 2) float64, rad: lower and upper end (90 %) along each axis
     direction_interval: Tensor
     wavelength_interval: Tensor  #: (laser, 2) float64, m: lower and upper end (90 %)
     strength_interval: Tensor  #: (laser, channel, 2) float64, electrons: lower and upper end (90 %)
-    identifiable: Tensor  #: (laser, 2) bool: True where the frame tells direction, and wavelength
-    #: (laser, 2) float64: log likelihood gained by the laser, and beyond what a lamp there gains
+    #: (laser, 2) bool: True if the frame determines the direction, and the wavelength
+    identifiable: Tensor
+    #: (laser, 2) float64: gain in log likelihood by the laser, and its excess over the gain by a
+    #: lamp there
     gain: Tensor
-    #: (laser, value, value) float64, of n_y, n_x, wavelength and `straight` of each channel
+    #: (laser, value, value) float64, correlation matrix of n_y, n_x, wavelength and `straight` of
+    #: each channel
     correlation: Tensor
-    #: (laser, channel) float64, electrons that follow the pattern: ``strength`` less what dirt
-    #: takes
+    #: (laser, channel) float64, electrons in the pattern: ``strength`` less the light that dirt
+    #: removes from it
     straight: Tensor
     #: (laser, channel) float64, electrons, standard deviation of ``straight``
     straight_spread: Tensor
 
 
 class WienerProblem(NamedTuple):
-    """The deconvolution of `restore.wiener`: a linear problem for a scene of mean 0 and variance
-    1, and its answer.
+    """The deconvolution of `restore.wiener` as a linear problem, for a scene of mean 0 and variance
+    1, with its solution.
     """
 
-    picture: Tensor  #: (channel, y, x), without the glare, of mean 0 and in units of ``scale``
+    #: (channel, y, x), picture without the glare, of mean 0, in units of ``scale``
+    picture: Tensor
     weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where a pixel is clipped
-    psf: Tensor  #: (channel, any, any), of a sum near 1
-    glare: Tensor  #: (pattern, channel, y, x), patterns that are added with any strength
-    #: (pattern, channel, y, x), patterns that are added with a strength of mean 0 and variance 1
+    psf: Tensor  #: (channel, any, any), with a sum near 1
+    glare: Tensor  #: (pattern, channel, y, x), additive patterns of unknown strength
+    #: (pattern, channel, y, x), additive patterns whose strength has mean 0 and variance 1
     doubts: Tensor
-    answer: Tensor  #: (channel, y, x), what the filter restores, in units of ``scale``
-    #: (channel, y, x), the blurred answer, in which light from beyond the frame counts too
+    answer: Tensor  #: (channel, y, x), restored picture, in units of ``scale``
+    #: (channel, y, x), the answer blurred by the PSF, with light from outside the frame
     seen: Tensor
     scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
     mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
 
 
 class FilterFacts(NamedTuple):
-    """What `restore.wiener` finds in a picture and knows of it, as maps that a network can see."""
+    """Quantities that `restore.wiener` estimates or uses for a picture, as maps for the input of a
+    network.
+    """
 
-    #: (channel, y, x), what the filter restores, of mean 0 and in units of ``scale``
+    #: (channel, y, x), restored picture, of mean 0, in units of ``scale``
     answer: Tensor
     deviation: Tensor  #: (channel, y, x), predicted error of the answer, in units of ``scale``
     maps: Tensor  #: (map, y, x), in the order that `restore.filter_facts` states
@@ -242,8 +247,8 @@ class FilterFacts(NamedTuple):
 
 
 class MeasuredPsf(NamedTuple):
-    """PSFs that frames of point sources gave, at the nodes of a grid over the frame, and how sure
-    they are.
+    """PSFs measured from frames of point sources, at the nodes of a grid over the frame, with their
+    uncertainties.
 
     Node (i, j) lies in the middle of its zone, which is one of rows x columns equal parts of the
     frame.
@@ -252,25 +257,28 @@ class MeasuredPsf(NamedTuple):
     kernels: Tensor  #: (row, column, channel, y, x) float64, each of sum 1
     #: (row, column, channel, y, x) float64, standard deviation of each pixel of the kernels
     deviation: Tensor
-    #: (draw, row, column, channel, y, x) float32, kernels that the frames allow as well
+    #: (draw, row, column, channel, y, x) float32, random draws of kernels consistent with the
+    #: frames
     draws: Tensor
-    #: (point, 4) float64: file from 0, y and x of each point in pixels, and its signal in e-
+    #: (point, 4) float64: index of the file (from 0), y and x of each point in pixels, and its
+    #: signal in e-
     places: Tensor
-    #: (channel,) float64, chi-square of the frames per seen pixel, 1 for a model as good as the
+    #: (channel,) float64, chi-square of the frames per used pixel; 1 if the model fits within the
     #: noise
     fit: Tensor
-    #: (channel,) float64, bound of the light beyond the window, as a share of the light within
+    #: (channel,) float64, bound of the light outside the window, as a share of the light inside
     outside: Tensor
-    #: (row, column) float64, number of points at the node that would tell its PSF as well
+    #: (row, column) float64, number of points at the node that would determine its PSF as
+    #: accurately
     support: Tensor
     inflation: (
-        #: (row, column) float64, of the variance of the PSF, because points tell several at once; 1
-        #: is best
+        #: (row, column) float64, factor on the variance of the PSF, because points determine
+        #: several PSFs at once; 1 is best
         Tensor
     )
 
 
-#: for each class, the fields with one entry per band
+#: by class: the fields with one entry per band
 BAND_FIELDS: dict[type, tuple[str, ...]] = {
     Bands: Bands._fields,
     Pupil: ("index", "wavelengths"),
@@ -279,7 +287,7 @@ BAND_FIELDS: dict[type, tuple[str, ...]] = {
 
 
 def band_names(value: object) -> list[str]:
-    """Return the names of the fields with one entry per band; a field of values that are not
-    known is empty.
+    """Return the names of a value's fields with one entry per band, without empty ones, which are
+    unknown.
     """
     return [name for name in BAND_FIELDS.get(type(value), ()) if getattr(value, name).numel()]

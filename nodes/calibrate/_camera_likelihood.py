@@ -1,4 +1,6 @@
-"""The likelihood of the levels of a real camera, with drift and unequal pixels."""
+"""The likelihood of the light levels of a real camera, whose lamp drifts and whose pixels
+differ.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from neusee.nodes.units import Efficiency, Electrons, Exposure, Gain, Real
 from neusee.nodes.values import Levels
 
 Scattered = Annotated[float, Field(ge=0, le=100)]  #: a standard deviation; 0 for none
-_ITERATIONS = 40  #: of the inverse of a response that bends by less than a half
+_ITERATIONS = 40  #: fixed-point iterations that invert a response that bends by less than a half
 
 
 class CameraValues(NamedTuple):
@@ -58,7 +60,7 @@ class _Signal(NamedTuple):
     """
 
     electrons: Tensor  #: electrons above the shortest dark level
-    slope: Tensor  #: DN per electron at that signal
+    slope: Tensor  #: derivative of the response at that signal, DN per electron
     possible: Tensor  #: True if the response rises
 
 
@@ -145,10 +147,10 @@ def camera(
     ).index_copy(-1, fitted_index, squared_residuals)
     # two observations in each level used: its mean and its variance
     degrees_of_freedom = torch.zeros_like(levels.mean).index_fill(0, fitted_index, 2.0)
-    # squared derivatives of a residual and of its log width sum, on average, to the Fisher
-    # information
+    # the expected Fisher information is the sum of squared derivatives of each residual and of its
+    # log width
     mean = levels.mean.expand(*squared_residuals.shape[:-1], -1)
-    # for the levels used
+    # expected variances of the fitted levels; 0 for the others
     variance = torch.zeros_like(mean).index_copy(-1, fitted_index, residuals.expected)
     return Likelihood(
         log_likelihood,
@@ -193,11 +195,11 @@ def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
 
 
 def expected_levels(levels: Levels, params: Mapping[str, Any]) -> Levels:
-    """Return measured levels with the means and variances that a camera with given parameters
-    should have.
+    """Return the measured levels with their means and variances replaced by those that the camera
+    model expects.
 
-    ``params`` are the parameters of `camera`, and all numbers. Levels that `camera` leaves out stay
-    as they are.
+    ``params`` are the parameters of `camera`, each a number. Levels that `camera` excludes from the
+    fit keep their measured values.
 
     Shapes: levels (level,) -> levels (level,), without histograms.
     Units:  those of `Levels`.
@@ -248,7 +250,7 @@ def _residuals(
     variance = variance.where(possible, 1.0)
     # a variance of nu degrees of freedom has the relative variance 2 / nu
     log_variance_width = (2.0 / levels.degrees_of_freedom + camera.scatter.square()).sqrt()
-    # the mean log variance is below the log of the mean variance by one over the degrees of freedom
+    # the expectation of a log sample variance is ln(variance) - 1 / nu, to first order in 1 / nu
     variance_residual = (
         levels.variance.log() - variance.log() + 1.0 / levels.degrees_of_freedom
     ) / log_variance_width
@@ -291,8 +293,8 @@ def camera_signal(signal: Tensor, top: float, camera: CameraValues) -> _Signal:
 
 
 def levels_to_fit(levels: Levels, share: float) -> tuple[Tensor, float, float]:
-    """Return the indices of the light levels to fit, their largest signal in DN, and the
-    shortest dark exposure.
+    """Return the indices of the levels to fit, the largest signal above the dark among them in DN,
+    and the shortest dark exposure in s.
     """
     is_dark, unclipped = levels.photons == 0, ~_piles_up(levels)
     if not bool((is_dark & unclipped).any()):
@@ -305,7 +307,7 @@ def levels_to_fit(levels: Levels, share: float) -> tuple[Tensor, float, float]:
     is_lit = ~is_dark
     if not bool(is_lit.any()):
         raise ValueError("there are no lit levels: give two or more different light levels")
-    # of the level of the greatest variance
+    # saturation: the signal of the lit level of the greatest variance
     saturation_signal = float(signal[is_lit][levels.variance[is_lit].argmax()])
     fitted = unclipped & (is_dark | (signal <= share * saturation_signal))
     if len(set(levels.photons[fitted & is_lit].tolist())) < 2:
@@ -330,10 +332,11 @@ def levels_to_fit(levels: Levels, share: float) -> tuple[Tensor, float, float]:
 
 
 def _piles_up(levels: Levels) -> Tensor:
-    """Return a mask of the levels whose numbers pile up at an end of the range.
+    """Return a mask (level,) of the levels in which digital numbers pile up at an end of the range
+    (clipping).
 
-    Such levels have a histogram; one that has it for coarse numbers alone, with little variance and
-    without the number 0, does not pile up.
+    Such a level has a histogram. A level without the number 0 and with a small variance has a
+    histogram only because its numbers are coarse; it is not clipped.
     """
     has_histogram, has_zero = (torch.zeros_like(levels.mean, dtype=torch.bool) for _ in range(2))
     has_histogram[levels.cell_level] = True

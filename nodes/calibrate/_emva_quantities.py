@@ -1,4 +1,4 @@
-"""Quantities of the linear model of EMVA 1288, from photon transfer to dark current."""
+"""Quantities of the linear camera model of EMVA 1288, from photon transfer to dark current."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _WHOLE_RANGE = (1e3, 1e7)  #: values that are shown as whole numbers
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of a sheet by the name, symbol and unit of EMVA 1288; ``value`` is None if the
-    frames do not tell it.
+    """A quantity of an EMVA 1288 data sheet, with its name, symbol and unit; ``value`` is None if
+    the frames do not determine it.
 
     With a ``bound`` the frames give a limit only: the quantity is below (``<``) or above (``>``)
-    the value. Without a value, or with a bound, ``reason`` says why.
+    the value. ``reason`` says why there is no value, or only a limit.
     """
 
     key: str
@@ -52,15 +52,15 @@ class Quantity:
         return f"{self.bound} {number} {self.unit}".strip()
 
     def told(self, value: float, bound: Bound = "", reason: str = "") -> Quantity:
-        """Return the quantity with a value; a value that is not finite counts as none, and needs
-        a reason.
+        """Return a copy of the quantity with a value; a value that is not finite becomes None, with
+        ``reason`` as the reason.
         """
         if not math.isfinite(value):
             return self.untold(reason or "no finite value follows from these frames")
         return replace(self, value=float(value), bound=bound, reason=reason)
 
     def untold(self, reason: str) -> Quantity:
-        """Return the quantity without a value, and why."""
+        """Return a copy of the quantity without a value, with the reason why it has none."""
         return replace(self, value=None, bound="", reason=reason)
 
 
@@ -74,21 +74,22 @@ FloatArray = NDArray[np.float64]
 FITTED_SHARE = 0.7  #: share of saturation up to which gain and responsivity are fitted
 #: shares of saturation between which the response is compared with a line
 LINEAR_RANGE = (0.05, 0.95)
-#: a maximum of the variance below this share of the greatest one is noise of saturated levels
+#: a local maximum of the variance below this share of the greatest variance is noise of saturated
+#: levels
 _PEAK_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """Lit levels (level,) in rising order of light, the dark of each, and all darks (dark,) in
-    rising exposure.
+    """A photon-transfer measurement: lit levels (level,) in rising order of light, the dark level
+    subtracted from each, and all dark levels (dark,) in rising order of exposure.
     """
 
     photons: FloatArray  #: mu_p, per pixel and exposure
     exposure: FloatArray  #: s
     mean: FloatArray  #: mu_y, DN
     variance: FloatArray  #: sigma_y^2, DN2
-    mean_dark: FloatArray  #: mu_y.dark of the nearest exposure, DN
+    mean_dark: FloatArray  #: mu_y.dark of the dark level of the nearest exposure, DN
     variance_dark: FloatArray  #: DN2
     dark_exposure: FloatArray  #: s
     dark_mean: FloatArray  #: DN
@@ -120,7 +121,7 @@ class PhotonTransfer:
 
 
 def photon_transfer(levels: Levels) -> PhotonTransfer:
-    """Return the photon-transfer measurement of light levels, each lit level with the dark of the
+    """Return the photon-transfer measurement, which pairs each lit level with the dark level of the
     nearest exposure.
 
     Shapes: levels (level,).
@@ -160,11 +161,10 @@ def photon_transfer(levels: Levels) -> PhotonTransfer:
 
 
 def saturation_point(variance: FloatArray) -> int:
-    """Return the index of saturation: from the brightest level, the first variance that exceeds the
-    next two below it.
+    """Return the index of the level at saturation: coming down from the brightest level, the first
+    local maximum of the variance, which exceeds the variances of the next two darker levels.
 
-    A peak below half of the greatest variance is noise of levels that are saturated, and does not
-    count.
+    A maximum below half of the greatest variance is noise of saturated levels, and is skipped.
     """
     peak = len(variance) - 1
     for i in range(len(variance) - 2, -1, -1):
@@ -177,33 +177,35 @@ def saturation_point(variance: FloatArray) -> int:
 
 
 def lit_order(photons: FloatArray, exposure: FloatArray) -> NDArray[np.int64]:
-    """Return the indices of the lit levels, by light and then by exposure."""
+    """Return the indices of the lit levels, sorted by light and then by exposure."""
     lit = np.flatnonzero(photons > 0)
     order: NDArray[np.int64] = lit[np.lexsort((exposure[lit], photons[lit]))]
     return order
 
 
 def slope_through_origin(x: FloatArray, y: FloatArray) -> float:
-    """Return the slope of the line through the origin that fits (x, y) best, each point with
+    """Return the slope of the least-squares line through the origin and the points (x, y), all of
     equal weight.
     """
     return float(x @ y / (x @ x))
 
 
 def line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Return slope and value at 0 of the line that fits (x, y) best."""
+    """Return slope and intercept (value at x = 0) of the least-squares line through the points (x,
+    y).
+    """
     centred_x = x - x.mean()
     slope = float(centred_x @ y / (centred_x @ centred_x))
     return slope, float(y.mean() - slope * x.mean())
 
 
 def relative_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Return slope and value at 0 of the line with the least squares of relative deviations,
-    which is linear in y.
+    """Return slope and intercept of the line that minimises the squared relative deviations
+    from y.
     """
-    # slope x + start = y, divided by y: both columns times their parameters add up to 1
+    # slope x + intercept = y, divided by y: a linear least-squares problem with the right side 1
     design = np.stack([x / y, 1 / y], axis=1)
-    # columns of equal length keep their digits
+    # columns scaled to unit length, so that the problem is well conditioned
     scaled_parameters: Any = np.linalg.lstsq(
         design / np.linalg.norm(design, axis=0), np.ones_like(y), rcond=None
     )[0]
@@ -219,8 +221,8 @@ def relative_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 QUANTIZATION = 1.0 / 12.0  #: sigma_q^2, DN2
 #: DN2, least temporal dark variance that rounding leaves measurable; its root is 0.49 DN
 LEAST_DARK_VARIANCE = 0.24
-_LINE_EXPOSURES = 2  #: exposures that a slope needs more than
-_SLOPE_SIGMA = 2.0  #: standard errors of a slope below which no slope is told
+_LINE_EXPOSURES = 2  #: a slope needs more exposures than this
+_SLOPE_SIGMA = 2.0  #: a slope of fewer standard errors than this is not stated
 #: why a quantity in electrons has no value
 NO_GAIN = "K is not told, so that no value in electrons is"
 _NO_LIGHT = "the photons of the levels are not told"
@@ -228,8 +230,8 @@ _NO_LIGHT = "the photons of the levels are not told"
 
 @dataclass(frozen=True)
 class Linearity:
-    """The line of least relative deviation through the response, and the deviation from it in
-    percent (level,).
+    """The line fitted to the response by its relative deviations, and the deviation of each level
+    from it in percent.
     """
 
     slope: float  #: DN per photon
@@ -238,7 +240,7 @@ class Linearity:
 
 
 def gain(transfer: PhotonTransfer) -> Quantity:
-    """Return K, DN/e-, from the levels up to 70 % of saturation."""
+    """Return the overall system gain K in DN/e-, fitted to the levels up to 70 % of saturation."""
     blank = Quantity("K", "K", "overall system gain", "DN/e-")
     fitted = transfer.fitted
     if fitted.sum() < 2:
@@ -277,8 +279,8 @@ def sensitivity(transfer: PhotonTransfer, photons_told: bool = True) -> list[Qua
 
 
 def dark_noise(transfer: PhotonTransfer) -> tuple[float, bool]:
-    """Return sigma_y.dark in DN at exposure 0, and True if rounding hides it, so that 0.49 DN is
-    only a limit.
+    """Return the temporal dark noise sigma_y.dark in DN at exposure 0, and True if rounding hides
+    it: then the value, 0.49 DN, is only an upper limit.
     """
     if len(np.unique(transfer.dark_exposure)) > _LINE_EXPOSURES:
         _, variance = line(transfer.dark_exposure, transfer.dark_variance)
@@ -288,8 +290,8 @@ def dark_noise(transfer: PhotonTransfer) -> tuple[float, bool]:
 
 
 def linearity(transfer: PhotonTransfer) -> Linearity | None:
-    """Return the deviation of the response from a line, or None with fewer than three levels in
-    the range.
+    """Return the deviation of the response from a line, or None for fewer than three levels from 5
+    to 95 % of saturation.
     """
     linear = transfer.linear
     if linear.sum() < 3 or len(np.unique(transfer.photons[linear])) < 3:
@@ -301,7 +303,9 @@ def linearity(transfer: PhotonTransfer) -> Linearity | None:
 
 
 def linearity_errors(transfer: PhotonTransfer) -> list[Quantity]:
-    """Return LE_min and LE_max, the extreme relative deviations in percent."""
+    """Return the linearity errors LE_min and LE_max: the least and the greatest relative deviation
+    from the line, in percent.
+    """
     extremes = (("LE_min", "LE.min", "least"), ("LE_max", "LE.max", "greatest"))
     blanks = [
         Quantity(key, symbol, f"linearity error, {name} deviation", "%")
@@ -319,7 +323,8 @@ def linearity_errors(transfer: PhotonTransfer) -> list[Quantity]:
 
 
 def dark_current(transfer: PhotonTransfer) -> list[Quantity]:
-    """Return mu_I from the means and from the variances of dark frames, e-/s.
+    """Return the dark current mu_I in e-/s, once from the means and once from the variances of dark
+    frames.
 
     Source: EMVA Standard 1288, release 4.0 Linear.
     """
@@ -345,8 +350,8 @@ def dark_current(transfer: PhotonTransfer) -> list[Quantity]:
 def _slope_over_exposure(
     blank: Quantity, times: FloatArray, values: FloatArray, scale: float
 ) -> Quantity:
-    """Return the slope of values over exposures in units of ``scale``, if it is at least twice
-    its standard error.
+    """Return the slope of ``values`` over exposure time, divided by ``scale``; no value if the
+    slope is below twice its standard error.
     """
     slope, value_at_0 = line(times, values)
     residuals = values - value_at_0 - slope * times
@@ -373,7 +378,7 @@ def _responsivity(transfer: PhotonTransfer, k: Quantity, photons_told: bool) -> 
 
 
 def _efficiency(response: Quantity, k: Quantity, photons_told: bool) -> Quantity:
-    """Return the quantum efficiency in %, responsivity over gain."""
+    """Return the quantum efficiency in %, which is responsivity over gain."""
     blank = Quantity("eta", "η", "quantum efficiency", "%")
     if not photons_told:
         return blank.untold(_NO_LIGHT)
@@ -391,7 +396,7 @@ def _inverse(k: Quantity) -> Quantity:
 def _dark_noise_and_signal(
     transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool
 ) -> list[Quantity]:
-    """Return temporal dark noise and dark signal in DN and in electrons."""
+    """Return temporal dark noise and dark signal, each in DN and in electrons."""
     rounding_reason = (
         f"the dark noise is below the {math.sqrt(LEAST_DARK_VARIANCE):.2f} DN that the standard"
         " sets, because rounding hides it"
@@ -420,8 +425,8 @@ def _thresholds(
     """Return the absolute sensitivity threshold, the light whose signal equals its noise, in
     photons and in electrons.
 
-    ``k`` is the gain, ``eta`` the quantum efficiency in %, ``noise`` the dark noise in DN, of which
-    only a limit is known where rounding is ``coarse``.
+    ``k`` is the gain, ``eta`` the quantum efficiency in %, ``noise`` the dark noise in DN. If
+    ``coarse``, rounding hides the dark noise, and ``noise`` is only its upper limit.
     """
     photons = Quantity("mu_p_min", "μ_p.min", "absolute sensitivity threshold", "photons")
     electrons = Quantity("mu_e_min", "μ_e.min", "absolute sensitivity threshold", "e-")
@@ -469,7 +474,9 @@ def _saturation_and_range(
 
 
 def _ratios(electrons: Quantity, thresholds: list[Quantity]) -> list[Quantity]:
-    """Return SNR_max and the dynamic range, each as a number, in dB and in bits."""
+    """Return the maximum signal-to-noise ratio and the dynamic range, each as a ratio, in dB and in
+    bits.
+    """
     # in electrons
     threshold = thresholds[1]
     greatest_snr = Quantity("SNR_max", "SNR.max", "maximum signal-to-noise ratio", "")
@@ -491,7 +498,7 @@ def _ratios(electrons: Quantity, thresholds: list[Quantity]) -> list[Quantity]:
 
 
 def _on_three_scales(ratio: Quantity) -> list[Quantity]:
-    """Return a ratio as a number, in dB and in bits."""
+    """Return a quantity as a plain ratio, in dB and in bits."""
     in_decibels = replace(ratio, key=f"{ratio.key}_dB", unit="dB")
     in_bits = replace(ratio, key=f"{ratio.key}_bit", unit="bit")
     if ratio.value is not None:

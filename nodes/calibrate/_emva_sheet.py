@@ -1,5 +1,5 @@
-"""The whole sheet of EMVA 1288, with the least-squares fit of the linear model, and the
-general model that needs no line.
+"""The EMVA 1288 data sheet, the least-squares fit of the linear camera model, and the general
+model, which does not assume a linear response.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class LeastSquares(NamedTuple):
-    """The results of a photon-transfer measurement, float64 scalars; errors are standard errors
-    from noise alone.
+    """Results of the least-squares fit to a photon-transfer measurement, float64 scalars; errors
+    are standard errors from noise alone.
     """
 
     gain: Tensor  #: K, DN/e-
     efficiency: Tensor  #: electrons per photon
     temporal_dark_noise: Tensor  #: sigma_d, e-
-    dark_signal: Tensor  #: dark signal of the shortest exposure, DN
+    dark_signal: Tensor  #: mean of the dark level of the shortest exposure, DN
     dark_current: Tensor  #: e-/s; NaN where all dark levels have the same exposure
-    saturation: Tensor  #: electrons in the level of the largest variance, without the dark signal
+    saturation: Tensor  #: electrons above the dark in the level of the largest variance
     gain_error: Tensor
     efficiency_error: Tensor
     temporal_dark_noise_error: Tensor
-    fitted: Tensor  #: number of lit levels in both fits
+    fitted: Tensor  #: number of lit levels used in both line fits
 
 
 @node(rtol=1e-9)
@@ -137,7 +137,9 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
 
 
 def _refuse_too_few(dark: Tensor) -> None:
-    """Raise ValueError unless one level is ``dark``, (level,) bool, and two are lit."""
+    """Raise ValueError for fewer than one dark or two lit levels; ``dark`` (level,) is True for a
+    dark level.
+    """
     if not bool(dark.any()):
         raise ValueError(
             "the offset of the camera is unknown without dark frames: give frames without light"
@@ -150,7 +152,7 @@ def _refuse_too_few(dark: Tensor) -> None:
 
 
 def _refuse_falling(gain: Tensor, response: Tensor) -> None:
-    """Raise ValueError unless both slopes of a camera are positive."""
+    """Raise ValueError unless both fitted slopes, gain and responsivity, are positive."""
     if not (float(gain) > 0 and float(response) > 0):
         raise ValueError(
             f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive:"
@@ -169,20 +171,20 @@ def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
 
 
 def without_histograms(levels: Levels, which: Tensor) -> Levels:
-    """Return the light levels that an index or a mask selects, without their histograms."""
+    """Return the light levels selected by an index tensor or a mask, without their histograms."""
     return Levels._make([*(x[which] for x in levels[:6]), *(x[:0] for x in levels[6:])])
 
 
 def _slope(x: Tensor, y: Tensor) -> Tensor:
-    """Return the slope of the line through the origin that fits the points (x, y) best."""
+    """Return the slope of the least-squares line through the origin and the points (x, y)."""
     return (x @ y) / (x @ x)
 
 
 def _slope_error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
-    """Return the standard error of the slope (x y) / (x x) of a line through the origin.
+    """Return the standard error of the slope sum(x y) / sum(x x) of a line through the origin.
 
-    ``own`` is the variance of each lit value, ``dark`` that of the dark value subtracted from it.
-    ``which`` is the number of this dark level: points with the same one share its error.
+    ``own`` is the variance of each lit value, ``dark`` that of the dark value subtracted from it,
+    and ``which`` the index of that dark level. Points with the same dark level share its error.
     """
     dark_errors = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(
         0, which, x * dark.sqrt()
@@ -196,8 +198,8 @@ def _shortest_dark(levels: Levels, dark: Tensor) -> Tensor:
 
 
 def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the temporal dark noise without rounding noise and its standard error (infinite for
-    0 noise), in DN.
+    """Return the temporal dark noise in DN, with rounding noise subtracted, and its standard error
+    in DN (infinite for a noise of 0).
     """
     variance, freedom = (
         x[_shortest_dark(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom)
@@ -208,8 +210,8 @@ def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _dark_current(levels: Levels, dark: Tensor) -> Tensor:
-    """Return the slope of the dark signal over exposure, DN/s, or NaN if all dark levels have
-    the same exposure.
+    """Return the slope of the dark signal over exposure time in DN/s, or NaN if all dark levels
+    have the same exposure.
     """
     time, signal = levels.exposure[dark], levels.mean[dark]
     centred_time = time - time.mean()
@@ -220,33 +222,36 @@ def _dark_current(levels: Levels, dark: Tensor) -> Tensor:
 
 # --- general model --------------------------------------------------------------------------------
 
-# The general model of EMVA 1288, which needs no line: the local slope of the response refers noise
-# to the light.
+# The general model of EMVA 1288 does not assume a linear response: the local slope of the response
+# converts noise in DN to noise in photons.
 
 
 _LOCAL_LEVELS = 5  #: least number of levels of a local fit
-_LOCAL_SHARE = 0.25  #: share of all levels that a local fit takes
-_KNOWN_SLOPE_ERROR = 0.03  #: relative standard error of a slope above which nothing follows from it
+_LOCAL_SHARE = 0.25  #: share of all levels that a local fit uses
+_KNOWN_SLOPE_ERROR = 0.03  #: a slope with a larger relative standard error is not used
 
 
 class GeneralModel(NamedTuple):
-    """The response at the lit levels up to saturation, in rising order of light."""
+    """Local slope and input-referred signal-to-noise ratio of the lit levels up to saturation, in
+    rising order of light.
+    """
 
     photons: FloatArray  #: (level,) per pixel and exposure
-    slope: FloatArray  #: (1 + level,) DN per photon, local; the first is that of the dark
+    slope: FloatArray  #: (1 + level,) DN per photon, local; the first is the slope without light
     #: (1 + level,) relative standard error of the slope, from the scatter about the local fits
     error: FloatArray
-    #: (level,) light over the standard deviation of the light that the noise in time stands for
+    #: (level,) signal-to-noise ratio of the light: photons over the input-referred temporal noise
+    #: in photons
     ratio: FloatArray
 
 
 def general_model(transfer: PhotonTransfer) -> GeneralModel | None:
-    """Return local slope and signal-to-noise ratio of the light at each level up to saturation;
-    None below 3 levels.
+    """Return the local slope of the response and the signal-to-noise ratio of the light at each
+    level up to saturation; None for fewer than 3 levels.
 
-    The slope is that of a parabola through five or more neighbouring levels, the dark among them.
-    The light scatters from level to level, by the same share at all levels; its scatter about the
-    parabolas gives the errors.
+    The slope is that of a parabola fitted to five or more neighbouring levels; the dark counts as a
+    level. The light is assumed to scatter from level to level by the same relative amount, which is
+    estimated from the residuals of the parabolas and gives the errors.
 
     Source: EMVA Standard 1288, release 4.0 General (characteristic curve, and noise referred to the
             input).
@@ -257,7 +262,7 @@ def general_model(transfer: PhotonTransfer) -> GeneralModel | None:
     if len(np.unique(light)) < 4 or len(np.unique(light)) < len(light):
         return None
     slope, error = _local_slopes(light, signal)
-    # slope times light is the signal
+    # slope x light over the temporal noise in DN
     ratio = (
         light[1:]
         * slope[1:]
@@ -267,10 +272,11 @@ def general_model(transfer: PhotonTransfer) -> GeneralModel | None:
 
 
 def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> list[Quantity]:
-    """Return threshold, greatest signal-to-noise ratio and dynamic range without a linear model.
+    """Return sensitivity threshold, maximum signal-to-noise ratio and dynamic range of the general
+    model.
 
-    The threshold is the light whose signal equals the noise; from dark to the first level the
-    variance is taken as a line over the light.
+    The threshold is the light whose signal equals the noise; between the dark and the first lit
+    level the variance is interpolated linearly in the light.
 
     Units:  photons; a number; dB.
     Source: EMVA Standard 1288, release 4.0 General.
@@ -326,23 +332,25 @@ def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> l
     ]
 
 
-#: why a slope of the general model is not told
+#: why a quantity of the general model is not stated
 _SCATTER_REASON = (
     "the light scatters from level to level, so that the slope is known to {:.0%} only"
 )
 
 
 def _bound_of_brightest(transfer: PhotonTransfer) -> tuple[Bound, str]:
-    """Return the bound of what follows from the brightest level, and the reason of the bound."""
+    """Return the bound of quantities that depend on saturation, and its reason: lower limits if
+    saturation was not reached.
+    """
     return ("", "") if transfer.saturated else (">", "saturation was not reached")
 
 
 def _local_slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the slope at each point of a parabola through the nearest points, and the relative
-    standard error of each slope.
+    """Return the local slope at each point, from a parabola fitted to the nearest points, and the
+    relative standard error of each slope.
 
-    The scatter of the points is a share of their values, the same share everywhere; it is taken
-    from the deviations of the points from their parabolas.
+    The points are assumed to scatter by the same relative amount everywhere, which is estimated
+    from their residuals.
     """
     # an odd number of points: at least `_LOCAL_LEVELS`, and about `_LOCAL_SHARE` of all
     window_length = min(len(x), max(_LOCAL_LEVELS, 2 * round(_LOCAL_SHARE * len(x) / 2) + 1))
@@ -358,7 +366,7 @@ def _local_slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]
         slopes.append(float(parabola_weights[1] @ y[neighbours]) / x_range)
         error_weights.append(float(np.linalg.norm(parabola_weights[1] * y[neighbours])) / x_range)
         residual_weights = -parabola_weights[0]
-        # weight 1 of the point itself, less its weights in the parabola
+        # residual of the point: its value less the value of the parabola there
         residual_weights[index - first] += 1
         if residual_size := float(np.linalg.norm(residual_weights * y[neighbours])):
             relative_residuals.append(float(residual_weights @ y[neighbours]) / residual_size)
@@ -371,7 +379,7 @@ def _local_slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def _threshold(transfer: PhotonTransfer, model: GeneralModel) -> float:
-    """Return the light whose signal equals its noise in time, in photons."""
+    """Return the light in photons whose signal equals its temporal noise."""
     dark_variance = max(float(transfer.variance_dark[0]), LEAST_DARK_VARIANCE)
     variance_per_photon = max(0.0, float(transfer.excess[0]) / float(model.photons[0]))
     slope = float(model.slope[0])
@@ -379,7 +387,7 @@ def _threshold(transfer: PhotonTransfer, model: GeneralModel) -> float:
     threshold = (
         variance_per_photon + math.sqrt(variance_per_photon**2 + 4 * dark_variance * slope**2)
     ) / (2 * slope**2)
-    # the line of the variance holds up to the first level only; beyond, look for the ratio 1
+    # the linear variance holds up to the first level only; beyond it, find where the ratio is 1
     if threshold <= model.photons[0] or not (model.ratio < 1).any():
         return threshold
     brightest_below = int(np.flatnonzero(model.ratio < 1).max())
@@ -387,7 +395,7 @@ def _threshold(transfer: PhotonTransfer, model: GeneralModel) -> float:
         return float(model.photons[brightest_below])
     neighbours = slice(brightest_below, brightest_below + 2)
     return float(
-        # where the ratio is 1, between two levels, in logarithms of both
+        # interpolated between two levels, in logarithms of ratio and light
         np.exp(
             np.interp(
                 0.0, np.log(model.ratio[neighbours].clip(1e-300)), np.log(model.photons[neighbours])
@@ -398,12 +406,12 @@ def _threshold(transfer: PhotonTransfer, model: GeneralModel) -> float:
 
 # --- sheet ----------------------------------------------------------------------------------------
 
-# The whole sheet of EMVA 1288: all quantities that frames tell, and for the others the reason.
+# The EMVA 1288 data sheet: all quantities, each with a value or the reason why it has none.
 
 
 @dataclass(frozen=True)
 class EmvaSheet:
-    """The sheet of EMVA 1288 of a camera at one operating point."""
+    """The EMVA 1288 data sheet of a camera at one operating point."""
 
     transfer: PhotonTransfer
     linearity: Linearity | None
@@ -417,11 +425,12 @@ class EmvaSheet:
 def emva_sheet(
     levels: Levels, spatial: Nonuniformity | None = None, *, photons_told: bool = True
 ) -> EmvaSheet:
-    """Compute every quantity of the sheet of EMVA 1288 from light levels and from series of frames.
+    """Compute every quantity of the EMVA 1288 data sheet from light levels and from series of
+    frames.
 
-    ``levels`` are the pairs of the photon-transfer measurement, whose variance is the one in time;
-    ``spatial`` has the averaged frames. With ``photons_told`` False the light is known up to a
-    factor, and no quantity in photons follows.
+    ``levels`` are the levels of the photon-transfer measurement, with temporal variances;
+    ``spatial`` has the averaged frames. If ``photons_told`` is False, the light is known only up to
+    a factor, and no quantity in photons is stated.
 
     Shapes: levels (level,); frames (y, x).
     Units:  with each quantity.

@@ -1,4 +1,4 @@
-"""Files of raw frames: readers, the check before the run, and what headers say."""
+"""Files of raw frames: readers, the check before the run, and the values in their headers."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from neusee.nodes.scene._exr import exr_header
 #: pixel modes that Pillow reads without conversion
 _GREY_MODES = ("L", "I", "I;16", "I;16B", "I;16L", "F")
 FITS = (".fits", ".fit", ".fts")  #: suffixes
-#: DN; above any converter, and the limit of exact whole numbers in float32
+#: DN, 2^24: above the range of any converter, and the limit of exact whole numbers in float32
 LARGEST_NUMBER = 1 << 24
-#: bytes of a number while it is compared with a whole number: 8, and 3 of flags
+#: bytes per pixel value during the check for whole numbers: 8 for an int64, and 3 for masks
 _BYTES_COMPARED = 11
 
 
@@ -108,7 +108,7 @@ def refuse_page(file: Path, page: Any) -> None:
 
 
 def _read_exr(file: Path) -> NDArray[Any]:
-    """Read the one channel of an OpenEXR file (y, x); raise ValueError for several channels."""
+    """Read an OpenEXR file with a single channel, (y, x); raise ValueError for several channels."""
     import OpenEXR
 
     exr_needs(file, 4 + _BYTES_COMPARED)
@@ -138,8 +138,8 @@ def _read_npy(file: Path) -> NDArray[Any]:
 
 
 def fits_header(file: Path) -> tuple[tuple[int, ...], int]:
-    """Return the shape of the first image of a FITS file, and the bits of its numbers; only
-    headers are read.
+    """Return the shape of the first image of a FITS file and its BITPIX (bits per value, negative
+    for floating point); only headers are read.
     """
     from astropy.io import fits
 
@@ -150,10 +150,10 @@ def fits_header(file: Path) -> tuple[tuple[int, ...], int]:
 
 
 def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
-    """Return the shape of the first image of a FITS file, its last byte, and True if it may hold
-    other than counts.
+    """Return the shape of the first image of a FITS file, the position of its end in the file in
+    bytes, and True if it may hold values that are not digital numbers.
 
-    The type of the numbers and their scale tell whether they may be fractions, negative or too
+    The data type and the scale in the header show whether values may be fractional, negative or too
     large for a converter.
 
     Only headers are read. Raises ValueError for a file without an image.
@@ -165,10 +165,11 @@ def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
         image = _first_image(file, opened_file)
         header, positions = image.header, image.fileinfo()
         bits, zero = int(header["BITPIX"]), float(header.get("BZERO", 0))
-        lowest = zero - (2 ** (bits - 1) if bits > 8 else 0)  # eight bits have no sign
+        # FITS values of eight bits are unsigned
+        lowest = zero - (2 ** (bits - 1) if bits > 8 else 0)
         is_scaled = float(header.get("BSCALE", 1)) != 1 or zero % 1 != 0 or "BLANK" in header
         may_hold_others = is_scaled or bits < 0 or lowest < 0 or lowest + 2**bits > LARGEST_NUMBER
-        # its blocks of 2880 bytes, of which the last one may be short
+        # FITS data fill blocks of 2880 bytes; the last block may be cut short
         packed = isinstance(image, fits.CompImageHDU)
         image_bytes = (
             positions["datSpan"] - 2879 if packed else math.prod(image.shape) * abs(bits) // 8
@@ -177,7 +178,9 @@ def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
 
 
 def _first_image(file: Path, opened: Any) -> Any:
-    """Return the first unit of an opened FITS file with an image; raise ValueError for none."""
+    """Return the first header-data unit of an open FITS file that has an image; raise ValueError if
+    there is none.
+    """
     image = next((unit for unit in opened if getattr(unit, "is_image", False) and unit.shape), None)
     if image is None:
         raise ValueError(f"{file} holds no image: give a FITS file with an image")
@@ -196,8 +199,8 @@ _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
 
 # --- damaged frames -------------------------------------------------------------------------------
 
-# The check of a file of raw frames before the run, which reads the pixels only if their type has
-# other than counts.
+# The check of a file of raw frames before the run; it reads the pixels only if their data type
+# allows values that are not digital numbers.
 
 
 _STRIP_STARTS, _STRIP_LENGTHS = 273, 279  #: TIFF tags
@@ -205,8 +208,8 @@ _STRIP_STARTS, _STRIP_LENGTHS = 273, 279  #: TIFF tags
 
 @once_per_version
 def frame_problem(file: Path) -> str:
-    """Return a message for a file that is damaged or holds no raw frames, as far as headers show
-    it, else nothing.
+    """Return an error message for a file that is damaged or holds no raw frames, as far as its
+    header shows, else an empty text.
     """
     check = _CHECKS.get(file.suffix.lower())
     try:
@@ -221,8 +224,8 @@ def frame_problem(file: Path) -> str:
 
 
 def _check_picture(file: Path) -> str:
-    """Return a message for a PNG or TIFF file that is damaged or cut short, or has other than raw
-    grey pixels or digital numbers, else an empty text.
+    """Return an error message for a PNG or TIFF file that is damaged, cut short, or not raw grey
+    with digital numbers, else an empty text.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -252,12 +255,12 @@ def _check_picture(file: Path) -> str:
 
 
 def _tag_numbers(image: Any, tag: int) -> tuple[int, ...]:
-    """Return the numbers of a TIFF tag, empty for another file."""
+    """Return the values of a TIFF tag; empty for a file that is no TIFF."""
     return tuple(getattr(image, "tag_v2", {}).get(tag, ()))
 
 
 def _check_npy(file: Path) -> str:
-    """Return a message for a .npy file that is too large, holds no numbers or no digital numbers,
+    """Return an error message for a .npy file that is too large or does not hold digital numbers,
     else an empty text.
     """
     npy_needs(file, 1.0)
@@ -269,8 +272,8 @@ def _check_npy(file: Path) -> str:
 
 
 def _check_fits(file: Path) -> str:
-    """Return a message for a FITS file without an image, cut short, too large, or with other
-    than whole numbers.
+    """Return an error message for a FITS file that has no image, is cut short, is too large, or
+    does not hold digital numbers, else an empty text.
     """
     with warnings.catch_warnings():
         # astropy warns of a file that is cut short, which is refused here
@@ -285,7 +288,7 @@ def _check_fits(file: Path) -> str:
 
 
 def _too_large(file: Path, shape: tuple[int, ...]) -> str:
-    """Return a message for an array of more values than can be read, else an empty text."""
+    """Return an error message for an array of more values than can be read, else an empty text."""
     count = math.prod(map(int, shape))
     if count <= VALUES:
         return ""
@@ -296,11 +299,11 @@ def _too_large(file: Path, shape: tuple[int, ...]) -> str:
 
 
 def _wrong_numbers(file: Path, shape: tuple[int, ...], doubtful: bool) -> str:
-    """Return a message for an array that is no stack of frames, or holds no digital numbers, else
-    an empty text.
+    """Return an error message for an array that is no stack of frames or does not hold digital
+    numbers, else an empty text.
 
-    Numbers of a type that has counts of a converter alone, such as uint16, are not read before the
-    run.
+    The pixels are read only if ``doubtful``: a data type such as uint16 can hold nothing but
+    digital numbers.
     """
     if doubtful or len(shape) not in (2, 3) or not math.prod(shape):
         try:
@@ -311,8 +314,8 @@ def _wrong_numbers(file: Path, shape: tuple[int, ...], doubtful: bool) -> str:
 
 
 def _check_exr(file: Path) -> str:
-    """Return a message for an OpenEXR file that cannot be read, has several channels or other than
-    digital numbers, else an empty text.
+    """Return an error message for an OpenEXR file that cannot be read, has several channels, or
+    does not hold digital numbers, else an empty text.
     """
     try:
         _, names, size = exr_header(file)
@@ -335,11 +338,11 @@ _CHECKS: dict[str, Callable[[Path], str]] = {
 
 # --- frame headers --------------------------------------------------------------------------------
 
-# What the header of a file of frames says: size, bits of a number, exposure and light.
+# The values in the header of a file of frames: size, bits per value, exposure and light.
 
 
 _EXIF, _EXPOSURE, _DESCRIPTION = 0x8769, 33434, 270  #: tags of TIFF and Exif
-#: keys of an exposure, in seconds without a unit
+#: header keys of the exposure time; a value without a unit is in seconds
 _TIMES = ("exposuretime", "exptime", "exposure", "integrationtime")
 _LIGHTS = ("photons", "photonsperpixel")
 _SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
@@ -354,19 +357,19 @@ _PAIR = re.compile(
 
 
 class FrameHeader(NamedTuple):
-    """What the header of a file of frames says; None for what it does not say."""
+    """The values in the header of a file of frames; None for a value that is not there."""
 
     frames: int
     shape: tuple[int, int]  #: (y, x)
-    bits: int  #: of a number in the file
+    bits: int  #: bits per value in the file
     exposure: float | None  #: s
     photons: float | None  #: per pixel and exposure
 
 
 @once_per_version
 def frame_header(file: Path) -> FrameHeader:
-    """Return what the header of a file of raw frames says; raise ValueError for a file without raw
-    frames.
+    """Return the values in the header of a file of raw frames; raise ValueError for a file without
+    raw frames.
 
     Exposure and light are read from Exif, TIFF descriptions, texts of a PNG, FITS keywords and
     attributes of OpenEXR.
@@ -390,8 +393,9 @@ def frame_header(file: Path) -> FrameHeader:
 
 
 def _header_number(value: Any, is_time: bool = True) -> float | None:
-    """Return the number in a value of a header, a time in seconds or (not ``is_time``) a number of
-    photons; None for a text without one, for a time that is not above 0 and for negative photons.
+    """Return a header value as a number: a time in seconds, or a number of photons if ``is_time``
+    is False. None for a text without a number, a time that is not above 0, and a negative number of
+    photons.
     """
     match = _NUMBER.fullmatch(str(value))
     try:
@@ -414,7 +418,9 @@ _HeaderValues = tuple[int, tuple[int, int], int, Mapping[str, Any]]
 
 
 def _header_of_picture(file: Path) -> _HeaderValues:
-    """Return number of frames, size (y, x), bits and stated values of a PNG or TIFF file."""
+    """Return the number of frames, their size (y, x), the bits per value and the header values of a
+    PNG or TIFF file.
+    """
     from PIL import Image
 
     with Image.open(file) as image:
@@ -432,7 +438,7 @@ def _header_of_picture(file: Path) -> _HeaderValues:
 
 
 def _bits_of(mode: str, kind: str | None) -> int:
-    """Return the bits of a pixel in a picture of a mode and a format of Pillow."""
+    """Return the bits per pixel of a picture, from its Pillow mode and format."""
     if mode == "L":
         return 8
     return 16 if mode.startswith("I;16") or kind == "PNG" else 32
@@ -443,12 +449,14 @@ def _texts(info: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _pairs_in(text: str) -> dict[str, str]:
-    """Return the pairs such as ``ExposureTime=0.01 s`` in a text."""
+    """Return the pairs of key and value in a text, such as ``ExposureTime=0.01 s``."""
     return {key.strip(): value for key, value in _PAIR.findall(text)}
 
 
 def _header_of_fits(file: Path) -> _HeaderValues:
-    """Return number of frames, size (y, x), bits and stated values of a FITS file."""
+    """Return the number of frames, their size (y, x), the bits per value and the header values of a
+    FITS file.
+    """
     from astropy.io import fits
 
     refuse_packed(file)
@@ -465,7 +473,9 @@ def _header_of_fits(file: Path) -> _HeaderValues:
 
 
 def _header_of_exr(file: Path) -> _HeaderValues:
-    """Return one frame, its size (y, x), 32 bits and the stated values of an OpenEXR file."""
+    """Return the number of frames, their size (y, x), the bits per value (32) and the header values
+    of an OpenEXR file.
+    """
     import OpenEXR
 
     exr_needs(file)
@@ -488,8 +498,8 @@ def _count_and_size(shape: tuple[int, ...]) -> tuple[int, tuple[int, int]]:
 
 
 def frame_means(file: Path) -> list[tuple[float, float]]:
-    """Return the mean of each frame of a file and its standard error by the scatter of the
-    pixels, DN.
+    """Return the mean of each frame of a file in DN, and the standard error of the mean from the
+    scatter of the pixels.
     """
     return [
         (float(x.mean(dtype=np.float64)), float(x.std(dtype=np.float64)) / x.size**0.5)
@@ -498,8 +508,8 @@ def frame_means(file: Path) -> list[tuple[float, float]]:
 
 
 def frame_divisor(file: Path) -> int:
-    """Return the greatest common divisor of the numbers of a file of frames; 0 for numbers that
-    are all 0.
+    """Return the greatest common divisor of all pixel values of a file of frames; 0 if all are
+    0.
     """
     return int(np.gcd.reduce(np.unique(read_frames(file))))
 

@@ -1,4 +1,4 @@
-"""Frames of the light levels as pairs, and the verdict of a test of these frames."""
+"""Pairs of frames of each light level, and the results of the tests of these frames."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from neusee.nodes.calibrate._light_levels import Scatter, histogram
 
 # --- hidden faults --------------------------------------------------------------------------------
 
-# Faults that change the variance of noise in proportion: the error that frames leave open, found by
-# a test or not.
+# Faults that multiply the measured noise variance by a factor: the error that remains possible,
+# whether a test finds the fault or not.
 
 
-_POSTERIOR_POINTS = 2001  #: evenly spaced
-_POSTERIOR_REACH = 8.0  #: standard errors beyond estimate and zero
-#: odds of no fault at all, before frames of at least `CLEAN_PAIRS` are seen
+_POSTERIOR_POINTS = 2001  #: evenly spaced points of the posterior
+_POSTERIOR_REACH = 8.0  #: reach of these points beyond the estimate and zero, in standard errors
+#: prior odds of no fault, for frames of at least `CLEAN_PAIRS` pairs
 _ODDS_OF_NO_FAULT = 9.0
-#: pairs of pixels in the lit levels of the fit from which frames that show no fault hide little
+#: pairs of pixels in the fitted lit levels; with so many, frames that show no fault can hide little
 CLEAN_PAIRS = 4e6
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """A fault that changes the measured variance, and what the frames say of its size.
+    """A fault that changes the measured variance, and the estimate of its size from the frames.
 
-    The logarithm of the true over the measured variance has a normal likelihood about `estimate`.
-    Before the frames are seen it is 0 with the probability `sound`, and else has a Cauchy
-    distribution about 0, which leaves large values to the frames. Nothing is corrected by it: its
-    root mean square is an error that gain and noise may have, so that a fault that is found widens
-    by its whole size. Frames of many pixels that show nothing leave almost nothing open; with few
-    pixels `sound` is small, and the whole standard error counts.
+    The size of the fault is the logarithm of true over measured variance, with a normal likelihood
+    about `estimate`. Its prior is 0 with the probability `sound`, and else a Cauchy distribution
+    about 0, whose long tails hardly limit large values. Nothing is corrected: the root mean square
+    of the posterior is added as an error of gain and noise, so that a fault that is found widens
+    their intervals by its whole size. Frames of many pixels without a sign of a fault leave almost
+    no error; with few pixels `sound` is small, and the whole standard error counts.
     """
 
     fault: str  #: "mixing", "lag" or "pattern"
     estimate: float
     error: float  #: standard error of `estimate`
     scale: float  #: of the Cauchy distribution
-    gain: float = 0.0  #: change of the logarithm of the gain for 1
-    noise: float = 0.0  #: change of the logarithm of the dark noise in DN for 1
-    positive: bool = False  #: True if the logarithm cannot be negative
-    sound: float = 0.0  #: probability of no fault, from `chance_of_no_fault`
+    gain: float = 0.0  #: change of the log gain per unit of the size
+    noise: float = 0.0  #: change of the log dark noise (DN) per unit of the size
+    positive: bool = False  #: True if the size cannot be negative
+    sound: float = 0.0  #: prior probability of no fault, from `chance_of_no_fault`
 
     def posterior(self) -> tuple[Tensor, Tensor]:
-        """Return points of the logarithm and their probabilities, both (point,)."""
+        """Return points of the size and their posterior probabilities, both (point,)."""
         lowest = min(0.0, self.estimate) - _POSTERIOR_REACH * self.error
         if self.positive:
             lowest = 0.0
@@ -68,33 +68,31 @@ class Hidden:
         return points, probability / probability.sum()
 
     def size(self) -> float:
-        """Return the root mean square of the logarithm."""
+        """Return the root mean square of the size under its posterior."""
         points, weight = self.posterior()
         return math.sqrt(float(weight @ points.square()))
 
     def _likelihood(self, points: Tensor) -> Tensor:
-        """Return the likelihood of points relative to that of the likeliest value that is
-        possible.
-        """
+        """Return the likelihood of each point over the maximum likelihood among possible sizes."""
         likeliest = max(0.0, self.estimate) if self.positive else self.estimate
         least_squares = ((likeliest - self.estimate) / self.error) ** 2
         return (-0.5 * (((points - self.estimate) / self.error).square() - least_squares)).exp()
 
 
 def chance_of_no_fault(pairs: float) -> float:
-    """Return the probability of no fault before frames are seen, for a number of pairs of pixels in
-    lit levels.
+    """Return the prior probability of no fault, from the number of pairs of pixels in the lit
+    levels.
 
-    Frames of few pixels cannot show a fault that would matter: then nobody should believe that
-    there is none. The odds rise with the square of the pairs, up to 9 at `CLEAN_PAIRS`.
+    Frames of few pixels could not show a fault that matters, so the absence of a sign is no
+    evidence. The odds rise with the square of the number of pairs, up to 9 at `CLEAN_PAIRS`.
     """
     odds = _ODDS_OF_NO_FAULT * min(1.0, pairs / CLEAN_PAIRS) ** 2
     return odds / (1 + odds)
 
 
 def open_errors(hidden: Sequence[Hidden]) -> dict[str, float]:
-    """Return the relative errors that independent faults leave open, by the names "gain" and
-    "noise" (in DN).
+    """Return the relative errors of "gain" and of "noise" (dark noise in DN) that undetected or
+    uncorrected faults may cause.
     """
     sizes = [fault.size() for fault in hidden]
     # independent faults add in squares
@@ -107,24 +105,25 @@ def open_errors(hidden: Sequence[Hidden]) -> dict[str, float]:
 
 # --- frame pairs ----------------------------------------------------------------------------------
 
-# Frames of the light levels of a calibration as pairs, and the verdict of a test of these frames.
+# Pairs of frames of each light level of a calibration, and the verdict of a test of these frames.
 
 
 Verdict = Literal["passed", "modelled", "widened", "refused"]
-#: probability with which chance alone fails one test of a whole measurement
+#: probability that one test of a whole measurement fails by chance
 FALSE_ALARM_RATE = 1e-3
-#: relative error of gain or dark noise above which frames are refused, and below which intervals
-#: widen
+#: relative error of gain or dark noise; above it frames are refused, below it intervals are widened
 REFUSED_ERROR = 0.02
-#: pixels of the central window on a side, in which patterns and noise are tested
+#: side in pixels of the central window in which patterns and noise are tested
 _WINDOW_SIDE = 1024
-_TESTED_PIXELS = 1 << 21  #: pixels of a level in all tested frames together
-_BLOCK_SIDE = 8  #: pixels by which the window is aligned, as blocks of a compressed picture are
-_PILE_SIGMA = 5.0  #: standard deviations of counting by which numbers pile up at an end
-_PILE_PIXELS = 20  #: least count of pixels that pile up
+_TESTED_PIXELS = 1 << 21  #: largest number of tested pixels of a level, all frames together
+#: pixels; the window starts at a multiple of it, like the blocks of a compressed picture
+_BLOCK_SIDE = 8
+#: least excess of a pile at an end over the numbers beside it, in standard deviations of the counts
+_PILE_SIGMA = 5.0
+_PILE_PIXELS = 20  #: least number of pixels of a pile
 _FLAT_SHARE = 0.5  #: share of the greatest variance below which a brighter level is saturated
-_ZERO_SHARE = 5e-3  #: share of the pixels at 0, which hides numbers below 0
-_TESTED_FRAMES = 16  #: frames of a level whose noise and patterns are tested
+_ZERO_SHARE = 5e-3  #: share of pixels at 0 from which values below 0 count as cut off
+_TESTED_FRAMES = 16  #: largest number of frames of a level that are tested for noise and patterns
 #: what to do about refused frames, by the name of the test
 _REMEDIES = {
     "white noise": "take raw frames: without denoising, sharpening, interpolation and compression",
@@ -135,11 +134,11 @@ _REMEDIES = {
     "no drift within a level": "write `scatter: steady`, or let the lamp settle",
     "homogeneity of the light": "light the sensor evenly, or cut the frames to their even part",
 }
-VARIANCE_FLOOR = 1e-12  #: DN2, so that frames without noise divide by more than 0
+VARIANCE_FLOOR = 1e-12  #: DN2, added to variances so that frames without noise do not divide by 0
 
 
 class Stack(NamedTuple):
-    """The frames of one light level, as `reduce` receives them."""
+    """The raw frames of one light level, before `reduce`."""
 
     name: str
     photons: float  #: per pixel and exposure; 0 in the dark
@@ -150,8 +149,8 @@ class Stack(NamedTuple):
 
 
 class Level(NamedTuple):
-    """One light level: pairs of frames in the central window, and the histogram of the whole
-    frames.
+    """One light level as the tests use it: pairs of frames in the central window, and the histogram
+    of the full frames.
     """
 
     name: str
@@ -161,15 +160,14 @@ class Level(NamedTuple):
     #: (pair, y, x) float32, DN, with the mean of each frame removed; 0 in pixels that are left out
     first: Tensor
     second: Tensor  #: (pair, y, x), as `first`
-    #: (pair, y, x) DN, second less first, without what the lamp changed from the first to the
-    #: second
+    #: (pair, y, x) DN, second less first, corrected for the change of the lamp between the two
     differences: Tensor
     drift: Tensor  #: (pair,) DN, mean of the second frame less mean of the first
     variance: float  #: DN2, temporal, without the drift of the mean
     mean: float  #: DN
     value: Tensor  #: (code,) digital numbers that occur, rising
     pixels: Tensor  #: (code,) count of each number
-    flicker: float = 0.0  #: DN2, variance by the flicker of the lamp over light that is uneven
+    flicker: float = 0.0  #: DN2, variance that a flickering lamp adds where the light is uneven
     fitted: bool = True  #: True if the likelihood uses the level
 
     @property
@@ -184,8 +182,8 @@ class Level(NamedTuple):
 
     @property
     def low(self) -> bool:
-        """Return True if numbers pile up at the lowest number, or if 0 is a number of more than
-        a few pixels.
+        """Return True if pixel values pile up at the lowest value, or if more than 0.5 % of the
+        pixels are 0.
         """
         at_zero = float(self.pixels[self.value == 0].sum())
         return at_zero > _ZERO_SHARE * float(self.pixels.sum()) or _piled(
@@ -194,7 +192,7 @@ class Level(NamedTuple):
 
     @property
     def high(self) -> bool:
-        """Return True if numbers pile up at the highest number."""
+        """Return True if pixel values pile up at the highest value."""
         return _piled(self, -self.value.flip(0), self.pixels.flip(0))
 
 
@@ -203,20 +201,20 @@ class FrameTest:
     """The result of one test of the frames of a measurement."""
 
     name: str
-    number: float  #: in the unit of the limit
-    limit: float  #: above the limit chance alone does not explain the number
+    number: float  #: test statistic, in the unit of the limit
+    limit: float  #: chance rarely exceeds this value
     verdict: Verdict
     sentence: str
-    #: relative errors of "gain" and "noise" that may follow
+    #: relative errors of "gain" and "noise" that the fault may cause
     shifts: Mapping[str, float] = field(default_factory=dict)
     explains_all: bool = False  #: True if other tests would only find consequences of this fault
-    #: faults of which the frames tell a size, whether the test finds them or not
+    #: faults whose size the frames allow to estimate, whether the test finds them or not
     hidden: tuple[Hidden, ...] = ()
 
 
 class Evidence(NamedTuple):
-    """The strongest of several standard normal deviations, and the value that chance alone
-    exceeds rarely.
+    """The largest of several standard normal statistics, and the value that chance rarely
+    exceeds.
     """
 
     strength: float  #: standard deviations
@@ -229,8 +227,8 @@ class Evidence(NamedTuple):
 
 
 def paired_level(stack: Stack) -> Level:
-    """Return the pairs and the histogram of a light level; frame 0 forms a pair with 1, 2 with
-    3, and so on.
+    """Return the pairs and the histogram of a light level; frames 0 and 1 form a pair, 2 and 3, and
+    so on.
     """
     unmasked = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
     numbers, counts = histogram(unmasked)
@@ -257,12 +255,12 @@ def paired_level(stack: Stack) -> Level:
 
 
 def fitted_levels(levels: Sequence[Level], share: float | None) -> list[Level]:
-    """Return the levels with what the fit uses: dark levels, and lit levels up to ``share`` of
-    saturation.
+    """Return the levels with `fitted` set for those that the fit uses: dark levels, and lit levels
+    up to ``share`` of saturation.
 
     Saturation is at the lit level of the greatest variance, as for the likelihood. Without a
-    ``share`` each level is used. What the lamp changed from frame to frame, which is proportional
-    to the light of each pixel, is taken off the differences of the pairs.
+    ``share`` every level is used. The change of the lamp between the frames of a pair, which is
+    proportional to the light of each pixel, is subtracted from their difference.
     """
     dark = min((level.mean for level in levels if level.dark), default=0.0)
     lit_levels = [level for level in levels if not level.dark and level.paired]
@@ -279,18 +277,18 @@ def fitted_levels(levels: Sequence[Level], share: float | None) -> list[Level]:
 
 
 def dark_and_lit(levels: Sequence[Level]) -> tuple[list[Level], list[Level]]:
-    """Return the levels without light, and those with light."""
+    """Return the dark levels and the lit levels."""
     dark = [level for level in levels if level.dark]
     lit = [level for level in levels if not level.dark]
     return dark, lit
 
 
 def saturated_levels(levels: Sequence[Level]) -> list[Level]:
-    """Return the levels whose numbers pile up at the highest number, or whose variance has fallen
-    above its maximum.
+    """Return the saturated levels: pixel values pile up at the highest value, or the variance has
+    fallen below half of its maximum.
 
-    A well that differs from pixel to pixel, or that fills before the read noise is added, makes no
-    pile.
+    There is no pile if the full well differs from pixel to pixel, or if read noise is added after
+    clipping.
     """
     lit_levels = [level for level in levels if not level.dark and level.paired]
     peak = max(lit_levels, key=lambda level: level.variance, default=None)
@@ -300,16 +298,16 @@ def saturated_levels(levels: Sequence[Level]) -> list[Level]:
 
 
 def levels_to_test(levels: Sequence[Level]) -> list[Level]:
-    """Return the paired levels whose noise is tested: those that the fit uses, without a pile at
-    an end.
+    """Return the levels whose noise is tested: levels of the fit with pairs of frames and without
+    clipping at either end.
     """
     fitted = [level for level in levels if level.paired and level.fitted]
     return [level for level in fitted if not level.high and not level.low]
 
 
 def _is_flat(level: Level, peak: Level) -> bool:
-    """Return True for a lit level that is brighter than the ``peak`` of the variance and has less
-    than half of its variance.
+    """Return True for a lit level that is brighter than the level ``peak`` of the greatest variance
+    and has less than half of its variance.
     """
     return (
         level.paired
@@ -320,27 +318,27 @@ def _is_flat(level: Level, peak: Level) -> bool:
 
 
 def _without_flicker(level: Level, dark: float) -> Level:
-    """Return a lit level without what a change of the lamp between the frames of a pair adds to
-    their difference.
+    """Return a level whose differences are corrected for the change of the lamp between the frames
+    of a pair.
 
-    The light of the second frame is that of the first, times the ratio of their means above the
-    dark.
+    The light of the second frame is taken as that of the first times the ratio of their means above
+    the dark.
     """
     signal = level.mean - dark
     if level.dark or not level.paired or signal <= 0:
         return level
     relative_drift = (level.drift / signal)[:, None, None]
-    # both frames are brought to the mean of their lights
+    # both frames are scaled to the mean of their signals
     differences = level.second * (1 - relative_drift / 2) - level.first * (1 + relative_drift / 2)
     pattern_power = (level.first * level.second).mean((1, 2)).clamp_min(0.0)
-    # uneven light, the common pattern of both frames, times the change of the light
+    # variance of the common pattern of both frames, times the squared relative change of the light
     flicker = float((relative_drift[:, 0, 0].square() * pattern_power).mean()) / 2
     return level._replace(differences=differences, variance=_variance(differences), flicker=flicker)
 
 
 def _variance(differences: Tensor) -> float:
-    """Return the temporal variance of differences (pair, y, x) of two frames, without the drift of
-    the mean: half their mean square, with one degree of freedom a pair less; NaN without a pair.
+    """Return the temporal variance from the differences (pair, y, x) of two frames: half their mean
+    square, with one degree of freedom less per pair for the removed mean; NaN without a pair.
     """
     return (
         float(differences.square().sum()) / 2 / max(1, differences.numel() - len(differences))
@@ -350,7 +348,7 @@ def _variance(differences: Tensor) -> float:
 
 
 def _centred(frames: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the means (frame,) of frames, and the frames (frame, y, x) less their means, 0 in
+    """Return the means (frame,) of frames, and the frames (frame, y, x) less their means; 0 in
     masked pixels.
     """
     numbers = frames.double()
@@ -363,12 +361,14 @@ def _centred(frames: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
 
 
 def without_lines(x: Tensor) -> Tensor:
-    """Return frames (frame, y, x) without the means of their rows and columns."""
+    """Return frames (frame, y, x) with the means of their rows and columns subtracted."""
     return x - x.mean(2, keepdim=True) - x.mean(1, keepdim=True) + x.mean((1, 2), keepdim=True)
 
 
 def _central_window(frames: Tensor) -> Tensor:
-    """Return the middle of at most 16 frames, and fewer frames where they are large."""
+    """Return the central window of the first frames: at most 16, an even number, and fewer of large
+    frames.
+    """
     top, left = (
         max(0, n - _WINDOW_SIDE) // 2 // _BLOCK_SIDE * _BLOCK_SIDE for n in frames.shape[1:]
     )
@@ -379,11 +379,12 @@ def _central_window(frames: Tensor) -> Tensor:
 
 
 def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
-    """Return True if the lowest number occurs more often than the next number, or the two lowest
+    """Return True if the lowest pixel value occurs more often than the next one, or the two lowest
     more often than the next two.
 
-    The counts of numbers without a limit fall towards the ends. A full well fills two neighbouring
-    numbers. Coarse numbers, with few values or little variance, are compared only at 0.
+    Without clipping, counts fall towards the ends of a histogram. A full well fills two
+    neighbouring values. A level with few distinct values or little variance is tested only at the
+    value 0.
     """
     lowest = int(value[0])
     first, second, third, fourth = (float(count[value == lowest + i].sum()) for i in range(4))
@@ -396,7 +397,9 @@ def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
 
 
 def _exceeds(count_at_end: float, count_beside: float) -> bool:
-    """Return True if the count at an end exceeds that beside it by more than chance."""
+    """Return True if the count at an end exceeds the count beside it by more than chance
+    explains.
+    """
     excess = count_at_end - count_beside - 2
     return count_at_end >= _PILE_PIXELS and excess > _PILE_SIGMA * math.sqrt(
         count_at_end + count_beside
@@ -406,12 +409,12 @@ def _exceeds(count_at_end: float, count_beside: float) -> bool:
 def strongest_evidence(
     z: Sequence[Sequence[float]], others: Sequence[float] = (), sides: int = 1
 ) -> Evidence:
-    """Return the strongest evidence of independent standard normal numbers (statistic, level), and
-    its limit.
+    """Return the largest of independent standard normal statistics (statistic, level), with its
+    limit.
 
-    Each number counts alone, and all numbers of a statistic count together by their sum over the
-    square root of their count; ``others`` are further standard normal numbers. The limit is
-    Bonferroni's for all of these, and for both signs with two ``sides``.
+    Each value is tested alone, and so is the sum over the levels of each statistic, divided by the
+    square root of their number; ``others`` are further standard normal values. The limit has the
+    Bonferroni correction for all of these tests, and is two-sided if ``sides`` is 2.
     """
     sums_of_statistics = [sum(row) / math.sqrt(len(row)) for row in z if len(row) > 1]
     all_numbers = [*chain.from_iterable(z), *sums_of_statistics, *others]
@@ -423,14 +426,14 @@ def strongest_evidence(
 
 
 def normal_limit(probability: float) -> float:
-    """Return the number of standard deviations that a standard normal number exceeds with a
-    probability.
-    """
+    """Return the value that a standard normal variable exceeds with a probability."""
     return -float(torch.special.ndtri(torch.tensor(probability, dtype=torch.float64)))
 
 
 def studentised(product: Tensor) -> float:
-    """Return the sum of independent numbers of mean 0 in its own standard deviations."""
+    """Return the sum of independent values of mean 0, divided by its estimated standard
+    deviation.
+    """
     return float(product.sum()) / math.sqrt(float(product.square().sum()) + VARIANCE_FLOOR)
 
 
@@ -442,8 +445,8 @@ def outcome(
     passed: str,
     modelled: str = "",
 ) -> FrameTest:
-    """Return the result of a test: passed, modelled, widened, or refused where an error exceeds
-    2 %.
+    """Return the result of a test: passed, modelled, widened, or refused if the error exceeds 2
+    %.
     """
     if not evidence.found:
         return FrameTest(name, evidence.strength, evidence.limit, "passed", passed)
@@ -474,10 +477,11 @@ def sized_outcome(
     passed: str,
     modelled: str = "",
 ) -> FrameTest:
-    """Return the result of a test of a fault of which the frames tell a size, found or not.
+    """Return the result of a test for a fault whose size the frames allow to estimate, whether it
+    is found or not.
 
-    Nothing is corrected. A fault that is found is refused where gain or noise may be wrong by more
-    than 2 %, and else widens by its whole size.
+    Nothing is corrected. If a fault is found, the frames are refused where gain or noise may be
+    wrong by more than 2 %; else the intervals widen by its whole size.
     """
     largest_error = max(open_errors(hidden).values())
     if not evidence.found:

@@ -1,7 +1,7 @@
-"""All tests of the frames of a calibration, before any likelihood.
+"""All tests of the frames of a calibration, made before a likelihood is computed.
 
-The tests of digital numbers are here: missing, piled-up and too coarse numbers. Those of noise and
-of patterns have files of their own.
+This file has the tests of the digital numbers: missing codes, clipping, and noise below the
+rounding step. The tests of noise and of patterns have files of their own.
 """
 
 from __future__ import annotations
@@ -24,20 +24,21 @@ from neusee.nodes.calibrate._frame_pairs import (
 from neusee.nodes.calibrate._noise_tests import noise_tests
 from neusee.nodes.calibrate._pattern_tests import mosaic_test, pattern_tests
 
-_NEIGHBOURS = 8  #: numbers on either side of a number, which say how often it should occur
-#: least expected count of a number that is missing; chance leaves it out once in 1e11
+_NEIGHBOURS = 8  #: codes on either side of a code, from whose counts its count is predicted
+#: least expected count of a code that counts as missing; by chance such a code is absent once in
+#: 1e11
 _EXPECTED_COUNT = 25.0
-_CLIFF_COUNT = 50.0  #: least count of each of three numbers beside a block of missing numbers
-_CLIFF_RATIO = 3.0  #: largest ratio of the counts of these three numbers
-_TAIL_SHARE = 0.005  #: share of the pixels of a level at either end, where numbers need not occur
+_CLIFF_COUNT = 50.0  #: least count of each of the three codes beside a block of missing codes
+_CLIFF_RATIO = 3.0  #: largest ratio of the counts of these three codes
+_TAIL_SHARE = 0.005  #: share of the pixels of a level in either tail, where codes may be absent
 
 
 def number_tests(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
-    """Test digital numbers for missing codes, for a pile at either end, and for noise that the
-    numbers resolve.
+    """Test the digital numbers for missing codes, clipping at either end, and dark noise too small
+    to be resolved.
 
-    ``exact`` says that the likelihood uses the probability of each number, as `density` does, so
-    that the limits of the converter and rounding are modelled.
+    ``exact`` is True if the likelihood uses the probability of each digital number, as `density`
+    does: it then models clipping and rounding.
 
     Shapes: a list of levels -> a list of tests.
     Units:  counts of codes and levels; DN for the dark noise.
@@ -56,7 +57,9 @@ def number_tests(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
 
 
 def missing_codes(levels: Sequence[Level]) -> FrameTest:
-    """Test if every number occurs that its neighbours say should occur."""
+    """Test for missing codes: digital numbers that never occur although their neighbours are
+    frequent.
+    """
     code_count = max(int(level.value[-1]) for level in levels) + 1
     lowest = min(int(level.value[0]) for level in levels)
     level_counts = [
@@ -69,7 +72,7 @@ def missing_codes(levels: Sequence[Level]) -> FrameTest:
         torch.zeros(code_count, dtype=torch.float64),
     )
     is_missing = (total == 0) & ((expected >= _EXPECTED_COUNT) | _beside_cliff(total))
-    # numbers up to the lowest one of all need not occur
+    # codes up to the lowest one that occurs need not occur
     is_missing[: lowest + 1] = False
     missing_count, expected_count = (
         int(is_missing.sum()),
@@ -108,11 +111,11 @@ def missing_codes(levels: Sequence[Level]) -> FrameTest:
 
 
 def _expected_counts(count: Tensor) -> Tensor:
-    """Return the count (code,) that the neighbours on both sides predict for each number of one
-    level; 0 in the tails, where numbers need not occur.
+    """Return the expected count (code,) of each code of one level, predicted from its neighbours on
+    both sides; 0 in the tails, where codes may be absent.
 
-    ``count`` has the counts of all numbers from 0 on. The smaller of the means of `_NEIGHBOURS`
-    numbers on each side is taken.
+    ``count`` has the counts of all codes from 0 on. The prediction is the smaller of the mean
+    counts of `_NEIGHBOURS` codes on each side.
     """
     cumulated_share = count.cumsum(0) / count.sum()
     in_middle = ((cumulated_share > _TAIL_SHARE) & (cumulated_share < 1 - _TAIL_SHARE)).double()
@@ -135,10 +138,8 @@ def _expected_counts(count: Tensor) -> Tensor:
 
 
 def _beside_cliff(total: Tensor) -> Tensor:
-    """Return a mask of the numbers beside three numbers that occur often and about equally
-    often.
-    """
-    # the three numbers below each number, and the three above
+    """Return a mask of the codes next to three codes that occur often and about equally often."""
+    # the three codes below each code, and the three above
     neighbours = (
         [torch.roll(total, i) for i in (1, 2, 3)],
         [torch.roll(total, -i) for i in (1, 2, 3)],
@@ -154,7 +155,7 @@ def _beside_cliff(total: Tensor) -> Tensor:
 
 
 def _clipped_black(levels: Sequence[Level], exact: bool) -> FrameTest:
-    """Test if numbers pile up at the lowest number; `exact` likelihoods model a pile at 0."""
+    """Test for clipping at the lowest code; an ``exact`` likelihood models clipping at 0."""
     clipped_levels = [level for level in levels if level.low]
     name, count = "no pile at the lowest number", float(len(clipped_levels))
     if not clipped_levels:
@@ -173,8 +174,8 @@ def _clipped_black(levels: Sequence[Level], exact: bool) -> FrameTest:
 
 
 def _saturation(levels: Sequence[Level], exact: bool) -> FrameTest:
-    """Tell which levels are saturated; a dark one refuses the frames unless the likelihood is
-    ``exact``.
+    """Report which levels are saturated; a saturated dark level refuses the frames unless the
+    likelihood is ``exact``.
     """
     full_levels = saturated_levels(levels)
     name, count = "saturated levels are told", float(len(full_levels))
@@ -191,7 +192,9 @@ def _saturation(levels: Sequence[Level], exact: bool) -> FrameTest:
 
 
 def _kinds_of_saturation(full: Sequence[Level]) -> Iterator[str]:
-    """Yield a clause for levels that pile up at an end, and one for levels of unequal wells."""
+    """Yield a clause on the levels with a pile at the highest code, and one on levels saturated
+    without a pile.
+    """
     if piled_names := [level.name for level in full if level.high]:
         yield f"numbers pile up at the highest number in {', '.join(piled_names)}"
     if flat_levels := [level for level in full if not level.high]:
@@ -203,13 +206,15 @@ def _kinds_of_saturation(full: Sequence[Level]) -> Iterator[str]:
 
 
 def _dark_noise(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
-    """Return the test of the least dark variance, or no test without paired dark levels."""
+    """Return the test of the smallest dark variance; no test without a pair of dark frames."""
     darks = [level.variance for level in levels if level.dark and level.paired]
     return [coarse(min(darks), exact)] if darks else []
 
 
 def coarse(variance: float, exact: bool) -> FrameTest:
-    """Return the test of the least variance of dark levels, DN2, against the limit of EMVA 1288."""
+    """Return the test of the smallest temporal dark variance, DN2, against the limit of EMVA
+    1288.
+    """
     deviation, least_deviation = (math.sqrt(max(x, 0.0)) for x in (variance, LEAST_DARK_VARIANCE))
     name = "the dark noise exceeds rounding"
     text = f"the dark noise is {deviation:.2f} DN; the standard asks for {least_deviation:.2f} DN"
@@ -243,13 +248,13 @@ def coarse(variance: float, exact: bool) -> FrameTest:
 def inspect_frames(
     stacks: Iterable[Stack], exact: bool, share: float | None = None
 ) -> list[FrameTest]:
-    """Test the frames of all light levels for what no likelihood of this package describes.
+    """Test the frames of all light levels for faults that no likelihood of this package models.
 
     ``exact`` is True for `density`, which uses the probability of each digital number, and False
-    for `camera`. Levels above ``share`` of saturation, which the likelihood leaves out, are not
-    tested, but for saturation itself. Noise and patterns are tested in the central 1024 x 1024
-    pixels, digital numbers in the whole frames. Of a colour mosaic, and of shifted numbers, that
-    alone is said.
+    for `camera`. Levels above ``share`` of saturation, which the likelihood excludes, are tested
+    only for saturation. Noise and patterns are tested in the central 1024 x 1024 pixels, digital
+    numbers in the full frames. If the frames are a colour mosaic or have shifted numbers, only this
+    is reported.
 
     Shapes: frames (frame, y, x) of each level -> a list of tests.
     Units:  frames DN.

@@ -1,4 +1,6 @@
-"""Light levels of a measurement: the frames of each, hot pixels in them, and their statistics."""
+"""Light levels of a measurement: reading and simulating their frames, statistics, and hot
+pixels.
+"""
 
 from __future__ import annotations
 
@@ -39,19 +41,20 @@ from neusee.nodes.values import Levels
 
 # --- frame statistics -----------------------------------------------------------------------------
 
-# Statistics of frames of a flat illumination: mean, variance, and a histogram if these two do not
-# suffice.
+# Statistics of flat-field frames: mean, variance, and a histogram where these two do not suffice.
 
 
 Photons = Annotated[float, Field(ge=0, le=1e15)]  #: per pixel and exposure
 Temporal = Literal["temporal", "steady"]
 Scatter = Literal["all", "temporal", "steady"]
-_BLOCK_NUMBERS = 1 << 20  #: numbers of one block, so that no second copy of a stack is needed
-#: DN, standard deviation below which whole numbers are too coarse for a mean and a variance
+_BLOCK_NUMBERS = 1 << 20  #: pixel values per block: work in blocks needs no second copy of a stack
+#: DN; below this standard deviation whole numbers are too coarse to be described by mean and
+#: variance
 COARSE_DEVIATION = 0.8
-_PILE_COUNT = 8  #: least count of the two numbers at an end
-_PILE_SIGMA = 5.0  #: least excess in standard deviations of counting
-_PILE_RATIO = 5.0  #: least ratio to the expected count, for pixels that are unequal
+_PILE_COUNT = 8  #: least count of the two outermost values for a pile
+#: least excess of a pile over the expected count, in standard deviations of the count
+_PILE_SIGMA = 5.0
+_PILE_RATIO = 5.0  #: least ratio of a pile to the expected count, where pixels are unequal
 
 
 @node(rtol=1e-12)
@@ -99,7 +102,8 @@ def reduce(
     if scatter == "all":
         degrees_of_freedom, variance = total - 1, sum_of_squares / (total - 1)
     else:
-        # each pixel's mean is fitted, and with `steady` each frame's mean but one
+        # each pixel's mean takes one degree of freedom; with `steady` each frame's mean but one as
+        # well
         degrees_of_freedom = total - total / len(frames) - (scatter == "steady") * (len(frames) - 1)
         variance = _squares_within_pixels(frames, scatter == "steady") / degrees_of_freedom
     keeps_histogram = _needs_histogram(
@@ -116,7 +120,9 @@ def reduce(
 
 
 def _refuse_single(frames: Tensor, scatter: Scatter) -> None:
-    """Raise ValueError for frames without the variance that ``scatter`` selects."""
+    """Raise ValueError if there are too few frames or pixels for the variance that ``scatter``
+    selects.
+    """
     if scatter != "all" and len(frames) < 2:
         raise ValueError(
             "one frame has no temporal variance: give two frames or more, or set scatter: all"
@@ -126,7 +132,7 @@ def _refuse_single(frames: Tensor, scatter: Scatter) -> None:
 
 
 def _unmasked_pixels(frames: Tensor, mask: Tensor) -> Tensor:
-    """Return the pixels (frame, 1, pixel) that a mask does not leave out."""
+    """Return the unmasked pixels as a stack (frame, 1, pixel)."""
     if mask.shape != frames.shape[1:]:
         raise ValueError(
             f"the mask {tuple(mask.shape)} is not of the size of the frames"
@@ -175,9 +181,7 @@ def _(result: Levels, *inputs: object) -> list[Check]:
 
 
 def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the digital numbers that occur in frames, in rising order, and the count of each
-    number.
-    """
+    """Return the digital numbers that occur in frames, in rising order, and the count of each."""
     counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
     for piece in _column_blocks(frames.reshape(1, -1)):
         piece_counts = torch.bincount(_digital_numbers(piece).reshape(-1), minlength=len(counts))
@@ -193,9 +197,7 @@ def _column_blocks(rows: Tensor) -> Iterator[Tensor]:
 
 
 def _digital_numbers(piece: Tensor) -> Tensor:
-    """Return pixel values as int64; raise ValueError for a value that no analogue-to-digital
-    converter can give.
-    """
+    """Return pixel values as int64; raise ValueError for a value that is not a digital number."""
     numbers = piece.to(torch.int64)
     low, high = (int(end) for end in torch.aminmax(numbers))
     # only frames of floating-point numbers may hold fractions
@@ -215,9 +217,9 @@ def _digital_numbers(piece: Tensor) -> Tensor:
 
 def _squares_within_pixels(frames: Tensor, steady: bool) -> float:
     """Return the sum of squared deviations of all frames from each pixel's mean over the frames;
-    ``steady`` also subtracts what each frame's mean contributes.
+    ``steady`` also subtracts the contribution of the frame means.
 
-    The frames are taken in pieces of pixels, which need little memory.
+    The pixels are processed in blocks, which needs little memory.
     """
     piece_sums, frame_sums = [], torch.zeros(len(frames), dtype=torch.float64)
     for piece in _column_blocks(frames.reshape(len(frames), -1)):
@@ -230,15 +232,15 @@ def _squares_within_pixels(frames: Tensor, steady: bool) -> float:
 
 
 def _needs_histogram(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) -> bool:
-    """Return True if the histogram of a level holds information that mean and variance lack:
+    """Return True if mean and variance do not describe a level, so that its histogram is kept:
     coarse numbers, or a pile at an end.
 
-    ``sigma`` is the standard deviation in DN; ``alike`` says that pixels are equal, so that they
-    follow one Gaussian distribution.
+    ``sigma`` is the standard deviation in DN. With ``alike`` all pixels follow one Gaussian
+    distribution.
     """
     if sigma < COARSE_DEVIATION:
         return True
-    # each end holds two numbers, which begin half a number below the lower of them
+    # the two outermost values at each end cover 2 DN, from half a DN below the lower of them
     both_ends = (
         _End(value - value[0], count, float(value[0]) - 0.5),
         _End(value[-1] - value, count, float(value[-1]) - 1.5),
@@ -256,26 +258,24 @@ def _needs_histogram(value: Tensor, count: Tensor, mean: float, sigma: float, al
 
 @dataclass(frozen=True)
 class _End:
-    """One end of the numbers of a level: the two numbers there, and those beside them."""
+    """One end of the histogram of a level: its two outermost values, and the values beside them."""
 
     away: Tensor  #: distance of each number from the end
     count: Tensor
-    low: float  #: where the two numbers at the end begin
+    low: float  #: DN, lower edge of the interval of the two outermost values
 
     @property
     def held(self) -> float:
-        """Return the count of the two numbers at the end."""
+        """Return the count of the two outermost values."""
         return float(self.count[self.away <= 1].sum())
 
     @property
     def rises(self) -> bool:
-        """Return True if the numbers at the end are more than those beside them: towards a free
-        end, counts fall.
-        """
+        """Return True if the counts rise towards the end; without clipping they fall."""
         outermost, next_one, *two_beside = (
             float(self.count[self.away == i].sum()) for i in range(4)
         )
-        # the outermost number against the next one, the two outermost against the two beside them
+        # the outermost value against the next one, the two outermost against the two beside them
         pairs = ((outermost, next_one), (outermost + next_one, sum(two_beside)))
         return any(
             at_end - beside > _PILE_SIGMA * math.sqrt(at_end + beside) for at_end, beside in pairs
@@ -283,11 +283,11 @@ class _End:
 
 
 def _exceeds_gaussian(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
-    """Return True if the count ``held`` of two neighbouring numbers, which begin at ``low`` DN
-    from the mean, clearly exceeds that of a Gaussian.
+    """Return True if the count ``held`` of two neighbouring values clearly exceeds that of a
+    Gaussian; their interval begins at ``low`` DN from the mean.
 
-    Without pixels that are ``alike`` the excess must be several times the expected count, since
-    tails are long then.
+    If pixels are not ``alike``, tails are long, and the count must be several times the expected
+    one.
     """
     expected = (
         # total x probability of an interval of 2 DN
@@ -301,27 +301,28 @@ def _exceeds_gaussian(held: float, total: float, low: float, sigma: float, alike
 
 # --- saturation signal ----------------------------------------------------------------------------
 
-# The signal at which the pixels of a camera are full, from levels beyond saturation.
+# The signal of full pixels, from light levels beyond saturation.
 
 
-_FULL_SHARE = 0.5  #: share of the greatest variance below which a brighter level is full
+#: a level brighter than that of the greatest variance is full below this share of it
+_FULL_SHARE = 0.5
 
 
 class SaturationSignal(NamedTuple):
-    """The mean signal of full pixels above the dark, and its standard uncertainty."""
+    """The mean signal of full pixels above the dark level, and its standard uncertainty."""
 
     signal: float  #: DN
     uncertainty: float  #: DN
 
 
 def saturation_signal(levels: Levels) -> SaturationSignal | None:
-    """Return the signal of full pixels, or None where no level is full.
+    """Return the mean signal of full pixels above the dark level, or None where no level is full.
 
-    The mean of a level rises with its light until its pixels are full, and its variance falls. The
-    level of the greatest variance, where EMVA 1288 takes saturation, lies below by up to a step of
-    the levels: pixels, and the light of a frame, are unequal, and the fullest ones end the rise of
-    the variance. The brightest level is the fullest. It may still lack what the last two full
-    levels differ by, or with one full level what it exceeds the greatest variance's by.
+    As the light rises, pixels become full and the variance falls. EMVA 1288 takes saturation at the
+    level of the greatest variance, which lies below the signal of full pixels: pixels and light are
+    unequal, and the variance falls as soon as the first pixels are full. The brightest level is
+    nearest to full pixels. The signal that it may still lack is taken as the difference of the last
+    two full levels; with one full level, as its difference from the level of the greatest variance.
 
     Shapes: levels (level,) -> two scalars, or None.
     Units:  DN above the dark level of the nearest exposure.
@@ -352,7 +353,7 @@ def saturation_signal(levels: Levels) -> SaturationSignal | None:
 
 # --- level frames ---------------------------------------------------------------------------------
 
-# A node that reads the frames of one light level from image files.
+# The node that reads the frames of one light level from image files.
 
 
 Divisor = Annotated[int, Field(ge=1, le=1 << 16)]
@@ -430,7 +431,7 @@ def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
 
 # --- simulated frames -----------------------------------------------------------------------------
 
-# A node that simulates frames of a flat field by the same sensor steps as a picture.
+# The node that simulates flat-field frames with the sensor steps that also simulate a picture.
 
 
 add_dark_current, add_read_noise = dark_current, read_noise  # parameters below have the same names
@@ -515,14 +516,14 @@ def _(result: Tensor, **params: Any) -> list[Check]:
 
 # --- hot pixels -----------------------------------------------------------------------------------
 
-# Hot pixels of a sensor, which collect far more dark current than the others.
+# Hot pixels of a sensor, whose dark current is far larger than that of the others.
 
 
-#: robust standard deviations of the pixels above their median from which a pixel is hot
+#: a pixel is hot if it exceeds the median by more than this number of robust standard deviations
 _HOT_SIGMA = 10.0
-#: standard deviation of a normal distribution over its median absolute deviation
+#: ratio of standard deviation to median absolute deviation of a normal distribution
 _SIGMA_OVER_MAD = 1.4826
-_HOT_SHARE = 0.05  #: share of the pixels above which they are no exceptions
+_HOT_SHARE = 0.05  #: if more pixels than this share are above the limit, none is called hot
 
 
 @node(rtol=0.0)
@@ -546,10 +547,11 @@ def hot_pixels(*, files: DataFiles, divisor: Divisor = 1) -> Tensor:
     numbers = torch.from_numpy(stack(files)).double().div(divisor)
     pixel_means = numbers.mean(0)
     median_of_means = pixel_means.median()
-    # the mean of a few whole numbers is a multiple of a step, which hides a smaller deviation
+    # the mean of n whole numbers is a multiple of 1 / n DN: add the standard deviation of that
+    # rounding
     step = 1 / (12**0.5 * len(numbers))
     width = _SIGMA_OVER_MAD * float((pixel_means - median_of_means).abs().median()) + step
-    # in each frame: its smallest number is far above the median
+    # hot in every frame: even its smallest value is far above the median
     is_hot: Tensor = numbers.amin(0) - median_of_means > _HOT_SIGMA * width
     return is_hot if float(is_hot.double().mean()) <= _HOT_SHARE else torch.zeros_like(is_hot)
 

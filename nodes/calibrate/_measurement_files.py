@@ -1,7 +1,8 @@
-"""Files of measurements that others took: the data format of EMVA 1288, and tables of moments.
+"""Files of measurements by other programs: EMVA 1288 descriptors, and tables of means and
+variances.
 
-A descriptor of EMVA 1288 lists the frames of a measurement; a table has the means and variances of
-frames, computed by another program.
+An EMVA 1288 descriptor lists the image files of a measurement; a table has means and variances that
+another program computed from frames.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from neusee.nodes.values import Levels
 
 # --- descriptor of EMVA 1288 ----------------------------------------------------------------------
 
-_PAIR_IMAGES = 2  #: images of a level of the photon transfer
+_PAIR_IMAGES = 2  #: images per level in a photon-transfer measurement
 _LINE_FORMS = {
     "b": "b EXPOSURE_NS PHOTONS",
     "d": "d EXPOSURE_NS [0]",
@@ -41,7 +42,7 @@ class _DescribedLevel:
     line: int
     photons: float
     exposure: float  #: s
-    #: each with the number of its line
+    #: each image with its line number in the descriptor
     images: list[tuple[int, Path]] = field(default_factory=list)
 
 
@@ -49,27 +50,25 @@ class _DescribedLevel:
 class _Measurement:
     bits: int = 24
     shape: tuple[int, int] | None = None
-    release: str = ""  #: of EMVA 1288, as line v states it
+    release: str = ""  #: release of EMVA 1288 that line v states
     levels: list[_DescribedLevel] = field(default_factory=list)
 
     @property
     def transfer(self) -> list[_DescribedLevel]:
-        """The levels of the photon transfer: the pairs of images, or all levels if there is no
-        pair.
+        """The levels of the photon-transfer measurement: those with a pair of images, or all levels
+        if none has a pair.
         """
         pairs = [level for level in self.levels if len(level.images) == _PAIR_IMAGES]
         return pairs or self.levels
 
     @property
     def series(self) -> list[_DescribedLevel]:
-        """The levels of more images than a pair, for spatial quantities."""
+        """The levels with more than two images, for spatial quantities (DSNU and PRNU)."""
         return [level for level in self.levels if len(level.images) > _PAIR_IMAGES]
 
 
 def _with_images(file: Any) -> tuple[Path, ...]:
-    """Return the path of the descriptor, and then the path of each image that the descriptor
-    names.
-    """
+    """Return the path of the descriptor, followed by the paths of the images that it names."""
     if isinstance(file, tuple):
         return file
     path = Path(file)
@@ -137,8 +136,8 @@ def _(result: Levels, **params: Any) -> list[Check]:
 
 
 def descriptor_frames(files: Sequence[Path]) -> Iterator[tuple[str, float, float, Tensor]]:
-    """Yield name, photons, exposure (s) and frames (frame, y, x) of each level of a descriptor's
-    photon transfer.
+    """Yield name, photons, exposure (s) and frames (frame, y, x) of each photon-transfer level of a
+    descriptor.
 
     ``files`` is the value of the parameter `file` of `descriptor`, whose first path is the
     descriptor.
@@ -152,7 +151,7 @@ def descriptor_series(files: Sequence[Path]) -> Iterator[tuple[float, float, Ite
     """Yield photons, exposure (s) and an iterator of frames (y, x) of each spatial series of a
     descriptor.
 
-    ``files`` is as in `descriptor_frames`. Each image is read when its turn comes.
+    ``files`` is as in `descriptor_frames`. Images are read one at a time.
     """
     for level in parsed_descriptor(files[0]).series:
         yield (
@@ -163,8 +162,8 @@ def descriptor_series(files: Sequence[Path]) -> Iterator[tuple[float, float, Ite
 
 
 def descriptor_release(files: Sequence[Path]) -> str:
-    """Return the release of EMVA 1288 that line v of a descriptor states, such as ``3.0``; empty
-    without such a line.
+    """Return the release of EMVA 1288 from line v of a descriptor, such as ``3.0``; empty if there
+    is no such line.
 
     ``files`` is as in `descriptor_frames`.
     """
@@ -181,8 +180,8 @@ def refuse_descriptor(file: Path) -> None:
 def _level_statistics(
     name: str, measurement: _Measurement, level: _DescribedLevel, scatter: Temporal
 ) -> Levels:
-    """Return the statistics of one level of a descriptor, which is called ``name``; raise
-    ValueError for images of another size or of more bits than the descriptor says.
+    """Return the statistics of one level of the descriptor ``name``; raise ValueError for images
+    whose size or bits differ from those stated there.
     """
     images = stack([image for _, image in level.images])
     if measurement.shape and images.shape[1:] != measurement.shape:
@@ -202,8 +201,8 @@ def _level_statistics(
 
 
 def parsed_descriptor(path: Path) -> _Measurement:
-    """Return the measurement that a descriptor states, line by line; raise ValueError, with the
-    line, for a mistake.
+    """Return the parsed content of a descriptor; raise ValueError, with the line number, for a
+    mistake.
     """
     measurement = _Measurement()
     for number, line in _lines(path):
@@ -261,10 +260,10 @@ def _add_line(measurement: _Measurement, kind: str, content: str, folder: Path, 
 
 
 def _level_of_line(line: int, kind: str, numbers: list[float]) -> _DescribedLevel:
-    """Return the light level of a descriptor line; raise ValueError for an invalid exposure or
-    number of photons.
+    """Return the light level that a descriptor line states; raise ValueError for an invalid
+    exposure or number of photons.
     """
-    # a dark line may leave its number of photons, 0, out
+    # a dark line may omit its number of photons, 0
     exposure, photons = (*numbers, 0.0)[:2] if kind == "d" else numbers
     if not 0 <= exposure < float("inf") or not (
         0 < photons < float("inf") if kind == "b" else photons == 0
@@ -326,7 +325,7 @@ def table(
     columns = {
         name: torch.tensor([row[name] for row in rows], dtype=torch.float64) for name in rows[0]
     }
-    # half the squared difference of the means belongs to the variance of a pair
+    # the EMVA 1288 variance of a pair includes half the squared difference of its means
     total_variance = columns["variance"] + (
         columns["drift"].square() / 2 if drift is not None else 0.0
     )
@@ -335,7 +334,7 @@ def table(
     return Levels(
         columns["photons"],
         exposures,
-        # pixels of both frames; a pair has one degree of freedom a pixel
+        # pixels of both frames; a pair of frames has one degree of freedom per pixel
         2 * pixel_count,
         columns["mean"],
         total_variance,
@@ -366,8 +365,8 @@ def _(*, file: Path, exposure_unit: str = "s", **names: Any) -> list[str]:
 
 @once_per_version
 def _wrong_cell(file: Path, *columns: tuple[str, str]) -> str:
-    """Return a message for the first cell of a table that is not a valid number, else an empty
-    text.
+    """Return an error message for the first cell of a table that is not a valid number, else an
+    empty text.
     """
     try:
         rows = _rows(file, dict(columns))
@@ -383,8 +382,8 @@ def _(result: Levels, **params: Any) -> list[Check]:
 
 
 def _rows(file: Path, columns: dict[str, str]) -> list[dict[str, float]]:
-    """Read the lines of a table as numbers by name; ``columns`` has the heading of each name.
-    Raises ValueError, with line and column, for a cell that is no valid number.
+    """Read each line of a table as numbers by quantity; ``columns`` maps quantities to column
+    headings. Raises ValueError, with line and column, for a cell that is no valid number.
     """
     rows = csv_rows(file)
     _, header = next(rows, (0, list[str]()))
@@ -396,8 +395,8 @@ def _rows(file: Path, columns: dict[str, str]) -> list[dict[str, float]]:
 
 
 def _number(text: str | None, name: str, where: str) -> float:
-    """Return the number in the cell of a column ``name``; raise ValueError, with the place
-    ``where``, for a text that is no valid number of it.
+    """Return the number in a cell of the quantity ``name``; raise ValueError, which names the place
+    ``where``, for a text that is no valid number for this quantity.
     """
     condition = _CONDITIONS.get(name, "finite")
     try:

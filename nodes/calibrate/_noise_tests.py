@@ -1,4 +1,4 @@
-"""Tests of the noise of frames: white, Gaussian, without trend or compressed blocks."""
+"""Tests of the noise of frames: is it white and Gaussian, without drift and block compression?"""
 
 from __future__ import annotations
 
@@ -29,23 +29,24 @@ from neusee.nodes.calibrate._frame_pairs import (
 
 # --- block test -----------------------------------------------------------------------------------
 
-# A test of frames for compression in blocks of 8 x 8 pixels, by borders and cosines of blocks.
+# A test for compression in blocks of 8 x 8 pixels, such as JPEG, by the borders of blocks and their
+# cosine transform (DCT).
 
 
 _BLOCK_SIDE = 8  #: pixels of a block on a side
-_STEPS = range(1, 33)  #: DN, steps to which compression may round the cosines of a block
-#: standard deviations of a cosine over a step, above which noise covers the step evenly
+_STEPS = range(1, 33)  #: DN, quantisation steps of the DCT coefficients that are tested
+#: noise of at least this many steps makes the DCT coefficients uniform modulo a step
 _EVEN_COVER = 1.2
-_COSINE_LEVELS = 4  #: levels whose cosines are computed, those of the most noise
-_COSINE_SIDE = 256  #: pixels on a side whose cosines are computed
+_COSINE_LEVELS = 4  #: number of levels whose DCT is computed, the noisiest ones
+_COSINE_SIDE = 256  #: side in pixels of the area whose DCT is computed
 
 
 def block_test(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
-    """Test if pixels were compressed in blocks of 8 x 8.
+    """Test if frames were compressed in blocks of 8 x 8 pixels.
 
-    Products of neighbouring differences ``white`` must be alike across the borders of blocks and
-    inside blocks. The cosines of a block must not keep to multiples of a step: the mean of cos(2 pi
-    cosine / step) is 0 without compression.
+    The mean product of neighbouring differences ``white`` must be the same across block borders and
+    inside blocks. The DCT coefficients of a block must not be multiples of a step: without
+    compression the mean of cos(2 pi coefficient / step) is 0.
 
     Shapes: differences (pair, y, x) of each level -> a test.
     Units:  the number and the limit in standard deviations of chance.
@@ -73,17 +74,17 @@ def block_test(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
 
 
 def neighbour_products(x: Tensor, lag: tuple[int, int]) -> Tensor:
-    """Return the product of each pixel with its neighbour at a lag, of which the mean is 0 for
+    """Return the product of each pixel with its neighbour at a lag (y, x); the mean is 0 for
     independent pixels.
 
-    The removal of the means of lines correlates the pixels of a line by minus one over the length
-    of the line.
+    Subtracting line means correlates the pixels of a line by -1 / length; this is corrected.
     """
     down, right = lag
     height, width = x.shape[1:]
     pixels = x[:, : height - down, max(0, -right) : width - max(0, right)]
     neighbours = x[:, down:, max(0, right) : width - max(0, -right)]
-    line_length = math.inf  # of the line that holds both pixels, if one does
+    # length of the row or column that contains both pixels; infinite for a diagonal lag
+    line_length = math.inf
     if down == 0:
         line_length = width
     elif right == 0:
@@ -92,10 +93,10 @@ def neighbour_products(x: Tensor, lag: tuple[int, int]) -> Tensor:
 
 
 def _contrast_at_borders(products: Tensor, axis: int) -> float:
-    """Return the difference between products across block borders and products inside blocks, in
+    """Return the difference of the mean products inside blocks and across block borders, in
     standard errors.
     """
-    # the product of the last pixel of a block is that with the first of the next one
+    # the last pixel of a block is multiplied by the first pixel of the next block
     is_last_of_block = torch.arange(products.shape[axis]) % _BLOCK_SIDE == _BLOCK_SIDE - 1
     across_border, inside_blocks = (
         products[(slice(None),) * axis + (places,)].reshape(-1)
@@ -108,11 +109,10 @@ def _contrast_at_borders(products: Tensor, axis: int) -> float:
 
 
 def _step_evidence(step: int, levels: Sequence[Level]) -> list[float]:
-    """Return how strongly each cosine of the blocks keeps to multiples of a ``step`` in DN, as
-    standard normal numbers, and last all cosines together.
+    """Return a standard normal statistic for each DCT coefficient, large if its values are
+    multiples of ``step`` DN, and last one for all coefficients together.
 
-    Levels whose noise does not cover the step evenly are left out; without a level the list is
-    empty.
+    Levels whose noise is too small for the step are left out; if none remains, the list is empty.
     """
     sums_of_cosines, block_count = torch.zeros(_BLOCK_SIDE * _BLOCK_SIDE, dtype=torch.float64), 0
     for level in levels:
@@ -123,16 +123,17 @@ def _step_evidence(step: int, levels: Sequence[Level]) -> list[float]:
         block_count += len(cosines)
     if not block_count:
         return []
-    # the first cosine is the mean of a block; the variance of cos of an even phase is 1/2
+    # without coefficient 0, the mean of a block; the variance of cos(phase) is 1/2 for a uniform
+    # phase
     standard_numbers = (sums_of_cosines[1:] / math.sqrt(block_count / 2)).tolist()
     return [*standard_numbers, sum(standard_numbers) / math.sqrt(len(standard_numbers))]
 
 
 def _block_cosines(frame: Tensor) -> Tensor:
-    """Return the orthonormal cosine transform (block, 64) of the blocks of a frame (y, x)."""
+    """Return the orthonormal DCT coefficients (block, 64) of the 8 x 8 blocks of a frame (y, x)."""
     block_rows, block_columns = (min(size, _COSINE_SIDE) // _BLOCK_SIDE for size in frame.shape)
     frequency, pixel = (torch.arange(_BLOCK_SIDE, dtype=torch.float64) for _ in range(2))
-    # cosine transform of type II, with rows of length 1
+    # cosine transform of type II (DCT-II), with basis vectors of length 1
     basis = (math.pi / _BLOCK_SIDE * frequency[:, None] * (pixel + 0.5)).cos() * math.sqrt(
         2 / _BLOCK_SIDE
     )
@@ -149,7 +150,7 @@ def _block_cosines(frame: Tensor) -> Tensor:
 # --- noise tests ----------------------------------------------------------------------------------
 
 # Tests of the difference of two frames of the same light: its noise must be white, Gaussian and
-# without a trend.
+# without drift.
 
 
 _NEAREST_LAGS = ((0, 1), (1, 0))  #: lags in pixels (y, x)
@@ -159,22 +160,23 @@ _NEIGHBOUR_NOISE = "the noise of neighbouring pixels"
 _TELEGRAPH_TEST = "no telegraph noise"
 _DRIFT_TEST = "no drift within a level"
 _ROOT_MEAN_SQUARE = "stated is the root mean square of all pixels, as EMVA 1288 defines it"
-#: scale of the prior of the share of the variance that neighbours take from each other
+#: prior scale of the relative change of the variance by mixing of neighbouring pixels
 _MIXING_SCALE = 0.02
-#: share of the variance that flicker over uneven light may add without a word
+#: share of the variance that a flickering lamp may add, over uneven light, without a warning
 _SMALL_FLICKER = 1e-3
-#: standard deviations of the middle of a distribution that gives its robust width
+#: half-width, in standard deviations, of the core of a distribution from which its width is
+#: estimated
 _CORE_HALF_WIDTH = 1.5
 
 
 def noise_tests(levels: Sequence[Level]) -> list[FrameTest]:
-    """Test the noise of pairs of frames for correlation, block compression, lines, rare jumps and
-    drift.
+    """Test the noise of pairs of frames for correlation, block compression, row and column noise,
+    telegraph noise and drift.
 
-    Only levels that the fit uses are tested. The differences of two frames of the same light hold
-    no fixed pattern. Sums of products of neighbouring differences are divided by the root of the
-    sum of their squares, so that they are standard normal for independent pixels of any variance;
-    sums of squares of line means have a chi-square distribution.
+    Only levels that the fit uses are tested. The difference of two frames of the same light has no
+    fixed pattern. Sums of products of neighbouring differences are divided by the root of the sum
+    of the squared products, so that they are standard normal for independent pixels of any
+    variance; sums of squares of line means have a chi-square distribution.
 
     Shapes: a list of levels -> a list of tests.
     Units:  numbers and limits in standard deviations of chance.
@@ -200,7 +202,7 @@ def noise_tests(levels: Sequence[Level]) -> list[FrameTest]:
 
 
 def _correlation(levels: Sequence[Tensor], lag: tuple[int, int]) -> float:
-    """Return the correlation at a lag, of all levels with equal weight."""
+    """Return the correlation coefficient of pixels at a lag (y, x), averaged over the levels."""
     return sum(
         float(neighbour_products(x, lag).mean() / x.square().mean().clamp_min(1e-12))
         for x in levels
@@ -208,13 +210,13 @@ def _correlation(levels: Sequence[Tensor], lag: tuple[int, int]) -> float:
 
 
 def _whiteness(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
-    """Test if the noise of neighbouring pixels is independent.
+    """Test if the noise of neighbouring pixels is uncorrelated.
 
-    ``white`` has the differences of each level without the means of their lines. Correlation of an
-    electronic readout, which is in the dark alone, counts as dark noise; any other may have lowered
-    the variance.
+    ``white`` has the differences of each level with row and column means subtracted. Correlation
+    that the readout electronics cause, which shows in the dark only, counts as dark noise; any
+    other correlation may come from a filter that lowered the variance.
     """
-    # two lags of equal length together: their sum over sqrt(2) is standard normal
+    # two lags of equal length combined: the sum of two standard normal values over sqrt(2)
     nearest, diagonal, second_nearest = (
         [sum(studentised(neighbour_products(x, lag)) for lag in lags) / math.sqrt(2) for x in white]
         for lags in (_NEAREST_LAGS, _DIAGONAL_LAGS, _SECOND_LAGS)
@@ -236,17 +238,18 @@ def _whiteness(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
 
 
 def _correlation_clause(levels: Sequence[Tensor]) -> str:
-    """Return the clause of a sentence on the correlation of neighbours along rows and columns."""
+    """Return the text on the correlation of neighbours along rows and along columns."""
     rows, columns = (_correlation(levels, lag) for lag in _NEAREST_LAGS)
     return f"correlates by {rows:.2g} along rows and {columns:.2g} along columns"
 
 
 def _is_of_readout(darks: Sequence[Tensor], lit: Sequence[Tensor]) -> bool:
-    """Return True if neighbours are unlike in the dark, and more so than in light, beyond chance.
+    """Return True if neighbours are anticorrelated in the dark, and more so than in light, beyond
+    chance: a sign of readout electronics.
 
-    A filter that makes neighbours unlike acts on light too; those that act on weak noise alone make
-    neighbours alike. An electronic readout adds noise of any correlation, which shot noise hides in
-    light.
+    A filter that anticorrelates neighbours does so in light too, and a filter that acts on weak
+    noise only correlates them positively. Readout noise may have any correlation, and in light it
+    is hidden by shot noise.
     """
     if not darks or not lit:
         return False
@@ -263,9 +266,11 @@ def _is_of_readout(darks: Sequence[Tensor], lit: Sequence[Tensor]) -> bool:
 def _hidden_mixing(
     darks: Sequence[Tensor], lit: Sequence[Tensor], of_readout: bool, alarm: bool
 ) -> Iterator[Hidden]:
-    """Yield what a filter may have taken from the variance in light, and from that in the dark.
+    """Yield the possible loss of variance by a filter, in light and in the dark, each as a hidden
+    fault.
 
-    A filter reaches the eight neighbours of a pixel; one that is found may reach farther.
+    A filter is assumed to mix a pixel with its eight neighbours; if the test has found one, also
+    with pixels two away.
     """
     lags = (*_NEAREST_LAGS, *_DIAGONAL_LAGS, *(_SECOND_LAGS if alarm else ()))
     sound = chance_of_no_fault(sum(x.numel() for x in lit))
@@ -273,7 +278,7 @@ def _hidden_mixing(
         yield Hidden(
             "mixing", *_log_variance_factor(lit, lags), _MIXING_SCALE, gain=1.0, sound=sound
         )
-    if darks and not of_readout:  # the noise of a readout lacks nothing in the dark
+    if darks and not of_readout:  # correlated readout noise loses no variance in the dark
         yield Hidden(
             "mixing", *_log_variance_factor(darks, lags), _MIXING_SCALE, noise=0.5, sound=sound
         )
@@ -282,11 +287,11 @@ def _hidden_mixing(
 def _log_variance_factor(
     levels: Sequence[Tensor], lags: Sequence[tuple[int, int]]
 ) -> tuple[float, float]:
-    """Return the logarithm of one plus twice the sum of the correlations at ``lags``, as a mean
-    over levels, and its standard error.
+    """Return the logarithm of 1 + 2 x the sum of the correlations at ``lags``, averaged over
+    levels, and its standard error.
 
-    A linear filter that keeps the mean lowers the variance of white noise by the factor of all
-    lags.
+    With all lags, this factor is the true over the measured variance of white noise behind a linear
+    filter that keeps the mean.
     """
     sum_of_correlations, sum_of_variances = 0.0, 0.0
     for x in levels:
@@ -304,20 +309,20 @@ def _log_variance_factor(
 def _line_noise(
     name: str, axis: int, levels: Sequence[Level], white: Sequence[Tensor]
 ) -> FrameTest:
-    """Test if the means of rows (axis 2) or columns (axis 1) scatter more than white noise lets
-    them.
+    """Test if the means of rows (axis 2) or columns (axis 1) scatter more than white noise
+    explains.
     """
     down, right = (0, 1) if axis == 2 else (1, 0)
     standard_numbers, line_shares = [], []
-    # x: differences of a level without the means of their lines
+    # x: differences of a level with row and column means subtracted
     for level, x in zip(levels, white, strict=True):
         pair_count, height, width = x.shape
         line_means = level.differences.mean(axis)
         degrees_of_freedom = line_means.numel() - len(line_means)
-        # the means of all lines were fitted: as many degrees of freedom less
+        # the subtracted row and column means take as many degrees of freedom
         pixel_freedom = max(1, x.numel() - pair_count * (height + width - 1))
         pixel_variance = float(x.square().mean()) * x.numel() / pixel_freedom
-        # neighbours that correlate make the mean of a line scatter more
+        # correlated neighbours make the mean of a line scatter more
         correlation_factor = (
             1
             + 2 * max(0.0, _correlation([x], (down, right)))
@@ -358,8 +363,8 @@ def _line_noise(
 
 
 def _chi_square_as_normal(chi: float, freedom: float) -> float:
-    """Return a chi-square number as a standard normal number (Wilson and Hilferty: its cube root
-    is nearly normal).
+    """Convert a chi-square value to a standard normal value (Wilson and Hilferty: its cube root is
+    nearly normal).
     """
     cube_root_variance = 2 / (9 * freedom)
     return float((max(chi, 0.0) / freedom) ** (1 / 3) - (1 - cube_root_variance)) / math.sqrt(
@@ -368,12 +373,12 @@ def _chi_square_as_normal(chi: float, freedom: float) -> float:
 
 
 def _telegraph_noise(levels: Sequence[Level]) -> list[FrameTest]:
-    """Test if the noise of a pixel in the dark jumps, and tell how much the noise differs from
-    pixel to pixel.
+    """Test for telegraph noise, rare jumps of the dark noise, and report how much the noise differs
+    from pixel to pixel.
 
-    Large differences are of pixels that jump, or of pixels that are noisier than others. A pixel
-    that is noisier is so in each pair: then a third of the fourth power of its differences is the
-    product of the squares of two of them.
+    Large differences come from pixels that jump, or from pixels that are always noisier than
+    others. For normal noise of any width, E(d1^4) / 3 = E(d1^2 d2^2) for the differences d1 and d2
+    of two pairs of a pixel.
     """
     darks = [level for level in levels if level.dark and level.variance >= LEAST_DARK_VARIANCE]
     if not darks:
@@ -386,7 +391,7 @@ def _telegraph_noise(levels: Sequence[Level]) -> list[FrameTest]:
     # the kurtosis of normal noise is 3
     excess = max(1.0, sum(kurtoses) / len(kurtoses) / 3)
     if evidence.found and _noise_is_of_pixels(darks):
-        # unequal pixels leave the mean of their variances less certain than equal ones
+        # the mean variance of unequal pixels is less certain than that of equal ones
         variance_error = math.sqrt(
             (excess - 1) / 2 / sum(level.differences.numel() for level in darks)
         )
@@ -408,14 +413,16 @@ def _telegraph_noise(levels: Sequence[Level]) -> list[FrameTest]:
 
 
 def _kurtosis(level: Level) -> float:
-    """Return the kurtosis of the differences of a level; rounding takes 1/60 from the cumulant."""
+    """Return the kurtosis of the differences of a level; rounding lowers the fourth cumulant by
+    1/60, which is corrected.
+    """
     mean_square = float(level.differences.square().mean())
     return float(level.differences.pow(4).mean()) / mean_square**2 + 1 / 60 / mean_square**2
 
 
 def _width_over_core(level: Level) -> float:
-    """Return the relative excess of the standard deviation of a level's differences over that of a
-    normal distribution with the same middle.
+    """Return by what share the standard deviation of a level's differences exceeds that of a normal
+    distribution with the same core.
     """
     return (
         math.sqrt(float(level.differences.square().mean()))
@@ -425,11 +432,11 @@ def _width_over_core(level: Level) -> float:
 
 
 def _noise_is_of_pixels(levels: Sequence[Level]) -> bool:
-    """Return True if each pixel has normal noise in time, of a width that may differ from pixel to
-    pixel, as far as chance lets it be told.
+    """Return True if the data agree with normal temporal noise of each pixel, whose standard
+    deviation may differ from pixel to pixel.
 
-    Then the mean fourth power over 3 of a pixel is the mean product of the squares of two different
-    pairs.
+    Then, for each pixel, a third of the mean fourth power of its differences is the mean product of
+    the squared differences of two pairs.
     """
     shapes = [level.differences.shape[1:] for level in levels]
     common_shape = max(shapes, key=shapes.count)
@@ -443,7 +450,8 @@ def _noise_is_of_pixels(levels: Sequence[Level]) -> bool:
     if pair_count < 2:
         return False
     sum_of_squares, fourth_powers = squares.sum(0), squares.square().sum(0)
-    # (sum of squares)^2 less the squares of each pair, over the number of ordered pairs
+    # mean product of two different squares: ((sum of squares)^2 - sum of fourth powers) / (n (n -
+    # 1))
     products_of_pairs = (sum_of_squares.square() - fourth_powers) / (pair_count * (pair_count - 1))
     return abs(studentised(fourth_powers / (3 * pair_count) - products_of_pairs)) < normal_limit(
         FALSE_ALARM_RATE / 2
@@ -451,12 +459,13 @@ def _noise_is_of_pixels(levels: Sequence[Level]) -> bool:
 
 
 def _kurtosis_as_normal(kurtosis: float, n: int) -> float:
-    """Return the kurtosis of a sample of n normal numbers as a standard normal number (Anscombe
-    and Glynn 1983).
+    """Convert the sample kurtosis of n normal values to a standard normal value (Anscombe and Glynn
+    1983).
     """
     variance = 24 * n * (n - 2) * (n - 3) / ((n + 1) ** 2 * (n + 3) * (n + 5))
     standardised = (kurtosis - 3 * (n - 1) / (n + 1)) / math.sqrt(variance)
-    # of the kurtosis, for which a chi-square law of as many degrees of freedom is taken
+    # skewness of the sample kurtosis; a chi-square distribution of the same skewness approximates
+    # it
     skewness = (
         6
         * (n * n - 5 * n + 2)
@@ -467,26 +476,26 @@ def _kurtosis_as_normal(kurtosis: float, n: int) -> float:
     ratio = (1 - 2 / degrees_of_freedom) / (
         1 + standardised * math.sqrt(2 / (degrees_of_freedom - 4))
     )
-    # Wilson and Hilferty: the cube root of such a number is nearly normal
+    # Wilson and Hilferty: the cube root of a chi-square value is nearly normal
     cube_root = math.copysign(abs(ratio) ** (1 / 3), ratio)
     return (1 - 2 / (9 * degrees_of_freedom) - cube_root) / math.sqrt(2 / (9 * degrees_of_freedom))
 
 
 def _core_deviation(x: Tensor) -> float:
-    """Return the standard deviation of the normal distribution that has the same share of small
-    whole numbers as the differences ``x``.
+    """Return the standard deviation of the normal distribution with the same share of values within
+    1.5 standard deviations as the differences ``x``, which are whole numbers.
     """
     largest_in_core = round(_CORE_HALF_WIDTH * float(x.std()))
     core_share = float((x.abs() <= largest_in_core + 0.5).double().mean())
     width = (largest_in_core + 0.5) / -float(
         torch.special.ndtri(torch.tensor((1 - core_share) / 2, dtype=torch.float64))
     )
-    # whole numbers have 1/12 more variance than the normal distribution that they round
+    # rounding to whole numbers adds the variance 1/12
     return math.sqrt(width**2 + 1 / 12)
 
 
 def _drift(levels: Sequence[Level]) -> FrameTest:
-    """Test if the mean moves between the frames of a pair."""
+    """Test if the mean changes between the frames of a pair."""
     drift_numbers = list(chain.from_iterable(_drift_over_chance(level) for level in levels))
     evidence = strongest_evidence([[z] for z in drift_numbers], sides=2)
     dark, lit = dark_and_lit(levels)
@@ -520,14 +529,14 @@ def _farthest_drift(levels: Sequence[Level]) -> float:
 def _drift_over_chance(level: Level) -> list[float]:
     """Return the drift of each pair in standard errors."""
     standard_numbers: list[float] = (
-        # a mean of n pixels has the variance s^2 / n, the difference of two means twice that
+        # the difference of two means of n pixels has the variance 2 s^2 / n
         level.drift / math.sqrt(2 * level.variance / level.differences[0].numel() + VARIANCE_FLOOR)
     ).tolist()
     return standard_numbers
 
 
 def _largest_drift(levels: Sequence[Level]) -> float:
-    """Return the largest share of the variance of a level that is the drift of its mean."""
+    """Return the largest share of the drift of the mean in the variance of a level."""
     return max(
         (
             float(level.drift.square().mean()) / 2 / (level.variance + VARIANCE_FLOOR)

@@ -16,26 +16,24 @@ from neusee.nodes.calibrate._emva_quantities import NO_GAIN, FloatArray, Quantit
 
 # --- nonuniformity --------------------------------------------------------------------------------
 
-# DSNU and PRNU of the EMVA 1288 sheet: variances of averaged frames in total, by rows, by columns
-# and by pixels.
+# DSNU and PRNU of the EMVA 1288 sheet: spatial variances of averaged frames, in total and of rows,
+# columns and pixels.
 
 
-_VARIANCE_SIGMA = 2.0  #: standard errors of a variance below which only a limit follows
+_VARIANCE_SIGMA = 2.0  #: a variance of fewer standard errors than this gives only an upper limit
 _SMALLEST_SIDE = 8  #: pixels, side of the smallest frame
 PARTS = ("total", "row", "column", "pixel")
 
 
 @dataclass(frozen=True)
 class SpatialSeries:
-    """The sum of a series of frames of one illumination, from which spatial quantities are
-    computed.
-    """
+    """The sum of a series of frames of one illumination, for spatial quantities."""
 
     photons: float  #: per pixel and exposure; 0 in the dark
     exposure: float  #: s
     count: int  #: L, number of frames
     total: NDArray[np.int64]  #: (y, x) DN, sum of the frames
-    temporal: float  #: sigma_y.stack^2, DN2, mean over the pixels of the variance in time
+    temporal: float  #: sigma_y.stack^2, DN2, temporal variance, averaged over the pixels
 
     @property
     def average(self) -> FloatArray:
@@ -44,9 +42,7 @@ class SpatialSeries:
 
 
 class SpatialVariances(NamedTuple):
-    """Spatial variances of an averaged frame without what noise in time leaves in the average,
-    DN2.
-    """
+    """Spatial variances of an averaged frame, DN2, with the residual temporal noise subtracted."""
 
     total: float
     row: float
@@ -55,14 +51,14 @@ class SpatialVariances(NamedTuple):
 
 
 class Nonuniformity(NamedTuple):
-    """The dark and the lit series of a sheet; either is None if there is no such series."""
+    """The dark and the lit series of frames of a sheet; None for a series that does not exist."""
 
     dark: SpatialSeries | None
     lit: SpatialSeries | None
 
 
 def spatial_series(photons: float, exposure: float, frames: Iterable[Tensor]) -> SpatialSeries:
-    """Sum frames (y, x) of whole numbers, one by one, to a series.
+    """Sum a series of frames (y, x) of whole numbers, one frame at a time.
 
     Shapes: each frame (y, x).
     Units:  DN; exposure s.
@@ -110,7 +106,8 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
             total).
     """
     rows, columns = series.total.shape
-    # of an average of n frames; the mean of a line has it over its number of pixels
+    # temporal variance left in the average of n frames; in the mean of a line it is divided by its
+    # pixels
     temporal_rest = series.temporal / series.count
     variances = _measured_variances(series)
     total_variance, row_variance, column_variance = (
@@ -119,7 +116,7 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
         variances.column - temporal_rest / rows,
     )
     pixel_count = rows * columns
-    # rows, columns and pixels that add up to the total: solution of EMVA 1288 for the three parts
+    # the three parts that add up to the total, as EMVA 1288 solves for them
     denominator = pixel_count - rows - columns
     return SpatialVariances(
         total_variance,
@@ -132,7 +129,7 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
 
 
 def chance_of_variances(series: SpatialSeries) -> SpatialVariances:
-    """Return the standard errors of `spatial_variances`, DN2, for normal noise and a normal
+    """Return the standard errors of `spatial_variances`, DN2, for normally distributed noise and
     nonuniformity.
     """
     rows, columns = series.total.shape
@@ -155,8 +152,8 @@ def chance_of_variances(series: SpatialSeries) -> SpatialVariances:
 
 
 def _measured_variances(series: SpatialSeries) -> SpatialVariances:
-    """Return the variances of the averaged frame, of the means of its rows and of the means of its
-    columns, DN2, with what noise in time leaves in them; that of single pixels is NaN.
+    """Return the variances of the averaged frame, of its row means and of its column means, DN2;
+    they include residual temporal noise. The variance of single pixels is NaN.
     """
     image = series.average
     rows, columns = float(image.mean(1).var()), float(image.mean(0).var())
@@ -164,8 +161,8 @@ def _measured_variances(series: SpatialSeries) -> SpatialVariances:
 
 
 def nonuniformity(patterns: Nonuniformity, gain: float | None) -> list[Quantity]:
-    """Return DSNU1288 in DN and e-, PRNU1288 in percent, each in total and of rows, columns and
-    pixels.
+    """Return DSNU1288 in DN and in e-, and PRNU1288 in percent, each in total and of rows, columns
+    and pixels.
 
     Shapes: scalars.
     Units:  as in each `Quantity`.
@@ -176,7 +173,7 @@ def nonuniformity(patterns: Nonuniformity, gain: float | None) -> list[Quantity]
 
 def _dsnu(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
     """Return DSNU1288 in DN and in electrons, in total and of rows, columns and pixels; limits or
-    reasons where the ``series`` of dark frames does not tell them.
+    reasons where the ``series`` of dark frames does not determine them.
     """
     quantities: list[Quantity] = []
     for i, pattern in enumerate(PARTS):
@@ -187,7 +184,7 @@ def _dsnu(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
             reason = "no series of dark frames is given, only pairs"
             quantities += [in_numbers.untold(reason), in_electrons.untold(reason)]
             continue
-        # i counts the fields of `SpatialVariances`, in the order of `PARTS`
+        # the fields of `SpatialVariances` have the order of `PARTS`
         numbers = _root_or_limit(
             in_numbers, spatial_variances(series)[i], chance_of_variances(series)[i]
         )
@@ -216,7 +213,7 @@ def _prnu(patterns: Nonuniformity) -> list[Quantity]:
     signal = float(patterns.lit.average.mean() - patterns.dark.average.mean())
     if not signal > 0:
         return [blank.untold("the lit series is no brighter than the dark one") for blank in blanks]
-    # from DN2 to the square of percent of the signal
+    # conversion from DN2 to squared percent of the signal
     percent_squared = (100 / signal) ** 2
     variances = zip(spatial_variances(patterns.lit), spatial_variances(patterns.dark), strict=True)
     errors = zip(chance_of_variances(patterns.lit), chance_of_variances(patterns.dark), strict=True)
@@ -230,15 +227,15 @@ def _prnu(patterns: Nonuniformity) -> list[Quantity]:
 
 
 def _names(kind: str, pattern: str, name: str) -> tuple[str, str, str]:
-    """Return key, symbol and name of a quantity of a pattern, which has no suffix in total."""
+    """Return key, symbol and name of a quantity; a total has no suffix in its key."""
     if pattern == "total":
         return f"{kind}1288", f"{kind}1288", f"{name}, total"
     return f"{kind}1288_{pattern}", f"{kind}1288.{pattern}", f"{name}, {pattern}s"
 
 
 def _root_or_limit(blank: Quantity, variance: float, error: float) -> Quantity:
-    """Return the root of a variance, or a limit if the variance is less than two of its standard
-    errors.
+    """Return the square root of a variance, or an upper limit if the variance is below two of its
+    standard errors.
     """
     if variance >= _VARIANCE_SIGMA * error and variance > 0:
         return blank.told(math.sqrt(variance))
@@ -256,14 +253,14 @@ _BOX_SIDE = 5  #: pixels, side of the box whose mean is subtracted against uneve
 
 
 class Spectrogram(NamedTuple):
-    """The root of the mean power of the lines of a frame, in the unit of the frame."""
+    """The root of the mean power spectrum of the lines of a frame, in the unit of the frame."""
 
     frequency: FloatArray  #: (half,) cycles per pixel, 0 to 0.5
     amplitude: FloatArray  #: (half,)
 
 
 class Profiles(NamedTuple):
-    """Four lines through a frame, each (pixel,) in the unit of the frame."""
+    """Four profiles of a frame, each (pixel,) in the unit of the frame."""
 
     middle: FloatArray
     mean: FloatArray
@@ -272,21 +269,21 @@ class Profiles(NamedTuple):
 
 
 class DefectHistogram(NamedTuple):
-    """The distribution of pixels over their deviation from the mean, and the share of pixels
-    beyond each deviation.
+    """The histogram of the deviations of pixels from their mean, and the share of pixels beyond
+    each absolute deviation.
     """
 
     deviation: FloatArray  #: (class,) lower end of each class, in the unit of the frame
     pixels: NDArray[np.int64]  #: (class,)
     #: (class,) pixels of a normal distribution of the same mean and standard deviation
     normal: FloatArray
-    distance: FloatArray  #: (class,) rising amount of the deviation
-    beyond: FloatArray  #: (class,) %, pixels whose deviation amounts to that much or more
+    distance: FloatArray  #: (class,) absolute deviation, rising
+    beyond: FloatArray  #: (class,) % of the pixels with at least this absolute deviation
 
 
 def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
-    """Return the spectrogram of a frame (y, x) along its rows, or with ``vertical`` along its
-    columns.
+    """Return the spectrogram of a frame (y, x) along its rows, or along its columns if
+    ``vertical``.
 
     White noise of standard deviation s has the amplitude s at every frequency.
 
@@ -300,8 +297,8 @@ def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
 
 
 def profiles(image: FloatArray, vertical: bool = False) -> Profiles:
-    """Return the middle row of a frame (y, x), and mean, least and greatest number of each column;
-    or the transposed.
+    """Return the middle row of a frame (y, x), and mean, minimum and maximum of each column; with
+    ``vertical`` rows and columns change places.
 
     Source: EMVA Standard 1288, release 4.0 Linear.
     """
@@ -310,8 +307,8 @@ def profiles(image: FloatArray, vertical: bool = False) -> Profiles:
 
 
 def without_trend(total: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return 25 times a frame less the mean of 5 x 5 pixels, without a rim of two pixels; whole
-    numbers stay exact.
+    """Return 25 x (frame less its mean over 5 x 5 pixels), without a rim of two pixels; the factor
+    keeps whole numbers.
 
     Source: EMVA Standard 1288, release 4.0 Linear (highpass filtering of the lit frame).
     """
@@ -321,14 +318,14 @@ def without_trend(total: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
-    """Return the histogram of the numbers (y, x) of a frame about their mean; ``unit`` is the value
-    of the number 1.
+    """Return the histogram of the deviations of a frame (y, x) of whole numbers from its mean;
+    ``unit`` is the value of 1.
 
     Shapes: -> (class,), at most 256 classes of equal whole width.
     Source: EMVA Standard 1288, release 4.0 Linear (logarithmic and accumulated histograms).
     """
     low, high = int(total.min()), int(total.max())
-    # whole numbers, so that each class holds as many of them
+    # a whole width, so that every class has the same number of whole numbers
     width = 1 if high - low < _HISTOGRAM_CLASSES else (high - low) // _HISTOGRAM_CLASSES + 1
     class_index = (total - low) // width
     count = np.bincount(class_index.reshape(-1))

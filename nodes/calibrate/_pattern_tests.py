@@ -1,4 +1,4 @@
-"""Tests of what frames share: fixed patterns, uneven light, lag, mosaic of colours."""
+"""Tests of what frames have in common: fixed patterns, uneven light, lag, a colour mosaic."""
 
 from __future__ import annotations
 
@@ -27,24 +27,23 @@ from neusee.nodes.calibrate._frame_pairs import (
 
 # --- lag test -------------------------------------------------------------------------------------
 
-# A test of frames for lag: noise of a frame that persists in the next frame, apart from the
-# patterns that stay.
+# A test for image lag: noise of a frame that persists in the next frame, apart from fixed patterns.
 
 
-_OUTLIER_SIGMA = 4.5  #: standard deviations beyond which a pixel is defective, and left out
-_SPARE_LEVELS = 3  #: least levels in excess of the patterns that are fitted
-_CURVED_LEVELS = 6  #: lit levels from which a pattern may be a parabola of the signal
-_LAG_SCALE = 0.02  #: scale of the prior of the share of the variance that lag takes
+#: pixels beyond this number of standard deviations count as defective and are left out
+_OUTLIER_SIGMA = 4.5
+_SPARE_LEVELS = 3  #: least number of levels in excess of the fitted pattern terms
+_CURVED_LEVELS = 6  #: least number of lit levels for a term in the square of the signal
+_LAG_SCALE = 0.02  #: prior scale of the relative change of the variance by lag
 
 
 def lag_test(levels: Sequence[Level]) -> list[FrameTest]:
     """Test if the noise of a frame persists in the next frame of the same light.
 
     The pattern of each pixel is fitted over the levels, separately for first and for second frames:
-    an offset, a part in proportion to the signal and to its square, and one in proportion to the
-    exposure. What is left of the first frames and of the second frames is independent noise, unless
-    the first frame persists in the second. With a share L that stays, the variance of a pair falls
-    by the factor (1 - L)**2 / (1 + L).
+    an offset, and terms in proportion to the signal, to its square, and to the exposure. The
+    residuals of first and second frames are independent noise, unless the first frame persists in
+    the second. If a share L persists, the variance of a pair is multiplied by (1 - L)**2 / (1 + L).
 
     Shapes: a list of levels -> a list of one test, or of none.
     Units:  number and limit in standard deviations of chance.
@@ -60,10 +59,10 @@ def lag_test(levels: Sequence[Level]) -> list[FrameTest]:
     weight = torch.tensor(
         [max(level.variance, 1e-12) for level in comparable_levels], dtype=torch.float64
     ).rsqrt()
-    # orthonormal patterns over the levels, each level in its standard deviations
+    # orthonormal basis of the pattern terms over the levels, each level over its standard deviation
     pattern_basis = torch.linalg.qr(weight[:, None] * patterns).Q
     counted_levels = torch.tensor([not level.dark for level in comparable_levels])
-    # without light, all levels count
+    # without lit levels, the dark ones are used
     counted_levels = counted_levels if bool(counted_levels.any()) else ~counted_levels
     pairs = min(len(level.differences) for level in comparable_levels)
     first, second = (
@@ -84,7 +83,7 @@ def lag_test(levels: Sequence[Level]) -> list[FrameTest]:
         math.sqrt(float(product_of_all.square().sum())) / total_power,
     )
     limited_share = min(max(share, -0.9), 0.9)
-    # the true variance over that of a pair, (1 + L) / (1 - L)^2, in logarithms
+    # logarithm of true over measured variance, (1 + L) / (1 - L)^2
     log_variance_factor = math.log((1 + limited_share) / (1 - limited_share) ** 2)
     sound = chance_of_no_fault(
         pairs * int(counted_levels.sum()) * comparable_levels[0].first[0].numel()
@@ -108,8 +107,8 @@ def lag_test(levels: Sequence[Level]) -> list[FrameTest]:
 
 
 def _noise_of_pair(frames: Sequence[Tensor], pair: int, weight: Tensor, basis: Tensor) -> Tensor:
-    """Return what the patterns leave (level, y, x) of one frame of each level, that of the pair
-    number ``pair``, in standard deviations.
+    """Return the residuals (level, y, x) of one frame per level, of the pair with index ``pair``,
+    after the patterns are removed, in standard deviations.
     """
     return _without_patterns(
         torch.stack([of_level[pair].double() for of_level in frames]), weight, basis
@@ -117,8 +116,8 @@ def _noise_of_pair(frames: Sequence[Tensor], pair: int, weight: Tensor, basis: T
 
 
 def _product_and_power(u: Tensor, v: Tensor) -> tuple[Tensor, float]:
-    """Return the product of the noise of two frames, summed over the levels, and its mean power,
-    both without outliers.
+    """Return the product of the noise of two frames, summed over the levels, and the mean power of
+    the noise, both without outliers.
     """
     inliers = (u.abs() < _OUTLIER_SIGMA * _robust_deviation(u)) & (
         v.abs() < _OUTLIER_SIGMA * _robust_deviation(v)
@@ -128,8 +127,8 @@ def _product_and_power(u: Tensor, v: Tensor) -> tuple[Tensor, float]:
 
 
 def _comparable_levels(levels: Sequence[Level]) -> list[Level]:
-    """Return the levels of frames of the most frequent shape, up to the level of the greatest
-    variance.
+    """Return the dark levels, and the lit levels up to that of the greatest variance, whose frames
+    have the most frequent shape.
     """
     shapes = [level.differences.shape[1:] for level in levels]
     common_shape = max(shapes, key=shapes.count)
@@ -143,8 +142,8 @@ def _comparable_levels(levels: Sequence[Level]) -> list[Level]:
 
 
 def _pattern_parts(levels: Sequence[Level]) -> Tensor:
-    """Return the size (level, part) of each part of a pattern in each level, with as many parts as
-    levels allow: an offset, the signal, its square, and the exposure.
+    """Return the design matrix (level, term) of the pattern fit: offset, signal, squared signal and
+    exposure, as far as the number of levels allows.
     """
     darkest = min((level.mean for level in levels), default=0.0)
     signal = torch.tensor([level.mean - darkest for level in levels], dtype=torch.float64)
@@ -163,23 +162,23 @@ def _pattern_parts(levels: Sequence[Level]) -> Tensor:
 
 
 def _without_patterns(frames: Tensor, weight: Tensor, basis: Tensor) -> Tensor:
-    """Return frames (level, y, x) over their standard deviations, without patterns and without
-    means of lines.
+    """Return frames (level, y, x) over their standard deviations, with fixed patterns and line
+    means removed.
     """
     scaled_frames = weight[:, None] * without_lines(frames).flatten(1)
-    # without the projection on the patterns
+    # subtract the projection on the pattern terms
     return (scaled_frames - basis @ (basis.T @ scaled_frames)).view_as(frames)
 
 
 def _robust_deviation(x: Tensor) -> Tensor:
-    """Return a robust standard deviation (level, 1, 1) of each level."""
-    # a normal deviation over its median amount
+    """Return the robust standard deviation (level, 1, 1) of each level."""
+    # 1.4826: standard deviation over median absolute value of a normal distribution
     return 1.4826 * x.abs().flatten(1).median(1).values[:, None, None] + 1e-9
 
 
 # --- mosaic test ----------------------------------------------------------------------------------
 
-# A test of frames for a mosaic of colours, whose pixels have several quantum efficiencies.
+# A test for a colour mosaic, whose pixels differ in quantum efficiency.
 
 
 _PERIODS = {
@@ -187,15 +186,16 @@ _PERIODS = {
     4: "4 x 4 pixels, as of a quad mosaic",
     6: "6 x 6 pixels, as of X-Trans",
 }
-#: largest relative difference of the positions of a monochrome sensor with several readouts
+#: largest relative difference between the positions of a cell on a monochrome sensor with several
+#: readout channels
 _MONOCHROME_DIFFERENCE = 0.05
-#: standard errors by which the brightest and the darkest position differ by chance
+#: least difference of the brightest and darkest position, in standard errors, that is not chance
 _POSITION_SIGMA = 8.0
 
 
 def mosaic_test(levels: Sequence[Level]) -> Iterator[FrameTest]:
-    """Test if the light of pixels depends on their position in a small cell that repeats over the
-    frame.
+    """Test if the signal depends on the position of a pixel in a small cell that repeats over the
+    frame, as in a colour mosaic.
 
     Shapes: a list of levels -> a test, or none without light.
     Units:  number and limit: relative difference of the brightest and the darkest position of the
@@ -232,8 +232,8 @@ def mosaic_test(levels: Sequence[Level]) -> Iterator[FrameTest]:
 
 
 def _cell_contrast(picture: Tensor, period: int) -> float:
-    """Return the difference of the brightest and the darkest position of a cell, DN; 0 if chance
-    explains it.
+    """Return the difference in DN between the brightest and the darkest position of a cell; 0 if
+    chance explains it.
     """
     if min(picture.shape) < 2 * period:
         return 0.0
@@ -249,7 +249,7 @@ def _position_means(picture: Tensor, period: int) -> tuple[Tensor, float]:
     cells = picture[: cell_rows * period, : cell_columns * period].reshape(
         cell_rows, period, cell_columns, period
     )
-    # each cell less its mean, so that uneven light does not count
+    # less the mean of each cell, so that uneven light does not count
     deviations = cells - cells.mean((1, 3), keepdim=True)
     means = cells.mean((0, 2))
     variance = (deviations - (means - means.mean())[None, :, None, :]).square().mean()
@@ -258,26 +258,26 @@ def _position_means(picture: Tensor, period: int) -> tuple[Tensor, float]:
 
 # --- pattern tests --------------------------------------------------------------------------------
 
-# Tests of what two frames of the same light have in common: fixed patterns, uneven light, and lag
-# between frames.
+# Tests of what two frames of the same light have in common: fixed patterns, uneven light and lag.
 
 
-_BLOCKS_ON_SIDE = 8  #: blocks of a frame on a side, whose means show how even the light is
+_BLOCKS_ON_SIDE = 8  #: blocks along each side of a frame; their means show how even the light is
 #: difference of the largest and least irradiance that EMVA 1288 allows, relative to the mean
 _EVEN_LIGHT = 0.03
-_PATTERN_SCALE = 0.01  #: scale of the prior of the share of the variance that is of patterns
-_LARGEST_BEND = 0.1  #: largest relative bend of a response, by which uneven light shifts the gain
-_NEARLY_FULL = 0.95  #: share of the well above which a part of a frame is nearly full
-_SMOOTH_PIXELS = 5  #: pixels, over which uneven light is even
-#: standard errors by which the means of the brightest and the darkest block differ by chance
+_PATTERN_SCALE = 0.01  #: prior scale of the relative change of the variance by fixed patterns
+#: largest assumed relative curvature of a response; with it uneven light shifts the gain
+_LARGEST_BEND = 0.1
+_NEARLY_FULL = 0.95  #: share of the full well above which a block of a frame counts as nearly full
+_SMOOTH_PIXELS = 5  #: pixels; over this length the light counts as even
+#: difference of the brightest and darkest block mean, in standard errors, that chance may cause
 _BLOCK_SIGMA = 8.0
 
 
 def pattern_tests(levels: Sequence[Level]) -> list[FrameTest]:
     """Test frames of the same light for fixed patterns, for lag, and for uneven light.
 
-    Only levels that the fit uses are tested. The covariance of two frames of a level is that of the
-    patterns that stay.
+    Only levels that the fit uses are tested. The covariance of two frames of a level is the
+    variance of their common pattern.
 
     Shapes: a list of levels -> a list of tests.
     Units:  numbers and limits in standard deviations of chance, and the difference of the light as
@@ -297,9 +297,10 @@ def pattern_tests(levels: Sequence[Level]) -> list[FrameTest]:
 
 
 def _total_against_temporal(levels: Sequence[Level]) -> FrameTest:
-    """Test if the pixels of a level differ from each other in all frames, by DSNU and PRNU.
+    """Test for fixed patterns: differences between pixels that are the same in all frames (DSNU,
+    PRNU).
 
-    The temporal variance leaves these differences out; the variance of all pixels and frames counts
+    The temporal variance excludes these differences; the variance over all pixels and frames counts
     them as noise.
     """
     products = [level.first * level.second for level in levels]
@@ -328,8 +329,8 @@ def _total_against_temporal(levels: Sequence[Level]) -> FrameTest:
 def _dsnu_and_prnu(
     levels: Sequence[Level], common: Sequence[float], offset: float
 ) -> tuple[float, float]:
-    """Return how much pixels differ in the dark, in DN, and in light, relative to the signal, from
-    the variance of the pattern that is ``common`` to the frames of each level.
+    """Return DSNU in DN, and PRNU relative to the signal, from ``common``, the variance of the
+    common pattern of the frames of each level; ``offset`` is the dark level in DN.
     """
     pairs = list(zip(common, levels, strict=True))
     dark_variance = min((variance for variance, level in pairs if level.dark), default=0.0)
@@ -342,29 +343,29 @@ def _dsnu_and_prnu(
         for variance, mean in lit_variances
         if mean > offset
     ]
-    # the median of the levels
+    # median over the lit levels
     return dsnu, sorted(relative)[len(relative) // 2] if relative else 0.0
 
 
 def _pixel_response(lit: Sequence[Level], offset: float) -> float:
-    """Return by how much the responses of neighbouring pixels differ, relative to the mean; uneven
-    light is smooth.
+    """Return the relative standard deviation of the response between neighbouring pixels, without
+    uneven light, which is smooth.
 
-    Pixels whose gains differ by a share s have a mean gain that is too large by s**2.
+    A relative standard deviation s of the pixel gains makes the fitted gain too large by s**2.
     """
     squared_shares = []
     for level in lit:
         first_frames, second_frames = (frames.diff(dim=2) for frames in (level.first, level.second))
         squared_shares.append(
-            # differences of neighbours: twice the variance of a pixel, without smooth light
+            # differences of neighbours have twice the variance of a pixel, and cancel smooth light
             max(0.0, float((first_frames * second_frames).mean()) / 2) / (level.mean - offset) ** 2
         )
     return math.sqrt(sorted(squared_shares)[len(squared_shares) // 2]) if squared_shares else 0.0
 
 
 def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> Iterator[Hidden]:
-    """Yield the share of patterns in the slope of the total variance over the mean, and in the
-    total dark variance.
+    """Yield two hidden faults, the share of fixed patterns in the slope of total variance over
+    mean, and in the total dark variance.
     """
     mean = torch.tensor([level.mean for level in levels], dtype=torch.float64)
     level_patterns = torch.tensor([float(x.mean()) for x in products], dtype=torch.float64)
@@ -378,7 +379,7 @@ def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> It
     if len(levels) > 2 and float(mean.max()) > float(mean.min()):
         weights = total_variance.clamp_min(1e-12).reciprocal()
         design = torch.stack([torch.ones_like(mean), mean], 1) * weights[:, None]
-        # weights of the levels in the slope of a weighted line through their variances
+        # weights with which the variances of the levels enter the slope of a weighted line fit
         slope_weights = torch.linalg.pinv(design)[1] * weights
         yield _pattern_fault(
             float(slope_weights @ level_patterns),
@@ -398,8 +399,8 @@ def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> It
 def _pattern_fault(
     pattern: float, error: float, total: float, gain: float = 0.0, noise: float = 0.0
 ) -> Hidden:
-    """Return the fault of a part of the variance, ``pattern`` with its standard ``error``, that is
-    no noise in time; ``total`` is the whole variance.
+    """Return the hidden fault of fixed patterns: ``pattern``, with its standard ``error``, is the
+    part of the ``total`` variance that is not temporal noise.
     """
     temporal_share = max(1 - pattern / max(total, 1e-12), 1e-3)
     error = max(error / max(total, 1e-12) / temporal_share, 1e-9)
@@ -409,11 +410,11 @@ def _pattern_fault(
 
 
 def _homogeneity(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTest]:
-    """Test if the light of the brightest level is even enough for the standard.
+    """Test if the light of the brightest level is as even as the standard demands.
 
-    Light that is uneven leaves the gain alone as long as the response is straight: mean and
-    variance of each pixel grow alike. It does not where the brightest part of the frame is full
-    before the mean is, which ``full`` levels show.
+    Uneven light does not change the gain of a linear response, because mean and variance of each
+    pixel grow in proportion. It does if the brightest part of the frame saturates first, which the
+    ``full`` levels show.
     """
     dark, lit = dark_and_lit(levels)
     brightest = max(lit, key=lambda level: level.mean, default=None)
@@ -424,13 +425,13 @@ def _homogeneity(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[Fra
     if signal <= 0:
         return
     means, variance_by_chance = _block_means(brightest)
-    # less what chance explains
+    # less the largest difference that chance explains
     relative_difference = (
         max(0.0, float(means.max() - means.min()) - _BLOCK_SIGMA * math.sqrt(variance_by_chance))
         / signal
     )
     variation = max(0.0, float(means.var()) - variance_by_chance) / signal**2
-    # a bent response, and parts of the frame that are nearly full
+    # by a curved response, and by nearly full parts of the frame
     gain_shift = _LARGEST_BEND * variation + _nearly_full_share(brightest, full, nearest_dark.mean)
     sentence = (
         f"the brightest and the darkest part of the light differ by {relative_difference:.1%}, not"
@@ -449,8 +450,8 @@ def _homogeneity(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[Fra
 
 
 def _block_means(level: Level) -> tuple[Tensor, float]:
-    """Return the means (8, 8) of the blocks of a level, DN less that of the level, and their
-    variance by chance, DN2.
+    """Return the means (8, 8) of the blocks of a level, in DN less the mean of the level, and the
+    variance of a block mean by chance, DN2.
     """
     mean_picture = (level.first + level.second).mean(0)[None, None] / 2
     block_size = [n // _BLOCKS_ON_SIDE for n in mean_picture.shape[2:]]
@@ -463,8 +464,8 @@ def _block_means(level: Level) -> tuple[Tensor, float]:
 
 
 def _nearly_full_share(bright: Level, full: Sequence[Level], dark: float) -> float:
-    """Return the share of the light of the brightest level in parts of the frame that are nearly
-    full; the well is that of the ``full`` levels, ``dark`` the mean in the dark, DN.
+    """Return the share of the signal of the brightest level in nearly full blocks; the full well is
+    taken from the ``full`` levels, and ``dark`` is the dark mean in DN.
     """
     comparable_levels = [
         level for level in full if level.paired and level.first.shape == bright.first.shape

@@ -1,4 +1,4 @@
-"""Priors of sensor and camera, the coordinates of a sampler, and its first guess."""
+"""Priors of sensor and camera parameters, the coordinates of the sampler, and its start values."""
 
 from __future__ import annotations
 
@@ -22,52 +22,53 @@ from neusee.nodes.values import Levels
 
 # --- free parameters ------------------------------------------------------------------------------
 
-# The priors of free parameters, and the common base of the coordinates in which a sampler moves.
+# The priors of free parameters, and the base class of sampler coordinates.
 
 
-#: one standard deviation of the logarithm, as a ratio
+#: geometric standard deviation: exp(standard deviation of the logarithm)
 Factor = Annotated[float, Field(gt=1, le=1e6)]
 Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
 Pair = tuple[float, float]
-Known = Literal["unknown", "none"]  #: what is known of a fault of the frames before any frame
-#: faults that may hide in frames: each changes the variance in proportion
+Known = Literal["unknown", "none"]  #: prior knowledge of a fault of the frames
+#: faults that may remain hidden in frames; each multiplies the measured variance by a factor
 FAULTS = ("mixing", "lag", "pattern")
 
 
 class Ridge(NamedTuple):
-    """Parameters far from a fit that may fit the same data as well, and what is known if they
-    do.
+    """A point far from a fit that may fit the same data as well, and the limits that remain if it
+    does.
     """
 
-    place: Tensor  #: (free,) coordinates
-    kinds: Mapping[str, str]  #: from a parameter to "upper" or "lower", the limit that is known
-    text: str  #: a sentence
+    place: Tensor  #: (free,) sampler coordinates
+    #: by parameter: "upper" or "lower", the only limit that the data then give
+    kinds: Mapping[str, str]
+    text: str  #: sentence for the report
 
 
 class Prior(NamedTuple):
-    """Independent normal distributions, one for each parameter of a sensor; NaN stands for a
-    fixed parameter.
-    """
+    """Independent normal distributions, one for each parameter; NaN marks a fixed parameter."""
 
-    centre: Tensor  #: (parameter,) float64, mean of the logarithm, or of a linear parameter itself
+    #: (parameter,) float64, mean of the logarithm, or of the value of a linear parameter
+    centre: Tensor
     width: Tensor  #: (parameter,) float64, standard deviation of the same quantity
-    #: 1 for each of `FAULTS` that may hide, 0 for none
+    #: 1 for each of `FAULTS` that may be hidden in the frames, else 0
     hidden: Tensor = torch.ones(len(FAULTS), dtype=torch.float64)
 
     @property
     def may_hide(self) -> tuple[str, ...]:
-        """Return the names of the faults that may hide in the frames."""
+        """Return the names of the faults that may be hidden in the frames."""
         return tuple(fault for fault, may in zip(FAULTS, self.hidden.tolist(), strict=True) if may)
 
 
 def prior_of_pairs(
     pairs: Mapping[str, Pair | None], linear: frozenset[str], **faults_known: Known
 ) -> Prior:
-    """Build a prior from a pair of numbers for each free parameter, and None for each fixed
+    """Build a prior from a pair of numbers for each free parameter and None for each fixed
     parameter.
 
-    The pair is median and factor, or mean and standard deviation for a parameter in ``linear``. A
-    fault of the frames that is ``faults_known`` to be "none" cannot hide in them.
+    The pair is median and geometric standard deviation, or mean and standard deviation for a
+    parameter in ``linear``. ``faults_known`` is "none" for each fault that the frames are known not
+    to have.
     """
     centre_and_width = [_normal(name, pair, name in linear) for name, pair in pairs.items()]
     if all(math.isnan(width) for _, width in centre_and_width):
@@ -80,7 +81,7 @@ def prior_of_pairs(
 
 
 def free_names(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
-    """Return the names of the parameters that have a prior; ``names`` are the names of all
+    """Return the names of the free parameters, which have a prior; ``names`` are those of all
     parameters.
     """
     return tuple(
@@ -91,8 +92,8 @@ def free_names(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
 
 
 def _normal(name: str, pair: Pair | None, linear: bool) -> Pair:
-    """Return mean and standard deviation of the normal distribution of a parameter, or of its
-    logarithm unless it is ``linear``; NaN twice for a parameter without a prior.
+    """Return mean and standard deviation of the normal prior of the logarithm of a parameter, or of
+    its value if it is ``linear``; NaN twice for a parameter without a prior.
 
     Raises ValueError for a median or a width that is not positive.
     """
@@ -107,27 +108,27 @@ def _normal(name: str, pair: Pair | None, linear: bool) -> Pair:
 
 @dataclass(frozen=True)
 class Free:
-    """Free parameters and their prior; each subclass defines the coordinates for a sampler."""
+    """Free parameters and their prior; each subclass defines the sampler coordinates."""
 
-    every: ClassVar[tuple[str, ...]]  #: the names of all parameters, free or held
-    linear: ClassVar[frozenset[str]]  #: the parameters that may be 0 or negative
-    #: the parameters that are widths of the noise of the levels
+    every: ClassVar[tuple[str, ...]]  #: names of all parameters, free or fixed
+    linear: ClassVar[frozenset[str]]  #: parameters that may be 0 or negative
+    #: parameters that are standard deviations of the scatter of the levels
     widths: ClassVar[frozenset[str]] = frozenset()
-    edged: ClassVar[frozenset[str]] = frozenset()  #: the parameters that rounded numbers
-    #: constrain by edges and not by a slope: the last row of `Likelihood.scaled` describes the free
-    #: one of these
+    #: parameters whose likelihood has edges, because numbers are rounded; the last row of
+    #: `Likelihood.scaled` describes the free one of these
+    edged: ClassVar[frozenset[str]] = frozenset()
 
-    #: True if data may leave a posterior that is long, bent, or in several parts
+    #: True if the posterior may be elongated, curved or multimodal
     bent: ClassVar[bool] = False
 
     names: tuple[str, ...]  #: names of the free parameters
     prior: Prior
-    held: Mapping[str, float]  #: values of the held parameters
+    held: Mapping[str, float]  #: values of the fixed parameters
 
     @classmethod
     def of(cls, prior: Prior, nominal: Mapping[str, float]) -> Self:
-        """Build sampler coordinates for the free parameters of a prior; others keep the
-        ``nominal`` values.
+        """Build sampler coordinates for the free parameters of a prior; the others are fixed at
+        ``nominal``.
         """
         free = free_names(cls.every, prior)
         return cls(
@@ -141,50 +142,48 @@ class Free:
         )
 
     def whitened(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Convert parameters to distances from the prior's centre, in standard deviations of the
-        prior.
+        """Convert parameters to distances from the mean of the prior, in its standard
+        deviations.
         """
         return (self.scaled(parameters) - self._normals.centre) / self._normals.width
 
     def from_whitened(self, z: Tensor) -> dict[str, Tensor]:
-        """Convert distances from the prior's centre, in standard deviations of the prior, to
+        """Convert distances from the mean of the prior, in its standard deviations, to
         parameters.
         """
         return self.unscaled(self._normals.centre + self._normals.width * z)
 
     def scaled(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the logarithm of each free parameter, or the value of a parameter that may be 0
-        or negative.
+        """Return the logarithm of each free parameter, or the value of a linear parameter (...,
+        free).
         """
         values = ((name, parameters[name]) for name in self.names)
         return torch.stack([x if name in self.linear else x.log() for name, x in values], -1)
 
     def unscaled(self, values: Tensor) -> dict[str, Tensor]:
-        """Return the free parameters from logarithms, or from the values of parameters that may
-        be 0 or negative.
-        """
+        """Return the free parameters from their logarithms or values: the inverse of `scaled`."""
         pairs = zip(self.names, values.unbind(-1), strict=True)
         return {name: x if name in self.linear else x.exp() for name, x in pairs}
 
     def ridges(self, place: Tensor) -> list[Ridge]:
-        """Return parameters far from ``place`` (free,) that some data cannot distinguish from
-        it; by default none.
+        """Return points far from ``place`` (free,) that some data cannot distinguish from it; by
+        default none.
         """
         return []
 
     @cached_property
     def _normals(self) -> Prior:
-        """Return the prior of the free parameters alone."""
+        """Return the prior of the free parameters only."""
         free = self.prior.width.isfinite()
         return Prior(self.prior.centre[free], self.prior.width[free], self.prior.hidden)
 
 
 # --- sensor prior ---------------------------------------------------------------------------------
 
-# The prior of a sensor's parameters, and the coordinates that frames constrain independently.
+# The prior of a sensor's parameters, and sampler coordinates that are nearly uncorrelated.
 
 
-_OFFSET = "offset"  #: the only parameter that may be 0 or negative
+_OFFSET = "offset"  #: the only linear parameter; it may be 0 or negative
 
 
 @node()
@@ -237,13 +236,13 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 @dataclass(frozen=True)
 class Coordinates(Free):
-    """Coordinates of the free parameters of a sensor, in digital numbers, which frames constrain
-    independently.
+    """Sampler coordinates of a sensor, in units of digital numbers, in which the posterior is
+    nearly uncorrelated.
 
-    Frames constrain the slope of the photon-transfer curve, the offset in DN, the dark variance,
-    the response and the saturation level independently. Frames constrain gain, offset in electrons,
-    read noise and well only jointly, with a correlation of 1 - 1e-3. All coordinates except the
-    offset in DN are logarithms.
+    Frames determine the slope of the photon-transfer curve, the offset in DN, the dark variance,
+    the response and the saturation level independently of each other. Gain, offset in electrons,
+    read noise and full well in electrons would be correlated by 1 - 1e-3. All coordinates except
+    the offset in DN are logarithms.
     """
 
     every: ClassVar[tuple[str, ...]] = NAMES
@@ -280,7 +279,7 @@ class Coordinates(Free):
         log_values = {
             name: torch.tensor(coordinate, dtype=torch.float64) for name, coordinate in held.items()
         } | coordinates
-        # the coordinate of a free gain is ln(gain spread^2), the slope of the photon-transfer
+        # the coordinate of a free gain is ln(gain x spread^2), the log slope of the photon-transfer
         # curve
         log_gain = (
             log_values["gain"] - 2.0 * log_values["spread"]
@@ -292,10 +291,10 @@ class Coordinates(Free):
             if name == "gain":
                 parameters[name] = log_gain.exp()
             elif name == _OFFSET:
-                # from DN to electrons
+                # convert the offset from DN to electrons
                 parameters[name] = coordinate * (-log_gain).exp()
             else:
-                # all others but the spread are in numbers: value times gain
+                # the coordinates of all others except the spread are ln(value x gain)
                 parameters[name] = (coordinate if name == "spread" else coordinate - log_gain).exp()
         return parameters
 
@@ -303,13 +302,13 @@ class Coordinates(Free):
         """Return the log prior density per unit of the sampler coordinates, up to a constant."""
         log_density = -0.5 * self.whitened(parameters).square().sum(-1)
         if _OFFSET in self.names and "gain" in self.names:
-            # Jacobian from offset in DN to electrons
+            # Jacobian of the change from offset in DN to offset in electrons
             log_density = log_density - parameters["gain"].log()
         return log_density
 
     def _coordinate(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:
-        """Return the sampler coordinate of the parameter ``name``; ``full`` has all parameters by
-        name, and ``slope`` is the logarithm of the gain.
+        """Return the sampler coordinate of the parameter ``name``; ``full`` maps names to all
+        parameters, and ``slope`` is the logarithm of the gain.
         """
         if name == "gain":
             return slope + 2.0 * full["spread"].log()
@@ -320,7 +319,7 @@ class Coordinates(Free):
 
 # --- camera prior ---------------------------------------------------------------------------------
 
-# The prior of a real camera's parameters, and the coordinates in which a sampler moves.
+# The prior of a real camera's parameters, and its sampler coordinates.
 
 
 _LINEAR_CAMERA_NAMES = frozenset({"dark_signal", "bend", "twist"})
@@ -375,8 +374,8 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 @dataclass(frozen=True)
 class CameraCoordinates(Free):
-    """Coordinates of the free parameters of a camera: logarithms, or values of parameters that
-    may be 0 or negative.
+    """Sampler coordinates of a camera: logarithms, or the values of parameters that may be 0 or
+    negative.
     """
 
     every: ClassVar[tuple[str, ...]] = CAMERA_NAMES
@@ -407,18 +406,19 @@ class CameraCoordinates(Free):
 
 # --- first guess ----------------------------------------------------------------------------------
 
-# First guesses of the parameters of a sensor or camera, from measured light levels.
+# Start values of the parameters of a sensor or camera, from measured light levels.
 
 
-_WELL_FACTOR = 1.3  #: factor on the brightest number, for a full well that no level reaches
-_LEAST_SHARE = 1e-3  #: least dark current or read noise, relative to the believed value
+#: ratio of the assumed full well to the brightest value, where no level reaches the full well
+_WELL_FACTOR = 1.3
+_LEAST_SHARE = 1e-3  #: lower limit of dark current and read noise, relative to the nominal value
 
 
 def guess(
     levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]
 ) -> dict[str, float]:
-    """Return a least-squares estimate of each sensor parameter, or the ``believed`` value if there
-    is no estimate.
+    """Return the start value of each sensor parameter: a least-squares estimate, or the nominal
+    value ``believed`` if there is none.
 
     ``params`` are the fixed parameters of `density`.
 
@@ -429,15 +429,15 @@ def guess(
     """
     values = dict(believed)
     try:
-        # levels of mean and variance alone
+        # only the levels that have a mean and a variance
         estimate = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
     except ValueError:
         return values | {"full_well": _guessed_well(levels, values, params)}
     gain = float(estimate.gain)
-    # e-/s times the exposure in which the parameter counts electrons
+    # electrons in `dark_exposure`, the exposure for which the parameter is defined
     dark_electrons = float(estimate.dark_current) * params["dark_exposure"]
     shortest_dark = levels.exposure[levels.photons == 0].min()
-    # electrons in the shortest dark level, which its mean holds beside the offset
+    # dark electrons in the shortest dark level; its mean also contains the offset
     dark_of_shortest = (
         float(shortest_dark)
         / params["dark_exposure"]
@@ -462,8 +462,8 @@ def guess(
 def guess_camera(
     levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]
 ) -> dict[str, float]:
-    """Return a least-squares estimate of each camera parameter, or the ``believed`` value if there
-    is no estimate.
+    """Return the start value of each camera parameter: a least-squares estimate, or the nominal
+    value ``believed`` if there is none.
 
     ``params`` are the fixed parameters of `camera`.
 
@@ -480,7 +480,7 @@ def guess_camera(
         "quantum_efficiency": float(estimate.efficiency),
         "dark_signal": float(estimate.dark_signal),
         "temporal_dark_noise": float(estimate.temporal_dark_noise),
-        # in e- of one dark_exposure, as the parameter counts it
+        # electrons in one `dark_exposure`, as the parameter is defined
         "dark_current": float(estimate.dark_current) * params["dark_exposure"],
     }
     # only the dark signal may be 0 or negative
@@ -495,8 +495,8 @@ def guess_camera(
 def _guessed_well(
     levels: Sufficient, values: Mapping[str, float], params: Mapping[str, Any]
 ) -> float:
-    """Return the full well at which numbers pile up, or, if none pile up, a full well above
-    every number.
+    """Return a start value of the full well in electrons: where pixel values pile up below the
+    range of the converter, or, if they do not, above every value.
     """
     largest_number, rounding_shift, gain = (
         2 ** params["bits"] - 1,
@@ -506,7 +506,8 @@ def _guessed_well(
     means = levels.mean[levels.pixels > 0]
     brightest = max([*means.tolist(), *levels.cell_value.tolist()], default=0.0)
     top_cells = levels.cell_value >= brightest - 2
-    # the three brightest numbers are frequent, over half of the most frequent number
+    # a pile: the three brightest values together have over half the count of the most frequent
+    # value
     has_pile = bool(top_cells.any()) and float(levels.cell_count[top_cells].sum()) > 0.5 * float(
         levels.cell_count.max()
     )
@@ -516,5 +517,5 @@ def _guessed_well(
             float((levels.cell_value[top_cells] * counts).sum() / counts.sum() - rounding_shift)
             / gain
         )
-    # a well above the brightest number changes nothing
+    # a full well above the brightest value does not change the likelihood
     return max(values["full_well"], _WELL_FACTOR * min(brightest + 1, torch.inf) / gain)

@@ -1,5 +1,5 @@
-"""Shapes of the results of the calibration nodes; the number of histogram cells is only known
-from values.
+"""Shapes of the results of the calibration nodes; where a result has histogram cells, their number
+depends on the data and is not known before the run.
 """
 
 from typing import Any

@@ -1,6 +1,6 @@
-"""The scatter of a lens, estimated from rings about an overexposed point source.
+"""The scatter of a lens, estimated from rings around an overexposed point source.
 
-In this order: rings of frames, their likelihood, the prior, the coordinates of a sampler.
+In this order: rings from frames, their likelihood, the prior, the sampler coordinates.
 """
 
 from __future__ import annotations
@@ -47,32 +47,36 @@ from neusee.nodes.units import (
 
 # --- point source ---------------------------------------------------------------------------------
 
-# Reduction of overexposed frames of a point source to rings of pixels, from which the scatter of a
-# lens is fitted.
+# Reduction of overexposed frames of a point source to mean signals in rings of pixels, to which the
+# scatter of a lens is fitted.
 
 
 Place = Annotated[float, Field(ge=0, le=1e6)]  #: pixels, from the middle of the first pixel
 Numbers = NDArray[np.float64]
-_CUT_SHARE = 0.95  #: share of saturation from which a number says only that the pixel holds more
-_CUT_SIGMA = 5.0  #: standard deviations by which a ring must lie below this cut to be averaged
-#: ratio of the radii of a ring, from the radius at which this is wider than a pixel
+#: share of saturation from which a pixel counts as cut off: its value is only a lower limit
+_CUT_SHARE = 0.95
+#: standard deviations by which the mean of a ring must lie below this cut to be used
+_CUT_SIGMA = 5.0
+#: ratio of outer and inner radius of a ring, where that makes it wider than a pixel
 _RING_RATIO = 1.04
-_PARTS_OF_RING = 4  #: parts of a ring, each of which has a radius of its own
-_FIRST_RADIUS = 16.0  #: pixels from the source to the first ring, below which pixels are not small
-_LEAST_RINGS = 6  #: least number of rings that can tell anything of the scatter
+_PARTS_OF_RING = 4  #: concentric parts of a ring, over which the model is averaged
+#: pixels; radius of the first ring, below which pixels are not small against the radius
+_FIRST_RADIUS = 16.0
+_LEAST_RINGS = 6  #: least number of rings from which the scatter is fitted
 
 
 class Rings(NamedTuple):
-    """The mean signal in rings of pixels about an overexposed point source, and the rings that
-    are cut off.
+    """The mean signal in rings of pixels around an overexposed point source, and the rings that are
+    cut off near saturation.
     """
 
-    mean: Tensor  #: (ring,) float64, e- of a pixel in one exposure, without offset
+    mean: Tensor  #: (ring,) float64, e- per pixel and exposure, without offset
     pixels: Tensor  #: (ring,) float64, number of pixels, of all frames
     ring: Tensor  #: (part,) int64, ring of each part
     square: Tensor  #: (part,) float64, pixels², mean squared distance from the source
     weight: Tensor  #: (part,) float64, number of pixels
-    cut_square: Tensor  #: (cut,) float64, pixels², of each ring whose every pixel is cut off
+    #: (cut,) float64, pixels², mean squared distance of each ring in which every pixel is cut off
+    cut_square: Tensor
     cut: Tensor  #: () float64, e-: a pixel that is cut off has at least this signal
     centre: Tensor  #: (2,) float64, y and x of the source, from the middle of the first pixel
 
@@ -86,7 +90,7 @@ class PointCamera(NamedTuple):
 
     @property
     def cut(self) -> float:
-        """Return the digital number above which a pixel says only that it holds more."""
+        """Return the digital number from which a pixel counts as cut off."""
         return _CUT_SHARE * min(2.0**self.bits - 1, self.full_well * self.gain)
 
 
@@ -149,8 +153,8 @@ def _(result: Rings, *others: Any, **params: Any) -> list[Check]:
 
 
 def reduce_rings(frames: Numbers, camera: PointCamera, centre: tuple[float, float] | None) -> Rings:
-    """Return the rings of frames (frame, y, x) of digital numbers; raise ValueError for frames
-    that tell nothing.
+    """Reduce frames (frame, y, x) of digital numbers to rings; raise ValueError for frames from
+    which no scatter can be estimated.
     """
     _refuse_numbers(frames, camera)
     height, width = frames.shape[1:]
@@ -165,18 +169,18 @@ def reduce_rings(frames: Numbers, camera: PointCamera, centre: tuple[float, floa
     sector = _part_numbers(squared_distance)
     signal = frames / camera.gain - camera.offset
     is_cut: NDArray[np.bool_] = np.asarray((frames >= camera.cut).any(0))
-    # `sector` numbers the parts of all rings: ring number = part number // `_PARTS_OF_RING`
+    # `sector` is the number of the part of a ring: ring number = part number // `_PARTS_OF_RING`
     first_ring = _first_ring(frames, sector // _PARTS_OF_RING, camera)
     unsaturated = (sector >= first_ring * _PARTS_OF_RING) & ~is_cut
     cut_squares = _cut_rings(squared_distance, sector // _PARTS_OF_RING, is_cut, first_ring)
-    # the last three fields of `Rings`
+    # the last three fields of `Rings`: cut_square, cut and centre
     limits = (cut_squares, camera.cut / camera.gain - camera.offset, (source_y, source_x))
     rings = _ring_averages(signal, squared_distance, sector, unsaturated)
     return Rings(*rings, *(torch.as_tensor(x, dtype=torch.float64) for x in limits))
 
 
 def _refuse_numbers(frames: Numbers, camera: PointCamera) -> None:
-    """Raise ValueError for numbers that the converter cannot give, and for frames without a
+    """Raise ValueError for pixel values above the range of the converter, and for frames without a
     saturated pixel.
     """
     brightest = float(frames.max())
@@ -194,8 +198,8 @@ def _refuse_numbers(frames: Numbers, camera: PointCamera) -> None:
 
 
 def _source_centre(frames: Numbers, camera: PointCamera) -> tuple[float, float]:
-    """Return the middle of the saturated pixels; a median first excludes lone pixels far from
-    the source.
+    """Return the centroid (y, x) of the saturated pixels, without lone pixels far from their
+    median.
     """
     y, x = np.nonzero((frames >= camera.cut).all(0))
     if not len(y):
@@ -208,14 +212,14 @@ def _source_centre(frames: Numbers, camera: PointCamera) -> tuple[float, float]:
 
 
 def _part_numbers(square: Numbers) -> NDArray[np.int64]:
-    """Return the number of the part of a ring to which each pixel belongs, from its squared
-    distance.
+    """Return the number of the ring part to which each pixel belongs, from its squared distance to
+    the source.
 
-    Each ring has `_PARTS_OF_RING` parts. Rings are one pixel wide up to a radius, and grow by
-    the ratio `_RING_RATIO` from there on.
+    Each ring has `_PARTS_OF_RING` parts. Near the source rings are one pixel wide; farther out the
+    radius grows by `_RING_RATIO` from ring to ring.
     """
     radius = np.sqrt(square)
-    first_wide_radius = 1 / (_RING_RATIO - 1)  # below this radius rings are one pixel wide
+    first_wide_radius = 1 / (_RING_RATIO - 1)  # radius below which rings are one pixel wide
     ring_of_wide = first_wide_radius + np.log(
         np.maximum(radius, first_wide_radius) / first_wide_radius
     ) / math.log(_RING_RATIO)
@@ -226,15 +230,15 @@ def _part_numbers(square: Numbers) -> NDArray[np.int64]:
 
 
 def _first_ring(frames: Numbers, ring: NDArray[np.int64], camera: PointCamera) -> int:
-    """Return the number of the first ring beyond which every ring lies clearly below saturation,
-    lone bright pixels aside, at least `_FIRST_RADIUS`.
+    """Return the number of the first ring from which every ring lies clearly below saturation,
+    apart from lone bright pixels; `_FIRST_RADIUS` or more.
 
-    ``ring`` has the number of each pixel's ring.
+    ``ring`` is the ring number of each pixel.
     """
     pixel_count = np.bincount(ring.ravel())
     is_cut = (frames >= camera.cut).any(0)
     mean = np.bincount(ring.ravel(), frames.mean(0).ravel()) / pixel_count.clip(1)
-    # DN: shot noise K mean above the offset, and read noise
+    # DN: shot noise, whose variance is K x mean, and read noise
     noise = np.sqrt(np.maximum(mean * camera.gain, 0) + (camera.read_noise * camera.gain) ** 2)
     many_cut = np.bincount(ring.ravel(), is_cut.ravel()) > 0.05 * pixel_count
     is_bright = (mean + _CUT_SIGMA * noise >= camera.cut) | many_cut
@@ -246,8 +250,8 @@ def _first_ring(frames: Numbers, ring: NDArray[np.int64], camera: PointCamera) -
 def _cut_rings(
     square: Numbers, ring: NDArray[np.int64], cut: NDArray[np.bool_], first: int
 ) -> Numbers:
-    """Return the mean squared distance of each ring inside ``first`` and beyond 16 pixels whose
-    every pixel is cut.
+    """Return the mean squared distance of each ring in which every pixel is cut off, between 16
+    pixels and the ring ``first``.
     """
     pixel_count, cut_count, sum_of_squares = (
         np.bincount(ring.ravel(), x.ravel()) for x in (np.ones_like(square), cut, square)
@@ -266,8 +270,8 @@ def _cut_rings(
 def _ring_averages(
     signal: Numbers, square: Numbers, sector: NDArray[np.int64], unsaturated: NDArray[np.bool_]
 ) -> tuple[Tensor, ...]:
-    """Return mean and number of pixels of each ring, and ring, mean squared distance and pixels
-    of each part.
+    """Return the first five fields of `Rings`: mean and number of pixels of each ring, and ring,
+    mean squared distance and number of pixels of each part.
     """
     part_numbers, part_of_pixel = np.unique(sector[unsaturated], return_inverse=True)
     part_pixels = np.bincount(part_of_pixel).astype(np.float64)
@@ -295,12 +299,12 @@ def _ring_averages(
 
 # --- likelihood -----------------------------------------------------------------------------------
 
-# The likelihood of the rings about an overexposed point source under the Harvey-Shack scatter of a
-# lens.
+# The likelihood of the rings around an overexposed point source, with the Harvey-Shack model of the
+# scatter of a lens.
 
 
 Scattered = Annotated[float, Field(ge=0, le=100)]  #: a standard deviation; 0 for none
-#: relative: how well the mean wing of the core is that of a ring that is one pixel wide
+#: relative deviation of the diffraction wing in a ring one pixel wide from its mean, by fringes
 _FRINGE_DEVIATION = 0.02
 
 
@@ -355,13 +359,13 @@ def stray_light(
         name: torch.as_tensor(x, dtype=torch.float64)[..., None]
         for name, x in scatter_values.items()
     }
-    # wavelength x f-number in pixels, and the direction cosine of a pixel
+    # wavelength x f-number in pixels, and the direction cosine that one pixel spans
     lens_scales = (wavelength * focal_length / (diameter * pixel_pitch), pixel_pitch / focal_length)
     ring_mean = (
         _averaged_rings(_source_light(parameters, rings.square, *lens_scales), rings)
         + parameters["background"]
     )
-    # e-^2: shot noise, read noise and rounding
+    # variance in e-^2: shot noise, read noise and rounding
     pixel_variance = ring_mean.clamp_min(0) + read_noise**2 + 1 / (12 * gain**2)
     variance = (
         pixel_variance / rings.pixels
@@ -386,8 +390,8 @@ def stray_light(
     checked_log = log_likelihood.where(_total_scatter(parameters)[..., 0] < 1, -torch.inf)
     if not told:
         return without_details(checked_log)
-    # squared derivatives of a residual and of its log width sum, on average, to the Fisher
-    # information
+    # the expected Fisher information is the sum of squared derivatives of each residual and of its
+    # log width
     scaled_rows = torch.cat(torch.broadcast_tensors(residuals, 0.5 * variance.log()), -1)  # type: ignore[no-untyped-call]
     return Likelihood(
         checked_log,
@@ -407,15 +411,17 @@ def _(result: Likelihood, rings: Rings, **params: Any) -> list[Check]:
 
 
 def _total_scatter(numbers: Mapping[str, Tensor]) -> Tensor:
-    """Return the share of the light that the surface scatters (TIS)."""
+    """Return the total integrated scatter (TIS) of the surface: the share of the light that it
+    scatters.
+    """
     return scattered_share(numbers["b0"], numbers["l"], numbers["s"])
 
 
 def _source_light(
     numbers: dict[str, Tensor], square: Tensor, fringe: float, scale: float
 ) -> Tensor:
-    """Return the electrons of the source in pixels at squared distances; ``fringe`` is
-    wavelength N in pixels.
+    """Return the electrons from the source in pixels at squared distances ``square`` (pixels²);
+    ``fringe`` and ``scale`` are as in `share_of_light`.
     """
     light: Tensor = numbers["electrons"] * share_of_light(numbers, square, fringe, scale)
     return light
@@ -424,10 +430,11 @@ def _source_light(
 def share_of_light(
     numbers: Mapping[str, Tensor], square: Tensor, fringe: float, scale: float
 ) -> Tensor:
-    """Return the share of the light that core and scatter send into pixels at squared distances
-    from the source.
+    """Return the share of the source's light, diffracted and scattered, in a pixel at squared
+    distance ``square`` (pixels²) from the source.
 
-    ``fringe`` is wavelength N in pixels, and ``scale`` the direction cosine of a pixel.
+    ``fringe`` is wavelength times f-number in pixels, and ``scale`` the direction cosine that one
+    pixel spans.
     """
     b0, l, s = (numbers[name] for name in ("b0", "l", "s"))  # noqa: E741
     veil = on_far_pixels(lobe(b0, l, s, torch.tensor(scale, dtype=torch.float64)), square)
@@ -437,15 +444,17 @@ def share_of_light(
 
 
 def diffraction_wing(square: Tensor, fringe: float) -> Tensor:
-    """Return the mean share of light per pixel of a round aperture far from the source, with the
-    pixel integrated.
+    """Return the share of the light per pixel in the diffraction wing of a round aperture, averaged
+    over the fringes and over the pixel.
     """
-    # second factor: the pixel is integrated, Laplacian of r^-3 over 24
+    # second factor: average over the pixel, 1 + Laplacian of r^-3 over (24 r^-3)
     return fringe / (math.pi**3 * square**1.5) * (1 + 9 / (24 * square))
 
 
 def _averaged_rings(parts: Tensor, rings: Rings) -> Tensor:
-    """Return the mean over the parts of each ring, (..., ring)."""
+    """Return the mean of ``parts`` (..., part) over each ring, (..., ring), weighted by numbers of
+    pixels.
+    """
     share = (
         rings.weight
         / torch.zeros_like(rings.mean).index_add(0, rings.ring, rings.weight)[rings.ring]
@@ -458,10 +467,10 @@ def _averaged_rings(parts: Tensor, rings: Rings) -> Tensor:
 def guess_scatter(
     rings: Rings, believed: Mapping[str, float], params: Mapping[str, Any]
 ) -> dict[str, float]:
-    """Return a first guess of the scatter: over a grid of l and s, the b0 and background that fit
-    the rings best.
+    """Return start values of b0, l and s: the best fit to the rings over a grid of l and s, with b0
+    and background by linear least squares.
 
-    Guesses that scatter more than all light are left out.
+    The fitted background is not returned. Fits that scatter all light or more are excluded.
 
     Shapes: rings; numbers by name, with the names of ``believed``; ``params`` are those of
             `stray_light`.
@@ -474,7 +483,7 @@ def guess_scatter(
         dict(believed),
         math.inf,
     )
-    # one over the standard error of each ring's mean
+    # inverse standard error of the mean of each ring, rounding taken as 1 DN
     weight = (
         rings.pixels
         / (rings.mean.clamp_min(0) + params["read_noise"] ** 2 + 1 / params["gain"] ** 2)
@@ -517,8 +526,9 @@ def guess_scatter(
 
 # --- prior and coordinates ------------------------------------------------------------------------
 
-_WIDE_FACTOR = 30.0  #: factor on l at which a fit is compared
-_LARGEST_SCATTER = 0.3  #: share of scattered light up to which a narrower lobe is compared
+_WIDE_FACTOR = 30.0  #: factor on l between a fit and the lobes that are compared with it
+#: a narrower lobe is compared only if it scatters less than this share of the light
+_LARGEST_SCATTER = 0.3
 _LINEAR_NAMES = frozenset({"s", "background"})
 
 
@@ -563,18 +573,20 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 
 class Sight(NamedTuple):
-    """What a frame shows of a lens: the radii of the first and the last ring, and the scales of
-    a pixel.
+    """The range of distances that a frame covers: radii of the first and the last ring, with the
+    scales of diffraction and angle in pixels.
     """
 
     inner: float  #: pixels from the source
     outer: float  #: pixels from the source
-    fringe: float  #: wavelength N in pixels
-    scale: float  #: direction cosine of a pixel
+    fringe: float  #: wavelength times f-number, in pixels
+    scale: float  #: direction cosine that one pixel spans
 
     @classmethod
     def of(cls, rings: Rings, lens: Mapping[str, Any]) -> Sight:
-        """Return what the rings of a frame show; ``lens`` are parameters of `stray_light`."""
+        """Return the range that the rings of a frame cover; ``lens`` holds parameters of
+        `stray_light`.
+        """
         fringe = (
             lens["wavelength"] * lens["focal_length"] / (lens["diameter"] * lens["pixel_pitch"])
         )
@@ -587,15 +599,15 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True)
 class ScatterCoordinates(Free):
-    """Coordinates of the scatter of a lens in which what a frame determines does not depend on what
-    it leaves open.
+    """Sampler coordinates of the scatter of a lens, chosen so that quantities that a frame
+    determines are separate from those that it does not.
 
-    Where b0, l and s are free, their coordinates are ln l, the logarithm of the BSDF at a distance
-    between those of the first and the last ring, and the logarithm of the negative slope of the
-    BSDF there in double logarithms. Rings determine the last two, whatever l is. The coordinate of
-    the electrons is the logarithm of the signal of the source in the first ring, and that of the
-    background the whole signal in the last ring; without a ``sight`` they are the logarithm of the
-    electrons, and the background. Other parameters are logarithms.
+    If b0, l and s are free, their coordinates are ln l, the logarithm of the BSDF at a distance
+    between the first and the last ring, and the logarithm of minus the slope d ln BSDF / d ln beta
+    there. Rings determine the last two, whatever l is. The coordinate of the electrons is the
+    logarithm of the source's signal in the first ring, and that of the background the total signal
+    in the last ring; without a ``sight`` they are the logarithm of the electrons, and the
+    background. The coordinates of other parameters are logarithms.
     """
 
     every: ClassVar[tuple[str, ...]] = SCATTER_NAMES
@@ -604,7 +616,7 @@ class ScatterCoordinates(Free):
     sight: Sight | None = None
 
     def seen_by(self, rings: Rings, lens: Mapping[str, Any]) -> ScatterCoordinates:
-        """Return the coordinates for the rings of a frame; ``lens`` are parameters of
+        """Return the coordinates for the rings of a frame; ``lens`` holds parameters of
         `stray_light`.
         """
         return replace(self, sight=Sight.of(rings, lens))
@@ -662,25 +674,25 @@ class ScatterCoordinates(Free):
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the log prior density per unit of the sampler coordinates, up to a constant.
 
-        The coordinates of electrons and background are shifted by what the other parameters say,
-        which leaves volumes as they are; that of s contributes the factor -s.
+        The coordinates of electrons and background are shifted by functions of the other
+        parameters, whose Jacobian is 1; the Jacobian of the coordinate of s is -s.
         """
         log_density = -0.5 * self.whitened(parameters).square().sum(-1)
         return log_density + (-parameters["s"]).log() if self._joint else log_density
 
     @property
     def _joint(self) -> bool:
-        """Return True if b0, l and s are all free, so that their coordinates are mixed."""
+        """Return True if b0, l and s are all free, so that their coordinates are the joint ones."""
         return {"b0", "l", "s"} <= set(self.names)
 
     def _value_of(self, name: str, values: Mapping[str, Tensor]) -> Tensor:
-        """Return the value of a parameter, free or held."""
+        """Return the value of a parameter, free or fixed."""
         return (
             values[name] if name in values else torch.tensor(self.held[name], dtype=torch.float64)
         )
 
     def _shares(self, sight: Sight, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the shares of the light in a pixel of the first and of the last ring."""
+        """Return the shares of the source's light in a pixel of the first and of the last ring."""
         parameters = {
             name: self._value_of(name, values)[..., None] for name in ("b0", "l", "s", "core")
         }
@@ -691,11 +703,11 @@ class ScatterCoordinates(Free):
         return share_in_first, share_in_last
 
     def _squared_ratio(self, log_l: Tensor) -> Tensor:
-        """Return (beta / l)**2 at the direction cosine beta between the rings, or in the middle
-        of the prior of l.
+        """Return (beta / l)**2, with beta the direction cosine between the first and the last ring,
+        or without a ``sight`` the prior median of l.
         """
         if self.sight:
-            # of the geometric mean of the radii of the first and the last ring
+            # direction cosine at the geometric mean of the radii of the first and the last ring
             log_cosine = math.log(self.sight.scale) + 0.5 * math.log(
                 self.sight.inner * self.sight.outer
             )
@@ -703,11 +715,11 @@ class ScatterCoordinates(Free):
         return (2 * (self.prior.centre[SCATTER_NAMES.index("l")] - log_l)).exp()
 
     def ridges(self, place: Tensor) -> list[Ridge]:
-        """Return a much narrower and a much wider lobe with the same scatter outside and inside of
-        it.
+        """Return two alternatives that the data may not distinguish: a much wider lobe with the
+        same b0, and a much narrower lobe with the same b0 l**(-s).
 
-        Outside of l only b0 l**(-s) is seen, and inside of l only b0. The core keeps its
-        brightness, if it is free.
+        At angles far above l the BSDF depends only on b0 l**(-s), and far below l only on b0. The
+        core keeps its brightness.
         """
         if not {"b0", "l"} <= set(self.names):
             return []
@@ -723,7 +735,7 @@ class ScatterCoordinates(Free):
                 "l: only a lower limit, beyond the frame",
             )
         ]
-        # the narrowest lobe that still scatters a moderate share of the light
+        # the narrowest lobe that scatters less than `_LARGEST_SCATTER`
         for factor in (_WIDE_FACTOR, 10.0, 3.0):
             peak_factor = float(factor ** -float(s))
             if (
@@ -736,8 +748,8 @@ class ScatterCoordinates(Free):
         return ridges
 
     def _moved(self, lobe_values: Mapping[str, Tensor], peak: float, width: float) -> Tensor:
-        """Return the coordinates with b0 times ``peak`` and l times ``width``, where a free core,
-        or else the electrons, keep the brightness of the core as before.
+        """Return the coordinates with b0 times ``peak`` and l times ``width``; a free ``core``, or
+        else free ``electrons``, are scaled so that the core keeps its brightness.
         """
         b0, l, s = lobe_values["b0"] * peak, lobe_values["l"] * width, lobe_values["s"]  # noqa: E741
         core, electrons = lobe_values["core"], lobe_values["electrons"]

@@ -1,4 +1,4 @@
-"""The likelihood of light levels of a linear sensor, and the statistics it needs."""
+"""The likelihood of the light levels of a linear sensor, and its sufficient statistics."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from neusee.nodes.values import Levels
 # Sufficient statistics of the frames of each light level, for a sensor whose pixels are alike.
 
 
-#: DN from either end that keep a histogram: a full well affects two or three numbers
+#: DN; within this distance of either end the histogram is kept, since a full well affects two or
+#: three values
 _EDGE_NUMBERS = 4
 
 
 class Sufficient(NamedTuple):
-    """The mean and variance of most pixels of each light level, and a histogram of the remaining
-    pixels.
+    """Sufficient statistics of the light levels: mean and variance of most pixels of each level,
+    and a histogram of the remaining pixels.
     """
 
     photons: Tensor  #: (level,) float64, per pixel and exposure
@@ -70,7 +71,7 @@ def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
     for level in sorted(set(levels.cell_level.tolist())):
         cells_of_level = levels.cell_level == level
         deviation = math.sqrt(float(levels.variance[level]))
-        # the middle becomes mean and variance; the cells near both ends stay
+        # the middle is replaced by mean and variance; the cells near both ends are kept
         is_inner, moments[level] = _histogram_middle(
             levels.cell_value[cells_of_level], levels.cell_count[cells_of_level], deviation
         )
@@ -127,11 +128,11 @@ def _(levels: Levels, *, share: float | None = None) -> Sufficient:
 def _reference_middle(
     own: list[tuple[float, float]], variance: float
 ) -> tuple[list[float], list[tuple[float, float]]]:
-    """Return number, mean, variance and degrees of freedom of the middle of a histogram of numbers
-    and counts, and this middle; zeros and nothing if the middle is too narrow.
+    """Return count, mean, variance and degrees of freedom of the middle of a histogram of (value,
+    count), and the cells of the middle; zeros and no cells if the middle is too narrow.
     """
     lower_edge, upper_edge = own[0][0] + _EDGE_NUMBERS, own[-1][0] - _EDGE_NUMBERS
-    if not variance**0.5 >= COARSE_DEVIATION:  # or not a number
+    if not variance**0.5 >= COARSE_DEVIATION:  # also true for NaN
         return [0.0, 0.0, 0.0, 0.0], []
     middle_cells = [(v, n) for v, n in own if lower_edge < v < upper_edge]
     count = math.fsum(n for _, n in middle_cells)
@@ -145,7 +146,7 @@ def _reference_middle(
 
 
 def _levels_below(levels: Levels, share: float) -> Levels:
-    """Return the dark levels, and the lit levels up to a share of saturation."""
+    """Return the dark levels, and the lit levels up to a share of the saturation signal."""
     is_lit = levels.photons > 0
     if not bool(is_lit.any()):
         raise ValueError(
@@ -154,9 +155,9 @@ def _levels_below(levels: Levels, share: float) -> Levels:
     darkest = float(levels.mean[~is_lit].min()) if bool((~is_lit).any()) else 0.0
     saturation_signal = float(levels.mean[is_lit][levels.variance[is_lit].argmax()]) - darkest
     used_levels = ~is_lit | (levels.mean - darkest <= share * saturation_signal)
-    # numbers of the levels that stay, counted anew
+    # new indices of the levels that are kept
     new_number, kept_cells = used_levels.cumsum(0) - 1, used_levels[levels.cell_level]
-    # the first six fields have one value a level, the others one a cell of a histogram
+    # the first six fields have one value per level, the others one per histogram cell
     columns = [x[used_levels] for x in levels[:6]]
     cell_columns = (
         new_number[levels.cell_level[kept_cells]],
@@ -167,8 +168,8 @@ def _levels_below(levels: Levels, share: float) -> Levels:
 
 
 def _histogram_middle(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
-    """Return a mask of the digital numbers away from both ends of the range, and (number, mean,
-    variance, degrees of freedom) of their pixels; nothing and zeros where they are too coarse.
+    """Return a mask of the middle of a histogram, away from both ends, and (count, mean, variance,
+    degrees of freedom) of its pixels; an empty mask and zeros if the values are too coarse.
     """
     is_inner = (value > value[0] + _EDGE_NUMBERS) & (value < value[-1] - _EDGE_NUMBERS)
     pixel_count = float(count[is_inner].sum())
@@ -190,13 +191,12 @@ def _histogram_middle(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, 
 
 # --- quantised gaussian ---------------------------------------------------------------------------
 
-# The exact probability of each digital number of a converter, for a Gaussian signal limited by a
-# full well.
+# The exact probability of each digital number, for a Gaussian signal clipped at the full well.
 #
-# Numbers are not treated as continuous, and no quantization variance is added.
+# Digital numbers are treated as discrete, so that no quantisation variance is added.
 
 
-_LEAST_PROBABILITY = 1e-300  #: probability below which a probability counts as 0
+_LEAST_PROBABILITY = 1e-300  #: a smaller probability counts as 0
 
 
 def log_cell(
@@ -213,7 +213,8 @@ def log_cell(
     Source: s = round(x), floor(x), or floor(x + U(-1/2, 1/2)); NeuSee, Eq. (SensorImage).
     """
     if rounding == "nearest":
-        # the numbers 0 and `top` hold all that is below and above; a full pixel ends the signal
+        # the numbers 0 and `top` include all signals below and above; the full well clips the
+        # signal
         lower_edge = torch.where(value <= 0, -math.inf, value - 0.5)
         upper_edge = torch.where((value >= top) | (value + 0.5 >= well), math.inf, value + 0.5)
         return torch.where(
@@ -232,12 +233,10 @@ def log_cell(
 
 
 def _log_between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
-    """Return log P(low < x < high) for a Gaussian x, computed in the tail where no digits
-    cancel.
-    """
+    """Return log P(low < x < high) for a Gaussian x, without cancellation in the tails."""
     lower_z, upper_z = (low - mean) / sd, (high - mean) / sd
     is_above = lower_z + upper_z > 0
-    # above the mean, mirrored into the lower tail
+    # mirror an interval above the mean into the lower tail
     lower_z, upper_z = (
         torch.where(is_above, -upper_z, lower_z),
         torch.where(is_above, -lower_z, upper_z),
@@ -253,20 +252,20 @@ def _log_between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
 def _dithered_probability(
     value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int
 ) -> Tensor:
-    """Return P(floor(x + U(-1/2, 1/2)) = k): the density of x, weighted by a triangle from k - 1/2
-    to k + 3/2.
+    """Return P(floor(x + U(-1/2, 1/2)) = k), the integral of the density of x times a triangle from
+    k - 1/2 to k + 3/2.
 
-    Integration by parts uses the integral G of the distribution function: G'' is the density, and
-    the triangle has three corners. No x lies beyond the well; the probability beyond the well is
-    concentrated at the well. Above the mean the asymptote x - mean is subtracted from G, so that no
-    digits cancel far from the mean; the asymptotes and the triangle at the well add up to 0.
+    Integrated by parts, with G the integral of the distribution function (G'' is the density) at
+    the three corners of the triangle. The signal is clipped at the well, so that all probability
+    beyond it is at the well. Above the mean the asymptote x - mean is subtracted from G to avoid
+    cancellation far from the mean; the asymptotes and the term at the well add up to 0.
     """
     middle = value + 0.5
     first_corner, last_corner = (
         middle - 1.0,
         torch.minimum(torch.maximum(well, middle - 1.0), middle + 1.0),
     )
-    # the well may end the triangle before its middle or its last corner
+    # the well may cut the triangle off before its middle or its last corner
     middle_corner = torch.minimum(middle, last_corner)
     is_above = middle > mean
     integral_first, integral_middle, integral_last = (
@@ -292,20 +291,20 @@ def _dithered_probability(
 
 
 def _integrated_distribution(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
-    """Return the integral of the Gaussian distribution function up to x, minus (x - mean) if
-    ``above`` is True.
+    """Return the integral of the Gaussian distribution function up to x, less (x - mean) where
+    ``above``.
     """
     z = (x - mean) / sd
     density = torch.exp(-0.5 * z.square()) / math.sqrt(2.0 * math.pi)
     mirrored_z = torch.where(above, z, -z)
-    tail = 0.5 * torch.special.erfc(mirrored_z / math.sqrt(2.0))  # `ndtr` loses all digits below -8
+    tail = 0.5 * torch.special.erfc(mirrored_z / math.sqrt(2.0))  # `ndtr` is inaccurate below -8
     integral: Tensor = sd * (density - mirrored_z * tail)
     return integral
 
 
 # --- linear sensor --------------------------------------------------------------------------------
 
-# The distribution of a linear sensor's digital numbers under flat light, and the likelihood of
+# The distribution of a linear sensor's digital numbers in uniform light, and the likelihood of
 # light levels.
 
 
@@ -315,16 +314,16 @@ ROUNDED: dict[str, tuple[float, float]] = {
     "truncation": (-0.5, 1.0 / 12.0),
     "dithered_floor": (-0.5, 1.0 / 6.0),
 }
-_FEW_ELECTRONS = 8.0  #: electrons; up to this mean, coarse levels sum over the number of electrons
-_GRAIN_SHARE = 1e-3  #: share of the variance above which the discreteness of electrons matters
+#: electrons; up to this mean, coarse levels use a Poisson sum over numbers of electrons
+_FEW_ELECTRONS = 8.0
+#: share of the electrons' shot noise in the variance above which they are treated as discrete
+_GRAIN_SHARE = 1e-3
 #: electrons; with a mean of `_FEW_ELECTRONS`, only 1e-15 of all pixels hold more
 _MOST_ELECTRONS = 40
 
 
 class Sensor(NamedTuple):
-    """The parameters of a linear sensor in units of digital numbers; each tensor is (..., 1)
-    float64.
-    """
+    """The parameters of a linear sensor in units of DN; each tensor is (..., 1) float64."""
 
     gain: Tensor  #: K, DN/e-
     response: Tensor  #: DN per photon
@@ -337,18 +336,18 @@ class Sensor(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """The likelihood of the light levels; the leading dimensions of each tensor are those of the
-    sensor parameters.
+    """The likelihood of light levels; the leading dimensions (...) are those of the sensor
+    parameters.
     """
 
     log: Tensor  #: (...)
-    #: (..., level) twice the log-likelihood below that of a separate fit of each level
+    #: (..., level) twice the deficit of the log likelihood against a separate fit of each level
     deviance: Tensor
     degrees_of_freedom: Tensor  #: (level,) of each deviance; 0 for a level without deviance
-    #: (..., row) expected values in standard deviations: J^T J of these rows is the Fisher
+    #: (..., row) rows scaled to unit standard deviation: with J their Jacobian, J^T J is the Fisher
     #: information
     scaled: Tensor
-    #: (..., level) DN, of all numbers of a level, without clipping by well and converter
+    #: (..., level) DN, expected mean of a level, before clipping by full well and converter
     mean: Tensor
     variance: Tensor  #: (..., level) DN2, as `mean`
 
@@ -361,10 +360,10 @@ class _ExpectedSignal(NamedTuple):
 def likelihood(
     levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int, with_details: bool
 ) -> Likelihood:
-    """Compute the likelihood of light levels from means, variances, and exact probabilities of
-    histogram bins.
+    """Compute the likelihood of light levels from means and variances, and from the exact
+    probabilities of histogram bins.
 
-    Without ``with_details`` only the logarithm is computed, because a sampler needs no other field.
+    Without ``with_details`` only the log likelihood is computed, which is all that a sampler needs.
     """
     expected, (rounding_shift, rounding_variance), largest_number = (
         _expected_signal(levels, sensor),
@@ -380,7 +379,7 @@ def likelihood(
         + mean_term
     )
     has_cells, has_moments = _has_cells(levels), levels.pixels > 0
-    # of a level without a histogram, no pixel may be above the well
+    # a level without a histogram has no clipped pixel: probability that all lie below the full well
     log_below_well = levels.pixels * log_ndtr(
         (sensor.well - expected.mean) / expected.variance.sqrt()
     )
@@ -398,10 +397,10 @@ def likelihood(
         has_moments & ~has_cells,
     )
     rows = [_scaled(levels, mean, variance).where(has_moments.repeat(2), 0.0)]
-    # Poisson counts: 2 sqrt(expected count) has the standard deviation 1
+    # 2 sqrt(count) of a Poisson count has the standard deviation 1
     rows.append(2.0 * (_pixel_counts(levels)[levels.cell_level] * log_cells.exp()).sqrt())
-    if rounding != "dithered_floor":  # the well lies anywhere within one number, 1 DN wide
-        # standard deviation of an even distribution 1 DN wide: 1 / sqrt(12)
+    if rounding != "dithered_floor":  # rounded values determine the full well only to within 1 DN
+        # standard deviation of a uniform distribution 1 DN wide: 1 / sqrt(12)
         rows.append(
             math.sqrt(12.0) * sensor.well * _cut_off(levels, expected, sensor, largest_number)
         )
@@ -409,8 +408,8 @@ def likelihood(
 
 
 def _cut_off(levels: Sufficient, signal: _ExpectedSignal, sensor: Sensor, top: int) -> Tensor:
-    """Return a mask (..., 1) of the sensors whose full well clips numbers that the converter
-    could still give.
+    """Return a mask (..., 1) of the sensors whose full well clips pixels below the range of the
+    converter.
     """
     pixels_above = _pixel_counts(levels) * ndtr(
         (signal.mean - sensor.well) / signal.variance.sqrt()
@@ -420,13 +419,13 @@ def _cut_off(levels: Sufficient, signal: _ExpectedSignal, sensor: Sensor, top: i
 
 
 def without_details(total: Tensor) -> Likelihood:
-    """Return a log likelihood whose other fields are empty."""
+    """Return a `Likelihood` with a log likelihood only; its other fields are empty."""
     return Likelihood(total, *(torch.zeros(0, dtype=torch.float64) for _ in Likelihood._fields[1:]))
 
 
 def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
-    """Return expected mean and log variance of each light level, in standard deviations of the
-    measured values.
+    """Return the expected mean and log variance of each light level, divided by the standard
+    deviations of the measured values.
     """
     measured = levels.variance.where(levels.pixels > 0, 1.0)
     return torch.cat(
@@ -439,8 +438,8 @@ def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
 
 
 def _expected_signal(levels: Sufficient, sensor: Sensor) -> _ExpectedSignal:
-    """Return mean and variance (..., level) of the numbers of each level before rounding: offset,
-    dark signal and light, with read noise and the shot noise of both.
+    """Return mean and variance (..., level) of the signal before rounding: offset, dark signal and
+    light, with read noise and the shot noise of dark signal and light.
     """
     dark = sensor.dark * levels.exposure
     mean = sensor.offset + dark + sensor.response * levels.photons
@@ -455,7 +454,7 @@ def _has_cells(levels: Sufficient) -> Tensor:
 
 
 def _pixel_counts(levels: Sufficient) -> Tensor:
-    """Return the number of pixels of each light level, counted in mean and variance and in
+    """Return the number of pixels of each light level, those of its mean and variance plus those in
     histogram bins.
     """
     return levels.pixels.index_add(0, levels.cell_level, levels.cell_count)
@@ -466,8 +465,8 @@ def _log_cells(
 ) -> Tensor:
     """Return the logarithm of the probability of each histogram bin (..., bin).
 
-    For coarse levels of few electrons the probability is summed over their Poisson number, since a
-    Gaussian is too inaccurate there.
+    For coarse levels of few electrons, where a Gaussian is too inaccurate, it is summed over the
+    Poisson distribution of the number of electrons.
     """
     cell_level = levels.cell_level
     mean, variance = (
@@ -515,7 +514,7 @@ def _log_cells_by_electrons(
         electron_count * mean_electrons.log() - mean_electrons - torch.lgamma(electron_count + 1)
     )
     mean = signal.mean[..., cell_level] + sensor.gain * (electron_count - electrons)
-    # what is left without the variance of the counted electrons
+    # variance without the shot noise of the electrons that are summed over
     other_variance = (
         signal.variance[..., cell_level] - sensor.gain.square() * electrons
     ).clamp_min(0.0) + 1e-300
@@ -528,14 +527,15 @@ def _log_cells_by_electrons(
 def _deviance(
     levels: Sufficient, moments: Tensor, cells: Tensor, measured: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return deviance and degrees of freedom (..., level); both are 0 for a partly clipped level.
+    """Return deviance (..., level) and degrees of freedom (level,); both are 0 for a partly clipped
+    level.
 
-    ``moments`` is the deviance of mean and variance where they are ``measured``; elsewhere it is
-    that of the histogram, whose bins have the logarithmic probabilities ``cells``.
+    Levels marked in ``measured`` have the deviance ``moments`` of mean and variance. Levels with a
+    histogram only have that of its bins, whose log probabilities are ``cells``.
     """
     by_cells = levels.pixels == 0
     count, pixels_of_level = levels.cell_count, _pixel_counts(levels)[levels.cell_level]
-    # twice the log-likelihood below that of the measured shares
+    # twice the deficit of the log likelihood against that of the measured frequencies
     cell_deviance = 2.0 * count * ((count / pixels_of_level).log() - cells)
     level_deviance = torch.zeros_like(moments).index_add(
         -1, levels.cell_level, cell_deviance.expand(*moments.shape[:-1], -1)
@@ -543,7 +543,7 @@ def _deviance(
     bin_count = torch.zeros_like(levels.pixels).index_add(
         0, levels.cell_level, torch.ones_like(count)
     )
-    # mean and variance are two; a histogram has one less than its bins
+    # degrees of freedom: two for mean and variance, number of bins - 1 for a histogram
     freedom = torch.where(measured, 2.0, torch.where(by_cells, (bin_count - 1).clamp_min(0.0), 0.0))
     deviance = torch.where(measured, moments, torch.where(by_cells, level_deviance, 0.0))
     return torch.where(freedom > 0, deviance, 0.0), freedom
@@ -551,7 +551,7 @@ def _deviance(
 
 # --- likelihood node ------------------------------------------------------------------------------
 
-# The node of the likelihood of calibration frames, given the parameters of a sensor.
+# The node that computes the likelihood of calibration frames from the parameters of a sensor.
 
 
 @node()
@@ -614,7 +614,7 @@ def density(
         noise_factor,
     ) = broadcast
     mean_factor = mean_change + (mean == "additive")
-    # e-^2 per photon; noise that is drawn in photons is multiplied by the efficiency afterwards
+    # e-^2 per photon; noise drawn in photons is multiplied by the quantum efficiency afterwards
     variance_per_photon = noise_factor.square() * (
         efficiency if drawn_in == "electrons" else efficiency.square()
     )

@@ -1,4 +1,6 @@
-"""Uncertainty budgets of the quantities of the EMVA 1288 sheet, and their sources."""
+"""Uncertainty budgets of the quantities of the EMVA 1288 sheet, with their sources of
+uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,8 @@ from neusee.nodes.values import Levels
 
 # --- camera sources -------------------------------------------------------------------------------
 
-# The sources of the scatter of a real camera's levels: statistics of the frames, lamp, dark signal
-# and variances.
+# Sources of the scatter of a real camera's levels: statistics of the frames, lamp, dark signal, and
+# excess scatter of the variances.
 
 
 STATISTICS = "statistics of the frames"
@@ -46,10 +48,10 @@ SOURCES = (STATISTICS, LAMP, DRIFT, SCATTER)
 
 
 def camera_sources(levels: Levels, params: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the share of each source in the variance of each row of `Likelihood.scaled` of
-    `camera`.
+    """Return the share of each source of scatter in the variance of each row of
+    `Likelihood.scaled`, as `camera` computes these rows.
 
-    ``params`` are the parameters of `camera` at the mode.
+    ``params`` are the parameters of `camera` at the posterior mode.
 
     Shapes: levels (level,) -> (row,) by source; the shares of a row add up to 1.
     Units:  none.
@@ -82,8 +84,8 @@ def camera_sources(levels: Levels, params: Mapping[str, Any]) -> dict[str, Tenso
 def source_freedom(
     levels: Levels, params: Mapping[str, Any], free: tuple[str, ...]
 ) -> dict[str, float]:
-    """Return the degrees of freedom of each source: observations that scatter, less the ``free``
-    parameters they fit.
+    """Return the degrees of freedom of each source: the observations that it scatters, less the
+    ``free`` parameters fitted to them.
 
     Shapes: scalars by source.
     Units:  none.
@@ -108,9 +110,9 @@ def variance_shares(
     """Return the share of each source, and of the prior, in the variance of a function of the
     parameters.
 
-    The estimate is linear in the scattering rows, so that its covariance is a sum over sources: C
-    J^T F J C for the shares F of a source in the rows, and C C for the prior, with C = (J^T J +
-    1)^-1.
+    To first order the estimate is linear in the rows, so that its covariance is a sum over sources:
+    C J^T F J C for a source with the shares F of the row variances, and C C for the prior, with C =
+    (J^T J + 1)^-1.
 
     Shapes: slopes (row, free) derivatives per standard deviation of the prior; sources (row,)
             shares; along (free,) derivative of the function per standard deviation of the prior ->
@@ -133,7 +135,7 @@ def variance_shares(
 
 
 def _shares(parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return each variance over the sum of all, element by element."""
+    """Return each variance divided by the sum of all, element by element."""
     total = torch.stack(list(parts.values())).sum(0)
     return {name: variance / total for name, variance in parts.items()}
 
@@ -146,15 +148,16 @@ def _shares(parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 MODEL = "model of the response"
 SPACING = "spacing of the light levels"
-_INPUT_STEP = 0.1  #: standard uncertainties of an input, half the step of a derivative
-_PHOTON_STEP = 1e-4  #: half the step of a derivative by the photons, relative
-_ROUNDING_SHARE = 1e-6  #: share of a value below which a change is rounding
-#: share of saturation up to which the second model fits its lines
+#: half the step of a numerical derivative, in standard uncertainties of the input
+_INPUT_STEP = 0.1
+_PHOTON_STEP = 1e-4  #: half the relative step of a numerical derivative with respect to the photons
+_ROUNDING_SHARE = 1e-6  #: a smaller relative change counts as rounding error
+#: upper end of the alternative line fits, as a share of saturation
 _SECOND_RANGE = 0.5 * FITTED_SHARE
-#: change of a slope from 70 % of saturation to no light, over that from 70 to 35 %, if it is
-#: proportional
+#: ratio of two changes of a slope that is linear in the upper end of the fit: from 70 to 0 % of
+#: saturation over from 70 to 35 %
 _CHANGE_TO_NO_LIGHT = 2.0
-#: by key of the sheet: the parameter of `camera` whose temperature coefficient counts, and its sign
+#: by key of the sheet: the `camera` parameter whose temperature coefficient applies, and its sign
 _COEFFICIENTS = {
     "K": ("gain", 1.0),
     "inverse_K": ("gain", -1.0),
@@ -165,7 +168,7 @@ _COEFFICIENTS = {
     "mu_I_var": ("dark_current", 1.0),
 }
 
-#: by key: dy/ds for a relative change s of the saturation, over y, or as it stands for a logarithm
+#: by key: (dy/ds) / y for a relative change s of the saturation; for logarithmic quantities dy/ds
 _SATURATION_EXPONENTS = {"mu_p_sat": 1.0, "mu_e_sat": 1.0, "SNR_max": 0.5, "DR": 1.0}
 _LOGARITHM_SLOPES = {
     "SNR_max_dB": 10 / math.log(10),
@@ -181,8 +184,8 @@ Values = dict[str, float]
 
 @dataclass(frozen=True)
 class _Propagation:
-    """How far all quantities of a sheet move with its levels, the light of each level, all
-    photons and the model.
+    """Sensitivities of all quantities of a sheet to its levels, to the light of each level, to all
+    photons together and to the model.
     """
 
     levels: Levels
@@ -190,7 +193,9 @@ class _Propagation:
     photons_told: bool  #: True if the photons are known
 
     def values(self, levels: Levels) -> Values:
-        """Return the quantities of levels that have a value, without those of series of frames."""
+        """Return the values, by key, of the quantities that follow from levels alone, without
+        series of frames.
+        """
         quantities = emva_sheet(levels, None, photons_told=self.photons_told).quantities
         return {q.key: q.value for q in quantities if q.value is not None}
 
@@ -215,16 +220,16 @@ class _Propagation:
                         self._field_step(name, i), _INPUT_STEP * uncertainty
                     ).items():
                         contributions.setdefault(key, []).append(
-                            # only uncertainty, sensitivity and freedom count: the terms are
-                            # combined later
+                            # text fields stay empty: these terms are combined into one contribution
+                            # later
                             Contribution("", "A", "", uncertainty, "", slope, degrees_of_freedom)
                         )
         return contributions
 
     @cached_property
     def light(self) -> Values:
-        """Return the root of the sum of squares of dy/de over the lit levels, e the relative
-        light of one level.
+        """Return, by key, the root sum of squares of dy/de over the lit levels, where e is the
+        relative change of the light of one level.
         """
         sums_of_squares: Values = {}
         for i in (self.levels.photons > 0).nonzero().squeeze(1).tolist():
@@ -234,19 +239,19 @@ class _Propagation:
 
     @cached_property
     def photons(self) -> Values:
-        """Return dy/ds for a relative change s of all numbers of photons."""
+        """Return dy/ds, by key, for a common relative change s of all numbers of photons."""
         return self._slopes(
             lambda s: self.levels._replace(photons=self.levels.photons * (1 + s)), _PHOTON_STEP
         )
 
     @cached_property
     def other_model(self) -> Values:
-        """Return the quantities with lines that are fitted up to 35 % of saturation only."""
+        """Return the values, by key, with lines fitted only up to 35 % of saturation."""
         levels, transfer = self.levels, self.sheet.transfer
         saturation_signal = float(transfer.signal[transfer.saturation])
         darkest = float(transfer.mean_dark.min())
         signal = levels.mean - darkest
-        # lines up to half of the usual range; levels beyond the range tell the saturation
+        # levels up to 35 % of saturation, and those above 70 %, which determine the saturation
         used_levels = (
             (levels.photons == 0)
             | (signal <= _SECOND_RANGE * saturation_signal)
@@ -266,13 +271,13 @@ class _Propagation:
         if line is None:
             return math.nan, math.nan
         linear_levels = transfer.linear
-        # as the levels of `PhotonTransfer`
+        # in the order of the levels of `PhotonTransfer`
         order = lit_order(self.levels.photons.numpy(), self.levels.exposure.numpy())
         chance_variance = (self.levels.variance / self.levels.pixels).numpy()[order][
             linear_levels
         ] / transfer.signal[linear_levels] ** 2
         freedom = len(line.deviation) - 2
-        # scatter about the line less what chance explains; a line fits two parameters
+        # variance about the line, less the variance by noise; a line has two fitted parameters
         excess_variance = float(((line.deviation / 100) ** 2).sum()) / freedom - float(
             chance_variance.mean()
         )
@@ -280,10 +285,9 @@ class _Propagation:
 
     @cached_property
     def spacing(self) -> float:
-        """Return the standard uncertainty of the saturation, relative, that lies between its two
-        neighbouring levels.
+        """Return the relative standard uncertainty of the saturation by the spacing of the levels.
 
-        The distribution is rectangular, from the level before to the level after.
+        The true saturation lies between the neighbouring levels, with a rectangular distribution.
         """
         photons, saturation = self.sheet.transfer.photons, self.sheet.transfer.saturation
         neighbours = photons[[max(0, saturation - 1), min(len(photons) - 1, saturation + 1)]]
@@ -293,8 +297,8 @@ class _Propagation:
         )
 
     def _slopes(self, levels_at: Callable[[float], Levels], step: float) -> Values:
-        """Return the derivative of each quantity by central differences; ``levels_at`` gives the
-        levels for a step of an input to either side.
+        """Return the derivative of each quantity by central differences; ``levels_at(step)``
+        returns the levels with an input changed by ``step``.
         """
         values_above, values_below = self.values(levels_at(step)), self.values(levels_at(-step))
         return {
@@ -303,7 +307,9 @@ class _Propagation:
         }
 
     def _field_step(self, name: str, i: int) -> Callable[[float], Levels]:
-        """Return the levels as a function of a step of the field ``name`` of level ``i``."""
+        """Return a function of a step that adds it to the field ``name`` of level ``i`` and returns
+        the levels.
+        """
 
         def at(step: float) -> Levels:
             return self.levels._replace(**{name: _added(getattr(self.levels, name), i, step)})
@@ -311,8 +317,8 @@ class _Propagation:
         return at
 
     def _lit_step(self, i: int) -> Callable[[float], Levels]:
-        """Return the levels as a function of the relative light of level ``i``, which moves mean
-        and variance.
+        """Return a function of a relative change of the light of level ``i``, which changes its
+        mean and variance, and returns the levels.
         """
         levels, is_dark = self.levels, self.levels.photons == 0
         nearest_dark = torch.where(
@@ -333,14 +339,15 @@ class _Propagation:
 def sheet_budgets(
     levels: Levels, sheet: EmvaSheet, laboratory: Laboratory, photons_told: bool = True
 ) -> list[Budget]:
-    """Return the uncertainty budget of each quantity of a sheet that has a value and no mere limit.
+    """Return the uncertainty budget of each quantity of a sheet that has a value and is not only a
+    limit.
 
-    Derivatives are central differences of the whole sheet. The sources are the sampling of means
-    and variances, the scatter of the light from level to level, which the deviations from the line
-    of linearity give, the spacing of the levels, the model of the response, and what ``laboratory``
-    states. For the model the lines are fitted up to 35 % of saturation too. A slope that changes in
-    proportion to the range changes twice as much down to no light, and the quantity may lie
-    anywhere within that.
+    Derivatives are central differences of the whole sheet. The sources are the statistics of means
+    and variances; the scatter of the light from level to level, estimated from the deviations from
+    the line of linearity; the spacing of the levels; the model of the response; and the
+    uncertainties that ``laboratory`` states. For the model, the lines are also fitted up to 35 % of
+    saturation. A slope that is linear in the upper end of the fit would change twice as much down
+    to no light, and the quantity may lie anywhere within that change.
 
     Shapes: levels (level,).
     Units:  those of each quantity.
@@ -370,12 +377,12 @@ def _budget(
     laboratory: Laboratory,
     gain: Quantity,
 ) -> Budget:
-    """Return the budget of a quantity: its ``own`` contributions by the measurement, and those of
-    the laboratory.
+    """Return the budget of a quantity from its ``own`` contributions, those of the measurement, and
+    from those of the laboratory.
     """
     assert q.value is not None
     parameter, sign = _COEFFICIENTS.get(q.key, (q.key, 1.0))
-    # a coefficient of the quantity itself comes before that of its parameter
+    # a temperature coefficient of the quantity itself takes precedence over that of its parameter
     key = q.key if q.key in laboratory.coefficients else parameter
     photon_slope = moves.photons.get(q.key, 0.0)
     photon_slope = photon_slope if abs(photon_slope) > _ROUNDING_SHARE * abs(q.value) else 0.0
@@ -384,8 +391,8 @@ def _budget(
 
 
 def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
-    """Yield the contributions of the measurement to a quantity of the levels: statistics, lamp,
-    spacing of the levels, and model of the response.
+    """Yield the measurement's contributions to a quantity that follows from levels: statistics,
+    lamp, spacing of the levels, and model of the response.
     """
     assert q.value is not None
     contributions = moves.statistics.get(q.key, [])
@@ -416,8 +423,8 @@ def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
 
 
 def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribution:
-    """Return the contribution of the lamp, from the derivative of a quantity of this ``value`` by
-    the relative light of its levels.
+    """Return the contribution of the lamp; ``sensitivity`` is the derivative of the quantity with
+    respect to the relative light of a level, and ``value`` its value.
     """
     scatter, freedom = moves.lamp
     if sensitivity <= _ROUNDING_SHARE * abs(value):
@@ -428,15 +435,17 @@ def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribut
 
 
 def _is_of_series(q: Quantity) -> bool:
-    """Return True for a quantity that series of frames give, not levels."""
+    """Return True for a quantity that is computed from series of frames, not from levels."""
     return q.key.startswith(("DSNU1288", "PRNU1288"))
 
 
 def _chance_of_pattern(q: Quantity, sheet: EmvaSheet) -> float:
-    """Return the standard error of the square of a quantity of series of frames, by chance."""
+    """Return the standard error of the square of a quantity from series of frames, a spatial
+    variance.
+    """
     lit, dark = sheet.spatial.lit, sheet.spatial.dark
     pattern = q.key.removesuffix("_DN").partition("_")[2]
-    # in the order of `SpatialVariances`; a total has no suffix
+    # index of the field of `SpatialVariances`; the key of a total has no suffix
     index = ("", "row", "column", "pixel").index(pattern)
     is_response = q.key.startswith("PRNU")
     series = (dark, lit) if is_response else (dark,)
@@ -450,8 +459,8 @@ def _chance_of_pattern(q: Quantity, sheet: EmvaSheet) -> float:
 
 
 def _of_series(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Contribution]:
-    """Yield the contributions of a quantity of series of frames; one in electrons has those of
-    the gain too.
+    """Yield the contributions to a quantity from series of frames; a quantity in electrons also has
+    those of the gain.
     """
     assert q.value is not None
     gain = sheet["K"].value if q.unit == "e-" else None
@@ -467,7 +476,7 @@ def _of_series(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[C
         yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
         return
     chance, lamp, model = _of_levels(sheet["K"], moves)
-    # a relative change of the gain changes the quantity by as much
+    # a relative change of the gain changes the quantity by the same share
     ratio = q.value / gain
     contributions = [
         Contribution("", "A", "", own_uncertainty, "", 1.0, degrees_of_freedom),
@@ -487,7 +496,7 @@ def _scaled(c: Contribution, by: float) -> Contribution:
 
 
 def _added(values: Tensor, i: int, step: float) -> Tensor:
-    """Return a copy of values in which number ``i`` is larger by ``step``."""
+    """Return a copy of ``values`` with ``step`` added to element ``i``."""
     changed = values.clone()
     changed[i] += step
     return changed

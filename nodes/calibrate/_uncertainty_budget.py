@@ -1,6 +1,6 @@
-"""The uncertainty budget of one quantity: its sources, combined and expanded.
+"""The uncertainty budget of a quantity: contributions, combined and expanded uncertainty (GUM).
 
-Some sources are what a laboratory states of its light and its temperature.
+Some contributions come from a laboratory's statements on its light and temperature.
 """
 
 from __future__ import annotations
@@ -16,24 +16,25 @@ from pydantic import BeforeValidator, Field
 from neusee.nodes.parameters import ParameterModel
 from neusee.nodes.units import Linewidth, Wavelength, read_quantity
 
-COVERAGE = 0.95  #: probability with which the expanded uncertainty holds the value
+COVERAGE = 0.95  #: coverage probability of the expanded uncertainty
 NOT_STATED, NOT_INVOLVED = "not stated", "does not enter"
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """One source of uncertainty of a quantity: a line of its budget.
+    """The contribution of one source of uncertainty: a line of the budget of a quantity.
 
-    Without an ``uncertainty``, ``reason`` says why: the source is not stated, or does not enter the
-    quantity.
+    If ``uncertainty`` is None, ``reason`` says why: the source is not stated, or does not affect
+    the quantity.
     """
 
     source: str
-    kind: Literal["A", "B"]  #: evaluated from a series of observations, or by other means
+    #: type A, evaluated from a series of observations, or type B, by other means
+    kind: Literal["A", "B"]
     distribution: str = "normal"
     uncertainty: float | None = None  #: u(x), standard uncertainty of the input
     unit: str = ""  #: of the input
-    sensitivity: float = 1.0  #: c = dy/dx, in units of the quantity for a unit of the input
+    sensitivity: float = 1.0  #: c = dy/dx, unit of the quantity per unit of the input
     freedom: float = math.inf  #: nu, degrees of freedom of u(x)
     reason: str = ""
 
@@ -80,7 +81,9 @@ class Budget:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Return the sources that are not stated, so that the combined uncertainty lacks them."""
+        """Return the sources that are not stated and therefore missing from the combined
+        uncertainty.
+        """
         return tuple(
             c.source
             for c in self.contributions
@@ -89,8 +92,8 @@ class Budget:
 
 
 def welch_satterthwaite(contributions: Iterable[Contribution]) -> float:
-    """Return the effective degrees of freedom of the sum of independent contributions, infinite
-    without a finite one.
+    """Return the effective degrees of freedom of a sum of independent contributions; infinite if
+    all are infinite.
 
     Shapes: scalars.
     Units:  those of the quantity.
@@ -103,7 +106,8 @@ def welch_satterthwaite(contributions: Iterable[Contribution]) -> float:
 
 
 def coverage_factor(freedom: float, probability: float = COVERAGE) -> float:
-    """Return the factor k with which k standard uncertainties hold the value with a probability.
+    """Return the coverage factor k: the interval of +-k standard uncertainties has the given
+    coverage probability.
 
     Shapes: scalars.
     Units:  none.
@@ -123,8 +127,8 @@ def _shares(contributions: Iterable[Contribution]) -> list[float]:
 
 # --- traceability ---------------------------------------------------------------------------------
 
-# What a laboratory states of its light and of its temperature, so that its values can be traced to
-# a standard.
+# A laboratory's statements on its light and its temperature, which make its values traceable to a
+# standard.
 
 
 _CELSIUS = re.compile(r"([-+]?\d+(?:\.\d+)?)\s*(°C|C|degC)?")
@@ -138,7 +142,7 @@ Text = Annotated[str, BeforeValidator(lambda value: str(value).strip()), Field(m
 def _temperature(value: Any) -> float:
     """Return a temperature such as ``25 °C`` or ``298 K`` in kelvin."""
     match = _CELSIUS.fullmatch(str(value).strip())
-    # a number without a unit
+    # refuse a number without a unit
     if match and not match[2]:
         raise ValueError(f"needs a unit: write {value} °C or {value} K")
     kelvin = float(match[1]) + _ZERO_CELSIUS if match else read_quantity(value, "K")
@@ -148,38 +152,40 @@ def _temperature(value: Any) -> float:
 
 
 class Statement(ParameterModel):
-    """Base class of what a laboratory states; an unknown key is a mistake."""
+    """Base class of a laboratory's statements; an unknown key is an error."""
 
 
 class Photometry(Statement):
-    """Calibration of the light: what is known of the numbers of photons, and who says so."""
+    """Calibration of the light: uncertainty of the numbers of photons, certificate and
+    laboratory.
+    """
 
-    #: relative: up to a factor, so that no efficiency is told
+    #: relative: known only up to a factor, so that no quantum efficiency follows
     known: Literal["absolute", "relative"] = "absolute"
     #: standard uncertainty of the photons over their number
     relative_uncertainty: Relative | None = None
     distribution: Literal["normal", "rectangular"] = "normal"
     degrees_of_freedom: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True)] = math.inf
-    certificate: Text | None = None  #: its number
+    certificate: Text | None = None  #: number of the certificate
     date: Text | None = None
     laboratory: Text | None = None
     instrument: Text | None = None
 
 
 class Lamp(Statement):
-    """The lamp: its spectrum, and how far its light may have drifted since it was calibrated."""
+    """The lamp: its spectrum, and the possible drift of its light since calibration."""
 
     spectrum: Text | None = None  #: in words, or the name of a file
     centroid: Wavelength | None = None
     centroid_uncertainty: Linewidth | None = None  #: standard uncertainty
     fwhm: Linewidth | None = None
-    efficiency_per_nm: Finite | None = None  #: relative change of the efficiency
+    efficiency_per_nm: Finite | None = None  #: relative change of the quantum efficiency per nm
     #: relative standard uncertainty, from the calibration of the light to the frames
     drift: Relative | None = None
 
 
 class SensorTemperature(Statement):
-    """The temperature of the sensor, and the relative change of its parameters per kelvin."""
+    """The temperature of the sensor, and the temperature coefficients of its parameters."""
 
     value: (
         Annotated[
@@ -200,7 +206,7 @@ class SensorTemperature(Statement):
 
 
 class Traceability(Statement):
-    """What a laboratory states of its photons, its lamp and its temperature: the recipe key
+    """A laboratory's statements on its photons, its lamp and its temperature: the recipe key
     ``traceability``.
     """
 
@@ -211,8 +217,7 @@ class Traceability(Statement):
 
 # --- laboratory -----------------------------------------------------------------------------------
 
-# What a laboratory states of its light and its temperature, as contributions to the uncertainty of
-# a quantity.
+# A laboratory's statements as contributions to the uncertainty of a quantity.
 
 
 PHOTOMETRY = "photometric calibration of the light"
@@ -223,8 +228,8 @@ TEMPERATURE = "temperature"
 
 @dataclass(frozen=True)
 class Laboratory:
-    """Relative standard uncertainties of the light, and the uncertain temperature; None for what
-    is not stated.
+    """Relative standard uncertainties of the light, and the uncertainty of the temperature; None
+    for a value that is not stated.
     """
 
     photons: float | None = None  #: relative, of the number of photons
@@ -239,8 +244,8 @@ class Laboratory:
 
     @property
     def light(self) -> list[tuple[str, float]]:
-        """Return distribution and relative standard uncertainty of each stated source of the
-        quantum efficiency.
+        """Return distribution and relative standard uncertainty of each stated source that affects
+        the quantum efficiency.
         """
         sources = [(self.photons_distribution, self.photons), ("normal", self.drift)]
         if self.wavelength is not None and self.slope is not None:
@@ -251,11 +256,11 @@ class Laboratory:
 def laboratory_contributions(
     name: str, value: float, photons: float, laboratory: Laboratory
 ) -> Iterator[Contribution]:
-    """Yield what light and temperature add to the uncertainty of the quantity ``name``.
+    """Yield the contributions of light and temperature to the uncertainty of the quantity ``name``.
 
-    ``photons`` is dy/ds for a common relative change s of the numbers of photons, 0 where the light
-    does not enter. A change of the quantum efficiency with the wavelength acts as the opposite
-    change of the photons.
+    ``photons`` is dy/ds for a common relative change s of the numbers of photons; 0 if the light
+    does not affect the quantity. A change of the quantum efficiency with the wavelength acts like
+    the opposite change of the photons.
 
     Shapes: scalars.
     Units:  ``value`` and ``photons`` those of the quantity.
@@ -287,9 +292,9 @@ def _of_light(
     law: str = "normal",
     freedom: float = math.inf,
 ) -> Contribution:
-    """Return the contribution of a source of light whose relative standard uncertainty is
-    ``stated`` (None if it is not), with the ``sensitivity`` dy/ds of the quantity to a relative
-    change s of the light.
+    """Return the contribution of a source of uncertainty of the light: ``stated`` is its relative
+    standard uncertainty (None if not stated), ``sensitivity`` is dy/ds for a relative change s of
+    the light.
     """
     if not sensitivity:
         return Contribution(source, "B", reason=NOT_INVOLVED)
@@ -299,8 +304,8 @@ def _of_light(
 
 
 def _of_temperature(name: str, value: float, laboratory: Laboratory) -> Contribution:
-    """Return the contribution of the uncertain temperature to the quantity ``name``, by its
-    coefficient in 1/K.
+    """Return the contribution of the temperature's uncertainty to the quantity ``name``, by its
+    temperature coefficient in 1/K.
     """
     coefficient = laboratory.coefficients.get(name)
     if laboratory.temperature is None:

@@ -113,12 +113,12 @@ def cubic(
 def _half_rings(
     grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orientation: float
 ) -> Tensor:
-    """Return the phase (v, u) of the half-ring mask in rad: 2 pi a r, with the sign of one side of
-    the axis.
+    """Return the phase (v, u) of the half-ring mask in rad: 2 pi a r, with opposite signs on the
+    two sides of the axis.
     """
     v, u = pupil_axes(grid)
     squared_radius = v.square() + u.square()
-    # annuli of equal area have equal steps of the squared radius
+    # annuli of equal area are equally spaced in the squared radius
     annulus = (squared_radius * len(waves)).floor_().to(torch.int32).clamp_(max=len(waves) - 1)
     signed = [-slope if alternate and index % 2 else slope for index, slope in enumerate(waves)]
     slopes = 2 * math.pi * torch.tensor(signed, dtype=torch.float64, device=v.device)

@@ -1,4 +1,6 @@
-"""Fabrication of a mask: wrapping, depth, levels, smallest feature, and random errors."""
+"""Fabrication of a mask: wrapping, limited depth, discrete levels, smallest feature, height
+errors.
+"""
 
 import math
 from typing import Annotated, Any
@@ -32,8 +34,8 @@ _VIOLET = 400e-9  #: m, wavelength at which a change of height is converted to a
 
 
 def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
-    """Round each height to the nearest of ``levels`` discrete heights; the gradient passes
-    through unchanged.
+    """Round each height to the nearest of ``levels`` discrete heights; the gradient is that of the
+    identity.
     """
     with torch.no_grad():
         level_number = (height / step).round()
@@ -41,14 +43,14 @@ def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
             level_number.remainder(levels) if cyclic else level_number.clamp(0, levels - 1)
         )
         change = level_number * step - height
-    return height + change.detach()  # without a tangent too
+    return height + change.detach()  # detached: no gradient, and no forward-mode tangent
 
 
 def _refuse_impossible_limits(
     material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> None:
-    """Raise ParameterError for limits that no mask can have: a depth below one wave, levels without
-    a depth.
+    """Raise ParameterError for impossible limits: a depth below one wave, or levels without a
+    depth.
     """
     if (
         wrap_at is not None
@@ -98,7 +100,7 @@ def fabricate(
     refuse_half(height=height)
     if wrap_at is not None:
         period = wave_height(material, wrap_at)
-        # the period too is rounded in float32
+        # in float64, because a period rounded to float32 would add an error for each wrap
         wrapped = height.double().remainder(period).to(height.dtype)
         return (
             wrapped if levels is None else _quantize(wrapped, period / levels, levels, cyclic=True)
@@ -138,7 +140,7 @@ def _(
     allowed_heights = [depth * k / steps for k in range(steps + 1)]
     table = torch.tensor(allowed_heights, dtype=torch.float64, device=limited.device)
     nearest = table[(limited[..., None] - table).abs().argmin(-1)]
-    # a whole wave of height is the height 0
+    # the height of a whole wave is equivalent to 0
     return nearest if wave is None else torch.where(nearest == wave, 0.0, nearest)
 
 
@@ -154,9 +156,9 @@ def _(
     """Return an upper bound of the relative change of a height map by fabrication; 0 if every
     height fits.
 
-    A small change of height may be a large phase: the bound is never below the phase, in radians,
-    of that change at 400 nm, or at the nearest wavelength at which the glass is known. Wrapping
-    turns no phase at ``wrap_at``, and counts in full all the same.
+    A small change of height may be a large phase: the bound is at least the phase of that change in
+    radians at 400 nm, or at the nearest wavelength at which the index is known. Wrapping changes no
+    phase at ``wrap_at`` but is counted in full.
     """
     depth = max_height if wrap_at is None else wave_height(material, wrap_at)
     if not height.finite or depth is None:
@@ -175,20 +177,20 @@ def _(
 
 
 def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
-    """Return an upper bound, in m, of the change of any height within ``ends`` by fabrication;
-    exact without levels.
+    """Return an upper bound in m of the change by fabrication of any height between ``ends``; exact
+    if there are no levels.
     """
     lowest, highest = (float(end) for end in ends)
     if not cyclic:
-        # the limit in the precision of the height map
+        # the limit, rounded to the precision of the height map
         top = float(torch.tensor(top, dtype=ends.dtype))
         half_step = 0.0 if levels is None else top / (levels - 1) / 2
-        # what is cut off above or below, or half a step between levels
+        # the largest clipping above or below, or half a step between levels
         return max(highest - top, -lowest, half_step)
     waves = max(abs(math.floor(lowest / top)), abs(math.floor(highest / top)))
     if levels is None:
         return top * waves
-    # to a whole wave, which is 0
+    # True if the highest heights are rounded up to a whole wave, which is 0
     is_rounded_up = highest >= top * (1 - 0.5 / levels) * (1 - 4 * torch.finfo(ends.dtype).eps)
     return top * (waves + is_rounded_up + 0.5 / levels)
 
@@ -228,10 +230,10 @@ def _(
 
 # --- minimum feature ------------------------------------------------------------------------------
 
-# Smallest feature of a fabrication tool: the average of a height map over the spot of the tool.
+# The smallest feature of a fabrication tool: the height map averaged over the spot of the tool.
 
 
-_SPOT_REACH = 6.0  #: standard deviations beyond which the spot holds 1e-9 of its dose
+_SPOT_REACH = 6.0  #: standard deviations; beyond this radius the spot has only 1e-9 of its dose
 
 
 @node(rtol=1e-5)
@@ -261,10 +263,10 @@ def smooth(height: Tensor, stop: Stop, *, feature: PupilPitch) -> Tensor:
 
 
 def _averaging_matrix(samples: int, feature: float) -> Tensor:
-    """Return the float64 matrix that averages along one axis over a tool spot of ``feature``
-    samples; each row sums to 1.
+    """Return the matrix, float64, that averages along one axis over a tool spot with a full width
+    at half maximum of ``feature`` samples; each row sums to 1.
     """
-    # full width at half maximum = sqrt(8 ln 2) deviations
+    # full width at half maximum = sqrt(8 ln 2) standard deviations
     spot_deviation = feature / math.sqrt(8 * math.log(2))
     index = torch.arange(samples, dtype=torch.float64)
     weights = torch.exp(-((index[:, None] - index) ** 2) / (2 * spot_deviation**2))
@@ -276,13 +278,11 @@ def _averaging_matrix(samples: int, feature: float) -> Tensor:
 
 @smooth.reference
 def _(height: Tensor, stop: Stop, *, feature: float) -> Tensor:
-    """Compute the average of the height map over the tool's spot, for the samples of one row
-    after another.
-    """
+    """Return the height map averaged over the tool's spot, computed row by row."""
     samples, pitch, _ = grid_of(stop)
     sigma = feature / pitch / math.sqrt(8 * math.log(2))
     height_map, index = height.double(), torch.arange(samples, dtype=torch.float64)
-    # of each spot, over all columns
+    # squared distances along the columns
     squared_column_distance = (index[:, None, None] - index).square()
     rows = []
     for v in range(samples):
@@ -310,14 +310,14 @@ def _(result: Tensor, height: Tensor, *_: Any, feature: float, **__: Any) -> lis
 
 # --- height error ---------------------------------------------------------------------------------
 
-# The error of a mask that was made: the whole depth, and a smooth random error of the height.
+# The height error of a fabricated mask: a relative error of the depth, and a smooth random error.
 
 
 Rms = Annotated[Length, Field(ge=0, le=1e-3)]
 Scale = Annotated[float, Field(ge=0.01, le=1)]  #: share of the pupil's diameter
 Excess = Annotated[float, Field(gt=-1, le=1)]  #: share of the height
-_ROUNDING_SHARE = 1.2e-7  #: of the height, float32
-#: times its standard deviation, no sample of a smooth random field is larger; as for `flare.dirt`
+_ROUNDING_SHARE = 1.2e-7  #: relative round-off of a height in float32
+#: bound of every sample of a smooth random field, in standard deviations; as for `flare.dirt`
 _LARGEST_SIGMA = 31
 
 
@@ -363,10 +363,11 @@ def height_error(
 
 @height_error.skip_bound
 def _(height: TensorStats, *_: Any, rms: float, depth: float, **__: Any) -> float:
-    """Return an upper bound of the relative change of a height map, which is never below its phase
-    at 400 nm in rad.
+    """Return an upper bound of the relative change of a height map; at least the phase of the
+    change at 400 nm in rad.
 
-    The phase is that of a change of optical path by as much as the height, as for an index of 2.
+    The phase assumes that the optical path changes by the change of height, as for a refractive
+    index of 2.
     """
     if not (height.finite and math.isfinite(rms)):
         return math.inf

@@ -1,9 +1,9 @@
 """Files with the height map of a mask: .npy, .safetensors, grey .png, .exr and .mat.
 
-Beside the heights, a file other than .npy may state ``unit``, the height of the value 1, ``depth``,
-the height of white in a .png, and ``pitch``, the distance of the samples, each as a text with a
-unit, such as ``1 um``. These stand in the metadata of .safetensors, in a text chunk of .png, in the
-header of .exr and in a variable of .mat.
+In addition to the heights, a file other than .npy may state three lengths, each as a text with a
+unit, such as ``1 um``: ``unit``, the height of the value 1; ``depth``, the height of white in a
+.png; and ``pitch``, the distance between samples. They are read from the metadata of .safetensors,
+text chunks of .png, the header of .exr and variables of .mat.
 """
 
 from pathlib import Path
@@ -28,11 +28,12 @@ from neusee.nodes.units import read_quantity
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-#: the level of white in each mode of a grey picture
+#: grey level of white, by Pillow mode
 _WHITE_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
-_STATED_LENGTHS = ("unit", "depth", "pitch")  #: what a file may state beside the heights
-_HALF_TYPES = ("float16", "F16", "BF16")  #: names of types with 8 or 11 bits
-_BYTES_OF_HEIGHT = 4  #: bytes of a height
+#: lengths that a file may state in addition to the heights
+_STATED_LENGTHS = ("unit", "depth", "pitch")
+_HALF_TYPES = ("float16", "F16", "BF16")  #: names of data types with only 8 or 11 bits of precision
+_BYTES_OF_HEIGHT = 4  #: bytes of a height in float32
 _MAT_73 = b"MATLAB 7.3 MAT-file"
 _REAL_MAT_TYPES = {
     "double",
@@ -57,8 +58,8 @@ class MapHeader(NamedTuple):
 
 
 def size_metadata(pitch: float) -> dict[str, str]:
-    """Return the metadata of a .safetensors file whose samples are ``pitch`` m apart, as
-    `map_header` reads it.
+    """Return the metadata, for `map_header`, of a .safetensors file whose samples are ``pitch`` m
+    apart.
     """
     return {"pitch": f"{pitch * 1e6:.12g} um"}
 
@@ -103,7 +104,7 @@ def read_height_map(file: Path, depth: float, unit: float = 1.0) -> Tensor:
 
 
 def _numbers_of_file(file: Path, suffix: str) -> Tensor:
-    """Return the numbers of a height map in a file other than .png, in the type of the file."""
+    """Return the values of a height map in a file other than .png, in the data type of the file."""
     if suffix == ".safetensors":
         from safetensors.torch import load_file
 
@@ -172,7 +173,7 @@ def _png_header(file: Path) -> MapHeader:
 
 
 def _exr_header(file: Path) -> MapHeader:
-    """Return the header of an .exr file, whose numbers are read to learn their type."""
+    """Return the header of an .exr file; its values are read to determine their data type."""
     header, _, size = exr_header(file)
     refuse_large_array(file, size)
     _refuse_other_than_numbers(
@@ -186,7 +187,8 @@ def _mat_header(file: Path) -> MapHeader:
     name = _mat_name(file)
     size, number_type = _mat_variables(file)[name]
     _refuse_other_than_numbers(file, number_type, number_type in _REAL_MAT_TYPES)
-    if np.iscomplexobj(_mat_value(file, name)):  # the header of a .mat file does not say
+    # the header of a .mat file does not tell complex values from real ones
+    if np.iscomplexobj(_mat_value(file, name)):
         _refuse_other_than_numbers(file, "complex", real=False)
     words = {
         word: _mat_value(file, word) for word in _STATED_LENGTHS if word in _mat_variables(file)
@@ -209,9 +211,7 @@ _HEADERS = {
 
 
 def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
-    """Raise ParameterError for values that are not real numbers, or that are too coarse for
-    heights.
-    """
+    """Raise ParameterError for a data type that is not real, or too coarse for heights."""
     if not real:
         text = f"{file.name} holds values of type {kind}: save the heights as real numbers, in m"
         raise ParameterError("file", text)
@@ -238,13 +238,13 @@ def _grey_picture(file: Path) -> "Image":
         )
     picture_needs(
         file, picture, 8 + 8 + _BYTES_OF_HEIGHT
-    )  # levels and heights in float64, and the result
+    )  # bytes per pixel: levels and heights in float64, and the result
     return picture
 
 
 def _height_name(file: Path, names: list[str]) -> str:
-    """Return the name of the height map among the arrays of a file: `height`, or the only one there
-    is.
+    """Return the name of the height map among the arrays of a file: `height`, or the name of the
+    only array.
     """
     if "height" in names or len(names) == 1:
         return "height" if "height" in names else names[0]
@@ -273,7 +273,9 @@ def _mat_variables(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
 
 
 def _mat_name(file: Path) -> str:
-    """Return the name of the height map in a .mat file, other than texts that state lengths."""
+    """Return the name of the height map among the variables of a .mat file, texts with lengths
+    aside.
+    """
     return _height_name(
         file,
         [
@@ -294,7 +296,7 @@ def _mat_value(file: Path, name: str) -> NDArray[Any]:
 
 
 def _as_torch_needs(values: NDArray[Any]) -> NDArray[Any]:
-    """Return values in the byte order of this machine and of at most 64 bits, as torch needs."""
+    """Return values as torch needs them: in native byte order, with at most 64 bits."""
     if values.dtype.kind == "f" and values.dtype.itemsize > 8:
         return values.astype(np.float64)
     return values.astype(values.dtype.newbyteorder("="), copy=False)

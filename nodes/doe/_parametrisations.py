@@ -1,6 +1,6 @@
-"""Trainable height maps: pixels, polynomials, rings and a network, at any sampling.
+"""Trainable height maps at any sampling: pixels, polynomials, rings and a network.
 
-The network is also a node.
+The network is also available as the node `doe.unet`.
 """
 
 import math
@@ -35,11 +35,11 @@ from neusee.nodes.values import Stop
 
 # --- network --------------------------------------------------------------------------------------
 
-# A height map computed by a network from the pupil coordinates alone: smooth, with a million
+# A height map that a network computes from the pupil coordinates only: smooth, with a million
 # parameters.
 
 
-#: frequency of the first layer's sines: about four periods across the pupil at the start
+#: factor in the sines after the first layer: about four periods across the pupil before training
 _SINE_FREQUENCY = 15.0
 
 
@@ -47,13 +47,12 @@ class HeightNet(nn.Module):
     """A network of four downsampling and four upsampling convolutions, from (u, v) to one logit for
     each sample.
 
-    Sines follow the first convolution, so that the height map can be less smooth than the
-    coordinates.
+    Sines after the first convolution allow finer detail in the height map.
     """
 
     def __init__(self, width: int = 32) -> None:
-        """Build the network with ``width`` channels after its first layer, doubled at each of three
-        halvings.
+        """Build the network with ``width`` channels after the first layer, doubled at each of three
+        downsamplings.
         """
         super().__init__()
         sizes = [2, width, 2 * width, 4 * width, 8 * width]
@@ -83,8 +82,8 @@ class HeightNet(nn.Module):
 
 
 def _with_repeated_edges(x: Tensor) -> Tensor:
-    """Pad a tensor with its outermost rows and columns, because zeros would add a frame to the
-    height map.
+    """Pad a tensor by repeating its outermost rows and columns; zero padding would show at the
+    edges of the height map.
     """
     x = torch.cat([x[..., :1, :], x, x[..., -1:, :]], dim=-2)
     return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
@@ -100,8 +99,8 @@ def pupil_coordinates(grid: int, device: torch.device | None = None) -> Tensor:
 
 
 def network_height(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
-    """Return the height map (samples, samples) of a network, 0 to ``max_height``, differentiable
-    in the weights.
+    """Return the height map (samples, samples) of a network, between 0 and ``max_height``,
+    differentiable with respect to the weights.
     """
     like = next(net.parameters())
     logits = net(pupil_coordinates(min(grid, samples), like.device).to(like))
@@ -111,8 +110,8 @@ def network_height(net: nn.Module, samples: int, grid: int, max_height: float) -
 def new_network(width: int, grid: int, rng: torch.Generator) -> HeightNet:
     """Return a new height network with random orthogonal weights and zero biases.
 
-    The last layer is scaled to logits of mean 0 and standard deviation 1, so that the height map is
-    far from flat.
+    The last layer is scaled so that the logits have mean 0 and standard deviation 1, which gives a
+    height map that is far from flat.
     """
     net = HeightNet(width).to(rng.device)
     with torch.no_grad():
@@ -175,29 +174,30 @@ unet.check(height_checks)
 
 # --- parametrisations -----------------------------------------------------------------------------
 
-# Trainable height maps: pixels, Zernike polynomials, rings and a network, each for any sampling of
-# the pupil.
+# Trainable height maps for any sampling of the pupil: pixels, Zernike polynomials, rings and a
+# network.
 #
-# A module is called with the stop and returns the height map (v, u), float32 in m, at least 0. The
-# trained numbers do not depend on the sampling, so that a mask that was trained on few samples can
-# be evaluated on many samples.
+# Each module is called with the stop and returns the height map (v, u), float32, in m, at least 0.
+# The trained parameters do not depend on the sampling: a mask trained on few samples can be
+# evaluated on many.
 
 
 HeightMapOf = Callable[[Stop], Tensor]
-#: from a stop and parameters of a node
+#: makes a trainable height map from a stop and the parameters of a node
 Start = Callable[[Stop, Mapping[str, Any], torch.Generator], nn.Module]
-#: share of the depth at both ends that a start avoids, because the sigmoid has almost no slope
-#: there
+#: share of the depth at both ends that start values avoid, because the gradient of the sigmoid
+#: almost vanishes there
 _LOGIT_MARGIN = 0.01
-_FREE_SHARE = 0.05  #: share of a formula's depth that is free above and below its height map
+#: margin of trainable height above and below a formula's height map, as a share of its depth
+_FREE_SHARE = 0.05
 
 
 class Pixels(nn.Module):
-    """A trainable height map of ``grid`` x ``grid`` pixels, limited to ``max_height`` by a sigmoid,
-    resampled smoothly.
+    """A trainable height map of ``grid`` x ``grid`` pixels, limited to ``max_height`` by a sigmoid
+    and resampled by bicubic interpolation.
 
-    The heights start from a smooth random height map with features of ``scale`` diameters, or from
-    ``start``.
+    The start is the height map ``start``, or a smooth random one with features ``scale`` pupil
+    diameters wide.
     """
 
     def __init__(
@@ -208,8 +208,8 @@ class Pixels(nn.Module):
         rng: torch.Generator,
         start: Tensor | None = None,
     ) -> None:
-        """Start at random, smooth over ``scale`` of the pupil, or at the height map ``start``
-        in m.
+        """Start from a random height map that is smooth over ``scale`` pupil diameters, or from
+        ``start`` in m.
         """
         super().__init__()
         self.max_height = max_height
@@ -230,19 +230,17 @@ class Pixels(nn.Module):
 
 
 class Modes(nn.Module):
-    """A trainable height map of ``count`` Zernike polynomials from Noll number 4 on, with root mean
-    squares in waves.
+    """A trainable height map of ``count`` Zernike polynomials, from Noll number 4 on, with
+    coefficients in waves rms.
 
-    Numbers 1 to 3 are absent: piston changes nothing, and tilt only shifts the spot. The start is a
-    random sum of ``waves`` root mean square.
+    Numbers 1 to 3 are omitted: piston has no effect, and tilt only shifts the spot. The start is a
+    random sum with ``waves`` rms.
     """
 
     def __init__(
         self, count: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
     ) -> None:
-        """Start with random modes of ``waves`` root mean square together, at ``wavelength`` in
-        m.
-        """
+        """Start with a random sum of modes of ``waves`` rms in total, at ``wavelength`` in m."""
         super().__init__()
         self.wavelength, self.material = wavelength, material
         random_direction = torch.randn(count, generator=rng, dtype=torch.float64)
@@ -288,21 +286,22 @@ class Rings(nn.Module):
         material: Material,
         rng: torch.Generator,
     ) -> None:
-        """Start with slopes of alternating sign, in waves at the rim, that differ in ``noise``.
+        """Start with slopes of alternating sign in waves at the rim, plus random slopes of standard
+        deviation ``noise``.
 
-        ``sided`` turns the sign of the phase on one side of the axis, as in half rings.
+        ``sided`` inverts the sign of the phase on one side of the axis, as in half rings.
         """
         super().__init__()
         self.sided, self.wavelength, self.material = sided, wavelength, material
         fifth_of_rings = (torch.arange(count) * 5).div(count, rounding_mode="floor")
-        # 12, -18, 24, -30 and 36 waves in the five fifths of the rings
+        # slopes of 12, -18, 24, -30 and 36 waves in the five fifths of the rings
         start_slopes = (12.0 + 6.0 * fifth_of_rings) * (1 - 2 * (fifth_of_rings % 2))
         self.slopes = nn.Parameter(start_slopes + noise * torch.randn(count, generator=rng))
         self.steps = nn.Parameter(torch.zeros(count))
         self._annuli = lru_cache(maxsize=1)(self._annuli_on)
 
     def _annuli_on(self, grid: PupilGrid) -> Tensor:
-        """Return the number (v, u) of the annulus in which each sample lies."""
+        """Return the index (v, u) of the annulus in which each sample lies."""
         v, u = pupil_axes(grid, self.slopes.device)
         return (
             ((v.square() + u.square()) * len(self.slopes))
@@ -324,8 +323,8 @@ class Rings(nn.Module):
 
 
 class Drawn(nn.Module):
-    """A trainable height map on ``grid`` samples, from the network ``net`` of `doe.unet` or a
-    new random network.
+    """A trainable height map on ``grid`` samples, computed by a height network: ``net``, or a new
+    random one.
     """
 
     def __init__(
@@ -349,8 +348,8 @@ class Drawn(nn.Module):
 
 
 class Written(nn.Module):
-    """A height map smoothed by `doe.smooth` to ``feature``, so that training uses no details too
-    fine for the tool.
+    """A trainable height map ``shape``, smoothed by `doe.smooth` to ``feature``, so that training
+    uses no detail too fine for the tool.
     """
 
     def __init__(self, shape: HeightMapOf, feature: float) -> None:
@@ -367,15 +366,17 @@ class Written(nn.Module):
 
 
 def _start_pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
-    """Return pixels that start at the height map of `doe.pixelwise` with these parameters."""
+    """Return trainable pixels that start at the height map of `doe.pixelwise` with these
+    parameters.
+    """
     start: Tensor = pixelwise(stop, **params, rng=rng)
     highest = height_range(params["file"], params["depth"])
     return Pixels(int(stop.samples), highest, params["scale"], rng, start.to(rng.device))
 
 
 def _pixels_from_formula(mask: Callable[..., Tensor]) -> Start:
-    """Return a function that starts trainable pixels at a formula's height map, away from the
-    ends of their sigmoid.
+    """Return a function that makes trainable pixels starting at a formula's height map, away from
+    the saturation of their sigmoid.
     """
 
     def start(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
@@ -393,7 +394,9 @@ def _pixels_from_formula(mask: Callable[..., Tensor]) -> Start:
 
 
 def _start_network(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
-    """Return a height network with the weights of a step of `doe.unet`, or with new ones."""
+    """Return a trainable height network with the weights of a `doe.unet` step, or with new random
+    ones.
+    """
     width, grid, weights = (
         params["width"],
         min(params["grid"], int(stop.samples)),
@@ -417,16 +420,16 @@ PARAMETRISATIONS: dict[str, Start] = {
 
 # --- polynomial height maps -----------------------------------------------------------------------
 
-# Trainable height maps of few numbers: products of Legendre polynomials, and polynomials along one
-# direction.
+# Trainable height maps with few parameters: products of Legendre polynomials, and polynomials along
+# one direction.
 #
-# A module is called with the stop and returns the height map (v, u), float32 in m, at least 0, for
-# any sampling.
+# Each module is called with the stop and returns the height map (v, u), float32, in m, at least 0,
+# for any sampling.
 
 
 def legendre(position: Tensor, degree: int) -> list[Tensor]:
-    """Return the Legendre polynomials of degree 0 to ``degree``, with a root mean square of 1
-    over [-1, 1].
+    """Return the Legendre polynomials of degree 0 to ``degree``, normalised to a root mean square
+    of 1 over [-1, 1].
     """
     unscaled = [torch.ones_like(position), position]
     for k in range(1, degree):
@@ -441,17 +444,15 @@ class Polynomials(nn.Module):
     """A trainable height map of products of Legendre polynomials in both axes of the pupil, up to a
     total degree.
 
-    Piston and tilt are absent: piston changes nothing, and tilt only shifts the spot. Defocus,
-    astigmatism, coma and the cubic mask are special cases. The numbers are root mean squares in
-    waves over the square about the stop; the start is a random sum of ``waves`` root mean square.
+    Piston and tilt are omitted: piston has no effect, and tilt only shifts the spot. Defocus,
+    astigmatism, coma and the cubic mask are special cases. The coefficients are in waves rms over
+    the square around the stop; the start is a random sum with ``waves`` rms.
     """
 
     def __init__(
         self, degree: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
     ) -> None:
-        """Start with random products of ``waves`` root mean square together, at ``wavelength`` in
-        m.
-        """
+        """Start with a random sum of products of ``waves`` rms in total, at ``wavelength`` in m."""
         super().__init__()
         self.degree, self.wavelength, self.material = degree, wavelength, material
         random_direction = torch.randn(
@@ -463,7 +464,7 @@ class Polynomials(nn.Module):
         self._products = lru_cache(maxsize=1)(self._products_on)
 
     def _exponents(self) -> Iterator[tuple[int, int]]:
-        """Yield the degrees along both axes of each product; below 2 a mask only shifts the
+        """Yield the degrees of each product along both axes; a total degree below 2 only shifts the
         spot.
         """
         for total_degree in range(2, self.degree + 1):
@@ -490,19 +491,19 @@ class Polynomials(nn.Module):
 
 
 class Streak(nn.Module):
-    """A trainable height map that varies along one direction and throws the light into a line, as
-    cylinders do.
+    """A trainable height map that varies along one direction only and spreads light into a line,
+    like a cylindrical lens.
 
     The phase is a sum of Legendre polynomials of degree 2 to ``degree`` in t = u cos a + v sin a.
-    Learnt are the angle ``a`` in radians and the root mean square of each polynomial in waves. The
-    start has a random angle and a random sum of ``waves`` root mean square.
+    The trained parameters are the angle ``a`` in radians and the coefficient of each polynomial in
+    waves rms. The start has a random angle and a random sum with ``waves`` rms.
     """
 
     def __init__(
         self, degree: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
     ) -> None:
-        """Start with random polynomials along a random direction, of ``waves`` root mean square
-        together.
+        """Start with a random sum of polynomials of ``waves`` rms in total, along a random
+        direction.
         """
         super().__init__()
         self.wavelength, self.material = wavelength, material
@@ -519,17 +520,18 @@ class Streak(nn.Module):
         grid = grid_of(stop)
         v, u = pupil_axes(grid, self.waves.device)
         position = u * self.angle.cos() + v * self.angle.sin()
-        # from degree 2 on: below it a mask only shifts the spot
+        # from degree 2 on: lower degrees only shift the spot
         polynomials = legendre(position, len(self.waves) + 1)[2:]
         phase = torch.tensordot(2 * math.pi * self.waves.to(position), torch.stack(polynomials), 1)
         return height_from_phase(phase, grid, self.wavelength, self.material)
 
 
 class LearntStop(nn.Module):
-    """A round stop whose diameter is learnt, as a share of that of the lens, above ``least`` and at
-    most 1.
+    """A round stop with a trainable diameter, relative to that of the lens, between ``least`` and
+    1.
 
-    The rim is one sample wide, so that the amplitude has a gradient; `doe.shade` has a sharp rim.
+    The amplitude falls over one sample at the rim, so that it has a gradient; `doe.shade` has a
+    sharp rim.
     """
 
     def __init__(self, diameter: float = 0.95, least: float = 0.1) -> None:
@@ -544,13 +546,13 @@ class LearntStop(nn.Module):
         return self.least + (1 - self.least) * share
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the amplitude (v, u) that the stop lets through on the pupil grid of ``stop``,
-        float32 in [0, 1].
+        """Return the amplitude transmittance (v, u) on the pupil grid of ``stop``, float32 in [0,
+        1].
         """
         grid = grid_of(stop)
         v, u = pupil_axes(grid, self.logit.device)
         samples = grid.diameter / grid.pitch
-        # a stop of diameter 1 is open up to the rim of the lens
+        # half a sample wider, so that a stop of diameter 1 is fully open up to the rim of the lens
         rim_radius = self.diameter().double() * (1 + 1 / samples)
         # falls from 1 to 0 over one sample at the rim
         return (

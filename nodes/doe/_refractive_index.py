@@ -1,7 +1,7 @@
-"""Materials of the mask, their refractive indices, and the height that gives a phase.
+"""Materials of the mask, their refractive indices, and the height for a given phase.
 
-A material is one of four known ones, or a glass of the user: Sellmeier coefficients, or a table of
-the index by wavelength.
+A material is one of four built-in ones, or a glass of the user: Sellmeier coefficients, or a table
+of index over wavelength.
 """
 
 import math
@@ -47,7 +47,7 @@ _COLUMN_ADVICE = (
     "write a header such as wavelength (um),n (1) and two columns, or B (1),C (um^2),from (nm),to"
     " (nm) with one row for each term of the Sellmeier formula"
 )
-_LEAST_INDEX, _LARGEST_INDEX = 1.0, 5.0  #: no glass has an index outside these
+_LEAST_INDEX, _LARGEST_INDEX = 1.0, 5.0  #: plausible range of a refractive index
 _AREA = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
 
@@ -68,8 +68,8 @@ Area = Annotated[float, BeforeValidator(_area, json_schema_input_type=str)]  #: 
 
 @with_config(ConfigDict(extra="forbid"))
 class Sellmeier(TypedDict):
-    """Coefficients of n^2 = 1 + sum of B w^2 / (w^2 - C), and the range of wavelengths over
-    which they were fitted.
+    """Coefficients of the Sellmeier formula n^2 = 1 + sum of B w^2 / (w^2 - C), and the range of
+    wavelengths over which they were fitted.
     """
 
     B: Annotated[tuple[Real, ...], Field(min_length=1)]
@@ -77,7 +77,7 @@ class Sellmeier(TypedDict):
     range: tuple[Wavelength, Wavelength]  #: m
 
 
-#: of `Sellmeier` as a recipe writes the coefficients
+#: JSON schema of `Sellmeier` in a recipe
 SELLMEIER_SCHEMA = {
     "type": "object",
     "properties": {
@@ -91,8 +91,8 @@ SELLMEIER_SCHEMA = {
 
 
 def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:
-    """Return the refractive index of a glass at wavelengths in m; the result is differentiable and
-    keeps the dtype.
+    """Return the refractive index of a glass at wavelengths in m, differentiable and in their
+    dtype.
 
     Raises ValueError for wavelengths outside the range of the table or the coefficients.
     """
@@ -119,7 +119,9 @@ def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:
 
 
 def glass_range(glass: Path | Sellmeier) -> tuple[float, float]:
-    """Return the wavelengths in m between which the index of a glass is known."""
+    """Return the shortest and the longest wavelength in m at which the index of a glass is
+    known.
+    """
     index_data = _index_of_file(glass) if isinstance(glass, Path) else glass
     if isinstance(index_data, Table):
         return float(index_data.wavelengths[0]), float(index_data.wavelengths[-1])
@@ -127,7 +129,7 @@ def glass_range(glass: Path | Sellmeier) -> tuple[float, float]:
 
 
 def index_rows(file: Path) -> tuple[Tensor, Tensor] | None:
-    """Return the wavelengths in m and the indices in the rows of a file, or None for a file of
+    """Return the wavelengths in m and the indices of the table in a file, or None for a file of
     coefficients.
     """
     index_data = _index_of_file(file)
@@ -135,7 +137,7 @@ def index_rows(file: Path) -> tuple[Tensor, Tensor] | None:
 
 
 def refuse_glass(glass: Path | Sellmeier) -> None:
-    """Raise ParameterError for a glass without a plausible index anywhere in its range."""
+    """Raise ParameterError for a glass with an implausible index somewhere in its range."""
     try:
         index_data = _index_of_file(glass) if isinstance(glass, Path) else glass
         if not isinstance(index_data, Table):
@@ -151,9 +153,7 @@ def _glass_name(glass: Path | Sellmeier) -> str:
 
 
 def _refuse_coefficients(glass: Sellmeier, name: str) -> None:
-    """Raise ValueError for coefficients that give no plausible index at some wavelength of their
-    range.
-    """
+    """Raise ValueError for coefficients that give an implausible index somewhere in their range."""
     low, high = glass["range"]
     if len(glass["B"]) != len(glass["C"]):
         raise ValueError(
@@ -176,7 +176,7 @@ def _refuse_coefficients(glass: Sellmeier, name: str) -> None:
 
 
 def _sellmeier_index(glass: Sellmeier, wavelengths: Tensor) -> Tensor:
-    """Return the index by the Sellmeier formula, n^2 = 1 + sum of B w^2 / (w^2 - C), w in um."""
+    """Return the index from the Sellmeier formula n^2 = 1 + sum of B w^2 / (w^2 - C), w in um."""
     squared_um = (wavelengths * 1e6).square()
     terms = [b * squared_um / (squared_um - c) for b, c in zip(glass["B"], glass["C"], strict=True)]
     return (1 + torch.stack(terms).sum(0)).sqrt()
@@ -198,14 +198,14 @@ def _interpolated_index(table: Table, wavelengths: Tensor) -> Tensor:
     ratios = (
         flat_wavelengths[:, None, None] - row_wavelengths[:, None, :]
     ) / distances.masked_fill(is_same_row, 1.0)
-    # Lagrange's polynomials: the product over all other rows
+    # Lagrange basis polynomials: product over all other rows
     weights = ratios.masked_fill(is_same_row, 1.0).prod(2)
     return (weights * row_values).sum(1).reshape(wavelengths.shape)
 
 
 @once_per_version
 def _index_of_file(file: Path) -> Table | Sellmeier:
-    """Read a glass from a CSV file; the header says if the file holds a table or coefficients."""
+    """Read a glass from a CSV file; its header tells a table from coefficients."""
     rows = table_rows(file)
     if rows.columns[0].quantity.upper() == "B":
         return _coefficients(file, rows)
@@ -225,11 +225,11 @@ def _index_of_file(file: Path) -> Table | Sellmeier:
 
 
 def _refuse_gap(index_curve: Curves) -> None:
-    """Raise ValueError for a gap between two rows in which the cubic leaves the straight line by
-    more than half a step.
+    """Raise ValueError for a gap between two rows in which cubic and linear interpolation differ by
+    more than half a step of the index.
 
-    The step is the largest of the gap and its neighbours. A few rows close together decide the
-    slope in a wide gap.
+    The step is the largest among the gap and its two neighbours. This finds wide gaps in which a
+    few close rows would determine the slope.
     """
     table = index_curve.table()
     wavelengths, values = table.wavelengths, table.values[0]
@@ -250,7 +250,7 @@ def _refuse_gap(index_curve: Curves) -> None:
 
 
 def _coefficients(file: Path, rows: Rows) -> Sellmeier:
-    """Return the glass of a table of Sellmeier coefficients, one term a row."""
+    """Return the glass from a table of Sellmeier coefficients with one term per row."""
     um2_per_unit, from_unit, to_unit = _column_units(file, rows)
     values = rows.values
     if len({tuple(row) for row in values[:, 2:]}) > 1:
@@ -267,8 +267,8 @@ def _coefficients(file: Path, rows: Rows) -> Sellmeier:
 
 
 def _column_units(file: Path, rows: Rows) -> tuple[float, float, float]:
-    """Return the factors that bring C to um^2, and from and to to m; raise ValueError for other
-    columns.
+    """Return the factors that convert column C to um^2, and the columns `from` and `to` to m; raise
+    ValueError for other columns.
     """
     names = [column.quantity.lower() for column in rows.columns]
     if names != ["b", "c", "from", "to"]:
@@ -289,13 +289,13 @@ def _column_units(file: Path, rows: Rows) -> tuple[float, float, float]:
 
 
 Material = Literal["fused silica", "PMMA", "BK7", "photoresist"]
-#: a known material, a file with a table or coefficients, or coefficients
+#: a built-in material, a file with a table or coefficients, or coefficients
 Glass = Annotated[
     Annotated[Material | DataFile, Tag("file")]
     | Annotated[Sellmeier, Tag("coefficients"), WithJsonSchema(SELLMEIER_SCHEMA)],
     Discriminator(lambda value: "coefficients" if isinstance(value, Mapping) else "file"),
 ]
-AnyGlass = str | Path | Sellmeier  #: `Glass` as a function receives it
+AnyGlass = str | Path | Sellmeier  #: a `Glass` after validation
 
 
 class _Dispersion(NamedTuple):
@@ -326,10 +326,9 @@ _DISPERSION: dict[str, _Dispersion] = {
 
 
 def excess_index(name: AnyGlass, wavelengths: Tensor) -> Tensor:
-    """Return n - 1 of a material at wavelengths in m; the result is differentiable and keeps the
-    dtype.
+    """Return n - 1 of a material at wavelengths in m, differentiable and in their dtype.
 
-    Raises ValueError for wavelengths outside the range of a material of your own.
+    Raises ValueError for wavelengths outside the range of a user's glass.
     """
     if not isinstance(name, str):
         return glass_index(name, wavelengths) - 1
@@ -347,8 +346,8 @@ def wave_height(name: AnyGlass, wavelength: float) -> float:
 
 
 def index_curve(glass: AnyGlass, count: int = 400) -> tuple[Tensor, Tensor]:
-    """Return ``count`` wavelengths in m over the range in which a material is known, and its
-    refractive index there.
+    """Return ``count`` wavelengths in m over the range in which the index of a material is known,
+    and the index there.
     """
     _, (low, high) = _name_and_range(glass)
     wavelengths = torch.linspace(low, high, count, dtype=torch.float64)
@@ -356,8 +355,8 @@ def index_curve(glass: AnyGlass, count: int = 400) -> tuple[Tensor, Tensor]:
 
 
 def nearest_known(name: AnyGlass, wavelength: float) -> float:
-    """Return the wavelength in m nearest to ``wavelength`` at which the index of a material of
-    your own is known.
+    """Return the wavelength in m, nearest to ``wavelength``, at which the index of a user's glass
+    is known; for a built-in material ``wavelength`` itself.
     """
     if isinstance(name, str):
         return wavelength
@@ -395,11 +394,11 @@ def _(*, bands: Bands | None = None, material: AnyGlass = "fused silica") -> lis
 
 
 def refuse_material(parameter: str, material: AnyGlass, wavelengths: Tensor | None) -> list[str]:
-    """Raise ParameterError for a material of your own that is wrong or not known at wavelengths in
+    """Raise ParameterError for a user's glass that is invalid, or not known at the wavelengths in
     m; return no notes.
 
-    ``parameter`` is the parameter that the wavelengths come from; a wrong file is always a mistake
-    of ``material``.
+    An error of the wavelengths names ``parameter``, from which they come; an error of the file
+    names ``material``.
     """
     if isinstance(material, str):
         return []
@@ -426,7 +425,9 @@ def _(result: Tensor, bands: Bands, *, material: AnyGlass) -> list[Check]:
 
 
 def _name_and_range(material: AnyGlass) -> tuple[str, tuple[float, float]]:
-    """Return the name of a material, and the wavelengths in m between which its index is known."""
+    """Return the name of a material, and the shortest and the longest wavelength in m at which its
+    index is known.
+    """
     if isinstance(material, str):
         return material, _DISPERSION[material].fit
     return material.name if isinstance(
@@ -436,16 +437,16 @@ def _name_and_range(material: AnyGlass) -> tuple[str, tuple[float, float]]:
 
 # --- height from phase ----------------------------------------------------------------------------
 
-# The height map of a mask that produces a given phase, and the check of a height map.
+# The height map that produces a given phase, and the check of a height map.
 
 
 def height_from_phase(
     phase: Tensor, grid: PupilGrid, wavelength: float, material: AnyGlass
 ) -> Tensor:
-    """Return the height map (float32, m) that delays ``wavelength`` by ``phase``; the least height
-    is 0.
+    """Return the height map (v, u), float32, in m, that delays light of ``wavelength`` by ``phase``
+    in rad, with a minimum of 0.
 
-    The height outside the stop is 0 too.
+    Outside the stop the height is 0.
     """
     in_stop = inside_stop(grid, phase.device)
     phase_from_lowest = phase - torch.where(in_stop, phase, math.inf).min()
@@ -455,8 +456,8 @@ def height_from_phase(
 
 
 def height_checks(height: Tensor, *_: Any, **__: Any) -> list[Check]:
-    """Check that all heights are finite and at least 0, and state the least and the greatest
-    height.
+    """Check that all heights are finite and not negative; the text states the smallest and the
+    largest height.
     """
     lowest, highest = (float(value) for value in torch.aminmax(height))
     is_valid = math.isfinite(lowest) and math.isfinite(highest) and lowest >= 0

@@ -1,6 +1,6 @@
-"""A height map read from a file, or a smooth random height map at which a training starts.
+"""A height map read from a file, or a smooth random height map as a start for training.
 
-A map of a file has a pitch of its own, and is resampled to the grid of the pupil.
+A height map from a file may have its own pitch; it is then resampled to the pupil grid.
 """
 
 import math
@@ -23,15 +23,15 @@ from neusee.nodes.values import Stop
 # --- resampling -----------------------------------------------------------------------------------
 
 Between = Literal["linear", "nearest"]
-_JUMP_SHARE = 0.5  #: share of the range of heights by which a sample may differ from its neighbour
+_JUMP_SHARE = 0.5  #: largest difference of neighbouring samples, as a share of the range of heights
 
 
 def resampled(height: Tensor, pitch: float, grid: PupilGrid, between: Between = "linear") -> Tensor:
-    """Return a height map (y, x) with samples ``pitch`` apart on the grid of the pupil, (v, u)
+    """Resample a height map (y, x) with samples ``pitch`` m apart to the pupil grid, (v, u)
     float32.
 
-    The centre of the height map lies on the axis. Beyond the last samples, within half a pitch,
-    their heights continue.
+    The centre of the height map lies on the axis. The outermost samples extend half a pitch beyond
+    their positions.
     """
     positions = [_map_positions(n, pitch, grid) for n in height.shape]
     if between == "nearest":
@@ -56,8 +56,8 @@ def resampling_error(height: Tensor, pitch: float, grid: PupilGrid) -> float:
 
 
 def coverage_problem(shape: tuple[int, ...], pitch: float, grid: PupilGrid) -> str:
-    """Return a message for a height map that does not cover the clear aperture, else an empty
-    text.
+    """Return an error message for a height map that does not cover the clear aperture, else an
+    empty text.
     """
     size = [n * pitch for n in shape]
     if min(size) >= grid.diameter * (1 - 1e-9):
@@ -71,11 +71,11 @@ def coverage_problem(shape: tuple[int, ...], pitch: float, grid: PupilGrid) -> s
 
 
 def largest_jump(height: Tensor, pitch: float, grid: PupilGrid) -> str:
-    """Return the place of the largest step between neighbours that linear interpolation would turn
-    into a ramp.
+    """Return a text on the largest step between neighbouring samples, which linear interpolation
+    would turn into a ramp.
 
-    Only samples inside the clear aperture count. The text is empty if no step is larger than half
-    of their range.
+    Only samples inside the clear aperture count. The text is empty if the step is at most half of
+    their range of heights.
     """
     y, x = (
         (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * (2 * pitch / grid.diameter)
@@ -101,7 +101,7 @@ def largest_jump(height: Tensor, pitch: float, grid: PupilGrid) -> str:
 
 
 def _map_positions(count: int, pitch: float, grid: PupilGrid) -> Tensor:
-    """Return the place of each sample of the pupil along one axis, in samples of the height map,
+    """Return the position of each pupil sample along one axis, in samples of the height map,
     float64.
     """
     steps = torch.arange(grid.samples, dtype=torch.float64) - (grid.samples - 1) / 2
@@ -109,7 +109,7 @@ def _map_positions(count: int, pitch: float, grid: PupilGrid) -> Tensor:
 
 
 def _interpolated(height: Tensor, positions: list[Tensor], cubic: bool) -> Tensor:
-    """Return a height map at positions along both axes, in samples of the map, float64."""
+    """Interpolate a height map at positions along both axes, in samples of the map, float64."""
     rows, columns = (
         _interpolation_matrix(x, n, cubic) for x, n in zip(positions, height.shape, strict=True)
     )
@@ -117,8 +117,8 @@ def _interpolated(height: Tensor, positions: list[Tensor], cubic: bool) -> Tenso
 
 
 def _interpolation_matrix(position: Tensor, count: int, cubic: bool) -> Tensor:
-    """Return the matrix (position, sample) of linear interpolation, or of the cubic through four
-    samples.
+    """Return the matrix (position, sample) of linear interpolation, or of cubic interpolation
+    through four samples.
     """
     point_count = min(4 if cubic else 2, count)
     position = position.clamp(0, count - 1)
@@ -126,7 +126,7 @@ def _interpolation_matrix(position: Tensor, count: int, cubic: bool) -> Tensor:
     matrix = torch.zeros(len(position), count, dtype=torch.float64)
     for k in range(point_count):
         others = [j for j in range(point_count) if j != k]
-        # Lagrange's polynomial of each point
+        # Lagrange basis polynomial of each point
         factors = [(position - (first + j)) / (k - j) for j in others]
         share = torch.stack(factors).prod(0) if factors else torch.ones_like(position)
         matrix[torch.arange(len(position)), first + k] = share
@@ -134,8 +134,8 @@ def _interpolation_matrix(position: Tensor, count: int, cubic: bool) -> Tensor:
 
 
 def lost_detail(pitch: float, grid: PupilGrid) -> str:
-    """Return a note for a height map that is finer than the grid of the pupil, which loses its
-    finest detail.
+    """Return a note for a height map with a finer pitch than the pupil grid, which loses its finest
+    detail; else an empty text.
     """
     ratio = grid.pitch / pitch
     if ratio <= 1 + 1e-6:
@@ -150,10 +150,10 @@ def lost_detail(pitch: float, grid: PupilGrid) -> str:
 # --- map of a file, or a random map ---------------------------------------------------------------
 
 Scale = Annotated[float, Field(gt=0, le=1)]  #: share of the pupil's diameter
-_DEFAULT_DEPTH = 1.2e-6  #: m, height of white where neither the recipe nor the file says
-_WRITTEN_PRECISION = 1e-3  #: relative difference of a pitch that is written with four digits
+_DEFAULT_DEPTH = 1.2e-6  #: m, height of white if neither recipe nor file states it
+_WRITTEN_PRECISION = 1e-3  #: relative rounding of a pitch written with four digits
 _EQUAL_PITCH = 1e-6  #: relative difference of two pitches that counts as rounding
-_TALLEST_MASK = 0.01  #: m; a higher mask is a mistake of the unit
+_TALLEST_MASK = 0.01  #: m; a higher mask is taken as a wrong unit
 
 
 @node()
@@ -207,8 +207,8 @@ def pixelwise(
 def height_map(
     file: Path, *, depth: float | None = None, unit: float | None = None, pitch: float | None = None
 ) -> tuple[Tensor, float | None]:
-    """Read a height map in m as its file samples it, and the distance of its samples in m, None if
-    nothing states it.
+    """Return the height map in a file in m, at its own sampling, and its pitch in m (None if not
+    stated).
 
     The parameters are those of `pixelwise`.
     """
@@ -217,8 +217,8 @@ def height_map(
 
 
 def height_range(file: Path | None, depth: float | None) -> float:
-    """Return the largest height in m that `doe.pixelwise` draws or learns: that stated, or 1.2
-    um.
+    """Return the largest height in m of a random or trainable `doe.pixelwise` map: the stated
+    depth, or 1.2 um.
     """
     if file is None:
         return _DEFAULT_DEPTH if depth is None else depth
@@ -251,10 +251,10 @@ def _lengths(
 def _interpolation_pitch(
     file: Path, grid: PupilGrid, pitch: float | None, pupil_pitch: float | None
 ) -> float | None:
-    """Return the pitch from which a height map is interpolated, or None if it has the samples of
-    the pupil grid.
+    """Return the pitch in m of a height map that must be interpolated, or None if its samples are
+    those of the pupil grid.
 
-    Raises ParameterError for another size than the pupil needs, and for a size that nothing states.
+    Raises ParameterError for a map that does not fit the pupil, and for an unknown size.
     """
     samples, shape = grid.samples, map_header(file).shape
     has_pupil_samples = shape == (samples, samples)
@@ -316,8 +316,8 @@ def _(
 
 
 def _refuse_unknown_size(file: Path, grid: PupilGrid, pupil_pitch: float | None) -> None:
-    """Raise ParameterError for a file without a pitch where the pupil has another pitch than the
-    recipe writes.
+    """Raise ParameterError for a file without a pitch if the pitch of the pupil differs from the
+    one that the recipe states.
     """
     if pupil_pitch is None or abs(pupil_pitch / grid.pitch - 1) <= _WRITTEN_PRECISION:
         return
@@ -335,7 +335,7 @@ def _size_text(grid: PupilGrid) -> str:
 def _size_note(
     file: Path, stop: Stop | None, pitch: float | None, pupil_pitch: float | None
 ) -> list[str]:
-    """Return a note on a file of which nothing states the distance of its samples."""
+    """Return a note if nothing states the pitch of a file, else nothing."""
     if stop is None or pitch is not None or pupil_pitch is not None:
         return []
     return [
@@ -345,7 +345,7 @@ def _size_note(
 
 
 def _white_note(file: Path, depth: float | None) -> list[str]:
-    """Return a note on a picture of which nothing states the height of white."""
+    """Return a note if nothing states the height of white in a .png file, else nothing."""
     if file.suffix.lower() != ".png" or depth is not None or "depth" in map_header(file).stated:
         return []
     return [
@@ -364,7 +364,9 @@ def _refuse_unused(file: Path, depth: float | None, unit: float | None) -> None:
 
 @once_per_version
 def _file_problem(file: Path, depth: float, unit: float) -> str:
-    """Return a message for a file whose heights cannot be read or are wrong, else an empty text."""
+    """Return an error message for a file whose heights cannot be read or are invalid, else an empty
+    text.
+    """
     try:
         return _height_problem(file, read_height_map(file, depth, unit))
     except (OSError, ValueError, SyntaxError) as error:
@@ -372,7 +374,7 @@ def _file_problem(file: Path, depth: float, unit: float) -> str:
 
 
 def _height_problem(file: Path, height: Tensor) -> str:
-    """Return a message for heights that are not finite, negative, or higher than any mask, else
+    """Return an error message for heights that are not finite, negative, or implausibly large, else
     an empty text.
     """
     is_finite = torch.isfinite(height)
@@ -399,7 +401,9 @@ def _height_problem(file: Path, height: Tensor) -> str:
 
 @once_per_version
 def _jump_in_file(file: Path, depth: float, unit: float, pitch: float, grid: PupilGrid) -> str:
-    """Return where a file has a step that interpolation would make a ramp, or an empty text."""
+    """Return a text on a step in the file that interpolation would turn into a ramp, else an empty
+    text.
+    """
     return largest_jump(read_height_map(file, depth, unit), pitch, grid)
 
 

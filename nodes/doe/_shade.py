@@ -1,4 +1,6 @@
-"""Shades: what anyone can buy in place of a mask, and the grey filter that protects as well."""
+"""Shades, the commercially available alternatives to a mask, and the grey filter with equal
+protection.
+"""
 
 import math
 from typing import Annotated, Any
@@ -15,8 +17,8 @@ from neusee.nodes.values import Bands, Shade, Stop
 
 # --- shade ----------------------------------------------------------------------------------------
 
-# Shades: what anyone can buy in place of a mask, which are a grey filter, a smaller stop and a
-# notch filter.
+# Shades are commercially available alternatives to a mask: a grey filter, a smaller stop and notch
+# filters.
 
 
 Share = Annotated[float, Field(gt=0, le=1)]  #: number above 0, at most 1
@@ -55,7 +57,7 @@ def shade(
     v, u = pupil_axes(grid)
     is_open = (v.square() + u.square() <= diameter**2).float()
     rows = [(centre, width, depth) for centre in notches]
-    # the amplitude is the root of the transmittance
+    # the amplitude is the square root of the transmittance
     return Shade(
         is_open * transmittance**0.5, torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
     )
@@ -84,7 +86,8 @@ def _(result: Shade, stop: Stop, **params: Any) -> list[Check]:
 
 # --- equal filter ---------------------------------------------------------------------------------
 
-# The grey filter that protects the sensor as well as a mask does: the rival that anyone can buy.
+# The grey filter that protects the sensor as well as a mask: the commercially available
+# alternative.
 
 
 @node(rtol=1e-6)
@@ -112,17 +115,17 @@ def equal_filter(
 
 @equal_filter.propagate_error
 def _(light: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
-    """Return an error bound from the relative error of the light and the error of the ratio.
+    """Return a bound of the rms error of the result from the errors of the light and of the ratio.
 
-    The filter takes the ratio of one band, which may have all of the error of the ratios. The two
-    errors multiply too.
+    The filter uses the ratio of one band, which may have the whole error of the ratios. The product
+    of both errors is included.
     """
     ratio = others[0] if others else None
     if light.stats is None or (ratio is not None and ratio.rms and ratio.stats is None):
         return math.inf
     largest = max(abs(result.min), abs(result.max))
     filter_transmittance = largest / light.top if light.top > 0 else 1.0
-    # all of the rms error may be in one band
+    # the whole rms error may be in one band
     largest_ratio_error = (
         ratio.rms * math.sqrt(math.prod(ratio.stats.shape)) if ratio and ratio.stats else 0.0
     )
@@ -140,7 +143,7 @@ def _(
 
 
 def transmittance(lsr: Tensor, bands: Bands, lines: list[Bands] | None) -> Tensor:
-    """Return the share of the light () that the filter passes."""
+    """Return the transmittance () of the filter."""
     if len(lsr) != len(bands.centres):
         raise ValueError(
             f"{len(lsr)} ratios and {len(bands.centres)} bands: compute the ratios from the same"

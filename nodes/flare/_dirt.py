@@ -1,4 +1,6 @@
-"""Dirt on the window: grains and scratches, the same at any sampling of the pupil."""
+"""Dirt on the window: grains, scratches and films that are the same at any sampling of the
+pupil.
+"""
 
 import math
 from collections.abc import Sequence
@@ -16,21 +18,22 @@ from neusee.nodes.values import Dirt, Stop
 
 # --- grains and scratches -------------------------------------------------------------------------
 
-# Round grains and scratches on glass, drawn with their correct area at any sampling of the pupil.
+# Round grains and scratches on glass, rendered with their correct area at any sampling of the
+# pupil.
 
 
 class Grain(NamedTuple):
-    """A round grain; position (from the centre) and radius are in diameters of the stop."""
+    """A round grain; position from the centre and radius are in diameters of the stop."""
 
     v: float
     u: float
     radius: float
-    opacity: float  #: opacity for the field; 1 is black
+    opacity: float  #: 1 - transmittance of the field; 1 is opaque
 
 
 class Scratch(NamedTuple):
-    """A scratched line through points; positions (from the centre) and width are in diameters of
-    the stop.
+    """A scratch along a line through points; positions from the centre and width are in diameters
+    of the stop.
     """
 
     points: Sequence[tuple[float, float]]  #: (v, u)
@@ -39,8 +42,8 @@ class Scratch(NamedTuple):
 
 
 def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) -> Tensor:
-    """Darken the pupil amplitude (v, u) in place by each grain and scratch, and return the
-    amplitude.
+    """Multiply the pupil amplitude (v, u) in place by the transmission of each grain and scratch,
+    and return it.
     """
     scale, middle_sample = grid.diameter / grid.pitch, (grid.samples - 1) / 2
     for mark in marks:
@@ -54,10 +57,11 @@ def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) 
 def _darken(
     amplitude: Tensor, places: list[tuple[float, float]], size: float, opacity: float
 ) -> None:
-    """Multiply the amplitude in place by 1 - opacity x covered share of a grain or a scratch.
+    """Multiply the amplitude in place by 1 - opacity x (covered share of each sample) of a grain or
+    scratch.
 
-    ``places`` (v, u) are the points of its line in samples (one for a grain), ``size`` its width in
-    samples. Where segments overlap, the larger share counts.
+    ``places`` (v, u) are the points of its line in samples (one point for a grain), ``size`` its
+    width in samples. Where segments overlap, the larger covered share is used.
     """
     window = _touched_samples(places, size / 2 + 1, amplitude.shape[-1])
     if window is None:
@@ -68,7 +72,7 @@ def _darken(
         None, :
     ]
     cover = amplitude.new_zeros(len(y), x.shape[1])
-    # a grain is one segment from its point to itself
+    # a grain is a segment of length 0
     for start, end in zip(places, places[1:] or places, strict=False):
         segment_window = _touched_samples([start, end], size / 2 + 1, amplitude.shape[-1])
         if segment_window is None:
@@ -87,8 +91,8 @@ def _darken(
 def _touched_samples(
     places: list[tuple[float, float]], margin: float, samples: int
 ) -> tuple[slice, slice] | None:
-    """Return the rows and columns of samples within ``margin`` of the points that a grain or
-    scratch can touch, or None if it is outside the grid.
+    """Return the rows and columns of the bounding box of a grain or scratch, widened by ``margin``
+    samples, or None if it is outside the grid.
     """
     spans = []
     for axis in (0, 1):
@@ -103,7 +107,7 @@ def _touched_samples(
 def _distance_to_line(
     y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float, float]
 ) -> Tensor:
-    """Return the distance of each sample, in samples, from the line between two points."""
+    """Return the distance of each sample from the segment between two points, in samples."""
     (start_y, start_x), (end_y, end_x) = start, end
     line_y, line_x = end_y - start_y, end_x - start_x
     squared_length = line_y**2 + line_x**2
@@ -115,12 +119,12 @@ def _distance_to_line(
 
 
 def _covered_share(distance: Tensor, size: float, is_grain: bool) -> Tensor:
-    """Return the covered share of each sample under a grain or scratch ``size`` samples wide; the
-    shares sum to the area.
+    """Return the covered share of each sample under a grain or scratch ``size`` samples wide,
+    normalised so that the shares add up to its area.
     """
     if is_grain:
         squared_radius = size**2 / 4
-        # the sum over samples of a disc with a linear edge 1 wide is pi (r^2 + 1 / 12)
+        # a disc of radius r with a linear edge one sample wide has the area pi (r^2 + 1 / 12)
         edge_radius = math.sqrt(max(squared_radius - 1 / 12, 1 / 4))
         return min(3 * squared_radius, 1.0) * (edge_radius + 0.5 - distance).clamp(0, 1)
     return ((size + 1) / 2 - distance).clamp(0, min(size, 1.0))
@@ -128,15 +132,15 @@ def _covered_share(distance: Tensor, size: float, is_grain: bool) -> Tensor:
 
 # --- dirt -----------------------------------------------------------------------------------------
 
-# Dirt on the window in front of the lens, with statistics that do not depend on the sampling of the
+# Dirt on the window in front of the lens; its statistics do not depend on the sampling of the
 # pupil.
 
 
 Mean = Annotated[float, Field(ge=0, le=10_000)]  #: expected number
 Part = Annotated[float, Field(gt=0, le=1)]  #: relative to the diameter of the pupil
-Rms = Annotated[Waves, Field(ge=0)]  #: root mean square path, waves at 550 nm
+Rms = Annotated[Waves, Field(ge=0)]  #: root mean square optical path, in waves at 550 nm
 WAVE = 550e-9  #: m
-_VIOLET = 400e-9  #: m, shortest wavelength, at which a path gives the largest phase
+_VIOLET = 400e-9  #: m, shortest wavelength, for which a path gives the largest phase
 _ROUNDING = 6e-8  #: round-off of an amplitude near 1, float32
 DENT_TERMS = range(4, 16)  #: Noll numbers from defocus to the fourth radial order
 
@@ -180,7 +184,7 @@ def dirt(
     grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _generators(5, rng)
     grains = _grains(dust, dust_radius, grains_rng)
     scratch_lines = _scratches(scratches, scratch_length, scratch_width, lines_rng)
-    # each random field is the product of a factor along the rows and one along the columns
+    # each random field is the matrix product of a factor for the rows and one for the columns
     film_rows, film_columns = phase_screen_factors(grid, grease_scale, film_rng)
     patch_rows, patch_columns = phase_screen_factors(grid, smudge_scale, patches_rng)
     dent_terms = _dents(WAVE * dents, dents_rng)
@@ -198,22 +202,22 @@ def dirt(
 
 
 def _generators(count: int, rng: torch.Generator) -> list[torch.Generator]:
-    """Create one random generator for each kind of dirt, so that more dust leaves the scratches
-    unchanged.
+    """Create one random generator for each kind of dirt, so that more dust does not change the
+    scratches.
     """
     seeds = torch.randint(2**62, (count,), generator=rng, device=rng.device).tolist()
     return [torch.Generator(rng.device).manual_seed(seed) for seed in seeds]
 
 
 def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float:
-    """Draw an evenly distributed number from ``low`` to ``high``."""
+    """Draw a uniformly distributed number between ``low`` and ``high``."""
     return low + (high - low) * float(
         torch.rand((), generator=rng, device=rng.device, dtype=torch.float64)
     )
 
 
 def _normal_number(mean: float, spread: float, rng: torch.Generator) -> float:
-    """Sample a normal distribution, and replace a negative number by 0."""
+    """Draw a normally distributed number; a negative one becomes 0."""
     return max(
         mean
         + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)),
@@ -222,8 +226,8 @@ def _normal_number(mean: float, spread: float, rng: torch.Generator) -> float:
 
 
 def _grains(mean: float, radius: float, rng: torch.Generator) -> list[Grain]:
-    """Return round dust grains at random positions: radii up to a largest one drawn about
-    ``radius``, numbers drawn about ``mean``.
+    """Return random dust grains: their number is drawn about ``mean``, their radii up to a largest
+    radius drawn about ``radius``.
     """
     largest = _normal_number(radius, radius / 2, rng)
     return [
@@ -238,8 +242,8 @@ def _grains(mean: float, radius: float, rng: torch.Generator) -> list[Grain]:
 
 
 def _scratches(mean: float, length: float, width: float, rng: torch.Generator) -> list[Scratch]:
-    """Return random scratches: a number drawn about ``mean``, with widths up to a widest one drawn
-    about ``width``.
+    """Return random scratches: their number is drawn about ``mean``, their widths up to a largest
+    width drawn about ``width``.
     """
     number, widest = (
         round(_normal_number(mean, mean / 6, rng)),
@@ -260,8 +264,8 @@ def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
 
 
 def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
-    """Return random Zernike coefficients of the dents in a window, whose root sum of squares is
-    ``rms``.
+    """Return random Zernike coefficients, by Noll number, of the dents in a window; their root sum
+    of squares is ``rms``.
     """
     normal_numbers = torch.randn(
         len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64
@@ -281,12 +285,13 @@ def _(
     dents: float,
     **_: Any,
 ) -> float:
-    """Return an upper bound of the change of the pupil field by dirt, at 400 nm or longer; 0 for a
-    clean window.
+    """Return an upper bound of the change of the pupil field by dirt at wavelengths from 400 nm; 0
+    for a clean window.
 
-    A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps
-    below 8.6, so that the film stays below 31 times its root mean square. The twelve terms of a
-    dent together reach sqrt(50) times their root mean square, at the rim.
+    A grain or a scratch may be opaque. A film is a weighted sum of normal random numbers, which the
+    generator keeps below 8.6, so that the film stays below 31 times its root mean square. The
+    twelve terms of the dents together reach at most sqrt(50) times their root mean square, at the
+    rim.
     """
     if not any((dust, scratches, grease, smudges, dents)):
         return 0.0
@@ -310,8 +315,8 @@ def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
 
 
 def _light_and_path(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
-    """Return the share of the light that passes the dirt, and the standard deviation of the path
-    in the dirt in waves at 550 nm, over the pupil.
+    """Return the share of the light that passes the dirt, and the standard deviation of its optical
+    path over the pupil, in waves at 550 nm.
     """
     pupil_sums = torch.zeros(4, dtype=torch.float64)
     for rows in row_stripes(grid):
@@ -320,7 +325,7 @@ def _light_and_path(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
             dirt.amplitude[rows][in_pupil].double(),
             dirt.path[rows][in_pupil].double() / WAVE,
         )
-        # samples, light, path and squared path, stripe after stripe
+        # sums over the pupil of samples, light, path and squared path, stripe by stripe
         pupil_sums += torch.stack(
             [in_pupil.sum(), amplitude.square().sum(), path_waves.sum(), path_waves.square().sum()]
         ).cpu()

@@ -1,4 +1,4 @@
-"""Ghosts: reflections between the surfaces of the lens, in paraxial form, without a lens
+"""Ghosts: reflections between the surfaces of the lens, in paraxial approximation, without a lens
 prescription.
 """
 
@@ -14,14 +14,14 @@ from neusee.nodes.precision import single
 from neusee.nodes.units import FocalLength, Fraction, PixelPitch, SensorLength
 from neusee.nodes.values import Bands
 
-_SMALLEST_RADIUS = 0.1  #: least radius of a ghost, relative to the largest
+_SMALLEST_RADIUS = 0.1  #: ratio of smallest to largest radius of a ghost
 
 
 class _Ghost(NamedTuple):
     magnification: float  #: distance of the ghost from the axis, relative to the source
     radius: float  #: m
-    share: float  #: relative to the energy of all ghosts, before colour
-    tuned: tuple[float, float]  #: wavelengths, m, of the two reflecting coatings
+    share: float  #: share of the energy of all ghosts, before the colour of the coatings
+    tuned: tuple[float, float]  #: m, design wavelengths of the two reflecting coatings
 
 
 @node()
@@ -64,7 +64,7 @@ def ghosts(
     spot = single(spot)
     # a float64 copy of the spot would be twice as large
     flux = spot.sum(-1).sum(-1, dtype=torch.float64)
-    # pixels from the axis to the laser
+    # position of the laser in pixels from the axis
     y, x = (focal_length * n / pixel_pitch for n in direction.tolist())
     light_of_ghosts = torch.zeros_like(spot)
     for ghost, colour in zip(
@@ -81,9 +81,9 @@ def ghosts(
 
 
 def _random_ghosts(count: int, spread: float, radius: float, rng: torch.Generator) -> list[_Ghost]:
-    """Draw ``count`` ghosts; sizes are normalised so that their shares of the energy add up to 1.
+    """Draw ``count`` random ghosts; their shares of the energy add up to 1.
 
-    Each ghost takes five random numbers: position, radius, energy and the wavelengths of two
+    Each ghost uses five random numbers: position, radius, energy and the wavelengths of two
     coatings.
     """
     random_numbers = torch.rand(
@@ -91,7 +91,7 @@ def _random_ghosts(count: int, spread: float, radius: float, rng: torch.Generato
     ).tolist()
     weights = [math.exp(2 * energy) for _, _, energy, *_ in random_numbers]
     drawn = []
-    # coatings are tuned to 400 to 700 nm
+    # design wavelengths of the coatings between 400 and 700 nm
     for (position, r, _, *coating_draws), weight in zip(random_numbers, weights, strict=True):
         first, second = (400e-9 + 300e-9 * coating_draw for coating_draw in coating_draws)
         magnification, drawn_radius = (
@@ -103,15 +103,15 @@ def _random_ghosts(count: int, spread: float, radius: float, rng: torch.Generato
 
 
 def _reflectance(wavelengths: Tensor, tuned: float) -> Tensor:
-    """Return the reflectance of a quarter-wave layer: 0.05 at the tuned wavelength, at most 1
-    elsewhere.
+    """Return the relative reflectance of a quarter-wave layer: 0.05 at its design wavelength
+    ``tuned``, at most 1 elsewhere.
     """
     return 0.05 + 0.95 * torch.cos(torch.pi / 2 * tuned / wavelengths).square()
 
 
 def _gains_of_bands(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
-    """Return the gain of each ghost in each band, scaled so that all ghosts together carry the
-    flux of the spot.
+    """Return the gain (band,) of each ghost, scaled so that all ghosts together carry the flux of
+    the spot.
     """
     gains = []
     for ghost in drawn:
@@ -139,7 +139,7 @@ def _add_disc(total: Tensor, energy: Tensor, centre: tuple[float, float], radius
     rows, columns = _touched_pixels(y, radius), _touched_pixels(x, radius)
     # the edge is one pixel wide
     disc = (radius + 0.5 - torch.hypot((rows - y)[:, None], (columns - x)[None, :])).clamp(0, 1)
-    # the whole disc has the sum 1, also where the image cuts it
+    # normalise the whole disc, even if the image cuts it off
     visible_disc = (disc / disc.sum())[
         _inside_image(rows, height), _inside_image(columns, width)
     ].to(total)
@@ -152,15 +152,15 @@ def _add_disc(total: Tensor, energy: Tensor, centre: tuple[float, float], radius
 
 def _touched_pixels(middle: float, radius: float) -> Tensor:
     """Return the pixel indices along one axis that a ghost's disc can touch, also outside the
-    image, as float64.
+    image, float64.
     """
     first, last = math.floor(middle - radius) - 1, math.ceil(middle + radius) + 1
     return torch.arange(first, last + 1, dtype=torch.float64)
 
 
 def _inside_image(numbers: Tensor, samples: int) -> slice:
-    """Return the slice of the pixel indices ``numbers`` that lies inside the image, or an empty
-    slice.
+    """Return the slice of the consecutive pixel indices ``numbers`` that lies inside the image; it
+    may be empty.
     """
     first = int(numbers[0])
     return slice(min(max(-first, 0), len(numbers)), max(samples - first, 0))
@@ -176,15 +176,15 @@ def _(
     radius: float,
     **__: Any,
 ) -> float:
-    """Return an upper bound of the ghosts' brightest pixel: all reflected light in one band of the
-    smallest ghost.
+    """Return an upper bound of the brightest pixel of the ghosts: all reflected light in one band
+    and in the smallest ghost.
 
     The samples of a disc of half a pixel or more sum to the area of the disc, pi (r^2 + 1 / 12),
     within 16 %.
     """
     if count == 0 or energy == 0:
         return 0.0
-    # of the smallest ghost; 0.8 is on the safe side of 16 %
+    # area of the smallest ghost; the factor 0.8 covers the 16 %
     area = 0.8 * math.pi * (_in_pixels(_SMALLEST_RADIUS * radius, pixel_pitch) ** 2 + 1 / 12)
     return energy * spot.sum / area
 
@@ -193,8 +193,8 @@ def _(
 def _(
     spot: TensorStats, *_: Any, pixel_pitch: float, energy: float, radius: float, **__: Any
 ) -> tuple[float, float]:
-    """Return the brightness of a ghost of medium size, if the light of the spot fell on one
-    pixel.
+    """Return the expected range: up to the brightness of a medium-sized ghost, if all light of the
+    spot fell on one pixel.
     """
     return 0.0, energy * spot.max / max(1.0, math.pi * _in_pixels(radius / 2, pixel_pitch) ** 2)
 

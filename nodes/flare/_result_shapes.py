@@ -9,7 +9,7 @@ from neusee.nodes.flare._stray_light import StrayShares, stray_light, stray_shar
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first
 from neusee.nodes.values import Dirt, Psf, Pupil, Stop
 
-#: operations for the scatter of a surface in a pixel, and for its addition to a band
+#: operations per pixel for the scatter of a surface, and for its addition to a band
 _LOBE, _ADD = 60.0, 3.0
 
 ghosts.shape(like_first)

@@ -1,7 +1,7 @@
-"""Stray light of a lens: what its surfaces scatter becomes a veil around every source, in every
+"""Stray light of a lens: light scattered by its surfaces adds a veil around every source, in every
 PSF.
 
-A surface scatters by the three-parameter model of Harvey and Shack.
+Surfaces scatter by the three-parameter model of Harvey and Shack.
 """
 
 from __future__ import annotations
@@ -24,39 +24,38 @@ from neusee.nodes.values import Psf, Pupil
 
 # --- Harvey-Shack model ---------------------------------------------------------------------------
 
-# The light that a surface scatters, on the pixels of a sensor; lengths are in pixels.
+# Scattered light of a surface on the pixels of a sensor; lengths are in pixels.
 #
-# With the direction cosine beta of a scattered ray, measured from the ray that is not scattered,
-# the surface scatters the share BSDF(beta) d2beta into d2beta, BSDF = b0 (1 + (beta / l)**2)**(s /
-# 2). A beam of radius a on the surface has the marginal ray NA at the image, and the optical
-# invariant gives r NA = a beta: the pixel at the distance r receives (NA / a)**2 BSDF(NA r / a) per
-# area, and r ends at a / NA, where beta is 1.
+# With the direction cosine beta of a scattered ray relative to the unscattered ray, the surface
+# scatters the share BSDF(beta) d2beta of the light into d2beta, with BSDF = b0 (1 + (beta /
+# l)**2)**(s / 2). For a beam of radius a on the surface and the numerical aperture NA at the image,
+# the optical invariant gives r NA = a beta: a pixel at the distance r receives (NA / a)**2 BSDF(NA
+# r / a) per area, up to r = a / NA, where beta is 1.
 
 
-#: pixels about the source, along each axis and direction, over which the light is integrated
-#: exactly
+#: within this number of pixels of the source along each axis, the light is integrated exactly
 NEAR_PIXELS = 16
-_GAUSS_NODES = 96  #: Gauss-Legendre nodes of one edge: 1e-13 for any width of the scatter
-#: pixels between an edge of a pixel and the source; a smaller distance is replaced by this one
+_GAUSS_NODES = 96  #: Gauss-Legendre nodes per edge: accurate to 1e-13 for any width of the scatter
+#: pixels; a smaller distance between the edge of a pixel and the source is replaced by this one
 _LEAST_DISTANCE = 1e-6
-#: argument below which a series replaces (exp(z) - 1) / z, whose derivatives would cancel
+#: argument below which a series replaces (exp(z) - 1) / z, whose derivatives suffer cancellation
 _SERIES_LIMIT = 1e-3
 
 
 class Lobe(NamedTuple):
-    """The scattered light of a surface on the sensor: peak (1 + (r / width)**2)**(s / 2) up to
+    """The scattered light of a surface on the sensor, peak (1 + (r / width)**2)**(s / 2) up to r =
     ``end``; scalars.
     """
 
     peak: Tensor  #: share of the light per pixel
     width: Tensor  #: pixels
     slope: Tensor  #: s
-    end: Tensor  #: pixels, where the direction cosine is 1
+    end: Tensor  #: pixels, radius at which the direction cosine is 1
 
 
 def lobe(b0: Tensor, l: Tensor, s: Tensor, scale: Tensor) -> Lobe:  # noqa: E741 (the symbol of the literature)
-    """Return the scattered light of a surface on the sensor; ``scale`` is the direction cosine
-    per pixel, NA p / a.
+    """Return the scattered light of a surface on the sensor; ``scale`` is the direction cosine that
+    one pixel spans, NA p / a.
     """
     return Lobe(b0 * scale.square(), l / scale, s, 1 / scale)
 
@@ -65,13 +64,13 @@ def scattered_share(b0: Tensor, l: Tensor, s: Tensor) -> Tensor:  # noqa: E741
     """Return the total integrated scatter (TIS) of a surface.
 
     TIS = 2 pi b0 ((l**2 + 1)**((s + 2) / 2) - l**(s + 2)) / (l**s (s + 2)), and its limit pi b0
-    l**2 ln(1 + l**-2) for s = -2; near s = -2 nothing cancels.
+    l**2 ln(1 + l**-2) for s = -2; it is computed without cancellation near s = -2.
     """
     return 2 * torch.pi * b0 * _enclosed_light(l, s, torch.ones_like(l))
 
 
 def surface_of(share: float, l: float = 0.01, s: float = -1.5) -> dict[str, float]:  # noqa: E741
-    """Return b0, l and s of a surface that scatters a share of the light; the share is
+    """Return b0, l and s of a surface with a given total integrated scatter ``share``, which is
     proportional to b0.
     """
     unit = scattered_share(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s)))
@@ -79,8 +78,8 @@ def surface_of(share: float, l: float = 0.01, s: float = -1.5) -> dict[str, floa
 
 
 def light_within(light: Lobe, radius: Tensor) -> Tensor:
-    """Return the share of the light that a surface scatters to less than ``radius`` pixels from
-    the source.
+    """Return the share of the light that a surface scatters into the circle of ``radius`` pixels
+    around the source.
     """
     inside = torch.minimum(radius, light.end)
     return 2 * torch.pi * light.peak * _enclosed_light(light.width, light.slope, inside)
@@ -90,10 +89,10 @@ def on_pixels(light: Lobe, centre: tuple[float, float], shape: tuple[int, int]) 
     """Return the share of the light that a surface scatters into each pixel (y, x), float64.
 
     ``centre`` is the position (y, x) of the source, counted from the middle of the first pixel.
-    Pixels up to 16 from the source are integrated exactly: the boundary of each pixel, by the
-    divergence theorem, so that a peak far narrower than a pixel loses nothing. Farther away the
-    value in the middle of the pixel and its second derivatives give the integral, to 3e-6 of the
-    pixel.
+    Within 16 pixels of the source the integral over each pixel is exact: by the divergence theorem
+    it is an integral over the edges, so that no light of a peak far narrower than a pixel is lost.
+    Farther away the value in the middle of the pixel and its second derivatives give the integral,
+    to 3e-6 of the pixel.
     """
     y, x = (torch.arange(n, dtype=torch.float64) - c for n, c in zip(shape, centre, strict=True))
     window = _light_of_far_pixels(light, y[:, None], x[None])
@@ -117,18 +116,16 @@ def _near_pixels(centre: float, size: int) -> slice:
 
 
 def _edges(pixels: slice, centre: float) -> Tensor:
-    """Return the positions of the edges of a row of pixels along one axis, counted from the
-    source.
-    """
+    """Return the positions of the edges of pixels along one axis, relative to the source."""
     return torch.arange(pixels.start, pixels.stop + 1, dtype=torch.float64) - 0.5 - centre
 
 
 def on_far_pixels(light: Lobe, square: Tensor) -> Tensor:
-    """Return the light of pixels at squared distances from the source: value in the middle, and
-    Laplacian / 24.
+    """Return the light of pixels at squared distances ``square`` from the source: value in the
+    middle plus Laplacian / 24.
 
-    The error is below 3e-6 of a pixel at 16 pixels from the source, and does not include the end of
-    the light.
+    The error is below 3e-6 of a pixel's light at 16 pixels from the source. The end of the lobe is
+    not taken into account.
     """
     q = square / light.width.square()
     laplacian = (
@@ -138,24 +135,24 @@ def on_far_pixels(light: Lobe, square: Tensor) -> Tensor:
 
 
 def _light_of_far_pixels(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
-    """Return the light of pixels at the distances ``y`` and ``x`` from the source along both axes,
-    0 beyond the end of the light.
+    """Return the light of pixels at the distances ``y`` and ``x`` from the source along both axes;
+    0 beyond the end of the lobe.
     """
     squared_distance = y.square() + x.square()
     light_of_pixels = on_far_pixels(light, squared_distance)
     if float(light.end.detach()) > float(squared_distance.max().sqrt()) + 1:
         return light_of_pixels
-    # a pixel across the end has a part of it
+    # a pixel that straddles the end receives a part
     return light_of_pixels * (light.end - squared_distance.sqrt() + 0.5).clamp(0, 1)
 
 
 def _light_of_near_pixels(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
-    """Return the light of each pixel between the edges ``y`` and ``x``: second differences of the
-    light in the rectangles from the source to the corners.
+    """Return the light of each pixel between the edges ``y`` and ``x``: mixed second differences of
+    the light in the rectangles between the source and the corners.
     """
     distance_y, distance_x = (edge.abs().clamp_min(_LEAST_DISTANCE) for edge in (y, x))
     corner_y, corner_x = torch.meshgrid(distance_y, distance_x, indexing="ij")
-    # two right triangles, on each side of the diagonal
+    # two right triangles, one on each side of the diagonal
     rectangle = _light_in_triangle(light, corner_y, corner_x) + _light_in_triangle(
         light, corner_x, corner_y
     )
@@ -164,16 +161,16 @@ def _light_of_near_pixels(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
 
 
 def _light_in_triangle(light: Lobe, near: Tensor, across: Tensor) -> Tensor:
-    """Return the light in the right triangle between the source, the foot of a perpendicular and a
-    corner, with the legs ``near`` (to the foot) and ``across``.
+    """Return the light in a right triangle with a corner at the source; ``near`` is the leg from
+    the source to the right angle, ``across`` the other leg.
 
-    The light within the hypotenuse at the angle phi is integrated over phi. With tan(phi) = sinh(u)
-    the integrand is smooth on the scale of 1, however narrow the scatter is.
+    The light up to the far leg in the direction phi is integrated over phi. With tan(phi) = sinh(u)
+    the integrand is smooth on a scale of 1, however narrow the scatter is.
     """
     nodes, weights = _gauss_nodes()
     largest_u = torch.asinh(across / near)[..., None]
     stretch = torch.cosh(largest_u * nodes)
-    # light up to the far leg, at the distance near / cos(phi) = near cosh(u), per angle
+    # light per angle up to the far leg, at the distance near / cos(phi) = near cosh(u)
     enclosed = light.peak * _enclosed_light(light.width, light.slope, near[..., None] * stretch)
     # dphi = du / cosh(u)
     return (weights * largest_u * enclosed / stretch).sum(-1)
@@ -190,14 +187,14 @@ def _gauss_nodes() -> tuple[Tensor, Tensor]:
 
 def _enclosed_light(width: Tensor, slope: Tensor, radius: Tensor) -> Tensor:
     """Return the integral of r (1 + (r / width)**2)**(slope / 2) over r from 0 to ``radius``."""
-    # with z = ln(1 + (r / width)^2): width^2 / 2 times the integral of exp((slope + 2) / 2 z) over
-    # z
+    # with z = ln(1 + (r / width)^2), it is width^2 / 2 times the integral of exp((slope + 2) / 2 z)
+    # over z
     log_term = torch.log1p((radius / width).square())
     return width.square() / 2 * log_term * _growth((slope + 2) / 2 * log_term)
 
 
 def _growth(z: Tensor) -> Tensor:
-    """Return (exp(z) - 1) / z, which is 1 at z = 0, with exact derivatives there."""
+    """Return (exp(z) - 1) / z, which is 1 at z = 0, with accurate derivatives there."""
     is_small = z.abs() < _SERIES_LIMIT
     safe_z = torch.where(is_small, 1.0, z)
     series = 1 + z / 2 * (1 + z / 3 * (1 + z / 4 * (1 + z / 5)))
@@ -211,7 +208,7 @@ Scaling = Literal["none", "roughness"]
 
 
 class Surface(TypedDict):
-    """A scattering surface: Harvey and Shack's b0 (1/sr), l and s, and the radius of the beam on
+    """A scattering surface: b0 (1/sr), l and s of Harvey and Shack, and the radius of the beam on
     the surface.
     """
 
@@ -222,30 +219,32 @@ class Surface(TypedDict):
     radius: NotRequired[BeamRadius | None]
 
 
-_DIAMETER_ROUNDING = 1e-3  #: relative difference of two diameters that is rounding
+_DIAMETER_ROUNDING = 1e-3  #: relative difference of two diameters that counts as rounding
 Surfaces = Annotated[dict[str, Surface], Field(min_length=1)]
 
 
 class StrayShares(NamedTuple):
-    """The light of a point source behind a lens that scatters, as shares of the light through
+    """The energy balance of a point source behind a scattering lens, in shares of the light through
     the clear pupil.
     """
 
     core: Tensor  #: (band,) float64, not scattered, inside and outside the window
     inside: Tensor  #: (band,) float64, scattered into the window
-    outside: Tensor  #: (band,) float64, scattered to places outside the window
+    outside: Tensor  #: (band,) float64, scattered outside the window
 
 
 class _ScatteredLight(NamedTuple):
     """The light that one surface of a lens scatters."""
 
-    arriving: Tensor  #: share of the light that reaches the surface without being scattered
+    arriving: Tensor  #: share of the light that reaches the surface unscattered
     lobe: Lobe
-    share: Tensor  #: TIS, of the light that reaches the surface
+    share: Tensor  #: TIS of the surface
 
 
 class _Lens(NamedTuple):
-    """The lens and sensor for which scatter is computed, and the law of its wavelengths."""
+    """The lens and sensor for which scatter is computed, and the wavelength scaling of the
+    scatter.
+    """
 
     surfaces: Mapping[str, Mapping[str, Any]]
     focal_length: float
@@ -308,7 +307,7 @@ def stray_light(
     height, width = psf.intensity.shape[-2:]
     window_shape = (height, width)
     centre = (
-        # pixels from the axis to the source: f x angle / pitch
+        # position of the source in pixels: f x angle / pitch from the axis
         height // 2 + focal_length * angle_y / pixel_pitch,
         width // 2 + focal_length * angle_x / pixel_pitch,
     )
@@ -395,8 +394,8 @@ def _(
 
 
 def _note_of_wider_lens(pupil: Pupil | None, diameter: float) -> list[str]:
-    """Return a note on a lens that scatters as a wider one than its pupil, which a reading of
-    the aperture narrowed.
+    """Return a note if ``diameter`` is larger than the pupil, which `reading.aperture` has
+    narrowed.
     """
     if pupil is None or pupil.pitch.is_meta:
         return []
@@ -418,13 +417,13 @@ def _(
     strength: float | None = None,
     **params: Any,
 ) -> float:
-    """Return an estimate of what a picture lacks without stray light, relative to its brightest or
+    """Return an estimate of the error of a picture without this step, relative to its brightest or
     saturated pixel.
 
-    It is no bound: points of light that fill a window, each dimmer than the brightest, add their
-    veils. What is not taken from the core is TIS. A scene of equal brightness lacks a veil of TIS
-    times its mean; a source of ``strength`` saturations, whose own picture is cut off, lacks a veil
-    of ``strength`` times the pixel on the axis.
+    It is no bound, since the veils of many sources add up. Without the step, the core is too bright
+    by the share TIS, a scene of uniform brightness lacks a veil of TIS times its mean, and a source
+    of ``strength`` times saturation, whose image is clipped, lacks a veil of ``strength`` times the
+    scattered light of the pixel on the axis.
     """
     if not any(surface["b0"] for surface in surfaces.values()):
         return 0.0
@@ -433,7 +432,7 @@ def _(
     sizes = {name: params[name] for name in ("focal_length", "pixel_pitch", "diameter")}
     lobes = _lobes(_Lens(surfaces, **sizes, wavelength=1.0, scaling="none"), 1.0)
     scattered, axis_light = float(_total_scatter(lobes)), float(_veil(lobes, (0.0, 0.0), (1, 1)))
-    # light of a band in the window, 1 if it is not known
+    # light of a band in the window; 1 if not known
     light_in_window = psf.sum / psf.shape[0] if psf.shape else 1.0
     return (
         scattered / (1 - scattered) * (1 + 1 / light_in_window)
@@ -461,7 +460,9 @@ def _(
 
 
 def _lobes(lens: _Lens, colour: float) -> list[_ScatteredLight]:
-    """Return the light that each surface scatters at the wavelength ``colour`` in m."""
+    """Return the scattered light of each surface at the wavelength ``colour`` in m, in the order of
+    the surfaces.
+    """
     scatterers, remaining = [], torch.ones((), dtype=torch.float64)
     for name, (b0, l, s, radius) in _surfaces_at(lens, colour):  # noqa: E741
         cosine_per_pixel = lens.diameter / (2 * lens.focal_length) * lens.pixel_pitch / radius
@@ -475,10 +476,10 @@ def _lobes(lens: _Lens, colour: float) -> list[_ScatteredLight]:
 
 
 def _surfaces_at(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
-    """Return b0, l, s and beam radius of each surface at the wavelength ``colour``, as float64
-    scalars.
+    """Yield the name of each surface with its b0, l, s and beam radius at the wavelength ``colour``
+    in m, as float64 scalars.
     """
-    # smooth surface: b0 goes as wavelength^-4, l as wavelength
+    # smooth surface: b0 is proportional to wavelength^-4, l to wavelength
     ratio = lens.wavelength / colour if lens.scaling == "roughness" else 1.0
     for name, surface in lens.surfaces.items():
         beam_radius = lens.diameter / 2 if surface.get("radius") is None else surface["radius"]
@@ -488,8 +489,8 @@ def _surfaces_at(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor
 
 
 def _refuse_surface(name: str, colour: float, share: float, end: float, lens: _Lens) -> None:
-    """Raise ValueError for a surface that scatters all light at the wavelength ``colour`` in m,
-    and for one whose light ends at ``end`` pixels, too near to the source.
+    """Raise ValueError for a surface that scatters all light at the wavelength ``colour`` in m, and
+    for one whose lobe ends too near to the source, at ``end`` pixels.
     """
     if not share < 1:
         raise ValueError(
@@ -514,8 +515,8 @@ def _total_scatter(lobes: list[_ScatteredLight]) -> Tensor:
 def _veil(
     lobes: list[_ScatteredLight], centre: tuple[float, float], size: tuple[int, int]
 ) -> Tensor:
-    """Return the light of all lobes in each pixel (y, x) of a window of ``size``, for a source at
-    ``centre``.
+    """Return the scattered light of all surfaces in each pixel of a window of ``size`` (y, x), for
+    a source at ``centre`` (y, x).
     """
     return torch.stack(
         [light.arriving * on_pixels(light.lobe, centre, size) for light in lobes]
@@ -533,7 +534,7 @@ def _transmitted(pupil: Pupil) -> Tensor:
 
 
 def _same_bands(psf: Psf, pupil: Pupil) -> None:
-    """Raise ValueError unless a PSF has the bands of a pupil."""
+    """Raise ValueError unless PSF and pupil have the same number of bands."""
     if psf.intensity.ndim != 3 or len(psf.intensity) != len(pupil.wavelengths):
         raise ValueError(
             f"PSF {tuple(psf.intensity.shape)} and pupil of {len(pupil.wavelengths)} bands must"
@@ -549,8 +550,8 @@ def veil_at(
     pixel_pitch: float,
     diameter: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return the light that the surfaces of a lens scatter into pixels at a distance from the spot,
-    and their share.
+    """Return the light that the surfaces of a lens scatter into a pixel at ``radius`` pixels from
+    the source, and the total share of scattered light.
 
     ``surfaces`` are those of `stray_light`. The source lies in the middle of a pixel.
 
@@ -570,8 +571,8 @@ def veil_at(
     pixel_offsets = torch.arange(-NEAR_PIXELS, NEAR_PIXELS + 1, dtype=torch.float64)
     squared_distances = (pixel_offsets[:, None].square() + pixel_offsets.square()).flatten()
     squared_radius = radius.double().square()
-    # near the source: mean over the pixels of equal distance, linear in the square of the distance
-    # between
+    # near the source: mean over pixels of equal distance, interpolated linearly in the squared
+    # distance
     ring_distances, ring_of_pixel = torch.unique(squared_distances, return_inverse=True)
     ring_mean = torch.zeros_like(ring_distances).scatter_reduce_(
         0, ring_of_pixel, near_window, "mean", include_self=False
@@ -594,7 +595,5 @@ def veil_at(
 
 
 def _light_up_to_end(light: Lobe, square: Tensor) -> Tensor:
-    """Return the light of a lobe at squared distances, which ends where the direction cosine is
-    1.
-    """
+    """Return the light of a lobe at squared distances; it ends where the direction cosine is 1."""
     return on_far_pixels(light, square) * (light.end - square.sqrt() + 0.5).clamp(0, 1)

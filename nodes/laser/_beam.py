@@ -1,4 +1,4 @@
-"""The Gaussian beam of a laser, and the transmittance of air on its way."""
+"""The Gaussian beam of a laser, and the transmittance of the air along its path."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ from neusee.nodes.laser._round_spot import spot_peak
 Number = TypeVar("Number", float, Tensor)
 Convention = Literal["1/e2", "1/e"]
 
-#: largest relative difference of two statements of one quantity, because data sheets round
+#: largest relative difference between stated and derived value, because data sheets round
 _STATEMENTS_AGREE = 0.02
-_SERIES_ARGUMENT = 1e-4  #: argument below which a series replaces a quotient of two small numbers
+#: argument below which a series replaces the quotient, to avoid cancellation
+_SERIES_ARGUMENT = 1e-4
 
 
 class Beam(NamedTuple):
-    """A laser beam as it leaves the laser; `beam` makes and checks a beam. Quantities are in SI
-    units.
+    """A laser beam at the exit of the laser, in SI units; the function `beam` builds and checks
+    it.
     """
 
     wavelength: float  #: m
@@ -69,7 +70,7 @@ def beam(
     m_squared: float | None = None,
     convention: Convention = "1/e2",
 ) -> Beam:
-    """Make a beam from what a data sheet states, and derive the missing quantities.
+    """Return a beam from the quantities that a data sheet states, with missing quantities derived.
 
     Waist w0, full divergence theta and M2 obey theta = 2 M2 wavelength / (pi w0): two of them give
     the third, and one alone is completed with M2 = 1. A pulse train obeys power = pulse energy x
@@ -116,8 +117,8 @@ def beam(
 def _completed_emission(
     power: float | None, energy: float | None, duration: float | None, rate: float | None
 ) -> tuple[float | None, float | None, float | None, float | None]:
-    """Return (mean power in W, pulse energy in J, pulse duration in s, repetition rate in Hz),
-    with what follows from the others.
+    """Return (mean power in W, pulse energy in J, pulse duration in s, repetition rate in Hz), with
+    missing values derived from the others.
 
     The last three are None for a continuous laser, and power and rate for a single pulse. Raises
     ParameterError for statements that are missing or disagree.
@@ -140,7 +141,9 @@ def _completed_emission(
 
 
 def _no_duration(energy: float | None) -> ParameterError:
-    """Return the error for a pulse without a duration, at the parameter that states the pulses."""
+    """Return the error for pulses without a duration; it names the parameter that states the
+    pulses.
+    """
     name = "repetition_rate" if energy is None else "pulse_energy"
     return ParameterError(name, "a pulse needs its duration: give pulse_duration")
 
@@ -185,8 +188,8 @@ def _refuse_long_pulse(duration: float, rate: float) -> None:
 def _completed_shape(
     wavelength: float, waist: float | None, divergence: float | None, m_squared: float | None
 ) -> tuple[float, float, float]:
-    """Return (waist in m, divergence in rad, M2) of a beam at 1/e2, from two or three of them, or
-    from waist or divergence alone with M2 = 1.
+    """Return (waist in m, divergence in rad, M2) of a beam at 1/e2, from two or three of these
+    values, or with M2 = 1 from waist or divergence alone.
 
     Raises ParameterError for an M2 below 1, for neither waist nor divergence, and for three that
     disagree.
@@ -213,8 +216,8 @@ def _completed_shape(
 def _implied_quality(
     waist: float, divergence: float, diffraction: float, m_squared: float | None
 ) -> float:
-    """Return the M2 of waist and divergence; raise ParameterError where no beam has it, or where
-    another M2 is stated.
+    """Return the M2 that follows from waist and divergence; raise ParameterError if it is below 1,
+    or differs from a stated M2.
     """
     implied = waist * divergence / diffraction
     stated_text = (
@@ -236,7 +239,7 @@ def _implied_quality(
 
 
 def plain(value: float | Tensor) -> float:
-    """Return a number, also of a tensor whose gradient is followed."""
+    """Return a number or a tensor as a float, without its gradient."""
     return float(value.detach()) if isinstance(value, Tensor) else value
 
 
@@ -252,7 +255,8 @@ def beam_radius(beam: Beam, distance: Number) -> Number:
 
 
 def curvature_radius(beam: Beam, distance: Number) -> Number:
-    """Return the radius in m of the wavefront of a beam at a distance: R + (2 w0 / theta)^2 / R.
+    """Return the radius of curvature in m of a beam's wavefront at the distance R: R + (2 w0 /
+    theta)^2 / R.
 
     Far from the laser the radius is the distance. The wavefront at the laser itself is plane.
     """
@@ -260,16 +264,18 @@ def curvature_radius(beam: Beam, distance: Number) -> Number:
 
 
 def axis_density(beam: Beam, distance: Number, transmittance: float = 1.0) -> Number:
-    """Return the share of a beam's power per m2 on the axis at a distance: 2 T / (pi w^2).
+    """Return the irradiance on the axis per watt of beam power at a distance, in 1/m2: 2 T / (pi
+    w^2).
 
-    Times the power it is the irradiance; times the energy of a pulse it is the radiant exposure of
-    one pulse.
+    Multiplied by the power it is the irradiance; multiplied by the pulse energy it is the radiant
+    exposure of one pulse.
     """
     return 2 * transmittance / (math.pi * _radius_squared(beam, distance))
 
 
 def axis_irradiance(beam: Beam, distance: Number, transmittance: float = 1.0) -> Number:
-    """Return the irradiance in W/m2 on the axis of a beam: 2 P T / (pi w^2), mean over the pulses.
+    """Return the irradiance in W/m2 on the axis of a beam, averaged over the pulses: 2 P T / (pi
+    w^2).
 
     Raises ValueError for a single pulse, which has no mean power.
     """
@@ -279,7 +285,7 @@ def axis_irradiance(beam: Beam, distance: Number, transmittance: float = 1.0) ->
 def share_through(
     beam: Beam, distance: Number, diameter: float, transmittance: float = 1.0
 ) -> Number:
-    """Return the share of a beam's power that passes a round aperture on the axis: T (1 -
+    """Return the share of a beam's power that passes a round aperture centred on the axis: T (1 -
     exp(-D^2 / (2 w^2))).
     """
     return -transmittance * _expm1(-(diameter**2) / (2 * _radius_squared(beam, distance)))
@@ -288,8 +294,8 @@ def share_through(
 def power_through(
     beam: Beam, distance: Number, diameter: float, transmittance: float = 1.0
 ) -> Number:
-    """Return the power in W that passes a round aperture on the axis of a beam, mean over the
-    pulses.
+    """Return the power in W, averaged over the pulses, that passes a round aperture centred on the
+    axis.
 
     Raises ValueError for a single pulse, which has no mean power.
     """
@@ -304,12 +310,12 @@ def sensor_density(
     lens_transmittance: float,
     transmittance: float = 1.0,
 ) -> Number:
-    """Return the share of a beam's power per m2 at the peak behind a clear, focused,
-    diffraction-limited lens.
+    """Return the peak irradiance behind a clear, focused, diffraction-limited lens per watt of beam
+    power, in 1/m2.
 
     P_in / P x tau (pi D^2 / 4) / (lambda f)^2 x (2 / x) tanh(x / 2), with x = D^2 / (4 w^2). The
-    last factor is 1 for a beam that overfills the aperture. Times the power it is the peak
-    irradiance; times the energy of a pulse it is the radiant exposure of one pulse.
+    last factor is 1 for a beam that overfills the aperture. Multiplied by the power it is the peak
+    irradiance; multiplied by the pulse energy it is the radiant exposure of one pulse.
     """
     passing_share = share_through(beam, distance, diameter, transmittance)
     even_gain = math.pi * diameter**2 / 4 / (beam.wavelength * focal_length) ** 2
@@ -328,7 +334,7 @@ def defocus_at(
     focus: float = math.inf,
     lens_defocus: float = 0.0,
 ) -> Number:
-    """Return the waves of defocus at the rim of a lens for a beam from a distance.
+    """Return the defocus in waves at the rim of a lens, for a laser at a distance.
 
     D^2 / (8 lambda) (1 / R' - 1 / R0), with the radius R' of the wavefront (`curvature_radius`) and
     the distance R0 on which the lens is focused, and ``lens_defocus``, in m of path at the rim.
@@ -345,11 +351,11 @@ def density_in_spot(
     waves: Tensor,
     within: float = 0.0,
 ) -> Tensor:
-    """Return the share of a beam's power per m2 at the brightest point behind a clear round lens
-    with defocus.
+    """Return the irradiance at the brightest point behind a clear, defocused round lens per watt of
+    beam power, in 1/m2.
 
-    The lens and the air pass all light. 2 / (pi w^2) (pi D^2 / (4 lambda f))^2 times `spot_peak` of
-    the fill (D / (2 w))^2 and of the ``waves`` of defocus, with ``within`` as there. In focus it is
+    Lens and air are lossless. It is 2 / (pi w^2) (pi D^2 / (4 lambda f))^2 times `spot_peak` for
+    the fill (D / (2 w))^2 and the defocus ``waves``, with ``within`` as there. In focus it equals
     `sensor_density`.
     """
     fill = diameter**2 / (4 * _radius_squared(beam, distance))
@@ -357,8 +363,8 @@ def density_in_spot(
 
 
 def even_density(beam: Beam, distance: Tensor, diameter: Tensor, focal_length: Tensor) -> Tensor:
-    """Return the share of a beam's power per m2 at the focus if the lens were lit evenly as on
-    its axis.
+    """Return the irradiance in focus per watt of beam power, in 1/m2, as if the axis irradiance
+    filled the whole lens.
     """
     gain = (math.pi * diameter**2 / (4 * beam.wavelength * focal_length)) ** 2
     return axis_density(beam, distance) * gain
@@ -367,16 +373,15 @@ def even_density(beam: Beam, distance: Tensor, diameter: Tensor, focal_length: T
 def scintillation(
     wavelength: float, distance: float | Tensor, cn2: float | Tensor, worst: float
 ) -> Tensor:
-    """Return the factor on the mean irradiance that turbulent air stays below for the share
-    ``worst`` of the time.
+    """Return the quantile of irradiance over mean irradiance in turbulent air: the irradiance stays
+    below it for the share ``worst`` of the time.
 
     The irradiance at a point is lognormal, with the variance of its logarithm 1.23 Cn2 k^(7/6)
     R^(11/6) (Rytov, plane wave, weak turbulence) and the mean of still air. It is an upper bound: a
     lens averages over its aperture, a diverging beam fluctuates less, and strong turbulence
     saturates.
     Source: Tatarskii, Wave Propagation in a Turbulent Medium (1961); Andrews, Phillips, Hopen,
-            Al-Habash, J. Opt. Soc.
-    Am. A 16, 1417 (1999).
+            Al-Habash, J. Opt. Soc. Am. A 16, 1417 (1999).
     """
     wavenumber = 2 * math.pi / wavelength
     quantile = float(torch.special.ndtri(torch.tensor(worst, dtype=torch.float64)))
@@ -386,8 +391,8 @@ def scintillation(
         * wavenumber ** (7 / 6)
         * torch.as_tensor(distance, dtype=torch.float64) ** (11 / 6)
     )
-    # a wider spread has a smaller factor again: the largest is the bound, that of still air below
-    # half of the time
+    # the quantile has its maximum at spread = quantile of the normal distribution: use it as the
+    # bound
     spread = variance.sqrt().clamp_max(max(quantile, 0.0))
     return torch.exp(quantile * spread - spread.square() / 2)
 
@@ -400,8 +405,8 @@ def peak_on_sensor(
     lens_transmittance: float,
     transmittance: float = 1.0,
 ) -> Number:
-    """Return the peak irradiance in W/m2 behind a clear, focused, diffraction-limited lens, mean
-    over the pulses.
+    """Return the peak irradiance in W/m2, averaged over the pulses, behind a clear, focused,
+    diffraction-limited lens.
 
     ``transmittance`` is that of the air. Raises ValueError for a single pulse, which has no mean
     power.
@@ -413,8 +418,8 @@ def peak_on_sensor(
 
 
 def underfilled(x: Number) -> Number:
-    """Return (2 / x) tanh(x / 2), the relative peak of a Gaussian beam behind an aperture with x
-    = (D / (2 w))^2.
+    """Return (2 / x) tanh(x / 2) with x = (D / (2 w))^2: the peak behind an aperture of a Gaussian
+    beam over that of an even beam of the same power in the aperture.
     """
     if isinstance(x, Tensor):
         safe_x = x.where(x > _SERIES_ARGUMENT, 1.0)
@@ -445,13 +450,13 @@ def _expm1(x: Number) -> Number:
 
 # --- air ------------------------------------------------------------------------------------------
 
-# Transmittance of air on the way from a laser to a camera, from the visibility (meteorological
-# range).
+# Transmittance of the air between laser and camera, from the visibility (meteorological range).
 
 
 Law = Literal["kruse", "kim"]
-_KOSCHMIEDER = 3.912  #: -ln 0.02: at the visibility a black object has 2 % of its contrast left
-_VISIBILITY_WAVELENGTH = 550e-9  #: m, wavelength of the visibility
+#: -ln 0.02: at the distance of the visibility the contrast of a black object has fallen to 2 %
+_KOSCHMIEDER = 3.912
+_VISIBILITY_WAVELENGTH = 550e-9  #: m, wavelength at which the visibility is defined
 
 
 def air_transmittance(
@@ -467,8 +472,7 @@ def air_transmittance(
 
     Raises ParameterError for a negative distance and a visibility that is not above 0.
     Source: Koschmieder (1924); Kruse, McGlauchlin, McQuistan, Elements of Infrared Technology
-            (1962); Kim, McArthur,
-    Korevaar, Proc. SPIE 4214, 26 (2001).
+            (1962); Kim, McArthur, Korevaar, Proc. SPIE 4214, 26 (2001).
     """
     if not (math.isfinite(plain(distance)) and distance >= 0):
         raise ParameterError(
@@ -493,7 +497,7 @@ def air_transmittance(
 
 
 def size_exponent(visibility: float, law: Law) -> float:
-    """Return the exponent q of the wavelength in the extinction of haze at a visibility in m."""
+    """Return the wavelength exponent q of the extinction of haze at a visibility in m."""
     km = visibility / 1e3
     if km > 50:
         return 1.6

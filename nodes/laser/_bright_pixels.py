@@ -1,4 +1,6 @@
-"""The light of a laser in the pixels of a sensor, and the peak of a sampled spot."""
+"""The distribution of a laser's light over the pixels of a sensor, and the peak of a sampled
+spot.
+"""
 
 from __future__ import annotations
 
@@ -21,37 +23,40 @@ from neusee.nodes.values import Bands, Psf
 
 # --- bright pixels --------------------------------------------------------------------------------
 
-# The light of a laser in the pixels of a sensor, by their distance from the spot: behind any mask,
-# or a round lens.
+# The distribution of a laser's light over pixels, by their distance from the spot, behind any mask
+# or behind a clear round lens.
 
 
-RINGS = 160  #: rings about the spot, at equal ratios of their radii
-PARTS = 48  #: groups of as many pixels in each ring, from the brightest to the faintest
-_LIGHT_LEVELS = 3000  #: of light, at equal ratios, into which pixels are sorted
-_LIGHT_DECADES = 24.0  #: of light below the brightest pixel; fainter pixels count as 0
-#: factor on the light of the radial law outside, since wings of a PSF are no smooth law
+RINGS = 160  #: number of rings around the spot, with equal ratios of their radii
+PARTS = 48  #: groups of equally many pixels in each ring, sorted by brightness
+_LIGHT_LEVELS = 3000  #: classes of light, at equal ratios, into which pixels are sorted
+#: decades of light covered below the brightest pixel; fainter pixels count as 0
+_LIGHT_DECADES = 24.0
+#: safety factor on the light outside by the radial law, since the wings of a PSF are not smooth
 _WING_FACTOR = 1.5
-_INNER_PIXELS = 48  #: pixels from the spot to each side that are computed one by one
-_SHELL_COUNT = 3000  #: radii beyond these pixels
-_FRINGE_STEP = 0.06  #: step of v = pi x / (lambda N) in which no fringe of a spot changes much
-_MOST_PIXEL_POINTS = 24  #: points across a pixel, at most, but for the brightest ones
+_INNER_PIXELS = 48  #: pixels on each side of the spot that are computed one by one
+_SHELL_COUNT = 3000  #: number of rings beyond these pixels
+_FRINGE_STEP = 0.06  #: step of v = pi x / (lambda N) that resolves the fringes of a spot
+#: largest number of quadrature points across a pixel, except for the brightest pixels
+_MOST_PIXEL_POINTS = 24
 
 
 class BrightPixels(NamedTuple):
-    """The light of a laser in groups of pixels, each at about one distance from the spot and about
-    equally bright.
+    """The light of a laser in groups of pixels that have about the same distance from the spot and
+    the same brightness.
 
-    The light that a lens scatters depends on this distance alone, so that it can be added before
-    pixels are ranked.
+    Light scattered by the lens depends on this distance alone, so that it can be added to each
+    group before pixels are ranked by brightness.
     """
 
-    #: (group,) float64, pixels, from the spot to the pixels of a group, root mean square
+    #: (group,) float64, pixels, root mean square distance from the spot
     radius: Tensor
     pixels: Tensor  #: (group,) float64, number of pixels
-    light: Tensor  #: (group,) float64, share of the light in a pixel
-    smooth: Tensor  #: (group,) float64, the same of the mean over a feature around each pixel
-    #: (3,) float64: distance and mean light of the rim where the sensor goes on, else 0 and 0; and
-    #: the light that the window and the radial law of `with_frame` account for
+    light: Tensor  #: (group,) float64, share of the light per pixel
+    #: (group,) float64, the same for the image averaged over a feature around each pixel
+    smooth: Tensor
+    #: (3,) float64: distance and mean light of the window's rim where the sensor extends beyond it,
+    #: else 0 and 0; and the light in the window and, by the radial law of `with_frame`, outside it
     rim: Tensor
 
 
@@ -84,7 +89,7 @@ def bright_pixels(
             ValueError for a PSF that is narrower than a pixel.
     Source: by definition.
     """
-    # photons of each wavelength, which fill wells
+    # weights by number of photons, because wells count photons
     weights = (bands.weights * bands.centres).double()
     weights = weights / weights.sum()
     samples_across = _samples_across(pixel_pitch, sample_pitch)
@@ -94,7 +99,7 @@ def bright_pixels(
     image = torch.as_tensor(
         sum(w * band for w, band in zip(weights.tolist(), bands_of_pixels, strict=True))
     )
-    # along which axes the window of the PSF is smaller than the sensor
+    # True for the axes along which the window of the PSF is smaller than the sensor
     window_smaller = [m < n for m, n in zip(image.shape, shape, strict=True)]
     rim = _rim(image.cpu(), window_smaller)
     image = crop(image, shape=(min(shape[0], image.shape[0]), min(shape[1], image.shape[1])))
@@ -116,8 +121,8 @@ def _samples_across(pixel_pitch: float, sample_pitch: float | None) -> int:
 
 
 def _light_of_pixels(light: Tensor, samples: int) -> Tensor:
-    """Return the light (y, x) of each pixel, the sum of its ``samples`` x ``samples`` samples; a
-    part of a pixel at the end is left out.
+    """Return the light (y, x) of each pixel, the sum of its ``samples`` x ``samples`` samples;
+    incomplete pixels at the end are left out.
     """
     if min(light.shape) < samples:
         size = f"{light.shape[0]} x {light.shape[1]}"
@@ -130,37 +135,37 @@ def _light_of_pixels(light: Tensor, samples: int) -> Tensor:
 
 
 def _pixel_groups(image: Tensor, smooth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return radius, number of pixels, light and smoothed light (group,) of the groups of pixels,
-    `PARTS` in each ring.
+    """Return radius, number of pixels, light per pixel and smoothed light per pixel (group,) of the
+    groups of pixels, `PARTS` per ring.
     """
     rows, columns = image.shape
     rings = _rings(rows, columns)
     ring_lights = [
         _quantiles(picture.double().numpy().ravel(), rings).ravel() for picture in (image, smooth)
     ]
-    # all parts of a ring have its radius and the same number of its pixels
+    # all groups of a ring have the same radius and the same number of pixels
     radius, pixels = np.repeat(rings.radius, PARTS), np.repeat(rings.pixels / PARTS, PARTS)
     groups = [torch.from_numpy(column) for column in (radius, pixels, *ring_lights)]
     return groups[0], groups[1], groups[2], groups[3]
 
 
 class _Rings(NamedTuple):
-    """The rings about the middle of a window."""
+    """The rings around the middle of a window."""
 
-    number: NDArray[np.int64]  #: (pixel,) number of its ring, times the number of levels and one
+    number: NDArray[np.int64]  #: (pixel,) index of its ring, times (number of light levels + 1)
     radius: NDArray[np.float64]  #: (ring,) pixels, root mean square
     pixels: NDArray[np.float64]  #: (ring,)
 
 
 @functools.lru_cache(maxsize=1)
 def _rings(rows: int, columns: int) -> _Rings:
-    """Return the rings of a window of rows x columns pixels; the rings of the last window are
-    kept, since many spots in turn have the same one.
+    """Return the rings of a window of rows x columns pixels; the last result is cached, since
+    successive spots often have windows of the same size.
     """
     y, x = ((np.arange(n) - n // 2).astype(np.float64) ** 2 for n in (rows, columns))
     squared_distance = (y[:, None] + x).ravel()
     log_largest = math.log(max(squared_distance.max(), 1.0)) + 1e-9
-    # ring 0 is the pixel of the spot; ring k > 0 ends at equal ratios of the radius
+    # ring 0 is the pixel of the spot; the radii of the rings k > 0 have equal ratios
     ring_number = np.zeros(squared_distance.size, np.int64)
     off_spot = squared_distance > 0
     ring_number[off_spot] = 1 + (
@@ -174,11 +179,11 @@ def _rings(rows: int, columns: int) -> _Rings:
 
 
 def _quantiles(light: np.ndarray, rings: _Rings) -> np.ndarray:
-    """Return the light (ring, part) of the pixels in the middle of each of `PARTS` groups of a
-    ring, from its brightest group to its faintest.
+    """Return the median light (ring, group) of each of the `PARTS` groups of a ring, from the
+    brightest group to the faintest.
 
-    The pixels are sorted into `_LIGHT_LEVELS` levels of light at equal ratios, so that one count
-    for each ring and level gives the order of all of them.
+    The pixels are sorted into `_LIGHT_LEVELS` classes of light at equal ratios: a histogram of each
+    ring then gives the quantiles.
     """
     brightest = float(light.max(initial=0.0))
     if not brightest > 0:
@@ -187,7 +192,7 @@ def _quantiles(light: np.ndarray, rings: _Rings) -> np.ndarray:
     faintest = brightest * math.exp(-(_LIGHT_LEVELS + 1) * log_step)
     steps_below = np.log(np.maximum(light, faintest) / brightest) * (-1 / log_step)
     level = np.minimum(steps_below, _LIGHT_LEVELS).astype(np.int64)
-    # one count for each ring and level: `number` is the ring times the number of levels
+    # one histogram per ring: `number` is the ring times the number of classes
     counts = np.bincount(rings.number + level, minlength=RINGS * (_LIGHT_LEVELS + 1)).reshape(
         RINGS, -1
     )
@@ -199,7 +204,7 @@ def _quantiles(light: np.ndarray, rings: _Rings) -> np.ndarray:
             for ring_counts, ring_ranks in zip(brighter_counts, middle_ranks, strict=True)
         ]
     )
-    # the middle of a level; the last level holds what counts as 0
+    # the middle of a class; the last class has the pixels that count as 0
     return np.where(
         levels_at_ranks < _LIGHT_LEVELS,
         brightest * np.exp(-(levels_at_ranks + 0.5) * log_step),
@@ -208,13 +213,13 @@ def _quantiles(light: np.ndarray, rings: _Rings) -> np.ndarray:
 
 
 def _rim(image: Tensor, narrow: list[bool]) -> Tensor:
-    """Return (distance, light of the rim, known light) of a window, of which ``narrow`` says along
-    which axes (y, x) the sensor goes on beyond it.
+    """Return (distance, light of the rim, known light) of a window; ``narrow`` (y, x) is True for
+    an axis along which the sensor extends beyond the window.
 
-    The distance, in pixels, is that of the nearest such side. The light of the rim is the mean of
-    all its pixels, each brought to this distance by the third power of its own. The known light is
-    that of the window and, `_WING_FACTOR` times, that of the radial law on the plane outside.
-    Without a side where the sensor goes on, distance and light are 0.
+    The distance, in pixels, is that of the nearest such side. The light of the rim is the mean over
+    the pixels of these sides, each scaled to this distance by the law 1 / r^3. The known light is
+    that in the window plus `_WING_FACTOR` times that of the radial law outside it. If the window
+    covers the sensor, distance and light of the rim are 0.
     """
     light_of_window = image.double().sum()
     if not any(narrow):
@@ -225,11 +230,11 @@ def _rim(image: Tensor, narrow: list[bool]) -> Tensor:
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in image.shape)
     end_rows = [image[end].double() * torch.hypot(y[end], x).pow(3) for end in (0, -1)]
     end_columns = [image[:, end].double() * torch.hypot(y, x[end]).pow(3) for end in (0, -1)]
-    # a list times False is empty: only the sides where the sensor goes on count
+    # a list times False is empty: only sides beyond which the sensor extends count
     sides = end_rows * narrow[0] + end_columns * narrow[1]
     light_times_cube = torch.cat(sides).mean()
     half_sides = [n / 2 for n in image.shape]
-    # the integral of cube / r^3 outside of a rectangle
+    # the integral of 1 / r^3 outside a rectangle
     outside_light = 4 * light_times_cube * math.hypot(*half_sides) / (half_sides[0] * half_sides[1])
     rim_distance = torch.tensor(distance, dtype=torch.float64)
     return torch.stack(
@@ -242,8 +247,8 @@ def _rim(image: Tensor, narrow: list[bool]) -> Tensor:
 
 
 def light_with_wings(image: Tensor) -> Tensor:
-    """Return the light of a window (y, x) and of the plane outside, there `_WING_FACTOR` times that
-    of the radial law.
+    """Return the light in a window (y, x) plus `_WING_FACTOR` times that of the radial law outside
+    it.
     """
     return _rim(image, [True, True])[2]
 
@@ -265,11 +270,11 @@ def _(result: BrightPixels, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def with_frame(groups: BrightPixels, shape: tuple[int, int]) -> BrightPixels:
-    """Add the pixels of a sensor of a ``shape`` that the window of the PSF did not hold, by a
-    radial law.
+    """Add the pixels of a sensor of ``shape`` (y, x) that lie outside the window of the PSF, with
+    light by a radial law.
 
-    Far from the spot the light of any aperture with edges falls as the third power of the distance,
-    on average. The added pixels have the light of the rim times this power.
+    Far from the spot the light of any aperture with edges falls on average as 1 / r^3. The added
+    pixels continue the light of the rim by this law.
     """
     missing_pixels = shape[0] * shape[1] - float(groups.pixels.sum())
     if not (missing_pixels >= 1 and float(groups.rim[0]) > 0):
@@ -291,11 +296,11 @@ def with_frame(groups: BrightPixels, shape: tuple[int, int]) -> BrightPixels:
 
 
 def hidden_light(groups: BrightPixels) -> float:
-    """Return the share of the light that neither the window of the PSF nor the radial law of
-    `with_frame` has.
+    """Return the share of the light that is neither in the window of the PSF nor in the radial law
+    of `with_frame`.
 
-    A mask may send it to a ring or to orders of diffraction beyond the window: it may fall on any
-    pixel there.
+    A mask may send this light into a ring or diffraction orders outside the window, onto any pixel
+    there.
     """
     return max(0.0, 1 - float(groups.rim[2])) if float(groups.rim[0]) > 0 else 0.0
 
@@ -319,9 +324,10 @@ def round_pixels(
     Raises: nothing.
     Source: Born and Wolf, Principles of Optics, 7th ed., section 8.8, integrated over the pixel.
     """
-    # share of the Gaussian beam on the lens, over that of an even beam
+    # power of the Gaussian beam through the lens, over that of an even beam of the same axis
+    # irradiance
     passing_share = 1.0 if fill < 1e-9 else -math.expm1(-2 * fill) / (2 * fill)
-    # light of a pixel as bright as the peak, in units of the light that passes
+    # light of a pixel with the peak irradiance, as a share of the light through the lens
     scale = peak_light(spread) / passing_share
     positions, alike_pixels = _inner_pixels(shape, spread)
     inner_light = scale * _over_squares(positions, fill, waves, spread)
@@ -336,11 +342,10 @@ def round_pixels(
 
 
 def _inner_pixels(shape: tuple[int, int], spread: float) -> tuple[Tensor, Tensor]:
-    """Return the positions (pixel, (y, x)) of the pixels around the spot, of which symmetric ones
-    are listed once, and the number of pixels that each stands for.
+    """Return the positions (pixel, (y, x)) of the pixels around the spot, one for each set of
+    symmetric pixels, and the number of pixels in each set.
 
-    Positions are in pixels from the spot, in one quadrant, and in half of it where the part is
-    square.
+    Positions are in pixels from the spot, in one quadrant, or in half of it if the area is square.
     """
     half_sides = [min(_INNER_PIXELS, (n - 1) // 2) for n in shape]
     y, x = torch.meshgrid(
@@ -349,7 +354,7 @@ def _inner_pixels(shape: tuple[int, int], spread: float) -> tuple[Tensor, Tensor
     )
     # a pixel off an axis has a mirror image across it
     alike_pixels = torch.where(y > 0, 2.0, 1.0) * torch.where(x > 0, 2.0, 1.0)
-    if half_sides[0] == half_sides[1]:  # of a quadrant, one side of its diagonal
+    if half_sides[0] == half_sides[1]:  # keep one side of the quadrant's diagonal
         alike_pixels = torch.where(y < x, 2 * alike_pixels, alike_pixels)
         half_quadrant = y <= x
         y, x, alike_pixels = y[half_quadrant], x[half_quadrant], alike_pixels[half_quadrant]
@@ -357,11 +362,11 @@ def _inner_pixels(shape: tuple[int, int], spread: float) -> tuple[Tensor, Tensor
 
 
 def _outer_rings(shape: tuple[int, int], counted: float, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the radii in pixels of rings beyond the inner pixels, and the number of pixels of the
-    sensor in each ring.
+    """Return the radii in pixels of the rings outside the inner pixels, and the number of sensor
+    pixels in each ring.
 
-    ``counted`` pixels at ``places`` are counted one by one already; together with the rings they
-    make the whole sensor.
+    The ``counted`` inner pixels at ``places`` are excluded; with the rings they make up the whole
+    sensor.
     """
     outer_pixels = shape[0] * shape[1] - counted
     if outer_pixels <= 0:
@@ -382,22 +387,24 @@ def _outer_rings(shape: tuple[int, int], counted: float, places: Tensor) -> tupl
     ) * edges.diff()
     not_empty = ring_pixels > 0
     radii, ring_pixels = radii[not_empty], ring_pixels[not_empty]
-    # scaled, so that the numbers add up to the pixels that are left
+    # scaled so that the numbers add up to the number of outer pixels
     return radii, ring_pixels * (outer_pixels / ring_pixels.sum())
 
 
 def _arc_inside(radius: Tensor, half: Tensor) -> Tensor:
-    """Return the length of the circle of each radius that lies inside a rectangle of half sides
-    (y, x).
+    """Return the arc length of each circle that lies inside a rectangle with the half sides
+    ``half`` (y, x).
     """
-    # of a quadrant: the angles at which the circle is beyond one of the two sides
+    # in one quadrant: the angles at which the circle is outside one of the two sides
     angle_outside = sum(torch.acos((h / radius).clamp_max(1.0)) for h in half)
     return 4 * radius * (math.pi / 2 - torch.as_tensor(angle_outside)).clamp_min(0)
 
 
 def _over_squares(places: Tensor, fill: float, waves: float, spread: float) -> Tensor:
-    """Return the mean irradiance of the pixels at ``places``, from a table over the radius."""
-    # from the middle of a pixel to its corner it is 0.71
+    """Return the irradiance averaged over each pixel at ``places``, from a table over the
+    radius.
+    """
+    # the corner of a pixel is 0.71 pixels from its middle
     table_end = float(places.square().sum(1).max().sqrt()) + 0.75
     steps = math.ceil(table_end * math.pi / spread / _FRINGE_STEP)
     radii = torch.linspace(0.0, table_end, min(max(steps, 400), 40_000), dtype=torch.float64)
@@ -405,7 +412,7 @@ def _over_squares(places: Tensor, fill: float, waves: float, spread: float) -> T
     table = round_spot(radii * (math.pi / spread), fill, waves)
     mean_irradiance = torch.zeros(len(places), dtype=torch.float64)
     near_spot = places.amax(1) <= 2
-    # the spot may be far smaller than one of the nearest pixels, which takes more points
+    # the nearest pixels need more points, because the spot may be far smaller than a pixel
     for pixels_of_group, node_limit in (
         (near_spot, 4 * _MOST_PIXEL_POINTS * 4),
         (~near_spot, _MOST_PIXEL_POINTS),
@@ -414,7 +421,7 @@ def _over_squares(places: Tensor, fill: float, waves: float, spread: float) -> T
             torch.from_numpy(values)
             for values in legendre(min(node_limit, 3 + math.ceil(5 / spread)))
         )
-        # from the interval -1 to 1 to that of a pixel, -1/2 to 1/2
+        # scale from the interval -1 to 1 to a pixel, -1/2 to 1/2
         mean_irradiance[pixels_of_group] = _mean_of_squares(
             places[pixels_of_group], points / 2, weights / 2, radii, table
         )
@@ -424,11 +431,11 @@ def _over_squares(places: Tensor, fill: float, waves: float, spread: float) -> T
 def _mean_of_squares(
     places: Tensor, points: Tensor, weights: Tensor, radii: Tensor, table: Tensor
 ) -> Tensor:
-    """Return the mean over the square of each pixel (pixel,) of a function of the distance from
-    the spot.
+    """Return the average over each pixel's square (pixel,) of a function of the distance from the
+    spot.
 
-    ``places`` has the middles of the pixels, ``points`` and ``weights`` are those of a quadrature
-    from -1/2 to 1/2 along each axis, and ``table`` has the function at evenly spaced ``radii`` from
+    ``places`` are the middles of the pixels, ``points`` and ``weights`` a quadrature rule on -1/2
+    to 1/2 along each axis, and ``table`` the values of the function at evenly spaced ``radii`` from
     0.
     """
     means = torch.zeros(len(places), dtype=torch.float64)
@@ -443,54 +450,55 @@ def _mean_of_squares(
 
 
 def _over_rings(radius: Tensor, fill: float, waves: float, spread: float) -> Tensor:
-    """Return the mean irradiance of pixels at distances ``radius`` from the spot, where the rings
-    are nearly straight lines.
+    """Return the irradiance averaged over pixels at the distances ``radius`` from the spot, where
+    fringes are nearly straight lines.
 
-    A pixel averages over the rings along one direction alone, and how much depends on the azimuth
-    of the pixel: each radius has another, random one.
+    The average then runs over one direction only and depends on the azimuth of the pixel, which is
+    drawn at random for each radius.
     """
     if not len(radius):
         return radius
     random_share = torch.rand(
         len(radius), 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )
-    # by chance, since even steps are in step with the fringes at some radii
+    # random, since regular steps could coincide with the fringes at some radii
     azimuth = random_share * (math.pi / 4)
     cosine, sine = azimuth.cos(), azimuth.sin()
     point_count = min(_MOST_PIXEL_POINTS, 5 + math.ceil(6 / spread))
-    # from corner to corner, the square is cos + sin wide across the rings
+    # across the fringes the square pixel is cos + sin wide
     offset = ((torch.arange(point_count, dtype=torch.float64) + 0.5) / point_count - 0.5) * (
         cosine + sine
     )
-    # length of the square along a ring: a trapezium that falls to 0 at the corners
+    # length of the pixel along a fringe: a trapezium that falls to 0 at the corners
     chord = ((cosine + sine) / 2 - offset.abs()).minimum(sine.clamp_min(1e-3))
     reaches = (radius[:, None] + offset) * (math.pi / spread)
     return (round_spot(reaches, fill, waves) * chord).sum(1) / chord.sum(1)
 
 
 def _smoothed(radius: Tensor, pixels: Tensor, light: Tensor, feature: float) -> Tensor:
-    """Return the mean light over a disc of the area of a feature around the pixels at each radius.
+    """Return the light averaged over a disc with the area of a feature, around the pixels at each
+    radius.
 
-    A spot inside the disc counts with all of its light; elsewhere the mean over the radii that the
-    disc covers counts.
+    Near the spot it is the larger of two means, that of the disc centred on the spot and that over
+    the radii that the disc covers; elsewhere the latter.
     """
     order = radius.argsort()
     radii = radius[order]
-    # light and pixels up to each radius, with 0 before the first
+    # cumulative light and pixels up to each radius, starting with 0
     enclosed_light = torch.cat(
         [torch.zeros(1, dtype=torch.float64), (light * pixels)[order].cumsum(0)]
     )
     enclosed_pixels = torch.cat([torch.zeros(1, dtype=torch.float64), pixels[order].cumsum(0)])
-    # pi r^2 is the area of the feature
+    # radius of a disc with the area of the feature
     disc_radius = feature / math.sqrt(math.pi)
     first_index = torch.searchsorted(radii, (radii - disc_radius).clamp_min(-1.0))
     end_index = torch.searchsorted(radii, radii + disc_radius, right=True)
-    # mean over the radii that the disc covers, from differences of the sums
+    # mean over the radii that the disc covers, from differences of the cumulative sums
     ring_mean = (enclosed_light[end_index] - enclosed_light[first_index]) / (
         enclosed_pixels[end_index] - enclosed_pixels[first_index]
     ).clamp_min(1e-300)
     spot_mean = (
-        # all light within the disc around the spot
+        # all light within the disc centred on the spot
         enclosed_light[torch.searchsorted(radii, torch.full_like(radii, disc_radius), right=True)]
         / feature**2
     )
@@ -503,24 +511,25 @@ def _smoothed(radius: Tensor, pixels: Tensor, light: Tensor, feature: float) -> 
 
 # --- summit ---------------------------------------------------------------------------------------
 
-# The peak of a sampled spot: between its samples, and the light outside its window that may hold a
-# higher one.
+# The peak of a sampled spot, between its samples, and the light outside its window, which may have
+# a higher peak.
 
 
-_LOBE_SHARE = 0.5  #: of the brightest sample, from which the summit of a lobe may be higher than it
-_DARK_SHARE = 1e-30  #: of the brightest sample, below which light is dark
-#: a sample and its four neighbours, in samples along y and x
+#: lobes above this share of the brightest sample are interpolated, since their peak may exceed it
+_LOBE_SHARE = 0.5
+_DARK_SHARE = 1e-30  #: share of the brightest sample below which light counts as dark
+#: offsets (y, x) of a sample and its four neighbours
 _NEIGHBOUR_OFFSETS = ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))
-#: share of the light outside a window, at most, that the wings of a spot in the window explain
+#: largest share of light outside a window that the wings of the spot may explain
 _WINGS_SHARE = 0.03
 
 
 def summit_gain(image: Tensor) -> Tensor:
-    """Return the peak of a spot over its brightest sample: the highest summit of the parabolas
-    through its lobes.
+    """Return the interpolated peak of a spot over its brightest sample, from parabolas through its
+    lobes.
 
-    A lobe is a sample that none of its four neighbours exceeds. Its summit is that of a parabola
-    along y and of one along x, in logarithms, for which a Gaussian lobe is exact.
+    A lobe is a sample that none of its four neighbours exceeds. Its peak is interpolated by
+    parabolas of the logarithm along y and along x, which is exact for a Gaussian lobe.
 
     Shapes: image (y, x) -> ().
     Units:  any -> none.
@@ -533,7 +542,7 @@ def summit_gain(image: Tensor) -> Tensor:
     if min(image.shape) < 3 or not brightest > 0:
         return torch.ones((), dtype=torch.float64)
     inner = image[1:-1, 1:-1]
-    # a few samples: no other one is a summit
+    # only these few samples can have the peak
     y, x = (inner > _LOBE_SHARE * brightest).nonzero(as_tuple=True)
     log_light, above, below, left, right = (
         (image[y + 1 + dy, x + 1 + dx].double() / brightest).clamp_min(_DARK_SHARE).log()
@@ -543,21 +552,21 @@ def summit_gain(image: Tensor) -> Tensor:
     for before, after in ((above, below), (left, right)):
         is_lobe = is_lobe & (log_light >= before) & (log_light >= after)
         curvature = (2 * log_light - before - after).clamp_min(_DARK_SHARE)
-        # summit of the parabola through three points above the middle one
+        # peak of the parabola through three points, above the middle one
         log_gain = log_gain + (after - before).square() / (8 * curvature)
     summits = torch.where(is_lobe, log_light + log_gain, 0.0)
     return torch.cat([summits, summits.new_zeros(1)]).max().clamp_min(0).exp()
 
 
 def unseen_light(image: Tensor, passing: float) -> Tensor:
-    """Return the share of a beam's light outside the window of its spot that may be in one spot
-    there.
+    """Return an upper bound of the share of a beam's light that may form another spot outside the
+    window.
 
-    Of a window that holds nearly all light, the wings go on outside by the radial law of
-    `with_frame`: what they explain is in no spot. A window that lacks more may lack a part of the
-    spot itself, so that no law counts. ``passing`` is the light through the lens, in the unit of
-    the image. A spot of the share s of the light has at most s times the peak of the clear lens in
-    focus with the same beam.
+    If the window contains nearly all light, the wings outside it follow the radial law of
+    `with_frame`, and their light forms no spot. If the window lacks more, it may lack a part of the
+    spot itself, and all missing light counts. ``passing`` is the light through the lens, in the
+    unit of the image. A spot with the share s of the light has at most s times the peak of the
+    clear, focused lens with the same beam.
 
     Shapes: image (y, x) -> ().
     Units:  share of the light through the clear pupil -> none.

@@ -1,4 +1,6 @@
-"""Exposure limits of a sensor, distances beyond them, size and heat of the spot."""
+"""Exposure limits of a sensor, distances at which they are exceeded, size and heating of the
+spot.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,11 @@ from neusee.nodes.laser._round_spot import bilinear, legendre
 
 # --- damage distances -----------------------------------------------------------------------------
 
-# Exposure limits of a sensor at its lens, and the intervals of distance at which a laser exceeds a
-# limit.
+# Exposure limits at the lens of a sensor, and the intervals of distance in which a laser exceeds
+# them.
 
 
-_SAMPLED_DISTANCES = 400  #: distances at which a margin is looked at first
+_SAMPLED_DISTANCES = 400  #: number of distances at which a margin is sampled
 _HALVINGS = 60  #: halvings of an interval, to the last bit of a distance
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
@@ -32,8 +34,8 @@ def sensor_gain(
     lens_transmittance: float = 1.0,
     peak_ratio: float = 1.0,
 ) -> float:
-    """Return the peak irradiance on the sensor over the irradiance at the lens: tau (pi D^2 / (4
-    lambda f))^2 x ratio.
+    """Return the ratio of peak irradiance on the sensor to irradiance at the lens: tau (pi D^2 / (4
+    lambda f))^2 x ``peak_ratio``.
 
     ``peak_ratio`` is the peak of the PSF over that of the clear, focused lens, such as the laser
     suppression ratio of a mask. The beam overfills the aperture. The same ratio holds for fluences.
@@ -43,8 +45,8 @@ def sensor_gain(
 
 
 def exposure_limit(threshold: float, gain: float) -> float:
-    """Return the exposure at the lens, in the unit of the threshold, that gives the threshold on
-    the sensor.
+    """Return the exposure at the lens, in the unit of the threshold, at which the sensor reaches
+    the threshold.
 
     With the damage threshold the result is the maximum permissible exposure of the sensor, MPE_S;
     with `sensor_gain` it is for a beam that overfills the aperture. Our derivation of the quantity
@@ -54,8 +56,8 @@ def exposure_limit(threshold: float, gain: float) -> float:
 
 
 def airy_diameter(wavelength: float, f_number: float) -> float:
-    """Return the 1/e2 diameter of the Gaussian spot that heats as an Airy spot of equal peak: 1.725
-    lambda N.
+    """Return the 1/e2 diameter of the Gaussian spot that heats its centre as much as an Airy spot
+    of equal peak: 1.725 lambda N.
 
     The steady heat at the centre is the integral of the irradiance along a radius: w sqrt(pi / 8)
     for a Gaussian spot, 16 lambda N / (3 pi^2) for an Airy spot.
@@ -66,11 +68,11 @@ def airy_diameter(wavelength: float, f_number: float) -> float:
 def defocus_of_source(
     distance: float, diameter: float, wavelength: float, focused_at: float = math.inf
 ) -> float:
-    """Return the defocus in waves at the rim of the pupil, D^2 / (8 lambda) (1 / R - 1 / R0), of a
-    source at R.
+    """Return the defocus in waves at the rim of the pupil for a source at the distance R: D^2 / (8
+    lambda) (1 / R - 1 / R0).
 
-    ``distance`` is the radius of the wavefront at the lens, which for a distant laser is the
-    distance.
+    ``distance`` R is the radius of curvature of the wavefront at the lens, for a distant laser its
+    distance; ``focused_at`` is R0.
     """
     return diameter**2 / (8 * wavelength) * (1 / distance - 1 / focused_at)
 
@@ -78,7 +80,7 @@ def defocus_of_source(
 def distance_intervals(
     margin: Callable[[float], float], near: float, far: float, samples: int = _SAMPLED_DISTANCES
 ) -> list[tuple[float, float]]:
-    """Return the intervals of distance in m between ``near`` and ``far`` at which a margin is above
+    """Return the intervals of distance in m between ``near`` and ``far`` in which a margin is above
     0, in rising order.
 
     ``margin(distance)`` is above 0 where a limit is exceeded, such as ln(exposure / limit); -inf
@@ -107,7 +109,7 @@ def distance_intervals(
     for (lower, lower_margin), (upper, upper_margin) in itertools.pairwise(points):
         if (lower_margin > 0) != (upper_margin > 0):
             interval_ends.append(_crossing(value, lower, upper, lower_margin > 0))
-    # the last interval is still open
+    # an odd number of ends: the last interval reaches to `far`
     if len(interval_ends) % 2:
         interval_ends.append(far)
     return list(zip(interval_ends[::2], interval_ends[1::2], strict=True))
@@ -116,13 +118,13 @@ def distance_intervals(
 def _with_extrema(
     value: Callable[[float], float], distances: list[float], values: list[float]
 ) -> list[tuple[float, float]]:
-    """Return the samples (distance, margin) in rising order, with one more for each local extremum
-    that may cross 0 between the samples.
+    """Return the samples (distance, margin) in rising order, with an added sample at each local
+    extremum between which the margin may change its sign.
     """
     points = list(zip(distances, values, strict=True))
     extrema = []
     for i in range(1, len(distances) - 1):
-        # a hidden zone is a maximum below 0, a hidden gap a minimum above 0
+        # between samples, a maximum below 0 may hide a zone above 0, and a minimum above 0 a gap
         sign = 1.0 if values[i] <= 0 else -1.0
         previous, middle, following = (sign * x for x in values[i - 1 : i + 2])
         if middle >= max(previous, following) and middle > min(previous, following):
@@ -133,8 +135,8 @@ def _with_extrema(
 def _extremum(
     value: Callable[[float], float], a: float, b: float, sign: float
 ) -> tuple[float, float]:
-    """Return the distance of the largest ``sign`` x margin between the distances a and b, and the
-    margin there, by golden section of the logarithm of the distance.
+    """Return the distance between a and b at which ``sign`` x margin is largest, and the margin
+    there, by golden-section search over the logarithm of the distance.
     """
     low, high = math.log(a), math.log(b)
     for _ in range(_HALVINGS):
@@ -149,8 +151,8 @@ def _extremum(
 
 
 def _crossing(value: Callable[[float], float], a: float, b: float, above: bool) -> float:
-    """Return the distance between a and b at which a margin passes 0, by bisection; ``above`` says
-    that it is above 0 at a.
+    """Return the distance between a and b at which a margin changes sign, by bisection; ``above``
+    is True if it is above 0 at a.
     """
     for _ in range(_HALVINGS):
         middle = math.sqrt(a * b)
@@ -160,39 +162,38 @@ def _crossing(value: Callable[[float], float], a: float, b: float, above: bool) 
 
 # --- spot heat ------------------------------------------------------------------------------------
 
-# The steady heat at the hottest point of a spot: the integral of the irradiance over the distance
-# to that point.
+# The steady-state temperature rise at the hottest point of a spot: the integral of irradiance over
+# distance to that point.
 #
-# A light spot on a half-space warms a point of its surface, in the steady state, by the integral of
-# E dA / (2 pi r), where r is the distance to the point. A wide spot of low irradiance may warm as
-# much as a small bright one, so that the heat decides about damage by continuous light. Units and
-# symbols are those of `round_spot`.
+# In the steady state, a light spot on a half-space warms a point of the surface in proportion to
+# the integral of E dA / (2 pi r), with r the distance to the point, called heat here. A wide spot
+# of low irradiance may warm as much as a small bright one; for continuous light the heat decides
+# about damage. Units and symbols are those of `round_spot`.
 
 
-#: of the even, focused pupil: integral of (2 J1(v) / v)^2 over v from 0 on
+#: heat of the evenly lit, focused pupil: integral of (2 J1(v) / v)^2 over v from 0 to infinity
 _AIRY_HEAT = 16 / (3 * math.pi)
-#: defocus and fill up to which the heat is interpolated in a table
+#: largest defocus in waves, and largest fill, of the table of heat
 _TABLE_WAVES, _TABLE_FILL = 8.0, 8.0
 _WAVE_STEPS, _FILL_STEPS = 401, 33
-#: reach up to which irradiance is summed, twice that of the geometric edge
+#: reach v up to which irradiance is summed, twice that of the geometric edge
 _LARGEST_REACH = 8 * math.pi * _TABLE_WAVES
-_REACH_STEP = 0.1  #: of the reach, between its samples
-#: reach within which the hottest point is looked for: farther out the heat of a spot only falls
+_REACH_STEP = 0.1  #: step of the reach v
+#: the hottest point is searched up to this reach v; farther out the heat of a spot only falls
 _HOTTEST_REACH = 6.0
-_HEATED_POINTS = 25  #: of them
-_STEP_PARTS = 32  #: of a step, over which the inverse distance is averaged
-_PUPIL_NODES = 256  #: of the quadrature over the pupil
-#: what keeps the heat of straight rays finite and flat near focus, and is as good as nothing
-#: elsewhere
+_HEATED_POINTS = 25  #: number of points at which the heat is computed
+_STEP_PARTS = 32  #: subdivisions of a step over which the inverse distance is averaged
+_PUPIL_NODES = 256  #: nodes of the quadrature over the pupil
+#: added term that keeps the geometric-optics heat finite and flat near focus; negligible elsewhere
 _FOCUS_TERM = 9.0
-#: power of the defocus with which the heat of the rings falls beyond the table, where it is found
+#: exponent with which the excess heat of the rings falls with defocus beyond the table; computed:
 #: 0.93
 _RING_FALL = 0.9
 
 
 def spot_heat(fill: Tensor, waves: Tensor) -> Tensor:
-    """Return the steady heat at the hottest point of the spot of a beam, over that of the even and
-    focused beam.
+    """Return the steady heat at the hottest point of a beam's spot, relative to that of an evenly
+    lit, focused lens.
 
     Both beams have the same irradiance on their axis at the lens. ``fill`` is (D / (2 w))^2 of a
     Gaussian beam of 1/e2 radius w behind a clear round lens of diameter D, and ``waves`` the
@@ -206,10 +207,10 @@ def spot_heat(fill: Tensor, waves: Tensor) -> Tensor:
     Source: Carslaw, Jaeger, Conduction of Heat in Solids, 2nd ed., section 10.5, for the heat;
             `round_spot` for the irradiance; geometric optics beyond 8 waves.
     """
-    # broadcasts both arguments to one shape
+    # zeros of the common shape, to broadcast both arguments
     zeros = torch.zeros_like(fill.double() + waves.double())
     fill, waves = fill.double() + zeros, waves.double().abs() + zeros
-    # the last row of the table, beyond the last step, holds the largest of the last wave
+    # row `_WAVE_STEPS`, used beyond the table, holds the maximum over the last wave of defocus
     table_row = (waves / _TABLE_WAVES * (_WAVE_STEPS - 1)).clamp(0, _WAVE_STEPS)
     table_column = (fill / _TABLE_FILL * (_FILL_STEPS - 1)).clamp(0, _FILL_STEPS - 1)
     heat_ratio = bilinear(_heat_table(), table_row, table_column)
@@ -224,25 +225,25 @@ def spot_heat(fill: Tensor, waves: Tensor) -> Tensor:
 
 
 def _even_disc(fill: Tensor, waves: Tensor) -> Tensor:
-    """Return the heat in the middle of the spot of straight rays, in the unit of `spot_heat`
-    before its division by `_AIRY_HEAT`; near focus a smooth function that stays finite.
+    """Return the heat in the middle of the spot by geometric optics, in the unit of `_AIRY_HEAT`;
+    near focus a smooth function that stays finite.
     """
     focus_term = _FOCUS_TERM / (1 + waves.square() + fill.square() / 4)
     spot_size = torch.sqrt(fill.square() + (2 * math.pi * waves).square() + focus_term)
     root = torch.sqrt(2 * fill).clamp_min(1e-6)
-    # mean of exp(-2 fill rho^2) along a radius
+    # mean of exp(-2 fill rho^2) over the radius rho from 0 to 1
     taper = math.sqrt(math.pi) / 2 * torch.erf(root) / root
     return 2 / spot_size * taper
 
 
 @functools.lru_cache(maxsize=1)
 def _heat_table() -> Tensor:
-    """Return the heat of the hottest point over `_even_disc` as a table (waves, fill), with one
-    more row: the largest values of the last wave of defocus.
+    """Return a table (waves, fill) of the heat of the hottest point over `_even_disc`; an added
+    last row has the maxima over the last wave of defocus.
     """
     waves = torch.linspace(0, _TABLE_WAVES, _WAVE_STEPS, dtype=torch.float64)
     fills = torch.linspace(0, _TABLE_FILL, _FILL_STEPS, dtype=torch.float64)
-    # middles of rings of the reach v
+    # reach v at the middle of each ring
     reach = (
         torch.arange(round(_LARGEST_REACH / _REACH_STEP), dtype=torch.float64) + 0.5
     ) * _REACH_STEP
@@ -267,8 +268,8 @@ def _heat_table() -> Tensor:
 
 
 def _mean_inverse_distance(reach: Tensor) -> Tensor:
-    """Return the weights (point, reach) of the heat at points: the integral of dA / (2 pi r) over a
-    ring of a step.
+    """Return the weights (point, reach) with which rings heat points: the integral of dA / (2 pi r)
+    over each ring.
 
     A ring of radius v warms a point at the distance u from its middle by 2 / pi v / (u + v) K(m),
     with the complete elliptic integral K and m = 4 u v / (u + v)^2.
@@ -293,20 +294,20 @@ def _mean_inverse_distance(reach: Tensor) -> Tensor:
 
 # --- spot on sensor -------------------------------------------------------------------------------
 
-# Spot of a laser on the sensor: its size, and the mean power of a frame in which at least one pulse
-# falls.
+# The spot of a laser on the sensor: its size, and the mean power during a frame with at least one
+# pulse.
 
 
 Number = TypeVar("Number", float, Tensor)
 
 
 def frame_power(beam: Beam, exposure: float) -> float:
-    """Return the mean power in W of a laser during an exposure in s, in which at least one pulse
-    falls.
+    """Return the mean power in W of a laser during an exposure in s that contains at least one
+    pulse.
 
-    A continuous laser has its power, a single pulse its energy over the exposure. A pulse train has
-    its mean power, or that of one pulse if the exposure is shorter than the period: the frame that
-    catches a pulse is the one that counts.
+    For a continuous laser it is the power, for a single pulse its energy over the exposure. For a
+    pulse train it is the mean power, or one pulse energy over the exposure if that is larger: the
+    frame that catches a pulse counts.
     """
     if beam.pulse_energy is None:
         assert beam.power is not None
@@ -317,15 +318,15 @@ def frame_power(beam: Beam, exposure: float) -> float:
 def spot_in_pixels(
     wavelength: float, focal_length: float, diameter: float, pixel_pitch: float
 ) -> float:
-    """Return the size of a diffraction-limited spot in pixels: wavelength times f-number over
-    pixel pitch.
+    """Return the size of a diffraction-limited spot in pixels, lambda N / p: wavelength times
+    f-number over pixel pitch.
     """
     return wavelength * focal_length / diameter / pixel_pitch
 
 
 def heated_diameter(beam: Beam, distance: Number, diameter: Number, focal_length: Number) -> Number:
-    """Return the 1/e2 diameter in m of the Gaussian spot that heats a sensor as the focused spot of
-    a beam.
+    """Return the 1/e2 diameter in m of the Gaussian spot that heats a sensor as much as the focused
+    spot of a beam with equal peak.
 
     It is `airy_diameter` for a beam that overfills the lens. A narrower beam has a wider spot: for
     equal power the peak is inversely proportional to the area of the spot, so that the diameter
@@ -346,12 +347,11 @@ def heated_in_spot(
     waves: Tensor,
     density: Tensor,
 ) -> Tensor:
-    """Return the 1/e2 diameter in m of the Gaussian spot that heats as the spot behind a clear
-    round lens with defocus.
+    """Return the 1/e2 diameter in m of the Gaussian spot that heats as much as the spot behind a
+    clear, defocused round lens.
 
-    ``density`` is what counts as the peak of the spot, as a share of the beam's power per m2
-    (`density_in_spot`). A peak that is stated too high has a spot that is too narrow, and the same
-    heat.
+    ``density`` is the peak irradiance per watt of beam power in 1/m2 (`density_in_spot`). If it is
+    too high, the diameter becomes too small, and the heat stays the same.
     """
     fill = diameter**2 / (4 * beam_radius(beam, distance) ** 2)
     airy: Tensor = airy_diameter(beam.wavelength, focal_length / diameter)  # type: ignore[assignment,arg-type]
@@ -364,8 +364,8 @@ def heated_in_spot(
 
 
 def widest_heated_diameter(clear: Number, peak_ratio: Number) -> Number:
-    """Return an upper bound of the 1/e2 diameter in m of the Gaussian spot that heats as a spot
-    behind a mask.
+    """Return an upper bound of the 1/e2 diameter in m of the Gaussian spot that heats as much as
+    the spot behind a mask.
 
     ``clear`` is `heated_diameter` of the clear lens, and ``peak_ratio`` the peak behind the mask
     over that of the clear lens. Of all spots with equal power and equal peak, an evenly lit disc
@@ -373,8 +373,8 @@ def widest_heated_diameter(clear: Number, peak_ratio: Number) -> Number:
 
     Source: rearrangement inequality for the integral of E / r over the plane; our derivation.
     """
-    # of the integral of E along a radius, in wavelengths times f-number and peaks
+    # integral of E along a radius over peak x lambda N, of the Airy spot
     airy_heat = 16 / (3 * math.pi**2)
-    disc_heat = 2 / math.pi  # radius of the disc of equal power and peak, in the same unit
+    disc_heat = 2 / math.pi  # the same of an even disc of equal power and peak: its radius
     wider: Number = clear * (disc_heat / airy_heat) / peak_ratio**0.5
     return wider

@@ -1,4 +1,4 @@
-"""Laws of damage by irradiance or fluence, published thresholds, silicon absorption."""
+"""Laws of laser damage by irradiance or fluence, published thresholds, absorption of silicon."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torch import Tensor
 
 # --- damage laws ----------------------------------------------------------------------------------
 
-# Laws of damage: the irradiance or the fluence at which a laser damages a sensor, with a bracket or
-# a spread.
+# A law of damage is the threshold, an irradiance or a fluence, at which a laser damages a sensor,
+# with a bracket or a spread.
 #
-# A published threshold is a figure or a bracket such as "tens of kW/cm2": it gives ratios and no
-# probability. A law with ``factor`` is lognormal and stands on data of devices: its median is the
-# threshold of the median device, ``factor`` is one geometric standard deviation from device to
-# device, and ``median_factor`` is one geometric standard deviation of the median itself, which is
-# known from few devices. A probability is the share of devices that are damaged; its interval comes
-# from the median.
+# A published threshold is a single value or a bracket such as "tens of kW/cm2": it gives ratios and
+# no probability. A law with ``factor`` is lognormal and rests on measurements of devices: its
+# median is the threshold of the median device, ``factor`` is the geometric standard deviation from
+# device to device, and ``median_factor`` is the geometric standard deviation of the median, which
+# was estimated from few devices. A probability is the share of devices that are damaged; its
+# interval comes from the uncertainty of the median.
 
 
 Number = float | Tensor
@@ -32,17 +32,17 @@ KINDS: tuple[Kind, ...] = ("point", "line", "cross", "destruction", "frame")
 #: m2/s, of silicon at room temperature: 148 W/(m K) / (2330 kg/m3 x 710 J/(kg K))
 DIFFUSIVITY = 9e-5
 LEVEL = 0.9  #: probability of every interval of this module
-#: of the standard normal distribution at 0.95: both ends of `LEVEL`
+#: quantile of the standard normal distribution at 0.95, for a two-sided interval of `LEVEL`
 _NORMAL_QUANTILE = 1.6448536269514722
 
 
 class DamageLaw(NamedTuple):
-    """The threshold of one kind of damage to one class of sensors, with the range where it was
-    measured.
+    """The threshold of one kind of damage to one class of sensors, with the ranges of wavelength
+    and duration for which it holds.
     """
 
     device: str  #: class of the sensor, such as CMOS
-    damage: Kind  #: what the damage looks like
+    damage: Kind  #: kind of damage, by its appearance
     quantity: Quantity  #: irradiance of continuous light, or fluence of one pulse
     median: float  #: W/m2 or J/m2, threshold of the median device, peak of the spot
     #: geometric standard deviation from device to device, above 1; None where it is not known
@@ -60,22 +60,22 @@ class DamageLaw(NamedTuple):
 
     @property
     def has_spread(self) -> bool:
-        """Return True if the law states the spread of devices and of its median, which a
-        probability needs.
+        """Return True if the law states both `factor` and `median_factor`, which a probability
+        needs.
         """
         return self.factor is not None and self.median_factor is not None
 
     @property
     def unit(self) -> str:
-        """Return the unit in which laser damage is usually stated: W/cm2 or J/cm2; 1 of it is
-        1e4 of the SI unit.
+        """Return the unit in which laser damage is usually stated, W/cm2 or J/cm2, which is 1e4 SI
+        units.
         """
         return "W/cm2" if self.quantity == "irradiance" else "J/cm2"
 
 
 class Damage(NamedTuple):
-    """How near a laser is to damage: the ratio to the threshold and, where the spread is known,
-    a probability.
+    """Exposure relative to a damage threshold and, where the spread is known, the probability of
+    damage.
     """
 
     ratio: float  #: exposure over the threshold of the median device
@@ -92,7 +92,9 @@ def double(value: Number) -> Tensor:
 def matching_laws(
     laws: Iterable[DamageLaw], device: str, wavelength: float, duration: float, quantity: Quantity
 ) -> tuple[DamageLaw, ...]:
-    """Return the laws that hold for a class of sensors, a wavelength in m and a duration in s."""
+    """Return the laws of a quantity that hold for a class of sensors, a wavelength in m and a
+    duration in s.
+    """
     device_laws = [law for law in laws if law.device.casefold() == device.casefold()]
     quantity_laws = [law for law in device_laws if law.quantity == quantity]
     return tuple(law for law in quantity_laws if _holds(law, wavelength, duration))
@@ -105,8 +107,8 @@ def _holds(law: DamageLaw, wavelength: float, duration: float) -> bool:
 
 
 def spot_reach(diameter: Number, duration: Number) -> Tensor:
-    """Return the length in m that is proportional to the heat at the centre of a Gaussian spot, per
-    peak irradiance.
+    """Return a length in m proportional to the temperature rise at the centre of a Gaussian spot
+    per peak irradiance.
 
     The surface of a half-space at the centre of a spot of radius w warms by A E w / (k sqrt(2 pi))
     times arctan(sqrt(8 kappa t) / w) after a time t. The result is w arctan(sqrt(8 kappa t) / w):
@@ -122,13 +124,13 @@ def spot_reach(diameter: Number, duration: Number) -> Tensor:
 def spot_factor(
     published: float, spot: Number, duration: Number, small_spot_exponent: Number = 0.0
 ) -> Tensor:
-    """Return the factor on a threshold of continuous light for a spot of another diameter than the
-    published one.
+    """Return the factor on a published threshold of continuous light for a spot of another
+    diameter, both 1/e2 in m.
 
-    A wider spot warms more at equal irradiance, and its threshold falls by equal heat at the
-    centre: published / spot in the steady state. A narrower spot gets no bonus: two published laws
-    contradict the factor 1 / diameter 40 times. ``small_spot_exponent`` above 0 asks for the bonus
-    (published / spot) to the power of the exponent.
+    A wider spot warms more at equal irradiance; its threshold is lowered to give equal heat at the
+    centre, by the factor published / spot in the steady state. The threshold of a narrower spot is
+    not raised by default: two published laws contradict the factor 1 / diameter by 40 times. With
+    ``small_spot_exponent`` above 0 it is raised by (published / spot) to the power of the exponent.
     """
     diameter = double(spot)
     narrower_factor = (published / diameter) ** double(small_spot_exponent)
@@ -142,8 +144,8 @@ def damage_threshold(
     duration: float | None = None,
     small_spot_exponent: float = 0.0,
 ) -> float:
-    """Return the threshold of the median device in W/m2 or J/m2 for a spot of another 1/e2 diameter
-    than the law's.
+    """Return the threshold of the median device in W/m2 or J/m2, for a spot of the 1/e2 diameter
+    ``spot``.
 
     The irradiance of continuous light is multiplied by `spot_factor`. A fluence is not scaled,
     because heat travels about 2 um in 10 ns. Without a spot, or for a law whose own spot is not
@@ -162,18 +164,18 @@ def damage_at(
     duration: float | None = None,
     small_spot_exponent: float = 0.0,
 ) -> Damage:
-    """Return how near an exposure in W/m2 or J/m2, at the peak of a spot, is to the damage that a
-    law describes.
+    """Return ratio and probability of damage by a law, for an exposure in W/m2 or J/m2 at the peak
+    of a spot.
 
-    The probability is that of a device drawn from all devices, Phi(ln ratio / ln factor). Its 90 %
-    interval has the median moved by 1.645 of its own standard deviations. A law without ``factor``
-    or ``median_factor`` has no probability. Neither the exposure time of a frame nor gain, full
-    well or quantum efficiency enters.
+    The probability is that of a random device, Phi(ln ratio / ln factor). Its 90 % interval follows
+    from the median shifted by +-1.645 of its standard deviations. A law without ``factor`` or
+    ``median_factor`` gives no probability. Exposure time of a frame, gain, full well and quantum
+    efficiency have no effect.
     """
     ratio = exposure / damage_threshold(law, spot, duration, small_spot_exponent)
     if law.factor is None or law.median_factor is None:
         return Damage(ratio, None, None, None)
-    # standard deviations of ln threshold by which the exposure is above the median device
+    # distance of the exposure above the median threshold, in standard deviations of ln threshold
     deviations = math.log(ratio) / math.log(law.factor) if ratio > 0 else -math.inf
     median_shift = _NORMAL_QUANTILE * math.log(law.median_factor) / math.log(law.factor)
     return Damage(
@@ -191,35 +193,34 @@ def _normal_distribution(x: float) -> float:
 
 # --- damage curve ---------------------------------------------------------------------------------
 
-# Threshold of the first damage over the duration of the light, between pulses of nanoseconds and
-# continuous light.
+# Threshold of the first damage as a function of the duration of the light, from nanosecond pulses
+# to continuous light.
 #
-# Two published ends hold the curve: a fluence for pulses of 10 ns and an irradiance for continuous
-# light. Between 10 ns and 10 us the fluence is interpolated in logarithms; beyond, the continuous
-# law counts as an irradiance. A longer pulse never needs less fluence, and a shorter one never
-# needs less irradiance.
+# The curve connects two published thresholds: a fluence for pulses of 10 ns and an irradiance for
+# continuous light. Between 10 ns and 10 us the fluence is interpolated log-log; beyond, the
+# irradiance of the continuous law is used. The threshold fluence never falls with duration, and the
+# threshold irradiance never rises.
 
 
 PULSE_END = 10e-9  #: s, duration of the published fluence
 CONTINUOUS_FROM = 10e-6  #: s, duration from which the continuous law counts
-SHORTEST = 1e-9  #: s; below, no threshold is known from below
-#: factor to each end of the bracket: by equal heat the two published ends disagree 40 times
+SHORTEST = 1e-9  #: s; for shorter pulses no lower end of the threshold is known
+#: factor from the curve to each end of its bracket: by equal heat the two published thresholds
+#: differ 40 times
 SPREAD = math.sqrt(40.0)
 
 
 @dataclass(frozen=True)
 class Bracket:
-    """A threshold with the ends of its bracket, in J/m2 or W/m2; tensors that broadcast against
-    each other.
-    """
+    """A threshold and the ends of its bracket, in J/m2 or W/m2, as tensors that broadcast."""
 
     low: Tensor  #: 0 where no lower end is known
-    middle: Tensor  #: the threshold that a ratio is stated for
+    middle: Tensor  #: the threshold to which ratios refer
     high: Tensor
 
     def times(self, factor: Number | tuple[float, float]) -> Bracket:
-        """Return the bracket times a factor, or with its ends times a least and a largest
-        factor.
+        """Return the bracket multiplied by a factor, or with its low and high ends multiplied by a
+        pair of factors.
         """
         if isinstance(factor, tuple):
             return Bracket(self.low * factor[0], self.middle, self.high * factor[1])
@@ -228,7 +229,7 @@ class Bracket:
 
 @dataclass(frozen=True)
 class CurveEnds:
-    """The published ends of the curve of one class of sensors."""
+    """The two published thresholds that define the curve of a class of sensors."""
 
     pulse: DamageLaw  #: fluence of the first damage by pulses of 10 ns
     #: irradiance of the first damage by continuous light, with its bracket and its spot
@@ -238,8 +239,8 @@ class CurveEnds:
 def first_damage(
     ends: CurveEnds, duration: Number, spot: Number | None = None, small_spot_exponent: Number = 0.0
 ) -> Bracket:
-    """Return the fluence in J/m2 of the first damage by light of a duration in s on a spot of a
-    1/e2 diameter in m.
+    """Return the threshold fluence in J/m2 of the first damage, for light of a duration in s on a
+    spot of a 1/e2 diameter in m.
 
     From 1 to 10 ns the fluence is that of 10 ns, because heat stays within the depth in which
     silicon absorbs. Below 1 ns the lower end is 0: pulses of picoseconds are reported to damage at
@@ -260,13 +261,13 @@ def first_damage(
         * ends.continuous.median
         * CONTINUOUS_FROM
     )
-    # a longer pulse never needs less fluence
+    # the threshold fluence must not fall with duration
     pulse_fluence = fluence_at_join.clamp_max(ends.pulse.median)
     decades = math.log10(CONTINUOUS_FROM / PULSE_END)
-    # of the logarithm of the fluence over that of the duration
+    # log-log slope of fluence over duration
     slope = torch.log10(fluence_at_join / pulse_fluence) / decades
     interpolated = pulse_fluence * (time.clamp(PULSE_END, CONTINUOUS_FROM) / PULSE_END) ** slope
-    # a law without a bracket has its median at both ends
+    # a law without a bracket: the median for both ends
     low_irradiance, high_irradiance = (
         end or ends.continuous.median for end in (ends.continuous.low, ends.continuous.high)
     )
@@ -282,7 +283,7 @@ def first_damage(
 def _steady_spot_factor(
     law: DamageLaw, duration: Tensor, spot: Number | None, small_spot_exponent: Number
 ) -> Tensor:
-    """Return the factor on the continuous law for a spot; 1 without a spot."""
+    """Return the factor of the spot size on the continuous law; 1 if a spot is not known."""
     if spot is None or law.spot is None:
         return torch.ones_like(duration)
     return spot_factor(law.spot, spot, duration, small_spot_exponent)
@@ -290,12 +291,12 @@ def _steady_spot_factor(
 
 # --- damage published -----------------------------------------------------------------------------
 
-# Published thresholds of damage: brackets and single figures, each with what was read and where.
+# Published thresholds of damage: brackets and single values, each with its source.
 #
-# The sources were read as abstracts and summaries, not as full tables, so that none has a spread of
-# devices and none has a probability. A bracket such as "tens of kW/cm2" is taken as 10 to 100
-# kW/cm2 around its geometric middle. The range of wavelengths around the laser of the experiment,
-# and the range of durations, are ours.
+# Only abstracts and summaries of the sources were read, not full tables, so that no law has a
+# spread of devices or a probability. A bracket such as "tens of kW/cm2" is taken as 10 to 100
+# kW/cm2 around its geometric mean. The ranges of wavelengths, around the laser of the experiment,
+# and of durations are our choice.
 
 
 _SCHWARZ = (
@@ -314,7 +315,7 @@ _PER_CM2 = 1e4
 
 
 def _single(device: str, damage: Kind, joules: float, spot: float | None, source: str) -> DamageLaw:
-    """Return the law of a published fluence in J/cm2 of pulses of nanoseconds, without spread."""
+    """Return a law from a published threshold in J/cm2 for nanosecond pulses, without spread."""
     return DamageLaw(
         device=device,
         damage=damage,
@@ -363,12 +364,11 @@ PUBLISHED_DAMAGE: tuple[DamageLaw, ...] = (
 
 # --- silicon absorption ---------------------------------------------------------------------------
 
-# Absorption of light in silicon, and what it says of thresholds of damage at wavelengths without an
-# experiment.
+# Absorption of light in silicon, used to extrapolate damage thresholds to other wavelengths.
 
 
 SILICON_RANGE = (400e-9, 1100e-9)  #: m, wavelengths of the table below
-DEPTH = 3e-6  #: m of silicon whose absorbed light warms a pixel
+DEPTH = 3e-6  #: m, depth of silicon in which absorbed light is taken to warm a pixel
 ABSORPTION_SOURCE = (
     "extinction of silicon at 300 K: Green, Sol. Energ. Mat. Sol. Cells 92, 1305 (2008), as"
     " tabulated in the refractiveindex.info database (CC0)"
@@ -402,7 +402,7 @@ def silicon_absorption(wavelength: float) -> float:
             f"no absorption of silicon at {wavelength * 1e9:.5g} nm: the table has 400 to 1100 nm"
         )
     entries = [first + _TABLE_STEP * index for index in range(len(_EXTINCTION))]
-    # of the entry below the wavelength; the last entry has no interval above it
+    # index of the interval that contains the wavelength
     index = min(max(bisect.bisect(entries, wavelength) - 1, 0), len(_EXTINCTION) - 2)
     share = (wavelength - entries[index]) / _TABLE_STEP
     log_extinction = (1 - share) * math.log(_EXTINCTION[index]) + share * math.log(
@@ -412,21 +412,21 @@ def silicon_absorption(wavelength: float) -> float:
 
 
 def absorbed_share(wavelength: float, depth: float = DEPTH) -> float:
-    """Return the share of the light that enters silicon and is absorbed within a depth in m: 1 -
+    """Return the share of light entering silicon that is absorbed within a depth in m: 1 -
     exp(-alpha depth).
     """
     return -math.expm1(-silicon_absorption(wavelength) * depth)
 
 
 def absorption_bracket(wavelength: float, measured: float) -> tuple[float, float]:
-    """Return the least and the largest factor on a threshold that was measured at another
-    wavelength in m.
+    """Return the least and the largest factor that converts a threshold measured at the wavelength
+    ``measured`` to another wavelength, both in m.
 
-    The factor 1 means that the sensor absorbs as it does at the wavelength of the experiment:
-    metal, filters and microlenses absorb beside the silicon. The other end means that 3 um of
-    silicon alone absorb. Both are an extrapolation: the true factor is somewhere between, or
-    outside where another mechanism damages.
+    One end is the factor 1: the sensor absorbs as much as at the measured wavelength, because
+    metal, filters and microlenses absorb too. The other end is that of absorption in 3 um of
+    silicon alone. Both are extrapolations: the true factor lies between them, or outside if another
+    mechanism causes the damage.
     """
-    # less absorption at the wavelength needs more light
+    # less absorption at the wavelength raises the threshold
     silicon_factor = absorbed_share(measured) / absorbed_share(wavelength)
     return min(1.0, silicon_factor), max(1.0, silicon_factor)

@@ -1,9 +1,9 @@
-"""The parts of a laser's light that can each damage a sensor, and the threshold that each is judged
-by, or why not.
+"""The parts of a laser's light that can each damage a sensor, each with its threshold, or the
+reason why it has none.
 
 The parts are the single pulse, the mean over the dwell time, the accumulation of the heat of both,
-and the incubation of many pulses. Continuous light is one pulse that lasts for the dwell time: its
-parts are alike.
+and the incubation of many pulses. Continuous light is one pulse as long as the dwell time, so that
+its parts are equal.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ State = Literal["above", "within", "below", "not judged"]
 
 PARTS: tuple[Part, ...] = ("pulse", "mean", "accumulation", "incubation")
 MEASURED = 532e-9  #: m, wavelength of the published experiments
-#: exponents S of F_N = F_1 N^(S - 1): least, middle, largest; an assumption
+#: exponents S of the incubation law F_N = F_1 N^(S - 1): least, middle, largest; an assumption
 INCUBATION = (0.8, 0.9, 1.0)
-_NORMAL_QUANTILE = 1.6448536269514722  #: of the standard normal distribution at 0.95
+_NORMAL_QUANTILE = 1.6448536269514722  #: quantile of the standard normal distribution at 0.95
 _MILLISECOND = 1e-3  #: s, shortest dwell of the published continuous law
 _OWN_LAW = "own law"
 _SUPERPOSED = (
@@ -58,19 +58,23 @@ _INCUBATED = (
 
 @dataclass(frozen=True)
 class LightInTime:
-    """What decides the threshold of a laser's light on one place of a sensor; tensors broadcast."""
+    """Quantities that determine the damage threshold of a laser's light at a place on the sensor;
+    tensors broadcast.
+    """
 
     wavelength: float  #: m
-    dwell: Number  #: s, for which the light stays on the place
+    dwell: Number  #: s, time for which the light stays on the place
     pulse_duration: Number | None = None  #: s; None for continuous light
     repetition_rate: Number | None = None  #: Hz; None for a single pulse
-    #: m, 1/e2 diameter of the Gaussian spot that heats as the light does
+    #: m, 1/e2 diameter of the Gaussian spot that heats as much as the light
     spot: Number | None = None
     small_spot_exponent: Number = 0.0
 
     @property
     def duration(self) -> Tensor:
-        """Return the time in s for which one pulse, or continuous light, warms the place."""
+        """Return the time in s for which one pulse, or continuous light, warms the place: at most
+        the dwell time.
+        """
         dwell = double(self.dwell)
         return (
             dwell
@@ -80,7 +84,7 @@ class LightInTime:
 
     @property
     def caught(self) -> Tensor:
-        """Return the share of a pulse that falls into the dwell time."""
+        """Return the share of a pulse within the dwell time."""
         return (
             double(1.0)
             if self.pulse_duration is None
@@ -89,7 +93,7 @@ class LightInTime:
 
     @property
     def rate(self) -> Tensor:
-        """Return the pulses a second over the dwell time, of which at least one falls into it."""
+        """Return the pulse rate in Hz during the dwell time, with at least one pulse in it."""
         one_in_dwell = 1 / double(self.dwell)
         return (
             one_in_dwell
@@ -103,35 +107,35 @@ class LightInTime:
         if self.repetition_rate is None:
             return double(1.0)
         return torch.ceil(
-            # a hair less, so that rounding counts no pulse at the end of the dwell time
+            # slightly less, so that rounding does not count a pulse at the very end of the dwell
+            # time
             double(self.dwell) * double(self.repetition_rate) * (1 - 1e-12)
         ).clamp_min(1.0)
 
 
 @dataclass(frozen=True)
 class DamagePart:
-    """One part of a laser's light with the threshold that judges it, or the reason why none
-    does.
-    """
+    """One part of a laser's light with its damage threshold, or the reason why it has none."""
 
     part: Part
     kind: Kind  #: of damage
-    quantity: Quantity  #: of the exposure: fluence of one pulse, or irradiance over the dwell time
-    threshold: Bracket | None  #: J/m2 of one pulse, or W/m2; None: not judged
+    #: quantity of the exposure: fluence of one pulse, or mean irradiance over the dwell time
+    quantity: Quantity
+    threshold: Bracket | None  #: J/m2 of one pulse, or W/m2; None if the part is not judged
     source: str = ""
     note: str = ""  #: what is extrapolated or assumed
-    reason: str = ""  #: why the part is not judged, or not judged from below
+    reason: str = ""  #: why the part has no threshold, or no lower end of it
     law: DamageLaw | None = None  #: a law with a spread of devices, which gives a probability
 
     @property
     def open_below(self) -> bool:
-        """Return True if no lower end of the threshold is known."""
+        """Return True if the threshold has no known lower end."""
         return self.threshold is not None and bool((self.threshold.low <= 0).any())
 
 
 def state_of(smallest: float, largest: float, open_below: bool = False) -> State:
-    """Return where an exposure is, from its ratios to the upper and to the lower end of a
-    threshold.
+    """Return whether an exposure is above, within or below the bracket of a threshold; ``smallest``
+    is its ratio to the upper end, ``largest`` to the lower end.
     """
     if math.isnan(smallest) or math.isnan(largest):
         return "not judged"
@@ -144,8 +148,8 @@ def state_of(smallest: float, largest: float, open_below: bool = False) -> State
 
 
 def worst_state(states: Iterable[State]) -> State:
-    """Return the state of a whole laser from those of its parts; `below` only if every part is
-    judged and below.
+    """Return the state of a laser from those of its parts; `below` only if every part is judged and
+    below its bracket.
     """
     worst_first: tuple[State, ...] = ("above", "not judged", "within", "below")
     states = tuple(states)
@@ -159,11 +163,11 @@ def damage_parts(
     published: Sequence[DamageLaw] = PUBLISHED_DAMAGE,
 ) -> tuple[DamagePart, ...]:
     """Return the parts of a laser's light with their thresholds: pulse, mean, accumulation,
-    incubation, then others.
+    incubation, and then others.
 
-    Laws of ``own`` count where they hold; elsewhere the published curve of the first damage does,
-    from 400 to 1100 nm. The first four parts are always there; what follows are further kinds of
-    damage by one pulse.
+    Where a law of the user (``own``) holds, it is used; elsewhere the published curve of the first
+    damage is, from 400 to 1100 nm. The first four parts are always present; they are followed by
+    further laws of the user, or further published kinds of damage by one pulse.
 
     Shapes: thresholds broadcast over the values of ``light``.
     Units:  J/m2 of one pulse, or W/m2.
@@ -171,7 +175,7 @@ def damage_parts(
     Source: of each part; the superposition of heat is our derivation.
     """
     curve = _curve_of(light, device, published)
-    # laws of the user replace the published curve
+    # laws of the user take precedence over the published curve
     pulses = [*_own_parts(light, device, own, "pulse")] or [_first_part(light, curve, "pulse")]
     means = [*_own_parts(light, device, own, "mean")] or [_first_part(light, curve, "mean")]
     pulse, mean = _lowest(pulses), _lowest(means)
@@ -184,7 +188,7 @@ def damage_parts(
 
 
 def _lowest(parts: Sequence[DamagePart]) -> DamagePart:
-    """Return the part whose middle threshold is lowest; a part without a threshold counts as
+    """Return the part with the lowest middle of its threshold; a part without a threshold counts as
     infinite.
     """
     return min(
@@ -199,7 +203,9 @@ def _lowest(parts: Sequence[DamagePart]) -> DamagePart:
 
 
 def _curve_of(light: LightInTime, device: str, published: Sequence[DamageLaw]) -> CurveEnds | str:
-    """Return the ends of the published curve of a device, or the reason why it does not hold."""
+    """Return the two thresholds of the published curve of a device, or the reason why it does not
+    hold.
+    """
     pulse_law = _first_law(device, "fluence", published)
     continuous_law = _first_law(device, "irradiance", published)
     if pulse_law is None or continuous_law is None:
@@ -214,8 +220,8 @@ def _curve_of(light: LightInTime, device: str, published: Sequence[DamageLaw]) -
 
 
 def _first_law(device: str, quantity: Quantity, published: Sequence[DamageLaw]) -> DamageLaw | None:
-    """Return the published law of the first damage (the kind `point`) of a device in a quantity,
-    or None.
+    """Return the published law of the first damage (kind `point`) of a device for a quantity, or
+    None.
     """
     for law in published:
         is_first_damage = law.damage == "point" and law.quantity == quantity
@@ -225,9 +231,11 @@ def _first_law(device: str, quantity: Quantity, published: Sequence[DamageLaw]) 
 
 
 def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part) -> DamagePart:
-    """Return one pulse, or the mean, judged by the published curve of the first damage.
+    """Return the part of one pulse, or of the mean, with its threshold from the published curve of
+    the first damage.
 
-    ``share_of_light`` is "pulse" or "mean"; ``curve`` is the curve, or the reason why none holds.
+    ``share_of_light`` is "pulse" or "mean"; ``curve`` is the published curve, or the reason why
+    none holds.
     """
     as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
     quantity: Quantity = "fluence" if as_pulse else "irradiance"
@@ -235,7 +243,8 @@ def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part
         return DamagePart(share_of_light, "point", quantity, None, reason=curve)
     duration = light.duration if as_pulse else double(light.dwell)
     bracket = first_damage(curve, duration, light.spot, light.small_spot_exponent)
-    # of a whole pulse, of which a share falls into the dwell time; or fluence to irradiance
+    # convert to the fluence of a whole pulse, of which a share is in the dwell time, or to
+    # irradiance
     bracket = bracket.times(1 / light.caught) if as_pulse else bracket.times(1 / duration)
     wavelength_factors, wavelength_note = _wavelength_factors(light, curve.pulse)
     return DamagePart(
@@ -250,8 +259,8 @@ def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part
 
 
 def _short_pulse_reason(duration: Tensor) -> str:
-    """Return why light that is shorter than any published threshold is not judged from below;
-    empty otherwise.
+    """Return the reason why a pulse shorter than those of all published thresholds has no lower end
+    of its threshold; empty for longer pulses.
     """
     if not bool((duration < SHORTEST).any()):
         return ""
@@ -262,15 +271,15 @@ def _short_pulse_reason(duration: Tensor) -> str:
 
 
 def _curve_source(curve: CurveEnds, duration: Tensor) -> str:
-    """Return the sources of the ends of the curve that a duration stands on."""
+    """Return the sources of the published thresholds that determine the curve at a duration."""
     if bool((duration >= CONTINUOUS_FROM).all()):
         return curve.continuous.source
-    # of both ends, the second without the name of the publication that they share
+    # both sources; the second without the publication, which is the same
     return f"{curve.pulse.source}; {curve.continuous.source.rpartition('; ')[2]}"
 
 
 def _duration_note(duration: Tensor) -> str:
-    """Return what is interpolated or extrapolated in the duration of the light."""
+    """Return a note on the interpolation or extrapolation over the duration of the light."""
     if bool((duration < SHORTEST).any()):
         return "upper end of the threshold of 10 ns, extrapolated to shorter pulses"
     if bool(((duration > PULSE_END) & (duration < CONTINUOUS_FROM)).any()):
@@ -289,8 +298,8 @@ def _duration_note(duration: Tensor) -> str:
 
 
 def _wavelength_factors(light: LightInTime, law: DamageLaw) -> tuple[tuple[float, float], str]:
-    """Return the least and the largest factor on a published threshold for the wavelength, and a
-    note on both.
+    """Return the least and the largest factor on a published threshold for the wavelength, with a
+    note.
     """
     if law.wavelengths[0] <= light.wavelength <= law.wavelengths[1]:
         return (1.0, 1.0), ""
@@ -308,8 +317,8 @@ def _wavelength_factors(light: LightInTime, law: DamageLaw) -> tuple[tuple[float
 def _further_kinds(
     light: LightInTime, device: str, curve: CurveEnds | str, published: Sequence[DamageLaw]
 ) -> Iterator[DamagePart]:
-    """Yield the further kinds of damage (line, cross, destruction, frame) that are published for
-    pulses of this duration.
+    """Yield parts for further kinds of damage (line, cross, destruction, frame) with published
+    thresholds for pulses of this duration.
     """
     if isinstance(curve, str) or light.pulse_duration is None:
         return
@@ -338,11 +347,13 @@ def _further_kinds(
 def _own_parts(
     light: LightInTime, device: str, own: Sequence[DamageLaw], share_of_light: Part
 ) -> Iterator[DamagePart]:
-    """Yield one pulse, or the mean, judged by each law of the user that holds for it."""
+    """Yield the part of one pulse, or of the mean, once for each law of the user that holds for
+    it.
+    """
     as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
     judged_quantity: Quantity = "fluence" if as_pulse else "irradiance"
     duration = light.duration if as_pulse else double(light.dwell)
-    # laws are chosen by the first of several durations
+    # if durations are a tensor, the first one selects the laws
     first_duration = float(duration.flatten()[0])
     quantities: tuple[Quantity, ...] = ("fluence", "irradiance")
     for quantity in quantities:
@@ -367,8 +378,8 @@ def _own_parts(
 
 
 def _to_quantity(law: DamageLaw, as_pulse: bool, duration: Tensor) -> Tensor:
-    """Return the factor from the quantity of a law to the fluence of one pulse, or to the
-    irradiance over a dwell.
+    """Return the factor that converts the quantity of a law to the fluence of one pulse, or to the
+    mean irradiance over the dwell time.
     """
     if as_pulse:
         # fluence = irradiance x duration
@@ -377,8 +388,8 @@ def _to_quantity(law: DamageLaw, as_pulse: bool, duration: Tensor) -> Tensor:
 
 
 def _own_spot(law: DamageLaw, light: LightInTime, duration: Tensor) -> Tensor:
-    """Return the factor of the spot on an irradiance; 1 for a fluence and where a spot is not
-    known.
+    """Return the factor of the spot size on a threshold irradiance; 1 for a fluence, and where a
+    spot is not known.
     """
     if law.quantity == "fluence" or law.spot is None or light.spot is None:
         return double(1.0)
@@ -386,8 +397,8 @@ def _own_spot(law: DamageLaw, light: LightInTime, duration: Tensor) -> Tensor:
 
 
 def _own_bracket(law: DamageLaw) -> Bracket:
-    """Return the bracket of a law: its own, else the middle 90 % of devices and medians, else
-    the median alone.
+    """Return the bracket of a law: the stated one, else the central 90 % from both spreads
+    combined, else the median alone.
     """
     median = double(law.median)
     if law.low is not None and law.high is not None:
@@ -395,7 +406,7 @@ def _own_bracket(law: DamageLaw) -> Bracket:
     log_deviations = [
         math.log(factor) for factor in (law.factor, law.median_factor) if factor is not None
     ]
-    # both spreads are independent: their logarithms add in squares
+    # the two spreads are independent: their logarithms add in quadrature
     bracket_factor = (
         math.exp(_NORMAL_QUANTILE * math.hypot(*log_deviations)) if log_deviations else 1.0
     )
@@ -406,11 +417,12 @@ def _own_bracket(law: DamageLaw) -> Bracket:
 
 
 def _accumulation(light: LightInTime, pulse: DamagePart, mean: DamagePart) -> DamagePart:
-    """Return the sum of the heat of one pulse above the mean and of the mean; as the mean for
-    continuous light.
+    """Return the part for the accumulated heat of the mean and of one pulse above it; for
+    continuous light it equals the mean.
 
-    The light of a train is its mean and a part whose mean is 0, so that a pulse warms as (1 - duty)
-    of its fluence beside the mean. With a duty near 1 the sum is that of continuous light.
+    The light of a pulse train is split into its mean and a remainder of mean 0, so that a pulse
+    adds the heat of (1 - duty) times its fluence to that of the mean. With a duty cycle near 1 the
+    sum is that of continuous light.
     """
     if light.pulse_duration is None:
         return DamagePart(
@@ -453,16 +465,18 @@ def _accumulation(light: LightInTime, pulse: DamagePart, mean: DamagePart) -> Da
 
 
 def _incubation(light: LightInTime, pulse: DamagePart) -> DamagePart:
-    """Return one pulse of many, each of which weakens the sensor; as the pulse for one pulse.
+    """Return the part for incubation, in which each of many pulses weakens the sensor; for a single
+    pulse it equals the pulse.
 
-    Only what is above the mean counts as pulses: with a duty near 1 the light is continuous and
-    nothing incubates.
+    Only the light above the mean counts as pulses: with a duty cycle near 1 the light is continuous
+    and there is no incubation.
     """
     if pulse.threshold is None:
         return DamagePart("incubation", pulse.kind, pulse.quantity, None, reason=pulse.reason)
     pulse_count = light.pulses
     duty_cycle = (light.duration * light.rate).clamp_max(1.0)
-    # F_N = F_1 N^(S - 1), with the share 1 - duty as pulses and the share duty as steady light
+    # F_N = F_1 N^(S - 1), applied to the share 1 - duty of the light; the share duty is steady
+    # light
     low_factor, middle_factor, high_factor = (
         1 / ((1 - duty_cycle) * pulse_count ** (1 - exponent) + duty_cycle)
         for exponent in INCUBATION

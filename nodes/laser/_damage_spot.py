@@ -1,4 +1,4 @@
-"""Damage of a sensor by the light of a laser, and the dead pixels that it leaves."""
+"""Damage of a sensor by a laser, and the resulting dead pixels."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from neusee.nodes.values import Bands, LaserLight
 
 # --- damage spot ----------------------------------------------------------------------------------
 
-# Damage of a sensor by the light of a laser on it: every part of the light is judged, or it is said
-# why not.
+# Damage of a sensor by a laser: every part of the light is compared with a threshold, or has a
+# reason why it is not.
 
 
 Thresholds = Literal["published"] | DataFile
@@ -57,15 +57,15 @@ _VERDICTS = {
 
 
 class SpotDamage(NamedTuple):
-    """How near each part of a laser's light is to damaging a sensor: pulse, mean, accumulation,
-    incubation, others.
+    """The exposure by each part of a laser's light relative to its damage threshold: pulse, mean,
+    accumulation, incubation, others.
     """
 
-    #: (part,) float64, exposure of the worst pixel over the threshold; NaN for a part that no law
-    #: judges
+    #: (part,) float64, exposure of the brightest pixel over the threshold; NaN for a part without a
+    #: law
     ratio: Tensor
-    least: Tensor  #: (part,) float64, the same over the upper end of the threshold's bracket
-    #: (part,) float64, the same over the lower end; infinite where no lower end is known
+    least: Tensor  #: (part,) float64, exposure over the upper end of the threshold's bracket
+    #: (part,) float64, exposure over the lower end; infinite where no lower end is known
     most: Tensor
     #: (part,) float64, share of devices that are damaged; -1 without device data behind the law
     probability: Tensor
@@ -73,13 +73,13 @@ class SpotDamage(NamedTuple):
     low: Tensor
     high: Tensor  #: (part,) float64, upper end; -1 without device data
     peak: Tensor  #: (part,) float64, W/m2, or J/m2 of one pulse, in the brightest pixel
-    threshold: Tensor  #: (part,) float64, W/m2 or J/m2; NaN for a part that no law judges
-    pattern: Tensor  #: (y, x) uint8, sum of 2^k over the kinds of damage k of `KINDS` in each pixel
+    threshold: Tensor  #: (part,) float64, W/m2 or J/m2; NaN for a part without a law
+    pattern: Tensor  #: (y, x) uint8, bit mask: bit k is set where the damage `KINDS[k]` occurs
 
 
 @dataclass(frozen=True)
 class _ExposedSensor:
-    """The light of a laser on the sensor."""
+    """The exposure of the sensor by a laser."""
 
     fluence: Tensor | None  #: (y, x) J/m2 of one pulse; None for continuous light
     irradiance: Tensor  #: (y, x) W/m2, mean over the dwell time
@@ -152,7 +152,7 @@ def damage(
             over_threshold = exposure_picture >= float(damage_part.threshold.middle) * resilience
             # bit k of the pattern stands for the kind KINDS[k]
             pattern |= over_threshold.to(torch.uint8) << KINDS.index(damage_part.kind)
-    # one row a part becomes one tensor for each of the first eight fields
+    # transpose: from one row per part to one tensor for each of the first eight fields
     part_columns = torch.tensor(part_rows, dtype=torch.float64).reshape(-1, 8).T.contiguous()
     return SpotDamage._make([*part_columns, pattern])
 
@@ -164,7 +164,7 @@ def _fields_of_part(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
     ``peak`` is the exposure of the brightest pixel in W/m2, or in J/m2 of one pulse; NaN if no
     pulse fell into the exposure.
     """
-    # share of damaged devices with the ends of its interval; -1: not known
+    # probability of damage and the ends of its interval; -1 means not known
     probability = (-1.0, -1.0, -1.0)
     if damage_part.threshold is None or math.isnan(peak):
         return (math.nan, math.nan, math.nan, *probability, peak, math.nan)
@@ -177,7 +177,7 @@ def _fields_of_part(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
         )
     )
     if damage_part.law is not None:
-        # the law holds for another spot: the ratio is that to the threshold of this spot
+        # the law holds for another spot size: pass on the ratio to the threshold of this spot
         damage_of_law = damage_at(damage_part.law, peak / middle * damage_part.law.median)
         probability = (damage_of_law.probability, damage_of_law.low, damage_of_law.high)  # type: ignore[assignment]
     return (
@@ -198,26 +198,24 @@ def _pulses_in_exposure(light: LaserLight) -> float:
 def _exposed_sensor(
     spot: Tensor, line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]
 ) -> _ExposedSensor:
-    """Return the fluence of one pulse and the mean irradiance over the dwell time, in each
-    pixel.
-    """
+    """Return the fluence of one pulse and the mean irradiance over the dwell time in each pixel."""
     mean_irradiance = spot.detach().sum(0, dtype=torch.float64)
     time = _light_in_time(line, light, exposure, choice)
     if choice["pulse_duration"] is None:
         return _ExposedSensor(None, mean_irradiance, time)
     pulse_count = 1.0 if light is None else _pulses_in_exposure(light)
-    # mean irradiance x exposure is the fluence of all pulses of the exposure
+    # mean irradiance x exposure time is the fluence of all pulses in the exposure
     fluence = mean_irradiance * (exposure / pulse_count if pulse_count > 0 else math.nan)
-    # fluence x pulses a second x share of a pulse in the dwell time
+    # fluence x pulse rate x share of a pulse in the dwell time
     return _ExposedSensor(fluence, fluence * float(time.rate * time.caught), time)
 
 
 def _light_in_time(
     line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]
 ) -> LightInTime:
-    """Return the duration and the rate of the light of a laser over the dwell time.
+    """Return dwell time, pulse duration and repetition rate of the light of a laser.
 
-    A train without a stated rate has the pulses that fall into the exposure, evenly spread over it.
+    If no rate is stated, it is the number of pulses in the exposure over the exposure time.
     """
     rate = choice["repetition_rate"]
     if rate is None and light is not None and not light.pulses.is_meta and float(light.pulses) > 1:
@@ -236,7 +234,9 @@ def _light_in_time(
 def _parts_for_spot(
     time: LightInTime, choice: dict[str, Any], diameter: float | None = None
 ) -> tuple[DamagePart, ...]:
-    """Return the parts of the light with their thresholds for a heated spot of a diameter in m."""
+    """Return the parts of the light with their thresholds; ``diameter`` is the heated diameter in
+    m.
+    """
     return damage_parts(
         LightInTime(
             wavelength=time.wavelength,
@@ -273,8 +273,8 @@ def _(
 
 
 def _has_sentence(damage_part: DamagePart, continuous: bool) -> bool:
-    """Return True if the report has a sentence on this part: on each part of pulsed light, but of
-    continuous light, whose parts are all alike, on the mean alone.
+    """Return True if the report has a sentence on this part: on every part of pulsed light, but
+    only on the mean of continuous light, whose parts are equal.
     """
     return damage_part.part == "mean" or not continuous
 
@@ -292,7 +292,7 @@ def _threshold_text(damage_part: DamagePart, continuous: bool) -> str:
     if damage_part.threshold is None:
         return f"{name}: not judged: {damage_part.reason}"
     low, middle, high = (
-        # from 1/m2 to 1/cm2
+        # convert from 1/m2 to 1/cm2
         float(end) / 1e4
         for end in (
             damage_part.threshold.low,
@@ -365,8 +365,8 @@ def _sentence(damage_part: DamagePart, row: tuple[float, ...], continuous: bool)
 def parts_before(
     line: Bands, light: LaserLight | None, *, exposure: float = 1.0, **params: Any
 ) -> tuple[DamagePart, ...]:
-    """Return the parts of the light with their thresholds for the published spot, from the
-    parameters of the step.
+    """Return the parts of the light from the parameters of the step, with the thresholds for the
+    published spot size.
     """
     choice = {
         "dwell": params["dwell"],
@@ -380,11 +380,11 @@ def parts_before(
 
 
 def heated_spot(image: Tensor, pitch: float, lost: float = 0.0) -> float | None:
-    """Return the 1/e2 diameter in m of the Gaussian spot that heats as an image of equal peak; None
-    without light.
+    """Return the 1/e2 diameter in m of the Gaussian spot that heats as much as an image of equal
+    peak; None without light.
 
-    ``lost`` is the light beyond the window, in the unit of the image: it counts as if it fell on
-    the rim of the window.
+    ``lost`` is the light outside the window, in the unit of the image; it is treated as if it fell
+    on the rim of the window.
     """
     peak = float(image.max())
     if not peak > 0:
@@ -414,11 +414,11 @@ def steady_heat(image: Tensor, pitch: float) -> Tensor:
         sign * (u * torch.asinh(v / u.abs()) + v * torch.asinh(u / v.abs()))
         for u, v, sign in signed_corners
     )
-    # the kernel is even: distances 0 .. n - 1, n .. 1 make it a circular one of twice the size
+    # the kernel is even: the distances 0 .. n - 1, n .. 1 give a circular kernel of twice the size
     row_distance, column_distance = (torch.cat([n[:-1], n[1:].flip(0)]).long() for n in (y, x))
     kernel = torch.as_tensor(quarter_kernel)[row_distance][:, column_distance]
     padded_size = (2 * rows, 2 * columns)
-    # convolution of the irradiance with 1 / r; twice the size, so that nothing wraps around
+    # convolution of the irradiance with 1 / r, zero-padded to twice the size against wrap-around
     heat: Tensor = torch.fft.irfft2(
         torch.fft.rfft2(image, padded_size) * torch.fft.rfft2(kernel), padded_size
     )
@@ -427,7 +427,7 @@ def steady_heat(image: Tensor, pitch: float) -> Tensor:
 
 
 def own_laws(thresholds: Thresholds) -> tuple[DamageLaw, ...]:
-    """Return the laws in the file of a user; raise ParameterError for a mistake in the file."""
+    """Return the laws of damage in a user's file; raise ParameterError for a mistake in it."""
     if not isinstance(thresholds, Path):
         return ()
     try:
@@ -443,8 +443,7 @@ def _laws_of_file(file: Path) -> tuple[DamageLaw, ...]:
 
 # --- damage pixels --------------------------------------------------------------------------------
 
-# Dead pixels in the raw frame of a sensor that a laser has damaged: points, lines, crosses and
-# whole frames.
+# Dead pixels in the raw frame of a damaged sensor: points, lines, crosses and whole frames.
 
 
 @node(rtol=0.0)
@@ -478,7 +477,7 @@ def damaged_pixels(
     pattern = torch.zeros(shape, dtype=torch.uint8, device=raw.device)
     for damage_of_laser in damages or ():
         pattern |= crop(damage_of_laser.pattern, shape=shape).to(raw.device)
-    # as the sensor saturates: at the largest value of its bits or at its full well
+    # the saturation value: the largest number of the converter, or the full well
     white = float(max(1, min(2**bits - 1, int(full_well * gain - 0.5))))
     damaged_frame = (
         single(raw)
@@ -494,7 +493,7 @@ def damaged_pixels(
             _pixels_with(pattern, "line").any(-1, keepdim=True), 0.0
         )
     cross = _pixels_with(pattern, "cross")
-    # `any` over an axis, kept: one damaged pixel takes its whole row or column
+    # `any` along an axis: one damaged pixel blackens its whole row or column
     damaged_frame = damaged_frame.masked_fill(
         cross.any(-1, keepdim=True) | cross.any(-2, keepdim=True), 0.0
     )
@@ -502,8 +501,8 @@ def damaged_pixels(
 
 
 def _pixels_with(pattern: Tensor, kind: Kind) -> Tensor:
-    """Return True for the pixels (y, x) of a pattern that have a kind of damage: bit k stands for
-    the kind KINDS[k].
+    """Return a mask (y, x) of the pixels of a pattern with a kind of damage: bit k stands for
+    `KINDS[k]`.
     """
     return (pattern & (1 << KINDS.index(kind))) > 0
 

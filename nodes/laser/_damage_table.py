@@ -1,4 +1,4 @@
-"""CSV files of damage thresholds of a user, and the fit of laws to own shots."""
+"""CSV files with a user's damage thresholds, and the fit of laws to the user's damage tests."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from neusee.nodes.spectra._table_files import Column, place
 
 # --- hit and miss ---------------------------------------------------------------------------------
 
-# Threshold of damage from own shots: at each level how many shots there were, and how many of them
-# damaged.
+# A damage threshold from damage tests: the number of shots at each level, and how many caused
+# damage.
 #
-# The share of damaged shots is fitted by a lognormal law, Phi((ln level - ln median) / ln factor),
-# with the largest likelihood (probit regression). Where no level has both damaged and undamaged
-# shots between the levels, the data hold a bracket and no spread.
+# The probability of damage, Phi((ln level - ln median) / ln factor), is fitted by maximum
+# likelihood (probit regression). If the levels with and without damage hardly overlap, the data
+# give a bracket but no spread.
 
 
-_MOST_ROUNDS = 200  #: of Fisher scoring, at most
-_CLOSE_PARAMETERS = 1e-10  #: change of the parameters at which the fit ends
-_LEAST_PROBABILITY = 1e-12  #: least probability of a shot in the weights
+_MOST_ROUNDS = 200  #: largest number of iterations of Fisher scoring
+_CLOSE_PARAMETERS = 1e-10  #: relative change of the parameters at which the fit ends
+_LEAST_PROBABILITY = 1e-12  #: probabilities are kept at least this far from 0 and 1
 
 Numbers = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Shots:
 
 @dataclass(frozen=True)
 class FittedThreshold:
-    """A threshold from shots: a law with spread, or the bracket that the data leave."""
+    """A threshold fitted to shots: a law with spread, or only a bracket."""
 
     median: float  #: in the unit of the levels
     #: geometric standard deviation of the threshold; None where the data do not show it
@@ -51,13 +51,13 @@ class FittedThreshold:
     #: geometric standard deviation of the median; None where the data do not show it
     median_factor: float | None
     low: float | None = None  #: highest level without any damage; None for a law with spread
-    #: lowest level at which every shot damaged; None for a law with spread
+    #: lowest level at which every shot caused damage; None for a law with spread
     high: float | None = None
 
 
 def fit_shots(shots: Sequence[Shots]) -> FittedThreshold:
-    """Return the threshold that shots at several levels show, with the spread and the uncertainty
-    of its median.
+    """Return the damage threshold fitted to shots at several levels, with its spread and the
+    uncertainty of its median.
 
     The uncertainty of the median is that of the Fisher information. Where at most one level has
     both damaged and undamaged shots and the others are in order, the threshold is between the
@@ -88,8 +88,8 @@ def fit_shots(shots: Sequence[Shots]) -> FittedThreshold:
 
 
 def _separated(levels: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
-    """Return the bracket of shots whose levels do not overlap; raise ValueError where one of its
-    ends is missing.
+    """Return the bracket if the levels with and without damage do not overlap; raise ValueError
+    where one of its ends is missing.
     """
     undamaged_levels, damaged_levels = levels[damaged == 0], levels[damaged == count]
     if not undamaged_levels.size:
@@ -106,8 +106,8 @@ def _separated(levels: Numbers, count: Numbers, damaged: Numbers) -> FittedThres
 
 
 def _probit(logs: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
-    """Return the threshold whose lognormal law has the largest likelihood, from the logarithms of
-    the levels and the numbers of shots and of damaged shots at them.
+    """Return the maximum-likelihood threshold of a lognormal law; ``logs`` are the logarithms of
+    the levels, ``count`` and ``damaged`` the numbers of shots and of shots with damage.
 
     The share of damaged shots is Phi(intercept + slope (ln level - centre)). Raises ValueError for
     damage that gets rarer with the level.
@@ -116,7 +116,7 @@ def _probit(logs: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
 
     centre = float(logs.mean())
     design = np.stack([np.ones_like(logs), logs - centre], 1)
-    # half a shot keeps the probits of levels with no or only damage finite
+    # adding half a shot keeps the probits finite at levels with no or only damage
     start_probits = ndtri((damaged + 0.5) / (count + 1))
     coefficients, *_ = np.linalg.lstsq(
         design * np.sqrt(count)[:, None], start_probits * np.sqrt(count), rcond=None
@@ -148,8 +148,8 @@ def _probit(logs: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
     gradient = np.array([-1 / slope, intercept / slope**2])
     deviation = math.sqrt(float(gradient @ covariance @ gradient))
     return FittedThreshold(
-        # median, factor and median factor: the law is 1/2 at the median, and 1 / slope is one
-        # standard deviation of ln level
+        # median, factor and median factor: the probability is 1/2 at the median, and the standard
+        # deviation of ln threshold is 1 / slope
         math.exp(centre - intercept / slope),
         math.exp(1 / slope),
         math.exp(deviation),
@@ -158,8 +158,8 @@ def _probit(logs: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
 
 # --- damage table ---------------------------------------------------------------------------------
 
-# CSV files of damage thresholds of a user: one law a row, or the shots at one level a row, from
-# which laws are fitted.
+# CSV files with a user's damage thresholds: each row has a law, or the shots at one level, to which
+# a law is fitted.
 #
 # The header names quantity and unit of each column.
 
@@ -245,7 +245,7 @@ def read_damage_laws(file: Path) -> tuple[DamageLaw, ...]:
 
 
 def _refuse_columns(file: Path, names: set[str], has_shots: bool) -> None:
-    """Raise ValueError for a column that is missing, and for thresholds beside shots."""
+    """Raise ValueError for a missing column, and for a table with both thresholds and shots."""
     required_columns = (
         (*_LAW_COLUMNS, "level", *_COUNTS) if has_shots else (*_LAW_COLUMNS, "threshold")
     )
@@ -275,8 +275,8 @@ def _cells(file: Path, columns: list[Column], line: int, cells: list[str]) -> li
 
 
 def _heading(file: Path, line: int, index: int, cell: str) -> Column:
-    """Return the quantity and the unit of a heading; raise ValueError for one that is not known."""
-    # `wavelength from (nm)`: quantity before the bracket, unit in it
+    """Return the quantity and the unit of a heading; raise ValueError for an unknown one."""
+    # `wavelength from (nm)`: quantity before the parenthesis, unit inside it
     quantity, _, unit = cell.strip().removesuffix(")").partition("(")
     column = Column(quantity.strip().casefold(), unit.strip())
     if column.quantity not in _UNITS:
@@ -293,8 +293,8 @@ def _heading(file: Path, line: int, index: int, cell: str) -> Column:
 
 
 def _law(cells: list[_Cell]) -> DamageLaw:
-    """Return the law of damage of one row: median threshold, and the spread of devices or the
-    bracket where the row states it.
+    """Return the law of damage in a row: median threshold, with the spread of devices or the
+    bracket if the row states one.
 
     Raises ValueError for only one of factor and median factor, and for the mistakes that `_values`,
     `_filled_cell` and `_bracket` refuse.
@@ -333,7 +333,7 @@ def _bracket(
     low, high = values.get("low"), values.get("high")
     if low is None and high is None:
         return None, None
-    # the end that is written down, for the message
+    # the cell of a stated end, for the error message
     end = cells["high"] if low is None else cells["low"]
     if low is None or high is None:
         raise ValueError(
@@ -355,8 +355,7 @@ def _bracket(
 
 
 def _values(cells: list[_Cell], *but: str) -> dict[str, Any]:
-    """Return the values of a row by the quantity of their column, but for the quantities in
-    ``but``.
+    """Return the values of a row by quantity, except for the quantities in ``but``.
 
     Numbers are in SI units; an empty cell of an optional column has None. Raises ValueError for a
     range of wavelengths or durations whose end is before its start.
@@ -375,8 +374,8 @@ def _values(cells: list[_Cell], *but: str) -> dict[str, Any]:
 
 
 def _filled_cell(cells: list[_Cell], name: str) -> _Cell:
-    """Return the one cell of a row with a text, among the columns of a quantity (thresholds may
-    have a column in W/cm2 and one in J/cm2).
+    """Return the only filled cell of a row among the columns of a quantity (thresholds may have a
+    column in W/cm2 and one in J/cm2).
 
     Raises ValueError for no such cell and for several.
     """
@@ -393,12 +392,12 @@ def _filled_cell(cells: list[_Cell], name: str) -> _Cell:
 
 
 def _quantity(cell: _Cell) -> Quantity:
-    """Return whether a threshold or a level is an irradiance or a fluence, by its unit."""
+    """Return "irradiance" or "fluence" for a threshold or a level, by its unit."""
     return "irradiance" if cell.column.unit in _IRRADIANCES else "fluence"
 
 
 def _law_arguments(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments of `DamageLaw` beside its threshold and spread, from the values of a
+    """Return the arguments of `DamageLaw` other than threshold and spread, from the values of a
     row.
     """
     return {
@@ -412,8 +411,8 @@ def _law_arguments(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fitted_laws(table: list[list[_Cell]]) -> tuple[DamageLaw, ...]:
-    """Return one law for each test in a table of shots; a test is all rows that agree in
-    everything but level, shots and damaged.
+    """Return one law for each damage test in a table of shots; rows that differ only in level,
+    shots and damaged belong to one test.
     """
     rows_of_test: dict[tuple[Any, ...], list[list[_Cell]]] = {}
     for cells in table:
@@ -424,8 +423,8 @@ def _fitted_laws(table: list[list[_Cell]]) -> tuple[DamageLaw, ...]:
 
 
 def _fitted_law(rows: list[list[_Cell]]) -> DamageLaw:
-    """Return the law that is fitted to the shots of one test; raise ValueError, with the place of
-    the first row, where they show no threshold.
+    """Return the law fitted to the shots of one test; raise ValueError, which names the first row,
+    if they determine no threshold.
     """
     first_level = _filled_cell(rows[0], "level")
     try:
@@ -451,7 +450,7 @@ class _AtCell(ValueError):
 
 
 def _shots(cells: list[_Cell]) -> Shots:
-    """Return the shots of one row; raise `_AtCell` for more damage than shots."""
+    """Return the shots of one row; raise `_AtCell` if more shots are damaged than fired."""
     cell_of = {cell.column.quantity: cell for cell in cells}
     count, damaged = (_count(cell_of[name]) for name in _COUNTS)
     if not count > 0 or damaged > count:
@@ -463,7 +462,7 @@ def _shots(cells: list[_Cell]) -> Shots:
 
 
 def _count(cell: _Cell) -> int:
-    """Return a whole number, 0 or more; raise `_AtCell` for another text."""
+    """Return the whole number (0 or more) in a cell; raise `_AtCell` for other text."""
     if not (cell.text.isascii() and cell.text.isdigit()):
         raise _AtCell(f"{cell.where}: {cell.text!r} is no whole number of shots")
     return int(cell.text)

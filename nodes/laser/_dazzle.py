@@ -1,4 +1,6 @@
-"""The dazzled area of a sensor: closed forms, a curve over strength, and pictures."""
+"""The dazzled area of a sensor: closed forms, a curve over the strength of a laser, and
+pictures.
+"""
 
 from __future__ import annotations
 
@@ -21,21 +23,21 @@ from neusee.nodes.values import Bands, Psf
 
 # --- dazzle area ----------------------------------------------------------------------------------
 
-# The dazzled area: closed forms and the exact area for a clear round pupil, and the light that
-# veils a feature.
+# The dazzled area behind a clear round pupil, by a closed form and by counting, and the veiling
+# light that hides a feature.
 
 
 Sampling = Literal["integrated", "point"]
 Rule = Literal["snr", "contrast"]
 
-_FIRST_ZERO = 3.8317059702075125  #: of J1
-_FARTHEST_COUNTED = 1024  #: pixels from the axis up to which pixels are counted one by one
-_HALVINGS = 60  #: of an interval of the strength
+_FIRST_ZERO = 3.8317059702075125  #: first zero of J1
+_FARTHEST_COUNTED = 1024  #: largest radius, in pixels, at which pixels are counted one by one
+_HALVINGS = 60  #: halvings of an interval of the strength
 
 
 def pixel_share(spread: float) -> float:
-    """Return the mean irradiance over the square pixel at the centre of an Airy spot, over its peak
-    irradiance.
+    """Return the ratio of the irradiance averaged over the central square pixel of an Airy spot to
+    its peak irradiance.
 
     ``spread`` is lambda N / p: wavelength times f-number over pixel pitch.
     """
@@ -43,22 +45,23 @@ def pixel_share(spread: float) -> float:
 
 
 def peak_light(spread: float) -> float:
-    """Return the share of the light of a clear round pupil in a pixel as bright everywhere as
-    the Airy peak.
+    """Return the share of the light of a clear round pupil that a pixel with the peak irradiance of
+    the Airy pattern receives.
     """
     return math.pi / (4 * spread**2)
 
 
 def dazzled_pixels(strength: float, spread: float, sampling: Sampling = "integrated") -> float:
-    """Return the number of pixels that a laser behind a clear round pupil fills, by the mean of the
-    Airy pattern.
+    """Return the number of pixels that a laser saturates behind a clear round pupil, from the mean
+    of the Airy pattern over its fringes.
 
-    Far from the axis the mean of the pattern falls as 4 / (pi v^3), so that N ~ pi (spread / pi)^2
-    (4 S / (pi a))^(2/3) for a laser of ``strength`` S, the irradiance of the brightest pixel over
-    saturation. ``spread`` is lambda N / p. ``a`` is 1 for pixels that sample a point and
-    `pixel_share` for pixels that average over their area. Within 7 % of `counted_pixels` for S from
-    1e4 and a spread from 0.35 to 5.2, and within 1 % from 1e5 and up to 1.3; a wider spread shows
-    single rings. Without a laser, or for S up to 1, the result is 0.
+    Far from the axis the mean of the pattern falls as 4 / (pi v^3), so that the number is about pi
+    (spread / pi)^2 (4 S / (pi a))^(2/3) for a laser of ``strength`` S, the irradiance of the
+    brightest pixel over saturation. ``spread`` is wavelength x f-number / pixel pitch. ``a`` is 1
+    for pixels that sample a point and `pixel_share` for pixels that average over their area. The
+    result is within 7 % of `counted_pixels` for S from 1e4 and a spread from 0.35 to 5.2, and
+    within 1 % for S from 1e5 and a spread up to 1.3; with a wider spread single rings matter.
+    Without a laser, or for S up to 1, it is 0.
     """
     if strength <= 1:
         return 0.0
@@ -67,7 +70,9 @@ def dazzled_pixels(strength: float, spread: float, sampling: Sampling = "integra
 
 
 def dazzle_strength(pixels: float, spread: float, sampling: Sampling = "integrated") -> float:
-    """Return the strength at which `dazzled_pixels` gives a number of pixels: its inverse."""
+    """Return the strength at which `dazzled_pixels` gives a number of pixels, its inverse; at least
+    1.
+    """
     mean_over_peak = pixel_share(spread) if sampling == "integrated" else 1.0
     return max(1.0, math.pi * mean_over_peak / 4 * math.pow(math.pi * pixels / spread**2, 1.5))
 
@@ -80,7 +85,7 @@ def counted_pixels(strength: float, spread: float, sampling: Sampling = "integra
     `dazzled_pixels` holds there.
     """
     mean_over_peak = pixel_share(spread) if sampling == "integrated" else 1.0
-    # where the envelope of the rings, 8 / (pi v^3), falls below saturation, and 3 pixels more
+    # radius at which the envelope of the rings, 8 / (pi v^3), falls below saturation, plus 3 pixels
     radius = (
         spread / math.pi * max(_FIRST_ZERO, (8 * strength / (math.pi * mean_over_peak)) ** (1 / 3))
         + 3
@@ -91,7 +96,7 @@ def counted_pixels(strength: float, spread: float, sampling: Sampling = "integra
         )
     quadrant = _airy_over_pixels(spread, math.ceil(radius), sampling)
     is_dazzled = quadrant >= mean_over_peak / strength
-    # the axis once; a half axis and the rest of the quadrant four times
+    # the central pixel once; the pixels of a half axis and of the rest of the quadrant four times
     return (
         int(is_dazzled[0, 0]) + 4 * int(is_dazzled[0, 1:].sum()) + 4 * int(is_dazzled[1:, 1:].sum())
     )
@@ -122,7 +127,8 @@ def veil_limit(
     rule: Rule,
     read_noise: float = 0.0,
 ) -> Tensor:
-    """Return the electrons of veiling light in a pixel above which a feature is lost.
+    """Return the largest veiling light, in electrons per pixel, at which a feature is still
+    visible.
 
     A feature of the Weber contrast C covers A = ``feature`` x ``feature`` pixels on a
     ``background`` of n electrons. With the rule `contrast`, light v leaves the contrast C n / (n +
@@ -137,15 +143,15 @@ def veil_limit(
 
 @functools.lru_cache(maxsize=8)
 def _airy_over_pixels(spread: float, count: int, sampling: Sampling = "integrated") -> Tensor:
-    """Return the Airy irradiance over its peak of count x count pixels (y, x), one quadrant from
-    the axis on.
+    """Return the Airy irradiance over its peak for count x count pixels (y, x) of one quadrant that
+    starts at the axis.
 
     ``spread`` is lambda N / p. Pixels average over their squares, or sample the points in their
     middles.
     """
     import numpy as np
 
-    # one point with the weight 2 of the interval from -1 to 1
+    # one point, with the weight 2 of the interval from -1 to 1
     points, weights = np.zeros(1), np.full(1, 2.0)
     if sampling == "integrated":
         points, weights = np.polynomial.legendre.leggauss(3 + math.ceil(4 / spread))
@@ -159,22 +165,22 @@ def _airy_over_pixels(spread: float, count: int, sampling: Sampling = "integrate
 
 
 def _airy(reach: Tensor) -> Tensor:
-    """Return (2 J1(v) / v)^2."""
+    """Return the Airy pattern (2 J1(v) / v)^2 at the reach v."""
     safe = reach.where(reach > 1e-6, 1.0)
     return torch.where(reach > 1e-6, (2 * torch.special.bessel_j1(safe) / safe).square(), 1.0)
 
 
 # --- dazzle curve ---------------------------------------------------------------------------------
 
-# The dazzled area against the strength of a laser, counted in the point-spread function.
+# The dazzled area as a function of the strength of a laser, counted in the point-spread function.
 
 
 Strengths = Annotated[tuple[Annotated[float, Field(gt=0, le=1e18)], ...], Field(min_length=1)]
-DECADES = tuple(10 ** (k / 4) for k in range(4, 25))  #: 10 to 1e6
+DECADES = tuple(10 ** (k / 4) for k in range(4, 25))  #: 10 to 1e6, four per decade
 
 
 class DazzleCurve(NamedTuple):
-    """The number of dazzled pixels against the strength of a laser."""
+    """The number of dazzled pixels as a function of the strength of a laser."""
 
     #: (strength,) float64, multiple of saturation at the peak behind the clear lens
     strengths: Tensor
@@ -210,7 +216,7 @@ def dazzle_curve(
     Source: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2 (the Airy pattern and its
             far rings).
     """
-    # photons of each wavelength, whose wells they fill
+    # weights by number of photons, because wells count photons
     weights = bands.weights.double() * bands.centres.double()
     pixel_light = torch.zeros(
         psf.intensity[0].numel(), dtype=torch.float64, device=psf.intensity.device
@@ -222,7 +228,7 @@ def dazzle_curve(
         refuse_not_finite("its pixels cannot be counted", psf=pixel_light.sum(), clear_peak=peak)
     strength_values = torch.tensor(strengths, dtype=torch.float64)
     ordered = pixel_light.sort().values.cpu()
-    # number of pixels from the limit on, among those in rising order
+    # number of pixels at or above the limit, from the sorted values
     pixels = (len(ordered) - torch.searchsorted(ordered, level * peak / strength_values)).double()
     cut_off_frequency = float(cut_off(psf).mean())
     point_to_pixel_peak = math.pi / 4 * cut_off_frequency**2 / float(psf.clear_peak.detach().mean())
@@ -241,25 +247,25 @@ def _(result: DazzleCurve, *inputs: Any, **params: Any) -> list[Check]:
     text = f"{share:.2%} of the window is dazzled at strength {strength:.3g}"
     if share < 0.5:
         return [Check(text, True)]
-    # a share that is NaN is not good either
+    # also for a share that is NaN
     return [Check(f"{text}: the PSF may reach beyond its window", False)]
 
 
 # --- dazzle picture -------------------------------------------------------------------------------
 
-# Dazzled pixels of a picture: those that a laser saturates, and those where its light veils a
-# stated feature.
+# Dazzled pixels of a picture: those that a laser saturates, and those where its light hides a
+# feature of stated size and contrast.
 
 
 class Dazzle(NamedTuple):
-    """The pixels that a laser takes from a picture; pixels that are lost without it are not
+    """The pixels that are lost to a laser; pixels that are already lost without it are not
     counted.
     """
 
-    saturated: Tensor  #: () float64, pixels with a channel that the laser fills
+    saturated: Tensor  #: () float64, pixels with a channel that the laser saturates
     #: () float64, other pixels at which the laser's light hides the feature in every channel
     veiled: Tensor
-    share: Tensor  #: () float64, both, relative to all pixels
+    share: Tensor  #: () float64, saturated and veiled pixels, relative to all pixels
     #: () float64, share of all pixels at which the feature is visible without the laser
     visible: Tensor
 
@@ -318,10 +324,10 @@ def dazzle(
         rule=rule,
         read_noise=read_noise,
     )
-    # a limit below 0: lost without a laser
+    # a limit below 0 means that the feature is not visible even without a laser
     visible = (largest_veil >= 0).any(-3) & ~lost_before
     saturated = full_with_laser & ~lost_before
-    # lost in every channel
+    # hidden in every channel
     veiled = visible & ~full_with_laser & ~(mean_veil <= largest_veil).any(-3)
     pixels = visible.numel()
     counts = [mask.sum().double() for mask in (saturated, veiled, visible)]
@@ -334,7 +340,7 @@ def mean_over_feature(image: Tensor, size: int) -> Tensor:
     """
     rows, columns = image.shape[-2:]
     averaged, half_size = image[None], size // 2
-    # along y, then along x; an even size makes one row and one column too many
+    # along y, then along x; an even size gives one row and one column too many
     for window, padding in (((size, 1), (half_size, 0)), ((1, size), (0, half_size))):
         averaged = avg_pool2d(averaged, window, stride=1, padding=padding, count_include_pad=False)
     return averaged[0, ..., :rows, :columns]

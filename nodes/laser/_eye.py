@@ -1,4 +1,6 @@
-"""The human eye and a laser: exposure limits, hazard distances, and dazzle by a visible laser."""
+"""Laser safety of the human eye: exposure limits, hazard distances, and dazzle by a visible
+laser.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from neusee.nodes.spectra._cie_tables import observer
 
 # --- eye limits -----------------------------------------------------------------------------------
 
-# Exposure limits of the human eye for a small source, and the distance where a laser meets them.
+# Exposure limits of the human eye for a small source, and the distance at which a laser reaches
+# them.
 #
 # The limits are those of IEC 60825-1:2014, Table A.1 (ICNIRP 2013, ANSI Z136.1-2014): a source that
 # the eye sees under less than 1.5 mrad. They are written out here from the formulas, and are an
@@ -19,25 +22,26 @@ from neusee.nodes.spectra._cie_tables import observer
 # Trains of pulses follow below.
 
 
-BLINK = 0.25  #: s, in which the eye turns away from visible light
-_SHORTEST_EXPOSURE, _LONGEST_EXPOSURE = 1e-11, 3e4  #: s, of an exposure
+BLINK = 0.25  #: s, duration of the aversion response to visible light
+_SHORTEST_EXPOSURE, _LONGEST_EXPOSURE = 1e-11, 3e4  #: s, range of exposure durations
 _SHORTEST_WAVELENGTH, _LONGEST_WAVELENGTH = 400e-9, 100e-6  #: m
 
 
 def eye_mpe(wavelength: float, duration: float) -> float:
-    """Return the largest permissible radiant exposure of the eye in J/m2 for one exposure of a
+    """Return the maximum permissible exposure (MPE) of the eye in J/m2, for one exposure of a
     duration in s.
 
-    Divided by the duration it is the largest permissible irradiance. It is compared with the mean
-    over the limiting aperture of `eye_aperture`.
+    Divided by the duration it is the maximum permissible irradiance. It is compared with the
+    exposure averaged over the limiting aperture of `eye_aperture`.
 
-    400 to 1400 nm (retina, small source): 2e-3 C_A J/m2 up to 5 us and 18 C_A t^0.75 up to 10 s
-    below 1050 nm; 2e-2 C_C up to 13 us and 90 C_C t^0.75 up to 10 s from 1050 nm; 10 C_A C_C W/m2
-    beyond 10 s. C_A = 10^(0.002 (nm - 700)) from 700 nm and 5 from 1050 nm; C_C = 10^(0.018 (nm -
-    1150)) from 1150 nm and 8 + 10^(0.04 (nm - 1250)) from 1200 nm. Below 500 nm and beyond 10 s at
-    most 100 C_3 J/m2 up to 100 s, then C_3 W/m2, with C_3 = 10^(0.02 (nm
-    - 450)) from 450 nm (photochemical). From 700 nm at most the limit of the skin, which protects
-      cornea and lens.
+    From 400 to 1400 nm (retina, small source): below 1050 nm 2e-3 C_A J/m2 up to 5 us, then 18 C_A
+    t^0.75 up to 10 s; from 1050 nm 2e-2 C_C up to 13 us, then 90 C_C t^0.75 up to 10 s; beyond 10 s
+    10 C_A C_C W/m2. C_A = 10^(0.002 (nm - 700)) from 700 nm and 5 from 1050 nm; C_C =
+    10^(0.018 (nm - 1150)) from 1150 nm and 8 + 10^(0.04 (nm - 1250)) from 1200 nm. Below 500 nm and
+    beyond 10 s the limit is at most 100 C_3 J/m2 up to 100 s, then C_3 W/m2, with C_3 =
+    10^(0.02 (nm - 450)) from 450 nm (photochemical). From 700 nm it is at most the limit of the
+    skin, which protects cornea and lens.
+
     From 1400 nm (cornea): 1e3 J/m2 up to 1 ms (1500 to 1800 nm 1e4 J/m2 up to 10 s; from 2600 nm
     100 J/m2 up to 0.1 us), then 5600 t^0.25 up to 10 s and 1000 W/m2.
 
@@ -48,8 +52,8 @@ def eye_mpe(wavelength: float, duration: float) -> float:
 
 
 def eye_mpe_formula(wavelength: float, duration: float) -> str:
-    """Return the formula of `eye_mpe` that holds, in J/m2, with its numbers put in: ``18 * 1 *
-    0.25**0.75``.
+    """Return the formula, in J/m2, that `eye_mpe` uses, with its numbers inserted, such as
+    ``18 * 1 * 0.25**0.75``.
 
     Raises ParameterError as `eye_mpe` does.
     """
@@ -57,14 +61,14 @@ def eye_mpe_formula(wavelength: float, duration: float) -> str:
 
 
 class _Law(NamedTuple):
-    """A limit of the radiant exposure in J/m2, and its formula with the numbers put in."""
+    """A limit of the radiant exposure in J/m2, and its formula with the numbers inserted."""
 
     limit: float
     formula: str
 
 
 def _strictest(wavelength: float, duration: float) -> _Law:
-    """Return the law that limits the exposure of the eye at a wavelength in m for a duration in
+    """Return the strictest limit of the exposure of the eye at a wavelength in m for a duration in
     s.
     """
     _refuse_unknown(wavelength, duration)
@@ -76,13 +80,13 @@ def _strictest(wavelength: float, duration: float) -> _Law:
 
 
 def _power_law(factor: float, weight: float, duration: float, exponent: float) -> _Law:
-    """Return the law factor x weight x duration^exponent, in J/m2."""
+    """Return the limit factor x weight x duration^exponent in J/m2."""
     limit = factor * weight * math.pow(duration, exponent)
     return _Law(limit, f"{factor:g} * {weight:.7g} * {duration:.7g}**{exponent:g}")
 
 
 def _constant_law(factor: float, weight: float, duration: float, full: float) -> _Law:
-    """Return the law factor x weight; for durations shorter than ``full`` s it is less in
+    """Return the limit factor x weight in J/m2; below a duration of ``full`` s it falls in
     proportion to the duration (a constant irradiance).
     """
     if duration >= full:
@@ -93,7 +97,7 @@ def _constant_law(factor: float, weight: float, duration: float, full: float) ->
 
 
 def _refuse_unknown(wavelength: float, duration: float) -> None:
-    """Raise ParameterError where this module has no formula."""
+    """Raise ParameterError for a wavelength or a duration for which this module has no formula."""
     if not _SHORTEST_WAVELENGTH <= wavelength <= _LONGEST_WAVELENGTH:
         text = (
             f"no exposure limit of the eye at {wavelength * 1e9:g} nm: 400 nm to 100 um are known"
@@ -107,7 +111,7 @@ def _refuse_unknown(wavelength: float, duration: float) -> None:
 
 def _infrared_factors(nm: float) -> tuple[float, float]:
     """Return the factors C_A and C_C of the standard at a wavelength in nm; both are 1 for visible
-    light and raise the limit in the infrared, of which less reaches the retina.
+    light and raise the limit in the infrared, where less light reaches the retina.
     """
     c_a = 5.0
     if nm < 700:
@@ -122,12 +126,12 @@ def _infrared_factors(nm: float) -> tuple[float, float]:
 
 
 def _retina(nm: float, duration: float) -> _Law:
-    """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry
-    below 500 nm.
+    """Return the limit of the retina in J/m2 from 400 to 1400 nm, for a small source: thermal, and
+    photochemical below 500 nm.
     """
     c_a, c_c = _infrared_factors(nm)
     if duration >= 10:
-        # J/m2 over more than 10 s: constant irradiances in W/m2 times the duration
+        # beyond 10 s: constant irradiances in W/m2 times the duration
         heat_limit = _power_law(10, c_a * c_c, duration, 1)
         photochemical_limit = _power_law(
             1, math.pow(10, 0.02 * max(0.0, nm - 450)), max(100.0, duration), 1
@@ -155,7 +159,7 @@ def _skin(nm: float, duration: float) -> _Law:
 
 
 def _cornea(nm: float, duration: float) -> _Law:
-    """Return the limit in J/m2 from 1400 nm on."""
+    """Return the limit of the cornea in J/m2 from 1400 nm on."""
     if duration >= 10:
         return _power_law(1000, 1, duration, 1)
     flat_limit, flat_duration = 1e3, 1e-3
@@ -169,7 +173,8 @@ def _cornea(nm: float, duration: float) -> _Law:
 
 
 def eye_aperture(wavelength: float, duration: float) -> float:
-    """Return the diameter in m of the aperture over which an exposure of the eye is averaged.
+    """Return the diameter in m of the limiting aperture, over which an exposure of the eye is
+    averaged.
 
     7 mm, the widest pupil, from 400 to 1400 nm; beyond, 1 mm up to 0.35 s, 1.5 t^(3/8) mm up to 10
     s, then 3.5 mm.
@@ -184,8 +189,8 @@ def eye_aperture(wavelength: float, duration: float) -> float:
 def hazard_distance(
     beam: Beam, limit: float, aperture: float = 0.0, transmittance: float = 1.0
 ) -> float:
-    """Return the distance in m beyond which the exposure on the axis of a beam is below a limit, or
-    0 for none.
+    """Return the distance in m beyond which the exposure by a beam is below a limit; 0 if it is
+    below it everywhere.
 
     ``limit`` is in W/m2 for a continuous beam and in J/m2 for each pulse of a pulsed one. The
     exposure is the mean over a round ``aperture`` in m, or that on the axis for 0. Both have a
@@ -194,14 +199,14 @@ def hazard_distance(
     of the optics or of air, the same at every distance.
     """
     power_or_energy = beam.power if beam.pulse_energy is None else beam.pulse_energy
-    assert power_or_energy is not None  # `beam` has made the one or the other
+    assert power_or_energy is not None  # `beam` guarantees one of the two
     power_or_energy *= transmittance
     if aperture == 0:
         radius_squared = 2 * power_or_energy / (math.pi * limit)
     else:
         aperture_share = eye_share(limit, aperture, power_or_energy)
         if aperture_share >= 1:
-            # the aperture needs more than all of the beam to have the limit
+            # even the whole beam in the aperture stays below the limit
             return 0.0
         radius_squared = -(aperture**2) / 2 / math.log1p(-aperture_share)
     # w^2 = w0^2 + (theta R / 2)^2
@@ -209,43 +214,44 @@ def hazard_distance(
 
 
 def eye_share(limit: float, aperture: float, emitted: float) -> float:
-    """Return the share of a power in W, or of an energy in J, that fills a round aperture in m with
-    a limit.
+    """Return the power that gives a limit when averaged over a round aperture, relative to the
+    emitted power (or the same with energies).
 
-    ``limit`` is in W/m2 or J/m2.
+    ``limit`` is in W/m2 or J/m2, ``aperture`` a diameter in m, ``emitted`` in W or J.
     """
     return math.pi * aperture**2 / 4 * limit / emitted
 
 
 # --- eye trains -----------------------------------------------------------------------------------
 
-# Exposure limits of the eye for beams and trains of pulses, by two rules that have names, and the
-# hazard distance.
+# Exposure limits of the eye for beams and pulse trains, by one of two named rules, and the hazard
+# distance.
 #
-# `eye_limit_source` names the rule that a limit was computed by.
+# `eye_limit_source` names the rule by which a limit was computed.
 
 
 TrainRule = Literal["IEC 60825-1:2014", "N^(-1/4)"]
 TRAIN_RULES: tuple[TrainRule, ...] = get_args(TrainRule)
 
-_COUNTED_TIME = 10.0  #: s, T2 of a small source: pulses are counted within this time for C5
+_COUNTED_TIME = 10.0  #: s, T2 of a small source: for C5, pulses are counted within this time
 _FEW_PULSES = 600  #: pulses up to which C5 is 1
 _LEAST_C5 = 0.4
-_BRIEF_EXPOSURE = 0.25  #: s, an exposure up to which C5 is 1
+_BRIEF_EXPOSURE = 0.25  #: s, exposure duration up to which C5 is 1
 
 
 class TrainLimit(NamedTuple):
-    """The largest permissible radiant exposure of the eye by one pulse of a train, by each of
-    three rules.
+    """The maximum permissible radiant exposure of the eye by one pulse of a train, by each of three
+    rules.
     """
 
     single: float  #: J/m2, limit of one pulse alone
-    mean: float  #: J/m2, limit of the whole exposure over the number of its pulses
+    mean: float  #: J/m2, limit of the whole exposure divided by its number of pulses
     #: J/m2, limit by the rule for repeated pulses; infinite where the standard has no such rule
     repeated: float
-    together: float  #: number of pulses that the rule for repeated pulses counts as one
-    groups: float  #: number of pulses, or of groups that count as one, that the rule counts
-    factor: float  #: C5 of the rule
+    #: number of pulses in a group, which the rule for repeated pulses counts as one
+    together: float
+    groups: float  #: number of groups of pulses that the rule counts
+    factor: float  #: factor C5 of the rule
 
     @property
     def limit(self) -> float:
@@ -254,7 +260,7 @@ class TrainLimit(NamedTuple):
 
     @property
     def strictest(self) -> Literal["single pulse", "mean", "repeated pulses"]:
-        """Return the name of the rule whose limit is the least."""
+        """Return the name of the rule with the lowest limit."""
         if self.single <= min(self.mean, self.repeated):
             return "single pulse"
         return "mean" if self.mean <= self.repeated else "repeated pulses"
@@ -267,7 +273,7 @@ def eye_mpe_train(
     duration: float,
     rule: TrainRule = "IEC 60825-1:2014",
 ) -> float:
-    """Return the largest permissible radiant exposure of the eye in J/m2 by each pulse of a train:
+    """Return the maximum permissible radiant exposure of the eye in J/m2 by each pulse of a train;
     see `train_limit`.
 
     Raises ParameterError for a pulse that is longer than the exposure or the period.
@@ -282,8 +288,8 @@ def train_limit(
     duration: float,
     rule: TrainRule = "IEC 60825-1:2014",
 ) -> TrainLimit:
-    """Return the limits of the eye for each pulse of a train in an exposure of ``duration`` s, by
-    three rules.
+    """Return the exposure limits of the eye for each pulse of a train, by three rules, for an
+    exposure of ``duration`` s.
 
     A pulse has to stay below the limit of one pulse alone, below that of the whole exposure over
     the number of pulses, and, up to 1400 nm, below that of one pulse times C5. Pulses within T_i, 5
@@ -298,9 +304,8 @@ def train_limit(
 
     Raises ParameterError for a pulse that is longer than the exposure or the period.
     Source: IEC 60825-1:2014, 4.3 f), A.3 and Table 9, as two public programs write them out, which
-            agree; the standard
-    itself was not read for C5. The interpretation sheet ISH1:2017 allows more for pulses below T_i;
-    it is not used.
+            agree; the standard itself was not read for C5. The interpretation sheet ISH1:2017
+            allows more for pulses below T_i; it is not used.
     """
     if not pulse_duration < min(duration, 1 / repetition_rate):
         text = (
@@ -310,7 +315,7 @@ def train_limit(
         raise ParameterError("pulse_duration", f"{text}: the pulse is too long")
     single = eye_mpe(wavelength, pulse_duration)
     mean = eye_mpe(wavelength, duration) / max(1.0, duration * repetition_rate)
-    # no rule for repeated pulses beyond the retina's wavelengths
+    # beyond the wavelengths that reach the retina there is no rule for repeated pulses
     if wavelength >= 1400e-9:
         return TrainLimit(single, mean, math.inf, 1.0, max(1.0, duration * repetition_rate), 1.0)
     group_time = _summed_time(wavelength)
@@ -323,7 +328,7 @@ def train_limit(
         if rule == "IEC 60825-1:2014"
         else math.pow(groups, -0.25)
     )
-    # several pulses within T_i count as one of T_i, with the limit of that duration
+    # several pulses within T_i count as one pulse of the duration T_i
     group_duration = max(group_time, pulse_duration) if pulses_in_group > 1 else pulse_duration
     group_limit = eye_mpe(wavelength, group_duration)
     return TrainLimit(
@@ -332,13 +337,14 @@ def train_limit(
 
 
 def _summed_time(wavelength: float) -> float:
-    """Return T_i in s: pulses within this time count as one."""
+    """Return the time T_i in s within which pulses count as one."""
     return 5e-6 if wavelength < 1050e-9 else 13e-6
 
 
 def _c5(groups: float, pulse_duration: float, duration: float, summed: float) -> float:
-    """Return C5 of the edition of 2014 for a source below 5 mrad, from the number of groups of
-    pulses, the durations in s and the time ``summed`` (T_i) within which pulses count as one.
+    """Return the factor C5 of the edition of 2014 for a source below 5 mrad, from the number of
+    groups of pulses, the durations in s, and T_i (``summed``), the time in s within which pulses
+    count as one.
     """
     if pulse_duration > summed or duration <= _BRIEF_EXPOSURE or groups <= _FEW_PULSES:
         return 1.0
@@ -346,10 +352,10 @@ def _c5(groups: float, pulse_duration: float, duration: float, summed: float) ->
 
 
 def eye_limit(beam: Beam, duration: float, rule: TrainRule = "IEC 60825-1:2014") -> float:
-    """Return the limit of the eye for a beam: W/m2 if it is continuous, J/m2 for each pulse if it
-    is pulsed.
+    """Return the exposure limit of the eye for a beam: in W/m2 if it is continuous, in J/m2 per
+    pulse if it is pulsed.
 
-    ``rule`` is that of `train_limit` for a train of pulses; the other beams do not need a rule.
+    ``rule`` is as in `train_limit`; it affects pulse trains only.
     """
     if beam.pulse_energy is None or beam.pulse_duration is None:
         return eye_mpe(beam.wavelength, duration) / duration
@@ -360,8 +366,7 @@ def eye_limit(beam: Beam, duration: float, rule: TrainRule = "IEC 60825-1:2014")
 
 
 def eye_limit_source(beam: Beam, duration: float, rule: TrainRule = "IEC 60825-1:2014") -> str:
-    """Return the name of the rule by which `eye_limit` computes the limit of a beam, with its
-    source.
+    """Return the rule by which `eye_limit` computes the limit of a beam, with its source, as text.
 
     Raises ParameterError as `eye_limit` does.
     """
@@ -389,7 +394,7 @@ def eye_limit_source(beam: Beam, duration: float, rule: TrainRule = "IEC 60825-1
 
 
 def _is_single(beam: Beam, duration: float) -> bool:
-    """Return True if at most one pulse of a pulsed beam falls within an exposure."""
+    """Return True if an exposure contains at most one pulse of a pulsed beam."""
     return beam.repetition_rate is None or duration * beam.repetition_rate <= 1
 
 
@@ -399,12 +404,12 @@ def nominal_ocular_hazard_distance(
     transmittance: float = 1.0,
     rule: TrainRule = "IEC 60825-1:2014",
 ) -> float:
-    """Return the distance in m beyond which a beam does not exceed the limit of the unaided eye for
-    an exposure in s.
+    """Return the nominal ocular hazard distance in m, beyond which a beam does not exceed the limit
+    of the unaided eye.
 
-    The exposure is averaged over the limiting aperture. Use 0.25 s for visible light that a person
-    turns away from, and 10 s or 100 s for invisible light. ``rule`` is that of `train_limit`.
-    Optical instruments such as binoculars are not part of it.
+    ``duration`` is the exposure in s: 0.25 s for visible light, with the aversion response, and 10
+    s or 100 s for invisible light. The exposure is averaged over the limiting aperture. ``rule`` is
+    as in `train_limit`. Optical instruments such as binoculars are not considered.
     """
     averaged = duration if beam.pulse_duration is None else beam.pulse_duration
     limit = eye_limit(beam, duration, rule)
@@ -413,40 +418,39 @@ def nominal_ocular_hazard_distance(
 
 # --- dazzle of the eye ----------------------------------------------------------------------------
 
-# Light of a laser scatters inside the eye and lays a veil over everything beside the laser. This
-# veil is that of the CIE general disability glare equation (CIE 146:2002). A target is hidden where
-# its luminance differs from the background by less than the threshold of Adrian (1989) at the
-# luminance of background and veil together. The largest exposure that hides no target is the
-# maximum dazzle exposure (MDE), and the distance where a laser has this exposure the nominal ocular
-# dazzle distance (NODD): Williamson and McLin, Appl. Opt. 54, 1564 (2015), define both. The
-# formulas here are not theirs: they have another threshold, so that their tables are not
-# reproduced.
+# Light of a laser scatters inside the eye and causes a veiling luminance over the field around the
+# laser, here by the CIE general disability glare equation (CIE 146:2002). A target is hidden if its
+# luminance differs from the background by less than the threshold of Adrian (1989) at the luminance
+# of background plus veil. The largest exposure at which the target stays visible is the maximum
+# dazzle exposure (MDE), and the distance at which a laser causes this exposure is the nominal
+# ocular dazzle distance (NODD): Williamson and McLin, Appl. Opt. 54, 1564 (2015), define both. The
+# formulas here differ from theirs by another threshold and do not reproduce their tables.
 
 LUMENS_PER_WATT = 683.0  #: at 555 nm
-STEADY = 100.0  #: Hz, from which a train of pulses looks steady: above the fusion of flicker
+STEADY = 100.0  #: Hz; from this rate a pulse train looks steady: above the flicker fusion threshold
 _VISIBLE = (380e-9, 780e-9)  #: m
-_GLARE_ANGLES = (0.1, 100.0)  #: deg, of the CIE general disability glare equation
-_AGES = (23.0, 75.0)  #: years, of Adrian's factor of age
-_TARGET_SIZES = (1.0, 60.0)  #: arc minutes of a target
-_VEIL_RANGE = (1e-6, 1e9)  #: least and largest veil that is looked for, times the background
+_GLARE_ANGLES = (0.1, 100.0)  #: deg, range of the CIE general disability glare equation
+_AGES = (23.0, 75.0)  #: years, range of Adrian's age factor
+_TARGET_SIZES = (1.0, 60.0)  #: arc minutes, range of the size of a target
+_VEIL_RANGE = (1e-6, 1e9)  #: range in which the veil is searched, in multiples of the background
 _VEIL_HALVINGS = 80  #: of the logarithm of the veil
 
 
 class DazzleTask(NamedTuple):
-    """What a viewer has to see beside a laser, and who sees it."""
+    """The visual task of a viewer near a laser: target, background and properties of the viewer."""
 
     angle: float  #: deg, between the laser and the target
     background: float  #: cd/m2, luminance behind the target
-    contrast: float = 0.2  #: Weber contrast of the target, without the sign
+    contrast: float = 0.2  #: absolute Weber contrast of the target
     size: float = 10.0  #: arc minutes across the target
     age: float = 40.0  #: years
     pigmentation: float = 0.5  #: of the iris: 0 black, 0.5 brown, 1.0 to 1.2 light
-    margin: float = 2.6  #: contrast that the viewer needs, over the threshold of the laboratory
+    margin: float = 2.6  #: contrast that a viewer needs in practice, over the laboratory threshold
 
 
 def luminous_efficiency(wavelength: float) -> float:
-    """Return V(lambda) of the CIE 1924 photopic observer at a wavelength in m; 0 beyond 380 to 780
-    nm.
+    """Return the luminous efficiency V(lambda) of the CIE 1924 photopic observer at a wavelength in
+    m; 0 outside 380 to 780 nm.
 
     Source: CIE 1931 2 degree observer of colour-science, whose second function it is; linear
             between 1 nm.
@@ -461,8 +465,8 @@ def luminous_efficiency(wavelength: float) -> float:
 
 
 def veil_per_lux(angle: float, age: float, pigmentation: float) -> float:
-    """Return the veiling luminance in cd/m2 for each lux at the eye, at an angle in degrees from a
-    source of light.
+    """Return the veiling luminance in cd/m2 per lux at the eye, at an angle in degrees from a light
+    source.
 
     10 / a^3 + (5 / a^2 + 0.1 p / a) (1 + (age / 62.5)^4) + 0.0025 p: the CIE general disability
     glare equation, from 0.1 to 100 degrees.
@@ -485,8 +489,8 @@ def veil_per_lux(angle: float, age: float, pigmentation: float) -> float:
 
 
 def threshold_luminance(background: float, size: float, age: float) -> float:
-    """Return the difference of luminance in cd/m2 at which a target is just seen, in sight for 2 s
-    or longer.
+    """Return the threshold luminance difference in cd/m2 at which a target is just seen, if it is
+    in view for 2 s or longer.
 
     (sqrt(phi) / size + sqrt(L))^2 x F(age): phi and L are functions of the background in cd/m2, for
     ``size`` in arc minutes. The target is brighter than the background.
@@ -507,8 +511,8 @@ def threshold_luminance(background: float, size: float, age: float) -> float:
 
 
 def _ricco(background: float) -> float:
-    """Return the square root of the flux function of Adrian for a background in cd/m2, which rules
-    small targets (law of Ricco).
+    """Return the square root of Adrian's flux function for a background in cd/m2, which governs
+    small targets (Ricco's law).
     """
     log_background = math.log10(background)
     if background >= 0.6:
@@ -521,8 +525,8 @@ def _ricco(background: float) -> float:
 
 
 def _weber(background: float) -> float:
-    """Return the square root of the luminance function of Adrian for a background in cd/m2, which
-    rules large targets (law of Weber).
+    """Return the square root of Adrian's luminance function for a background in cd/m2, which
+    governs large targets (Weber's law).
     """
     log_background = math.log10(background)
     if background >= 0.6:
@@ -533,18 +537,19 @@ def _weber(background: float) -> float:
 
 
 def _age_factor(age: float) -> float:
-    """Return how much larger the threshold is at an age in years than at 23."""
+    """Return Adrian's age factor on the threshold for an age in years; about 1 at 23 years."""
     if age <= 64:
         return (age - 19) ** 2 / 2160 + 0.99
     return (age - 56.6) ** 2 / 116.3 + 1.43
 
 
 def dazzle_illuminance(task: DazzleTask) -> float:
-    """Return the illuminance of the eye in lux at which the veil just hides a target, or 0 for one
-    that is never seen.
+    """Return the illuminance at the eye in lux at which the veil just hides a target; 0 if the
+    target is not visible even without a laser.
 
-    The target differs by contrast x background, with and without the veil. Its threshold is that at
-    the luminance of background and veil together, times the margin.
+    The luminance of the target differs from the background by contrast x background, with and
+    without the veil. It must exceed the threshold at the luminance of background plus veil, times
+    the margin.
 
     Raises ParameterError as `veil_per_lux` and `threshold_luminance`, and for a background that is
     not above 0.
@@ -569,10 +574,10 @@ def dazzle_illuminance(task: DazzleTask) -> float:
 
 
 def maximum_dazzle_exposure(wavelength: float, task: DazzleTask) -> float:
-    """Return the irradiance of the eye in W/m2 up to which a laser does not hide a target (MDE); 0:
-    never seen.
+    """Return the maximum dazzle exposure (MDE) in W/m2: the irradiance at the eye up to which a
+    laser does not hide a target.
 
-    E = lux / (683 V(lambda)).
+    MDE = lux / (683 V(lambda)); 0 if the target is not visible even without a laser.
 
     Raises ParameterError for a wavelength that the eye does not see, and as `dazzle_illuminance`.
     """
@@ -586,11 +591,11 @@ def maximum_dazzle_exposure(wavelength: float, task: DazzleTask) -> float:
 
 
 def nominal_ocular_dazzle_distance(beam: Beam, limit: float, transmittance: float = 1.0) -> float:
-    """Return the distance in m beyond which the irradiance on the axis is below a limit in W/m2
-    (NODD), or 0.
+    """Return the nominal ocular dazzle distance (NODD) in m, beyond which the irradiance on the
+    axis is below a limit in W/m2.
 
-    A train of pulses counts with its mean power: above the fusion of flicker it looks as steady as
-    its mean.
+    A pulse train counts with its mean power, because above the flicker fusion threshold it looks
+    steady.
 
     Raises ParameterError for a beam without a mean power that looks steady: see `unsteady`.
     """
@@ -601,7 +606,7 @@ def nominal_ocular_dazzle_distance(beam: Beam, limit: float, transmittance: floa
 
 
 def unsteady(beam: Beam) -> str:
-    """Return why the light of a beam does not look steady, or an empty text for light that does."""
+    """Return the reason why the light of a beam does not look steady; empty for light that does."""
     if not beam.is_pulsed:
         return ""
     if beam.repetition_rate is None:

@@ -1,5 +1,5 @@
-"""The light of a laser in absolute units: its wavefront at the lens of a camera, its light in one
-exposure, and what filters and a stop take from it.
+"""The light of a laser in absolute units: its wavefront at the lens of a camera, its light during
+an exposure, and its attenuation by filters and a stop.
 """
 
 from __future__ import annotations
@@ -46,14 +46,17 @@ from neusee.nodes.values import Bands, LaserLight, Stop, Wavefront
 
 Quality = Annotated[float, Field(ge=1, le=1e6)]  #: M2 of a beam
 Multiple = Annotated[float, Field(ge=0, le=1e18)]
-_NOTED_DEFOCUS = 0.25  #: waves of defocus at 550 nm from which a near laser is worth a note
-#: largest error of the spot by the staircase rim of the pupil, over waves of defocus / samples
+_NOTED_DEFOCUS = 0.25  #: waves of defocus at 550 nm above which a note on a near laser is given
+#: largest relative error of the spot by the staircase rim of the pupil grid, over (waves of defocus
+#: / samples)
 _RIM_ERROR = 1.5
-_DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
+_DEFOCUS_WAVELENGTH = 550e-9  #: m, wavelength of the unit "waves" of defocus
 
 
 class _Geometry(NamedTuple):
-    """What decides the wavefront of a laser: width, divergence, quality and distance."""
+    """The parameters that determine the wavefront of a laser: width, divergence, quality and
+    distance.
+    """
 
     waist: float | None
     divergence: float | None
@@ -164,13 +167,14 @@ def light(
     mean_power = beam.power if beam.pulse_energy is None else beam.pulse_energy * pulses / exposure
     assert mean_power is not None
     irradiance = mean_power * axis_density(beam, distance, air_share)
-    # through the aperture that is lit as on the axis
+    # W behind the lens, if the axis irradiance filled the clear aperture
     flux = irradiance * clear_area(stop) * lens_transmittance
     focus_area, radius_at_lens = (beam.wavelength * focal_length) ** 2, beam_radius(beam, distance)
     even_peak = flux * clear_area(stop) / focus_area
-    # the irradiance is the squared field: its radius is smaller by sqrt(2)
+    # irradiance is the squared field, so its Gaussian radius is smaller by sqrt(2)
     power_in_lens = irradiance * gaussian_integral(stop, radius_at_lens / math.sqrt(2))
-    # on the sensor: (integral of the field over the pupil / (wavelength x focal length))^2
+    # peak on the sensor per W: (integral of the field over the pupil / (wavelength x focal
+    # length))^2
     peak_density = (
         axis_density(beam, distance, air_share)
         * lens_transmittance
@@ -208,34 +212,34 @@ def _(
 
 
 def pulses_within(beam: Beam, exposure: float, delay: float) -> float:
-    """Return the number of pulses that a shutter lets through, with parts of pulses; 0 for a
+    """Return the number of pulses during an exposure, with fractions for cut pulses; 0 for a
     continuous laser.
     """
     if beam.pulse_duration is None:
         return 0.0
 
     def begun(time: float) -> float:
-        """Return the pulses from the delay to a time after the delay; a time before the delay
-        counts back.
+        """Return the number of pulses from the first pulse to a time in s after its start; negative
+        for earlier times.
         """
         assert beam.pulse_duration is not None
         if beam.repetition_rate is None:
             return min(max(time / beam.pulse_duration, 0.0), 1.0)
         whole_periods = math.floor(plain(time * beam.repetition_rate))
-        # and the share of the pulse that is on
+        # plus the emitted share of the current pulse
         return whole_periods + min(
             max(time - whole_periods / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0
         )
 
-    # those since the first, less those before the shutter opens at the time 0
+    # pulses until the shutter closes, less those before it opens at the time 0
     return begun(exposure - delay) - begun(-delay)
 
 
 def _beam_of_line(line: Bands, shape: _Geometry, *emission: float | None) -> Beam:
     """Return the beam of a laser line.
 
-    ``emission`` is (power, pulse energy, pulse duration, repetition rate); without it the power is
-    1 W, since the shape of the beam alone counts.
+    ``emission`` is (power, pulse energy, pulse duration, repetition rate). If it is empty, only the
+    shape of the beam matters, and the power is set to 1 W.
     """
     power, energy, duration, rate = emission or (1.0, None, None, None)
     return beam(
@@ -258,8 +262,8 @@ def _air_share(
     visibility: float | None,
     haze: Law | None,
 ) -> float:
-    """Return the transmittance of the air between a laser and a lens: ``share`` if it is stated,
-    that of the ``visibility`` by the law ``haze``, else 1.
+    """Return the transmittance of the air between a laser and a lens: ``share`` if stated, else
+    from the ``visibility`` by the law ``haze``, else 1.
     """
     if share is not None or visibility is None:
         return 1.0 if share is None else share
@@ -302,8 +306,8 @@ def _(*, line: Bands | None = None, stop: Stop | None = None, **params: Any) -> 
 
 
 def _refuse_unknown_light(stated: list[str]) -> None:
-    """Raise ParameterError for a laser in absolute units without its power or energy, or without
-    its distance.
+    """Raise ParameterError for a laser in absolute units without power or energy, or without a
+    distance.
     """
     if "power" not in stated and "pulse_energy" not in stated:
         text = (
@@ -320,7 +324,7 @@ def _refuse_unknown_light(stated: list[str]) -> None:
 
 
 def _refuse_beside_strength(stated: list[str]) -> None:
-    """Raise ParameterError for a laser that has a strength and statements in absolute units."""
+    """Raise ParameterError for a laser with both a strength and parameters in absolute units."""
     if stated:
         conflict = (
             f"{', '.join(stated)} state{'s' * (len(stated) == 1)} its light in absolute units"
@@ -333,7 +337,7 @@ def _refuse_beside_strength(stated: list[str]) -> None:
 
 
 def _refuse_air(stated: list[str]) -> None:
-    """Raise ParameterError for air that is stated twice, or by a law without a visibility."""
+    """Raise ParameterError if the air is stated twice, or by a law of haze without a visibility."""
     if "air_transmittance" in stated and ("visibility" in stated or "haze" in stated):
         raise ParameterError(
             "air_transmittance",
@@ -344,8 +348,8 @@ def _refuse_air(stated: list[str]) -> None:
 
 
 def _out_of_focus(line: Bands, stop: Stop, params: dict[str, Any]) -> list[str]:
-    """Return a note on a laser that is so near that a lens focused at infinity does not focus
-    it.
+    """Return a note for a laser so near that it is out of focus for a lens focused at infinity,
+    else nothing.
     """
     shape = {name: params[name] for name in (*_BEAM_SETTINGS, "convention", "distance")}
     # D^2 / (8 lambda R): defocus at the rim of a lens focused at infinity
@@ -361,7 +365,7 @@ def _out_of_focus(line: Bands, stop: Stop, params: dict[str, Any]) -> list[str]:
 
 
 def _pulse_notes(light_of_laser: LaserLight, params: dict[str, Any]) -> list[str]:
-    """Return a note on the pulses that an exposure catches."""
+    """Return a note on the number of pulses in the exposure."""
     if not params["pulse_duration"]:
         return []
     count = float(light_of_laser.pulses)
@@ -378,29 +382,29 @@ def _pulse_notes(light_of_laser: LaserLight, params: dict[str, Any]) -> list[str
 
 # --- a filter, a notch filter and a stop ----------------------------------------------------------
 
-# What they do to the light of a laser, and what they take from the picture.
+# Their effect on the light of a laser, and on the picture.
 
-_WHITE_RANGE = (400e-9, 700e-9)  #: m, over which the white light of the picture counts
+_WHITE_RANGE = (400e-9, 700e-9)  #: m, range of wavelengths over which white light is counted
 _DAYLIGHT_TEMPERATURE = 6504.0  #: K
-EDGE = 0.01  #: of the wavelength, on each side: what a real notch blocks beside its band
+EDGE = 0.01  #: relative width, on each side, of the edges of a real notch beyond its band
 _GREEN_WAVELENGTH = 550e-9  #: m
 
 
 def optical_density(factor: float) -> float:
-    """Return the optical density that divides light by a factor: its decimal logarithm; 0 for a
-    factor up to 1.
+    """Return the optical density of a filter that attenuates light by a factor: log10(factor), or 0
+    for a factor up to 1.
     """
     return math.log10(factor) if factor > 1 else 0.0
 
 
 def passing(density: float) -> float:
-    """Return the transmittance of a filter of an optical density."""
+    """Return the transmittance of a filter of a given optical density."""
     return math.pow(10, -density)
 
 
 def notch_wavelength(centre: float, angle: float, index: float) -> float:
-    """Return the wavelength in m that a notch filter blocks for light at an angle in rad from its
-    normal.
+    """Return the wavelength in m that a notch filter blocks for light incident at an angle in rad
+    to its normal.
 
     lambda(theta) = lambda_0 sqrt(1 - sin^2(theta) / n^2): an interference filter moves to shorter
     wavelengths. ``centre`` is the wavelength in m at normal incidence, ``index`` the effective
@@ -420,19 +424,19 @@ def notch_wavelength(centre: float, angle: float, index: float) -> float:
 
 
 def notch_band(shortest: float, longest: float, angle: float, index: float) -> tuple[float, float]:
-    """Return the ends in m of the band, at normal incidence, of a notch that covers a laser over
-    the whole field.
+    """Return both ends in m of the band, at normal incidence, of a notch filter that blocks a laser
+    over the whole field.
 
-    The laser has some wavelength from ``shortest`` to ``longest`` in m, and comes from any angle up
-    to ``angle`` in rad. At that angle the band has moved to shorter wavelengths, so that it has to
-    begin at the shortest and to end at the wavelength that moves to the longest.
+    The wavelength of the laser is between ``shortest`` and ``longest`` in m, its angle of incidence
+    up to ``angle`` in rad. At that angle the band is shifted to shorter wavelengths: it must begin
+    at ``shortest`` and end at the wavelength that is shifted to ``longest``.
     """
     return shortest, longest / notch_wavelength(1.0, angle, index)
 
 
 def white_share(low: float, high: float, edge: float = EDGE) -> float:
-    """Return the share of the photons of daylight from 400 to 700 nm in a band from ``low`` to
-    ``high`` m.
+    """Return the share of the daylight photons between 400 and 700 nm that lie in a band from
+    ``low`` to ``high`` in m.
 
     ``edge`` widens the band by a share of its ends, because a real notch has no vertical edges. The
     sensor counts photons with one efficiency from 400 to 700 nm.
@@ -442,11 +446,11 @@ def white_share(low: float, high: float, edge: float = EDGE) -> float:
     import torch
 
     wavelengths = (
-        # every 0.5 nm; the added 0.25 nm keeps the end in despite rounding
+        # every 0.5 nm; the added 0.25 nm includes the end despite rounding
         torch.arange(_WHITE_RANGE[0] * 1e9, _WHITE_RANGE[1] * 1e9 + 0.25, 0.5, dtype=torch.float64)
         * 1e-9
     )
-    # power of daylight times wavelength is proportional to photons
+    # spectral power times wavelength is proportional to the number of photons
     photons = daylight(_DAYLIGHT_TEMPERATURE).at(wavelengths)[0] * wavelengths
     total = torch.trapezoid(photons, wavelengths)
     band_start, band_end = (
@@ -456,7 +460,7 @@ def white_share(low: float, high: float, edge: float = EDGE) -> float:
     if not band_end > band_start:
         return 0.0
     band_ends = torch.tensor([band_start, band_end], dtype=torch.float64)
-    # the ends of the band stand beside the table's wavelengths
+    # grid wavelengths inside the band, with both ends of the band added
     inside_wavelengths = torch.cat(
         [
             band_ends[:1],
@@ -464,7 +468,7 @@ def white_share(low: float, high: float, edge: float = EDGE) -> float:
             band_ends[1:],
         ]
     )
-    # share of photons, by the same rule as the total
+    # trapezoidal rule, as for the total
     return float(
         torch.trapezoid(
             daylight(_DAYLIGHT_TEMPERATURE).at(inside_wavelengths)[0] * inside_wavelengths,
@@ -482,8 +486,8 @@ def field_angle(shape: tuple[int, int], pixel_pitch: float, focal_length: float)
 
 
 def stopped_share(diameter: float, stopped: float) -> float:
-    """Return the share of the light of the scene that a lens of ``diameter`` m passes when
-    stopped down to another.
+    """Return the share of the scene's light that remains when a lens of ``diameter`` m is stopped
+    down to ``stopped`` m.
     """
     return min(1.0, stopped / diameter) ** 2
 
@@ -491,10 +495,10 @@ def stopped_share(diameter: float, stopped: float) -> float:
 def diffraction_cutoff(
     focal_length: float, diameter: float, pixel_pitch: float, wavelength: float = _GREEN_WAVELENGTH
 ) -> float:
-    """Return the finest detail that diffraction leaves, in cycles a pixel: pixel pitch /
-    (wavelength x f-number).
+    """Return the diffraction cut-off frequency in cycles per pixel: pixel pitch / (wavelength x
+    f-number).
 
-    Below 0.5 diffraction takes detail that the pixels could hold.
+    Below 0.5, diffraction removes detail that the pixels could resolve.
     """
     return pixel_pitch * diameter / (wavelength * focal_length)
 

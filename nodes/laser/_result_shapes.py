@@ -1,5 +1,5 @@
-"""Values of the results of the laser nodes before a run, which have few numbers, and shapes of
-the other results.
+"""Results of the laser nodes before a run: values of those with few numbers, shapes of the
+others.
 """
 
 from typing import Any
@@ -46,7 +46,7 @@ def _(spot: Tensor, line: Bands, light: LaserLight | None = None, **params: Any)
 
 @damage.work
 def _(result: SpotDamage, spot: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
-    # six planes of twice the size for the heat, and the sum of the bands
+    # memory and operations: FFTs of twice the size for the heat, and the sum of the bands
     pixels = float(spot[0].numel())
     return 8.0 * 26 * pixels, float(spot.numel()) + 12 * transform_operations(
         2 * spot.shape[-2], 2 * spot.shape[-1]

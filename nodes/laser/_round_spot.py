@@ -17,29 +17,34 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_DARK = 40.0  #: fill from which the rim of the lens is dark: exp(-40) of the amplitude on the axis
-_SMALL = 60.0  #: |2 kappa| below which the integral is computed by quadrature up to the far wings
-_APART = 1.5  #: least ratio of v and |2 kappa|, or its inverse, at which a series converges fast
-_LARGE = 120.0  #: |2 kappa| from which the edge of the spot is that of a straight edge
-_TERMS = 44  #: of a series, 1.5^-44 = 2e-8
-_SMALLEST = math.log(2e-8)  #: of the logarithm of the last term of a series over the first
-_RATIOS = (0.3, 0.1, 0.03)  #: of a series, at which places are parted
-_PIECE = 1 << 21  #: Bessel functions at a time in a quadrature
+#: fill above which the rim of the lens is dark: amplitude exp(-40) of that on the axis
+_DARK = 40.0
+_SMALL = 60.0  #: |2 kappa| below which the field is computed by quadrature, except in the far wings
+_APART = 1.5  #: least ratio of v to |2 kappa|, or inverse, at which a series converges fast
+_LARGE = 120.0  #: |2 kappa| above which the edge of the spot is approximated by a straight edge
+_TERMS = 44  #: largest number of terms of a series; 1.5^-44 = 2e-8
+#: logarithm of the smallest term of a series that counts, relative to the first
+_SMALLEST = math.log(2e-8)
+#: ratios |2 kappa| / v that separate groups of places with different numbers of terms
+_RATIOS = (0.3, 0.1, 0.03)
+_PIECE = 1 << 21  #: values of Bessel functions computed at once in a quadrature
 _RING = 3.8317059702075125  #: first zero of J1, where J0 has its largest negative value
 _TROUGH = -0.4027593957025531  #: J0 there
-#: defocus and fill up to which the bright ring is interpolated in a table
+#: largest defocus in waves, and largest fill, of the table of the bright ring
 _TABLE_WAVES, _TABLE_FILL = 8.0, 8.0
-_FIRST = 0.5  #: waves of defocus from which a ring may be brighter than the axis
+_FIRST = 0.5  #: waves of defocus above which a ring may be brighter than the axis
 _WAVE_STEPS, _FILL_STEPS = 751, 33
-_STEP = 0.05  #: of the reach, between which the brightest ring is looked for
+_STEP = 0.05  #: step of the reach in the search for the brightest ring
 _SURE = 1.002  #: factor that makes the brightest ring an upper bound
-_EDGE = 1.5  #: times |kappa|^2, of the rings of an even beam near its geometric edge
-_WIDEST = 45.0  #: reach of the rings in the table; one farther out is never the brightest
+#: upper bound of irradiance x |kappa|^2 in the rings of an even beam near its geometric edge
+_EDGE = 1.5
+#: largest reach of the rings in the table; a ring farther out is never the brightest
+_WIDEST = 45.0
 
 
 def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
-    """Return the irradiance in the spot of a beam, over the peak of an even and focused beam of the
-    same axis value.
+    """Return the irradiance in the spot of a Gaussian beam, relative to the peak of an even,
+    focused beam with the same irradiance on the axis at the lens.
 
     ``reach`` is v = pi x / (lambda N) at the distance x from the axis, ``fill`` is (D / (2 w))^2
     and ``waves`` the defocus at the rim of the lens.
@@ -52,14 +57,14 @@ def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
             in between.
     """
     v = reach.double().abs().flatten()
-    # the sign of the defocus turns the phase of the field alone
+    # the sign of the defocus only conjugates the field and does not change the irradiance
     kappa = complex(fill, -2 * math.pi * abs(waves))
     double_kappa = 2 * abs(kappa)
-    # the lens cuts nothing off: a Gaussian spot
+    # the lens does not cut the beam off: a Gaussian spot
     if fill > _DARK:
         return _irradiance(_field_without_rim(v, kappa), reach)
-    # each region has the series that converges there; what is between is integrated, or taken as a
-    # straight edge for a wide spot
+    # in each region the series that converges there; between them quadrature, or for a wide spot
+    # the straight-edge approximation
     is_beyond = v > max(_APART * double_kappa, _SMALL / 2) + _SMALL / 2
     is_within = (
         (v * _APART < double_kappa) if double_kappa > _SMALL else torch.zeros_like(is_beyond)
@@ -78,8 +83,8 @@ def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
 
 
 def _irradiance(field: Tensor, reach: Tensor) -> Tensor:
-    """Return the irradiance of a field over that of an even pupil in focus, whose field is 1/2
-    on the axis.
+    """Return the irradiance of a field relative to the peak of an even pupil in focus, whose field
+    is 1/2 on the axis.
     """
     irradiance: Tensor = field.abs().square() * 4
     return irradiance.reshape(reach.shape)
@@ -93,7 +98,7 @@ def _field_without_rim(v: Tensor, kappa: complex) -> Tensor:
 def _field_beyond(v: Tensor, kappa: complex) -> Tensor:
     """Return the field for v above |2 kappa|: exp(-kappa) sum of (2 kappa / v)^n J(n + 1, v) / v.
 
-    Far out few terms are needed, so that the places are taken in parts.
+    Farther out fewer terms are needed, so that places are processed in groups.
     """
     field = torch.empty(len(v), dtype=torch.complex128)
     ratio = 2 * abs(kappa) / v
@@ -102,8 +107,8 @@ def _field_beyond(v: Tensor, kappa: complex) -> Tensor:
         if bool(in_range.any()):
             largest = float(ratio[in_range].max())
             terms = (
-                # the terms fall as ratio^n: as many as reach the smallest term, for the largest
-                # ratio
+                # terms fall as ratio^n: number of terms until the smallest one that counts, for the
+                # largest ratio
                 _TERMS
                 if largest > 1 / _APART
                 else math.ceil(_SMALLEST / math.log(max(largest, 1e-9))) + 1
@@ -113,8 +118,8 @@ def _field_beyond(v: Tensor, kappa: complex) -> Tensor:
 
 
 def _far_series(v: Tensor, kappa: complex, terms: int) -> Tensor:
-    """Return the field for v above |2 kappa| by a number of terms of its series; J(n + 1, v) = 2 n
-    / v J(n, v) - J(n - 1, v).
+    """Return the field for v above |2 kappa| by the first terms of its series, with J(n + 1, v) = 2
+    n / v J(n, v) - J(n - 1, v).
     """
     previous_bessel, bessel = torch.special.bessel_j0(v), torch.special.bessel_j1(v)
     ratio, power = 2 * kappa / v, torch.ones(len(v), dtype=torch.complex128)
@@ -128,8 +133,8 @@ def _far_series(v: Tensor, kappa: complex, terms: int) -> Tensor:
 
 
 def _field_within(v: Tensor, kappa: complex) -> Tensor:
-    """Return the field for v below |2 kappa|: that of a beam without a rim, less the wave from the
-    rim, a series of (-v / (2 kappa))^n J(n, v).
+    """Return the field for v below |2 kappa|: that of a beam without a rim, less the wave
+    diffracted at the rim, a series in (-v / (2 kappa))^n J(n, v).
     """
     safe_v = v.clamp_min(1e-9)
     bessel_n, bessel_next = torch.special.bessel_j0(safe_v), torch.special.bessel_j1(safe_v)
@@ -146,7 +151,7 @@ def _field_within(v: Tensor, kappa: complex) -> Tensor:
 def _next_bessel(n: int, v: Tensor, last: Tensor, bessel: Tensor) -> Tensor:
     """Return J(n + 1, v) from J(n - 1, v) (``last``) and J(n, v) (``bessel``).
 
-    Beyond the order v the recurrence is unstable while J falls fast: return 0 there.
+    For orders above v the recurrence is unstable, and J falls fast: return 0 there.
     """
     following = 2 * n / v * bessel - last
     return torch.where((v > n + 1) | (following.abs() < bessel.abs()), following, 0.0)
@@ -156,7 +161,7 @@ def _field_by_quadrature(v: Tensor, kappa: complex) -> Tensor:
     """Return the field by Gauss-Legendre quadrature over the square of the radius."""
     if not len(v):
         return torch.zeros(0, dtype=torch.complex128)
-    # of the phase of the lens and of J0 between axis and rim: a cycle takes about two nodes
+    # cycles of the defocus phase and of J0 between axis and rim; a cycle needs about two nodes
     phase_cycles = abs(kappa) / math.pi + float(v.max()) / (2 * math.pi)
     nodes, weights = (
         torch.from_numpy(x) for x in legendre(1 << math.ceil(math.log2(24 + 2.2 * phase_cycles)))
@@ -173,20 +178,21 @@ def _field_by_quadrature(v: Tensor, kappa: complex) -> Tensor:
 
 
 def _field_at_edge(v: Tensor, kappa: complex) -> Tensor:
-    """Return the field around the geometric edge of a wide spot: a beam behind a straight edge, to
-    first order in 1/v.
+    """Return the field around the geometric edge of a wide spot, in the straight-edge
+    approximation, to first order in 1/v.
 
-    J0 is the sum of two waves. The one that the beam brings to the place is cut off by an edge: a
-    complementary error function. The other one, and what the first misses, come from the rim.
+    J0 is the sum of two waves. The wave of the beam towards the place is cut off by the rim as by a
+    straight edge, which gives a complementary error function. The other wave, and the correction of
+    the first, come from the rim.
     """
     from scipy.special import wofz
 
-    # radius in the pupil, complex for a tapered beam, from which the light comes straight to v
+    # saddle point: radius in the pupil (complex for a tapered beam) from which a ray reaches v
     saddle = -1j * v / (2 * kappa)
     edge_depth = (complex(kappa) ** 0.5 * (saddle - 1)).numpy()
     is_lit = torch.from_numpy(edge_depth.real < 0)
     lit_sign = torch.where(is_lit, -1.0, 1.0)
-    # wofz(i z) is exp(z^2) erfc(z), which neither overflows nor cancels on its side
+    # wofz(i z) = exp(z^2) erfc(z), which neither overflows nor cancels on this side
     edge_wave = torch.from_numpy(wofz(1j * lit_sign.numpy() * edge_depth)) * lit_sign / (4 * kappa)
     eighth_turn = complex(math.cos(math.pi / 4), math.sin(math.pi / 4))
     amplitude, inward_wave = 1 / torch.sqrt(2 * math.pi * v), torch.exp(-1j * v)
@@ -216,13 +222,13 @@ def legendre(count: int) -> tuple[Any, Any]:
 
 
 def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
-    """Return the largest irradiance at any radius of the spot of a beam, in the unit of
-    `round_spot`, or a bit more.
+    """Return a tight upper bound of the irradiance at any radius in the spot of a beam, in the unit
+    of `round_spot`.
 
-    On the axis it is |1 - exp(-kappa)|^2 / |kappa|^2, which falls at whole waves of defocus; there
-    a bright ring counts. ``within`` makes it the largest value while the defocus changes by up to
-    that share to either side, so that a peak which comes and goes over a short distance is not
-    missed. The result is continuous.
+    On the axis the irradiance is |1 - exp(-kappa)|^2 / |kappa|^2, which has minima at whole waves
+    of defocus, where a bright ring exceeds it. With ``within``, the result is the largest value
+    while the defocus varies by that share to either side, so that a peak over a short range of
+    distance is not missed. The result is continuous.
 
     Shapes: fill, waves, of one shape or of shapes that broadcast -> that shape, float64.
     Units:  none.
@@ -239,9 +245,9 @@ def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
     rim = torch.exp(-fill)
     largest = _axis_irradiance(fill, rim, phase)
     if within:
-        # phase at which the sine on the axis is largest: an odd multiple of pi
+        # phase at which the sine in the axis irradiance is largest: an odd multiple of pi
         odd_phase = math.pi * (2 * torch.ceil(least_phase / (2 * math.pi) - 0.5) + 1)
-        # the maximum, as 1 / |kappa|^2 falls
+        # position of the maximum, shifted because 1 / |kappa|^2 falls
         phase_of_peak = odd_phase - (1 + rim).square() / (rim * odd_phase).clamp_min(1e-12)
         for angle in (least_phase, largest_phase, odd_phase, phase_of_peak):
             largest = torch.maximum(
@@ -263,22 +269,22 @@ def _axis_irradiance(fill: Tensor, rim: Tensor, phase: Tensor) -> Tensor:
     """
     kappa_squared = fill.square() + phase.square()
     numerator = torch.expm1(-fill).square() + 4 * rim * torch.sin(phase / 2).square()
-    # near kappa = 0 the first terms of the series
+    # near kappa = 0: first terms of the Taylor series
     return torch.where(
         kappa_squared > 1e-8, numerator / kappa_squared.where(kappa_squared > 1e-8, 1.0), 1 - fill
     )
 
 
 def _brightest_ring(fill: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Return the irradiance of the brightest ring, the largest for all phases 2 pi W at the rim
-    from ``low`` to ``high``.
+    """Return the largest irradiance of the brightest ring over all phases 2 pi W at the rim from
+    ``low`` to ``high``.
     """
     rim = torch.exp(-fill)
     largest = torch.zeros_like(fill)
     phases = [low] if bool((low == high).all()) else [low, high]
     if len(phases) == 2:
-        # the phase within the range at which the cosine below is largest: it and the phase of the
-        # ring add up to a multiple of 2 pi
+        # phase in the range at which the cosine below is largest: with the phase of the ring it
+        # adds up to a multiple of 2 pi
         ring_phase = _RING**2 / (4 * low.clamp_min(1.0))
         phases.append(
             (2 * math.pi * torch.ceil((low + ring_phase) / (2 * math.pi)) - ring_phase).clamp(
@@ -301,8 +307,8 @@ def _brightest_ring(fill: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def _ring_limit(rim: Tensor, fill: Tensor, phase: Tensor, cosine: Tensor) -> Tensor:
-    """Return, for strong defocus, the irradiance at the first zero of J1 times |kappa|^2: the beam
-    |exp(-v^2 / (4 kappa))|, the wave from the rim J0 exp(-fill), and their interference.
+    """Return irradiance x |kappa|^2 at the first zero of J1 for strong defocus: the beam |exp(-v^2
+    / (4 kappa))|, the wave from the rim J0 exp(-fill), and their interference.
 
     ``rim`` is exp(-fill), ``phase`` 2 pi W, and ``cosine`` that of the phase between both waves.
     """
@@ -312,8 +318,8 @@ def _ring_limit(rim: Tensor, fill: Tensor, phase: Tensor, cosine: Tensor) -> Ten
 
 
 def defocused_peak(waves: float, fill: float = 0.0) -> float:
-    """Return the largest irradiance behind a clear round lens with defocus, over that of the even,
-    focused pupil.
+    """Return the largest irradiance behind a clear, defocused round lens, relative to the peak of
+    the even, focused pupil.
 
     It is the largest value at any radius, not that on the axis, which is sinc^2(waves) for an even
     beam and has zeros. ``fill`` is (D / (2 w))^2 of a Gaussian beam of 1/e2 radius w: 0 for an even
@@ -331,8 +337,8 @@ def defocused_peak(waves: float, fill: float = 0.0) -> float:
 
 
 def _ring_share(fill: Tensor, waves: Tensor) -> Tensor:
-    """Return the irradiance of the brightest ring over `_ring_limit`, which is 1 for strong
-    defocus.
+    """Return the ratio of the irradiance of the brightest ring to `_ring_limit`; it tends to 1 for
+    strong defocus.
     """
     table_row = ((waves - _FIRST) / (_TABLE_WAVES - _FIRST) * (_WAVE_STEPS - 1)).clamp(
         0, _WAVE_STEPS - 1
@@ -356,8 +362,8 @@ def bilinear(table: Tensor, row: Tensor, column: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=1)
 def _ring_table() -> Tensor:
-    """Return the irradiance of the brightest ring over its limit for strong defocus, as a table
-    (waves, fill).
+    """Return a table (waves, fill) of the irradiance of the brightest ring over its limit for
+    strong defocus.
     """
     waves = torch.linspace(_FIRST, _TABLE_WAVES, _WAVE_STEPS, dtype=torch.float64)
     fills = torch.linspace(0, _TABLE_FILL, _FILL_STEPS, dtype=torch.float64)
@@ -385,7 +391,9 @@ def _ring_table() -> Tensor:
 
 
 def _summit(values: Tensor) -> Tensor:
-    """Return the largest value of each row, with a parabola through it and its neighbours."""
+    """Return the maximum of each row, interpolated by a parabola through the largest value and its
+    neighbours.
+    """
     index_of_peak = values[:, 1:-1].argmax(1) + 1
     row = torch.arange(len(values))
     previous, peak_value, following = (
@@ -395,7 +403,7 @@ def _summit(values: Tensor) -> Tensor:
     )
     curvature = (2 * peak_value - previous - following).clamp_min(1e-300)
     is_peak = (peak_value >= previous) & (peak_value >= following)
-    # the summit of the parabola through three points above the middle one
+    # maximum of the parabola through three points, above the middle one
     return torch.where(
         is_peak, peak_value + (following - previous).square() / (8 * curvature), values.amax(1)
     )

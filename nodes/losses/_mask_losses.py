@@ -1,5 +1,5 @@
-"""Losses of a mask: the peak of a laser, scattered scene light, lost image contrast, and the share
-of a picture that a Wiener filter cannot recover.
+"""Loss functions of a mask: the peak of a laser, scattered scene light, lost image contrast, and
+the error of a picture after a Wiener filter.
 """
 
 import math
@@ -19,11 +19,11 @@ from neusee.nodes.values import Bands, Psf
 
 # --- mask losses ----------------------------------------------------------------------------------
 
-# Losses of a mask: the remaining peak of a laser, and the scene light that the mask scatters out of
-# the field.
+# Loss functions of a mask: the remaining peak of a laser, and the scene light that the mask
+# scatters out of the field.
 
 
-_DARK = 1e-30  #: light, or ratio, below which a band counts as dark
+_DARK = 1e-30  #: light or ratio below which a band counts as dark
 
 
 @node()
@@ -49,9 +49,9 @@ def suppression_loss(
     largest_ratio = ratio.detach().amax((-2, -1), keepdim=True)
     is_dark = largest_ratio <= _DARK  # false for NaN, so that NaN reaches the result
     scale = largest_ratio.where(~is_dark, 1.0)
-    # the root has no gradient at 0
+    # 1 in dark bands, since the root has no finite gradient at 0
     power_sums = (ratio / scale).pow(power).sum((-2, -1)).where(~is_dark[:, 0, 0], 1.0)
-    # a p-norm is at least the maximum, and near it for a large power
+    # the p-norm is at least the maximum, and close to it for a large power
     norm = power_sums.pow(1.0 / power).where(~is_dark[:, 0, 0], 0.0)
     peaks = scale[:, 0, 0] * norm
     loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
@@ -91,8 +91,7 @@ def background_loss(psf: Psf, radiance: Tensor | None = None) -> Tensor:
 
 # --- contrast loss --------------------------------------------------------------------------------
 
-# The contrast loss, which keeps the image contrast of a mask while another loss lowers the laser
-# peak.
+# The contrast loss preserves the image contrast of a mask while another loss lowers the laser peak.
 
 
 ContrastFloor = Annotated[float, Field(gt=0, le=0.1)]
@@ -133,8 +132,8 @@ def contrast(
 
 
 def _contrast_loss(kernel: Tensor, passed: float, floor: float, up_to: float | None) -> Tensor:
-    """Return -mean(ln sqrt(MTF^2 + floor^2)) of one band, over the frequencies that the lens passes
-    and that are at most ``up_to``, in cycles per pixel.
+    """Return -mean(ln sqrt(MTF^2 + floor^2)) of one band over the frequencies up to ``passed``, the
+    cut-off of the lens, and up to ``up_to``, both in cycles per pixel.
     """
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
@@ -142,8 +141,8 @@ def _contrast_loss(kernel: Tensor, passed: float, floor: float, up_to: float | N
     in_band = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= highest
     light = kernel.sum()
     is_dark = light.detach() <= _DARK  # false for NaN, so that NaN reaches the result
-    # in float32, the round-off of the transform turns the gradient where the contrast is near the
-    # floor
+    # float64: in float32 the round-off of the transform would dominate the gradient where the
+    # contrast is near the floor
     otf = torch.fft.rfft2(kernel.double() / light.double().where(~is_dark, 1.0))[in_band]
     squared_mtf = (otf.real.square() + otf.imag.square()).where(~is_dark, 0.0)
     contrast_loss: Tensor = -0.5 * (squared_mtf + floor**2).log().mean()
@@ -213,16 +212,17 @@ def wiener(
     intensity = single(psf.intensity)
     channel_psfs = effective_psf(psf, illuminant, responses, bands).to(intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity)
-    signal = (fall((y, x)) / noise).to(intensity)  # signal over noise, by frequency
+    # ratio of signal power to noise power at each frequency
+    signal = (fall((y, x)) / noise).to(intensity)
     counted_signal = signal * _counted_frequencies((y, x), up_to).to(signal)
     bands_otf, error_shares = torch.fft.rfft2(intensity), list[Tensor]()
     for channel_otf, share in zip(torch.fft.rfft2(channel_psfs), shares, strict=True):
         signal_behind = signal * _squared_modulus(channel_otf)
-        # signal times the square of the filter
+        # signal power times the squared modulus of the filter
         signal_filtered = signal * signal_behind / (signal_behind + 1).square()
         band_difference = torch.tensordot(share, _squared_modulus(bands_otf - channel_otf), 1)
         error_variance = 1 / (signal_behind + 1) + colour * signal_filtered * band_difference
-        # relative to the variance of the picture, at the frequencies that count
+        # relative to the variance of the picture, both over the counted frequencies
         error_shares.append(
             variance(error_variance * counted_signal, (y, x)) / variance(counted_signal, (y, x))
         )
@@ -236,8 +236,8 @@ def _squared_modulus(spectrum: Tensor) -> Tensor:
 
 
 def _counted_frequencies(size: tuple[int, int], up_to: float | None) -> Tensor:
-    """Return True at the spatial frequencies above 0 and up to ``up_to``, in the layout of
-    `torch.fft.rfft2`.
+    """Return a mask of the spatial frequencies above 0 and up to ``up_to`` cycles per pixel, in the
+    layout of `torch.fft.rfft2`.
     """
     fy, fx = (
         torch.fft.fftfreq(size[0], dtype=torch.float64),

@@ -1,4 +1,4 @@
-"""Losses of a mask with a grey filter that holds the peak of a laser at a limit."""
+"""Loss functions of a mask combined with a grey filter that limits the peak of a laser."""
 
 from __future__ import annotations
 
@@ -20,18 +20,22 @@ from neusee.nodes.values import Bands, Psf
 
 # --- filtered picture -----------------------------------------------------------------------------
 
-# What an ideal linear filter leaves of a picture: noise equivalent quanta, error and information.
+# The quality of a picture after an ideal linear filter: noise equivalent quanta, error and
+# information.
 #
 # All spectra are half spectra, as `torch.fft.rfft2` returns them. A natural scene has a power
 # spectrum 1 / frequency^2.
 
 
-_DARK = 1e-30  #: ratio of light below which a band counts as dark
-_TABLE_RADII = 8192  #: of a table of contrast by frequency, up to the corner of the spectrum
+_DARK = 1e-30  #: ratio below which a band counts as dark
+#: entries of the table of contrast over frequency, up to the corner of the spectrum
+_TABLE_RADII = 8192
 
 
 class GreyScene(NamedTuple):
-    """What decides the share of each band in the channels of a camera that sees a grey scene."""
+    """The quantities that determine the weight of each band in each camera channel for a grey
+    scene.
+    """
 
     illuminant: Tensor  #: (band,)
     responses: Tensor  #: (channel, band)
@@ -39,35 +43,41 @@ class GreyScene(NamedTuple):
 
 
 class ProtectedPicture(NamedTuple):
-    """The picture that a camera takes of a natural scene, and the limit of a laser's peak in it."""
+    """Light, noise and contrast of a picture of a natural scene, and the limit of a laser's peak in
+    it.
+    """
 
-    light: float  #: e- in a pixel behind the clear lens, mean of the scene
+    light: float  #: e- per pixel behind the clear lens, mean of the scene
     read_noise: float  #: e-, standard deviation
-    veil: float = 0.0  #: e- in a pixel, even light of the laser
-    limit: float | None = None  #: of the LSR; None for no limit
+    veil: float = 0.0  #: e- per pixel, uniform veil of laser light
+    limit: float | None = None  #: largest laser suppression ratio (LSR); None for no limit
     contrast: float = 0.1  #: variance of the relative brightness of the scene
     up_to: float | None = None  #: cycles per pixel, highest frequency that counts; None for all
 
 
 class Exposure(NamedTuple):
-    """The light and the noise of a pixel behind the clear lens."""
+    """Light and read noise per pixel, as behind the clear lens, and the transmittance of the
+    mask.
+    """
 
     light: float  #: e-, mean of the scene
     read: float  #: e-, standard deviation
-    veil: float  #: e-, even light of the laser
+    veil: float  #: e-, uniform veil of laser light
     passed: float  #: share of the light that the pupil of the mask lets through
 
 
 def frequencies(size: tuple[int, int], like: Tensor) -> Tensor:
-    """Return the absolute value of each frequency of half a spectrum in cycles per pixel."""
+    """Return the absolute spatial frequency in cycles per pixel of each element of a half
+    spectrum.
+    """
     fy = torch.fft.fftfreq(size[0], dtype=torch.float64, device=like.device)
     fx = torch.fft.rfftfreq(size[1], dtype=torch.float64, device=like.device)
     return torch.hypot(fy[:, None], fx)
 
 
 def natural_spectrum(size: tuple[int, int], contrast: float, like: Tensor) -> Tensor:
-    """Return the power 1 / frequency^2 of the contrast of a scene; its mean over all frequencies
-    is ``contrast``.
+    """Return the power spectrum 1 / frequency^2 of a natural scene, scaled to the mean ``contrast``
+    over all frequencies.
     """
     frequency = frequencies(size, like)
     power = torch.where(frequency > 0, frequency, torch.inf).pow(-2.0)
@@ -79,26 +89,25 @@ def noise_equivalent_quanta(passed: Tensor, exposure: Exposure, filtered: Tensor
     """Return the noise equivalent quanta (T n MTF)^2 / (T n + veil + read^2) behind a filter of
     transmittance T.
 
-    ``passed`` is the squared modulus of the OTF, 1 at frequency 0 if all light reaches the window.
+    ``passed`` is the squared modulus of the OTF (1 at frequency 0 if all light reaches the window)
+    and ``filtered`` the transmittance T.
     """
     filtered_light = filtered * exposure.light
-    # shot noise of scene and veil, and read noise, in e-^2
+    # variance in e-^2: shot noise of scene and veil, and read noise
     noise = filtered_light * exposure.passed + filtered * exposure.veil + exposure.read**2
     return filtered_light.square() * passed / noise.clamp_min(_DARK)
 
 
 def spectrum_mean(values: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
-    """Return the mean of half a spectrum over the whole spectrum, at the frequencies
-    ``counted``.
-    """
+    """Return the mean of a half spectrum over the frequencies ``counted`` of the full spectrum."""
     frequency_counts = counted * times(size, values)
     mean: Tensor = (values * frequency_counts).sum((-2, -1)) / frequency_counts.sum()
     return mean
 
 
 def error_share(snr: Tensor, spectrum: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
-    """Return the error variance after a Wiener filter, over the variance of the scene, at some
-    frequencies.
+    """Return the error variance after a Wiener filter relative to the variance of the scene, over
+    the frequencies ``counted``.
     """
     return spectrum_mean(spectrum / (1 + snr), size, counted) / spectrum_mean(
         spectrum, size, counted
@@ -106,20 +115,20 @@ def error_share(snr: Tensor, spectrum: Tensor, size: tuple[int, int], counted: T
 
 
 def information_share(snr: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
-    """Return the mean of log2(1 + SNR) over some frequencies."""
+    """Return the mean of log2(1 + SNR) over the frequencies ``counted``."""
     return spectrum_mean(torch.log2(1 + snr), size, counted)
 
 
 def peak_share(intensity: Tensor, clear_peak: Tensor, power: float | None) -> Tensor:
-    """Return the largest LSR of any band; a norm of exponent ``power`` over pixels and bands
-    stands for the maximum.
+    """Return the largest laser suppression ratio of all bands; with ``power``, a p-norm over pixels
+    and bands replaces the maximum.
     """
     ratio = intensity.double() / clear_peak.to(intensity.device).double()[:, None, None]
     largest_ratio = ratio.detach().amax()
     if power is None:
         return ratio.amax()
-    # a p-norm of ratios to the largest one, so that no power overflows
-    # without light, the peak is 0 and has no gradient
+    # the p-norm of ratios over the largest one, so that no power overflows; without light the peak
+    # is 0 and has no gradient
     scale = torch.where(largest_ratio > _DARK, largest_ratio, 1.0)
     power_sums = (ratio / scale).pow(power).sum()
     smooth_peak: Tensor = torch.where(largest_ratio > _DARK, power_sums, 1.0).pow(
@@ -129,8 +138,8 @@ def peak_share(intensity: Tensor, clear_peak: Tensor, power: float | None) -> Te
 
 
 def filter_transmittance(peak: Tensor, limit: float | None) -> Tensor:
-    """Return the transmittance of the grey filter that lowers a peak to ``limit``; 1 where the
-    peak is lower.
+    """Return the transmittance of the grey filter that lowers a peak to ``limit``; 1 if the peak is
+    below it.
     """
     if limit is None:
         return torch.ones_like(peak)
@@ -138,16 +147,16 @@ def filter_transmittance(peak: Tensor, limit: float | None) -> Tensor:
 
 
 def round_mtf(frequency: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
-    """Return the MTF of a round aperture for each channel, at the frequencies ``frequency``, from
-    the cut-offs of its bands.
+    """Return the MTF of a round aperture for each channel at the spatial frequencies ``frequency``;
+    ``cuts`` are the cut-off frequencies of the bands.
 
-    ``shares`` (channel, band) are those of the bands in the channels. Between radii of a fine table
-    it is linear.
+    ``shares`` (channel, band) are the weights of the bands in each channel. Values are interpolated
+    linearly in a fine table.
     """
-    # 0.75 is beyond the corner of the spectrum, sqrt(1/2) cycles per pixel
+    # 0.75 is above the highest frequency of the spectrum, sqrt(1/2) cycles per pixel at its corner
     radii = torch.linspace(0.0, 0.75, _TABLE_RADII, dtype=torch.float64)
     share_of_cut = (radii / cuts[:, None]).clamp_max(1.0)
-    # transfer function of a round pupil without aberrations, summed over bands
+    # transfer function of an aberration-free round pupil, summed over the bands
     table = shares @ (
         (torch.acos(share_of_cut) - share_of_cut * (1 - share_of_cut.square()).sqrt())
         * (2 / math.pi)
@@ -163,14 +172,14 @@ def round_mtf(frequency: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
 
 # --- protected losses -----------------------------------------------------------------------------
 
-# Losses of a mask with a grey filter that holds the peak of a laser at a limit: error and
+# Loss functions of a mask combined with a grey filter that limits the peak of a laser: error and
 # information of a picture.
 
 
-PeakLimit = Annotated[float, Field(gt=0, le=1)]  #: of the LSR
+PeakLimit = Annotated[float, Field(gt=0, le=1)]  #: largest laser suppression ratio (LSR)
 ContrastVariance = Annotated[float, Field(gt=0, le=1)]
 SceneLight = Annotated[Electrons, Field(gt=0)]
-_TRIED_STOPS = 24  #: diameters that are tried, and again on each side of the best
+_TRIED_STOPS = 24  #: number of diameters tried at first, and then on each side of the best
 NormPower = Annotated[float, Field(ge=8, le=256)]
 
 
@@ -265,10 +274,11 @@ def _snr_behind_mask(
     transmittance: float,
     power: float | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return NEQ x S of each channel behind mask and filter, S, and which frequencies count.
+    """Return NEQ x S of each channel behind mask and filter, S, and the mask of the counted
+    frequencies. NEQ are the noise equivalent quanta, S the power spectrum of the scene.
 
-    ``transmittance`` is the share of the light that the pupil of the mask lets through, and
-    ``power`` that of the norm in place of the maximum over pixels.
+    ``transmittance`` is the share of the light that the pupil of the mask transmits, and ``power``
+    the exponent of the p-norm that replaces the maximum over pixels.
     """
     size, kernels = _window_of(psf), effective_psf(psf, *scene, torch.float64).double()
     otf = torch.fft.rfft2(kernels)
@@ -282,15 +292,15 @@ def _snr_behind_mask(
 
 
 def _counted_frequencies(size: tuple[int, int], up_to: float | None, like: Tensor) -> Tensor:
-    """Return True for the frequencies of half a spectrum above 0 and up to ``up_to``, None for
-    all.
+    """Return a mask of the frequencies of a half spectrum above 0 and up to ``up_to`` (None:
+    all).
     """
     frequency = frequencies(size, like)
     return (frequency > 0) & (frequency <= (1.0 if up_to is None else up_to))
 
 
 def _window_of(psf: Psf) -> tuple[int, int]:
-    """Return the size (y, x) of a PSF."""
+    """Return the size (y, x) of the window of a PSF."""
     return psf.intensity.shape[-2], psf.intensity.shape[-1]
 
 
@@ -338,7 +348,9 @@ def _by_definition(
     transmittance: float,
     power: float | None,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield NEQ x S, S and the counted frequencies of each channel, on the whole spectrum."""
+    """Yield NEQ x S, S and the mask of the counted frequencies for each channel, on the full
+    spectrum.
+    """
     y, x = psf.intensity.shape[-2:]
     fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.fftfreq(x, dtype=torch.float64)
     squared_frequency = fy[:, None].square() + fx.square()
@@ -374,12 +386,12 @@ def best_stop(
     picture: ProtectedPicture,
     measure: Literal["filtered_error", "information"] = "filtered_error",
 ) -> tuple[float, float, float]:
-    """Return the least loss of a round stop with a grey filter at the same limit, its diameter and
-    transmittance.
+    """Return the smallest loss that a circular stop with a grey filter reaches under the same
+    limit, with the diameter of the stop and the transmittance of the filter.
 
-    The diameter is a share of that of the clear aperture, whose cut-off is that of ``plain``. The
-    peak of a stop falls with the fourth power of its diameter, but for what pixels average away,
-    and its light with the second power. ``measure`` names the loss: ``filtered_error`` or
+    The diameter is relative to that of the clear aperture, whose cut-off is that of ``plain``. The
+    peak behind a stop falls with the fourth power of its diameter, apart from averaging over
+    pixels, and its light with the second power. ``measure`` names the loss: ``filtered_error`` or
     ``information``.
     """
     size, grey = _window_of(plain), grey_shares(illuminant, responses, bands)
@@ -406,11 +418,11 @@ def best_stop(
         loss = log_error if measure == "filtered_error" else -information_share(snr, size, counted)
         return float(loss.mean()), width, float(filtered)
 
-    # a narrower stop loses light and contrast, and protects more than is asked
+    # a narrower stop would protect more than the limit demands, and lose light and contrast
     narrowest = float(
         stop_width(torch.full_like(cut_offs, picture.limit or 1.0), cut_offs, sides).min()
     )
-    # evenly spaced widths, then finer ones on each side of the best
+    # evenly spaced diameters, then finer steps on each side of the best
     coarse_best = min(
         loss_of(1.0 + i / (_TRIED_STOPS - 1) * (narrowest - 1.0)) for i in range(_TRIED_STOPS)
     )
@@ -425,15 +437,17 @@ def best_stop(
 
 
 def _stop_peak(width: float, cuts: Tensor, sides: Tensor) -> Tensor:
-    """Return the largest LSR of any band of a stop, whose pixels average less of a wider spot
-    away.
+    """Return the largest laser suppression ratio of all bands of a stop; the wider spot loses less
+    of its peak to averaging over pixels.
     """
     ratios = round_lens(width * cuts, sides).peak / round_lens(cuts, sides).peak
     return width**4 * ratios.max()
 
 
 def _pixel_contrast(size: tuple[int, int], side: float) -> Tensor | float:
-    """Return the transfer function of pixels that average, at the frequencies of `frequencies`."""
+    """Return the transfer function of pixels that average over a square of ``side`` pixels, at the
+    frequencies of `frequencies`.
+    """
     if not side:
         return 1.0
     fy, fx = (

@@ -1,4 +1,4 @@
-"""Losses of a restored picture, of estimated spectra, and of a critic's gradient."""
+"""Loss functions of restored pictures, of estimated spectra, and of a GAN critic's gradient."""
 
 from typing import Annotated, Literal
 
@@ -12,12 +12,13 @@ from neusee.nodes.precision import single
 
 # --- restoration losses ---------------------------------------------------------------------------
 
-# Losses of a restored picture: differences from the true picture by pixel and by spatial frequency.
+# Loss functions of a restored picture: its difference from the true picture, by pixel and by
+# spatial frequency.
 
 
 Reduction = Literal["mean", "sum"]
-_LEAST = 1e-30  #: least power, because the root has no gradient at 0
-#: least mean square of a difference, and the slope of colours that no display shows
+_LEAST = 1e-30  #: added power, because the root has no finite gradient at 0
+#: added mean square of a difference, and the slope of the encoding outside [0, 1]
 _NEAR, _BEYOND = 1e-6, 0.1
 
 
@@ -94,7 +95,7 @@ def log_error(estimate: Tensor, truth: Tensor) -> Tensor:
 
 
 def _encoded(picture: Tensor) -> Tensor:
-    """Return a picture as a display encodes it; values that no display shows keep a small slope."""
+    """Return a linear picture in sRGB encoding; outside [0, 1] it continues with a small slope."""
     from kornia.color import linear_rgb_to_rgb
 
     displayable = picture.clamp(0, 1)
@@ -108,7 +109,8 @@ def _reduced(errors: Tensor, reduction: Reduction) -> Tensor:
 
 # --- spectral loss --------------------------------------------------------------------------------
 
-# The loss of spectra estimated from RGB: the error of every band, relative to the true value.
+# The loss function of spectra estimated from RGB: the error of each band relative to the true
+# value.
 
 
 @node()
@@ -146,7 +148,7 @@ def _(estimate: Tensor, truth: Tensor, *, floor: float = 0.02) -> Tensor:
 
 # --- gradient penalty -----------------------------------------------------------------------------
 
-# The gradient penalty, a loss that keeps the norm of a critic's gradient near 1.
+# The gradient penalty, a loss function that keeps the norm of a critic's gradient near 1.
 
 
 @node()
@@ -166,7 +168,7 @@ def gradient_penalty(slopes: Tensor) -> Tensor:
     flat_slopes = single(slopes).flatten(1)
     largest_slope = flat_slopes.detach().abs().amax(1, keepdim=True)
     is_zero = largest_slope == 0
-    # squares of gradients below 1e-19 underflow, and sqrt has no gradient at 0
+    # scaled, since squares of gradients below 1e-19 underflow; sqrt has no finite gradient at 0
     scale = largest_slope.where(~is_zero, 1.0)
     scaled_squares = (flat_slopes / scale).square().sum(1, keepdim=True)
     norm = scaled_squares.where(~is_zero, 1.0).sqrt().where(~is_zero, 0.0) * scale
