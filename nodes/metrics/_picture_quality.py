@@ -1,5 +1,5 @@
-"""Quality of a picture: compared with the true picture, and expected from its error and information
-after a Wiener filter, also under attack.
+"""Quality of a picture: comparison with the true picture, and expected error and information after
+a Wiener filter, also under attack by a laser.
 """
 
 import math
@@ -16,7 +16,7 @@ from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
 
 _SSIM_WINDOW = 11  #: width in pixels of the Gaussian window of SSIM
-_STRIPE_ROWS = 118  #: rows that are compared at a time: 128 with the margin of the window
+_STRIPE_ROWS = 118  #: number of rows compared at a time: 128 with the margin of the window
 
 
 class Quality(NamedTuple):
@@ -86,7 +86,7 @@ def require_same_shape(
 
 
 def _without_border(picture: Tensor, border: int) -> Tensor:
-    """Return a picture without a border of so many pixels, at least float32."""
+    """Return a picture without a border of ``border`` pixels, at least float32."""
     y, x = picture.shape[-2:]
     return single(picture)[..., border : max(y - border, border), border : max(x - border, border)]
 
@@ -101,7 +101,7 @@ def _displayed(picture: Tensor, domain: str) -> Tensor:
     if domain == "linear":
         return displayable
     encoded: Tensor = linear_rgb_to_rgb(displayable)
-    # float32 rounds 1.055 - 0.055 to less than 1
+    # white is set to exactly 1: float32 rounds 1.055 - 0.055 to less than 1
     return encoded.where(displayable < 1, encoded - encoded.detach() + 1)
 
 
@@ -119,7 +119,7 @@ def _difference_sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor,
             _displayed(picture[..., first : last + _SSIM_WINDOW - 1, :], domain)
             for picture in (a, b)
         )
-        # the next stripe counts the remaining rows
+        # the remaining rows of the margin are counted with the next stripe
         counted_rows = None if last == rows else last - first
         difference = (estimate_stripe - truth_stripe)[..., :counted_rows, :]
         absolute_sum = absolute_sum + difference.abs().sum(-1).sum(dtype=torch.float64)
@@ -146,22 +146,22 @@ def _ssim(p: Tensor, q: Tensor) -> Tensor:
 # (NEQ).
 
 
-Light = Annotated[Electrons, Field(gt=0)]  #: electrons a pixel
-_LOST_NEQ = 1e-30  #: NEQ below which a frequency counts as lost
+Light = Annotated[Electrons, Field(gt=0)]  #: electrons per pixel
+_LOST_NEQ = 1e-30  #: lower limit of the NEQ in its logarithm
 #: cycles per pixel; 0.71 is the corner of the spectrum
 HighestFrequency = Annotated[float, Field(gt=0, le=0.71)]
-#: of the contrast of a scene, relative to its squared mean
+#: variance of a scene, relative to its squared mean
 Variance = Annotated[float, Field(gt=0, le=10)]
 
 
 class Filtered(NamedTuple):
-    """What a Wiener filter makes of a noisy picture of a natural scene, by channel of the
-    sensor.
+    """Error and information of a noisy picture of a natural scene after a Wiener filter, in each
+    channel of the sensor.
     """
 
-    #: (channel,) float64, error variance after the filter over the variance of the scene
+    #: (channel,) float64, error variance after the filter / variance of the scene
     error: Tensor
-    information: Tensor  #: (channel,) float64, bits a pixel
+    information: Tensor  #: (channel,) float64, bits per pixel
     log_neq: Tensor  #: (channel,) float64, mean of the natural logarithm of the NEQ up to `up_to`
     light: Tensor  #: (channel,) float64, share of the scene's light that reaches the sensor
 
@@ -207,7 +207,7 @@ def filtered_picture(
     power, counted = _on_device_of(
         neq, natural_power(tuple(neq.shape[-2:]), variance), low_frequencies(neq.shape[-2:], up_to)
     )
-    # the Wiener filter leaves S / (1 + NEQ S) of the scene's power S
+    # error power after the Wiener filter: S / (1 + NEQ S) for a scene with the power S
     error = (power / (1 + neq * power)).sum((-2, -1)) / power.sum()
     information = 0.5 * torch.log2(1 + neq * power).mean((-2, -1))
     logs = neq[:, counted].clamp_min(_LOST_NEQ).log().mean(-1)
@@ -229,8 +229,8 @@ def _(
     variance: float = 0.1,
     up_to: float = 0.12,
 ) -> Filtered:
-    """Sum the same means over half of the spectrum in rows, with the PSF of each channel summed
-    band by band.
+    """Return the same means from explicit formulas, with the OTF of each channel summed band by
+    band.
     """
     y, x = psf.intensity.shape[-2:]
     photons = illuminant.double() * bands.centres
@@ -286,8 +286,8 @@ def _on_device_of(like: Tensor, *tensors: Tensor) -> list[Tensor]:
 
 
 def channel_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the PSF of each channel for a grey scene in float64, (channel, y, x); its sum is
-    the light that passes.
+    """Return the PSF (channel, y, x) of each channel for a grey scene in float64; its sum is the
+    transmitted share of the light.
     """
     lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
     if len(lengths) > 1:
@@ -351,30 +351,31 @@ def decibels(ratio: float) -> float:
 
 # --- picture spectrum -----------------------------------------------------------------------------
 
-# The spectrum of a picture as a histogram, from which errors at any light, filter and noise follow
-# in microseconds.
+# The spectrum of a picture as a histogram, from which the error for any light, filter and noise is
+# computed in microseconds.
 #
-# A grey filter scales the whole spectrum, and the light scales the scene: no PSF is computed again
-# for another transmittance, another scene light or another glare.
+# A grey filter scales the whole spectrum, and the light scales the scene. So no PSF has to be
+# computed for another transmittance, another scene light or another glare.
 
 
-#: decades of the bins, and bins a decade, which give an error of 1e-4
+#: first and last decade of the bins, and bins per decade, which give an error of 1e-4
 _FIRST_POWER_DECADE, _LAST_POWER_DECADE, _POWER_BINS_PER_DECADE = -20, 8, 40
 
 
 class PictureSpectrum(NamedTuple):
-    """Sums over the frequencies of a picture with like power p, by channel of the sensor.
+    """Sums over the frequencies of a picture, binned by their power p, for each channel of the
+    sensor.
 
-    The Wiener filter knows the OTF ``known``, and p is the power of the scene times |known|**2. The
-    picture has the OTF ``true``. Both OTFs are equal without mismatch.
+    The Wiener filter uses the OTF ``known``, and p is the power of the scene times |known|**2. The
+    picture has the OTF ``true``. Without mismatch, both OTFs are equal.
     """
 
     power: Tensor  #: (channel, bin) mean of p
     signal: Tensor  #: (channel, bin) share of the scene's variance
-    real: Tensor  #: (channel, bin) the same, times the real part of true / known
-    square: Tensor  #: (channel, bin) the same, times the square of |true / known|
-    strength: Tensor  #: (channel, bin) mean of scene power times |true OTF|**2
-    rate: Tensor  #: (channel, bin) share of the frequencies with this strength
+    real: Tensor  #: (channel, bin) sum of this share times the real part of true / known
+    square: Tensor  #: (channel, bin) sum of this share times |true / known|**2
+    strength: Tensor  #: (channel, bin) mean of scene power times |true OTF|**2, binned by itself
+    rate: Tensor  #: (channel, bin) share of the frequencies in this bin of ``strength``
     contrast: Tensor  #: (channel,) mean of log(|true OTF|**2) up to a highest frequency
     light: Tensor  #: (channel,) share of the scene's light in the picture
 
@@ -382,10 +383,10 @@ class PictureSpectrum(NamedTuple):
 def picture_spectrum(
     true: Tensor, assumed: Tensor, variance: float = 0.1, up_to: float = 0.12
 ) -> PictureSpectrum:
-    """Sort the frequencies of a picture by their power.
+    """Return the spectrum of a picture, with its frequencies binned by power.
 
-    ``true`` and ``assumed`` are PSFs (channel, y, x) of `channel_psf`: the one of the picture, and
-    the one that the filter takes for it.
+    ``true`` and ``assumed`` are PSFs (channel, y, x) of `channel_psf`: the PSF of the picture, and
+    the PSF that the filter assumes.
     """
     otf, assumed_otf = torch.fft.fft2(true), torch.fft.fft2(assumed)
     scene = natural_power(tuple(otf.shape[-2:]), variance)
@@ -394,7 +395,7 @@ def picture_spectrum(
     channel_rows = []
     for channel_otf, assumed_channel_otf in zip(otf, assumed_otf, strict=True):
         assumed_power = assumed_channel_otf.abs().square()
-        # true over assumed OTF, by which the filter's answer is off
+        # true OTF / assumed OTF: the factor of the error of the filter
         ratio = torch.where(
             assumed_power > 0,
             channel_otf * assumed_channel_otf.conj() / assumed_power.clamp_min(1e-300),
@@ -432,12 +433,12 @@ def _binned(value: Tensor, *weights: Tensor) -> list[Tensor]:
 
 
 def remaining_error(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
-    """Return the error after the filter over the variance of the scene, (noise, channel).
+    """Return the error variance after the filter / the variance of the scene, (noise, channel).
 
-    ``amplitude`` is the scene light in e- times the transmittance of a filter; ``noise`` (noise,
-    channel) the variance of a pixel in e-**2. With u = a**2 p / (a**2 p + noise) at amplitude a,
-    the filter passes u ratio of the scene; the ratio is true / known. The error is the sum of
-    signal |1 - u ratio|**2 and of the filtered noise, signal u (1 - u).
+    ``amplitude`` is the scene light in e- times the transmittance of a filter. ``noise`` (noise,
+    channel) is the noise variance of a pixel in e-**2. With u = a**2 p / (a**2 p + noise) for the
+    amplitude a, the filter multiplies the scene by u ratio, where ratio = true / known. The error
+    is the sum of signal |1 - u ratio|**2 and of the filtered noise, signal u (1 - u).
     """
     signal_power = amplitude**2 * spectrum.power
     wiener_gain = signal_power / (signal_power + noise[:, :, None])
@@ -452,8 +453,8 @@ def remaining_error(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) 
 
 
 def information_bits(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
-    """Return the bits a pixel, mean of log2(1 + NEQ S) / 2 over all frequencies, (noise,
-    channel).
+    """Return the information (noise, channel) in bits per pixel: the mean of log2(1 + NEQ S) / 2
+    over all frequencies, with the power S of the scene.
     """
     signal_to_noise = amplitude**2 * spectrum.strength / noise[:, :, None]
     return (spectrum.rate * torch.log2(1 + signal_to_noise)).sum(-1) / 2
@@ -467,10 +468,11 @@ def mean_log_neq(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> 
 def radial_contrast(
     psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, rings: int = 40
 ) -> tuple[Tensor, Tensor]:
-    """Return frequencies up to 1/2 cycle per pixel, and the mean of |OTF|**2 in a ring about each:
-    (ring,) each.
+    """Return frequencies up to 1/2 cycle per pixel, and the mean of |OTF|**2 in a ring around each
+    of them: (ring,) each.
 
-    The mean is over directions and channels, and the square of the light that passes is included.
+    The mean is over directions and channels. The OTF is not normalized: |OTF(0)|**2 is the square
+    of the transmitted share of the light.
     """
     mean_square_otf = (
         torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)).abs().square().mean(0)
@@ -489,16 +491,16 @@ def radial_contrast(
 
 # --- attacked picture -----------------------------------------------------------------------------
 
-# A picture under attack: the glare of a laser by its level, and what a filter recovers of the
-# pixels that are left.
+# A picture under attack: a histogram of the glare of a laser, and the error and information of the
+# unsaturated pixels after a Wiener filter.
 
 
 _FIRST_GLARE_DECADE, _LAST_GLARE_DECADE, _GLARE_BINS_PER_DECADE = (
     -16,
     1,
     20,
-)  #: decades of the glare, and bins a decade
-_TABLE_NOISES = 48  #: noises for which the error is computed; others are interpolated, to 1e-4
+)  #: first and last decade of the glare, and bins per decade
+_TABLE_NOISES = 48  #: noise levels in the table of errors; interpolation errors are below 1e-4
 
 
 class GlareLevels(NamedTuple):
@@ -528,16 +530,16 @@ class Attack(NamedTuple):
 
 
 class Attacked(NamedTuple):
-    """What is left of a picture under attack, averaged over pixels and channels."""
+    """Error and information of a picture under attack, averaged over pixels and channels."""
 
-    #: () error after the filter over the variance of the scene; a full pixel counts as 1
+    #: () error variance after the filter / variance of the scene; 1 for a saturated pixel
     error: Tensor
-    information: Tensor  #: () bits a pixel; a full pixel counts as 0
-    seen: Tensor  #: () share of the pixels that are not full
+    information: Tensor  #: () bits per pixel; 0 for a saturated pixel
+    seen: Tensor  #: () share of the pixels that are not saturated
 
 
 def glare_levels(light: Tensor, clear_peak: float) -> GlareLevels:
-    """Sort the pixels of a field by the light (y, x) that a laser sends to each pixel."""
+    """Return a histogram of the light (y, x) of a laser over the pixels of a field."""
     relative = light.double().flatten() / clear_peak
     bin_index = (
         ((relative.clamp_min(1e-300).log10() - _FIRST_GLARE_DECADE) * _GLARE_BINS_PER_DECADE)
@@ -563,15 +565,15 @@ def attacked_picture(
     electrons: float,
     transmittance: float,
 ) -> Attacked:
-    """Return error, information and share of seen pixels at each strength of a laser: (strength,)
-    each.
+    """Return error, information and share of unsaturated pixels for each strength of a laser:
+    (strength,) each.
 
-    A grey filter of ``transmittance`` dims scene and laser alike. The Wiener filter knows the noise
-    of each pixel, and a pixel is lost where scene and glare fill it.
+    A grey filter of ``transmittance`` attenuates scene and laser equally. The Wiener filter knows
+    the noise of each pixel. A pixel is lost if scene and glare fill its well.
     """
     amplitude = electrons * transmittance
     light = amplitude * spectrum.light
-    # strengths count in full wells at the peak of the clear lens
+    # a strength is in full wells at the peak of the clear lens
     peak_light = noise.full_well * attack.strengths[:, None, None] * transmittance
     laser_light = peak_light * glare.level[:, None] * attack.colour  # (strength, bin, channel)
     not_full = (laser_light + light) < noise.full_well
@@ -582,7 +584,7 @@ def attacked_picture(
         light, noise.full_well, noise.read_noise, noise.prnu, noise.residual_glare
     )
     noise_steps = torch.linspace(0, 1, _TABLE_NOISES, dtype=torch.float64)[:, None]
-    # the error depends on the noise alone: a table over its logarithm, (noise, channel)
+    # the error depends only on the noise: table over the logarithm of the noise, (noise, channel)
     log_noise_table = (
         noise_without_glare.log() + noise_steps * (noise_at_full_well / noise_without_glare).log()
     )
@@ -604,7 +606,9 @@ def attacked_picture(
 
 
 def _interpolated_rows(table: Tensor, place: Tensor) -> Tensor:
-    """Interpolate a table (noise, channel) at real rows ``place`` (strength, bin, channel)."""
+    """Return the values of a table (noise, channel), interpolated at fractional rows ``place``
+    (strength, bin, channel).
+    """
     row_below = place.floor().long()
     channel = torch.arange(table.shape[1])
     below, above = table[row_below, channel], table[row_below + 1, channel]

@@ -1,5 +1,5 @@
-"""Quality of a PSF: contrast (MTF), encircled energy, the error of too few bands, and how well an
-ideal observer detects detail.
+"""Quality of a PSF: contrast (MTF), encircled energy, error due to the number of bands, and
+detection of detail by an ideal observer.
 """
 
 import math
@@ -120,12 +120,12 @@ def _(result: Tensor, *inputs: Psf, **params: float) -> list[Check]:
     return [Check(f"{low:.1%} to {high:.1%} of the light falls within the radius", high <= 1.01)]
 
 
-# --- as curves ------------------------------------------------------------------------------------
+# --- curves ---------------------------------------------------------------------------------------
 
 
 def encircled_curve(light: Tensor) -> Tensor:
-    """Return the light of an image (y, x) within 0, 1, 2, … pixels of the optical axis, as
-    (radius,) float64.
+    """Return the light (radius,) of an image (y, x) within 0, 1, 2, … pixels of the optical axis,
+    float64.
     """
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in light.shape)
     radius = torch.hypot(y[:, None], x[None, :]).ceil().long().flatten()
@@ -134,17 +134,17 @@ def encircled_curve(light: Tensor) -> Tensor:
 
 
 def over_clear_peak(psf: Psf, band: int) -> Tensor:
-    """Divide the PSF (y, x) of a band by the peak of the PSF of the clear lens."""
+    """Return the PSF (y, x) of a band, divided by the peak of the PSF of the clear lens."""
     relative: Tensor = psf.intensity[band] / psf.clear_peak[band]
     return relative
 
 
 # --- spectral error -------------------------------------------------------------------------------
 
-# The error of a PSF of all bands together that comes from the number of spectral bands.
+# The error of a broadband PSF due to the finite number of spectral bands.
 
 
-_COMPARED_SIDE = 256  #: pixels; the light within this square about the axis is compared
+_COMPARED_SIDE = 256  #: side in pixels of the square around the axis in which PSFs are compared
 
 
 @node(rtol=1e-3)
@@ -187,7 +187,7 @@ def spectral_error(
         )
     finer_wavelengths, difference = _finer_wavelengths(bands, weights)
     thinned = _in_double(thinned_pupil(pupil))
-    # the bands in use first, then those between them
+    # first the bands of the recipe, then the added wavelengths
     index = torch.cat(
         [thinned.index, _interpolated(pupil.wavelengths, pupil.index, finer_wavelengths)]
     )
@@ -222,24 +222,24 @@ def _band_weights(bands: Bands, illuminant: Tensor | None, responses: Tensor | N
 
 
 def _finer_wavelengths(bands: Bands, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return further wavelengths, and the weights (channel, wavelength) of the error, centres of
-    bands first.
+    """Return the added wavelengths, and the weights (channel, wavelength) of the error; they are
+    for the centres of bands first, then for the added wavelengths.
     """
     steps = bands.centres.diff()
-    # adjoining bands of equal width: compare with twice as many, midpoints included
+    # adjoining bands of equal width: the comparison has the midpoints too
     if len(steps) and bool(((steps - bands.widths[1:]).abs() <= 0.01 * steps.abs()).all()):
         middles = (bands.centres[1:] + bands.centres[:-1]) / 2
         ends = torch.ones_like(bands.centres)
         ends[0] = ends[-1] = 0.5
         return middles, torch.cat([weights * ends, -(weights[:, 1:] + weights[:, :-1]) / 2], 1) / 2
-    # else halve each band by itself
+    # otherwise each band is split into halves
     halves = torch.cat([bands.centres - bands.widths / 4, bands.centres + bands.widths / 4])
     return halves, torch.cat([weights, -weights / 2, -weights / 2], 1)
 
 
 def _interpolated(points: Tensor, values: Tensor, where: Tensor) -> Tensor:
-    """Interpolate by the polynomial through the four nearest points, or through all points if
-    there are fewer.
+    """Return values at ``where``, by the polynomial through the four nearest points, or through all
+    points if there are fewer.
     """
     nearest = (where[:, None] - points).abs().argsort(1)[:, : min(4, len(points))]
     point_places, point_values = points[nearest], values[nearest]
@@ -248,7 +248,7 @@ def _interpolated(points: Tensor, values: Tensor, where: Tensor) -> Tensor:
         - point_places[:, None, :]
         + torch.eye(point_places.shape[1], dtype=point_places.dtype)
     )
-    # Lagrange's polynomials: the product over all other points
+    # Lagrange polynomials: products over all other points
     ratio = (where[:, None, None] - point_places[:, None, :]) / distances
     is_same_point = torch.eye(point_places.shape[1], dtype=torch.bool)
     value: Tensor = (ratio.where(~is_same_point, 1.0).prod(2) * point_values).sum(1)
@@ -274,9 +274,9 @@ def _(result: Tensor, pupil: Pupil, bands: Bands, *_: Any, **__: Any) -> list[Ch
 
 # --- detail ---------------------------------------------------------------------------------------
 
-# How well a tri-bar, an edge and a line of text are detected, by the ideal observer.
+# Detection of a tri-bar, an edge and a line of text by the ideal observer.
 
-_TARGET_SAMPLES = 8  #: samples of a target along each axis of a pixel, whose mean the pixel takes
+_TARGET_SAMPLES = 8  #: samples of a target per pixel along each axis; a pixel is their mean
 _LETTERS = {
     "S": ("01110", "10001", "10000", "01110", "00001", "10001", "01110"),
     "T": ("11111", "00100", "00100", "00100", "00100", "00100", "00100"),
@@ -288,12 +288,11 @@ TARGETS = ("tri-bar", "edge", "text")
 
 
 def detail_targets(size: float) -> dict[str, Tensor]:
-    """Return the targets (y, x) of a height of ``size`` pixels as relative contrasts with mean 0,
-    bright 1 above dark.
+    """Return the targets (y, x) with a height of ``size`` pixels, as relative contrasts with mean 0
+    and a difference of 1 between bright and dark.
 
-    tri-bar: three bars in place of the grey square that holds as much light. edge: a square that is
-    bright on one half. text: the word "STOP" in letters of five by seven dots in place of an even
-    grey line.
+    tri-bar: three bars, minus a grey square with the same light. edge: a square of which one half
+    is bright. text: the word "STOP" in letters of five by seven dots, minus a uniform grey line.
     """
     draw_target: Mapping[str, Callable[[float], Tensor]] = {
         "tri-bar": _bars,
@@ -304,10 +303,10 @@ def detail_targets(size: float) -> dict[str, Tensor]:
 
 
 def _bars(size: float) -> Tensor:
-    """Return three bright bars with two gaps as wide, in a square of ``size`` pixels, in fine
-    samples.
+    """Return three bright bars with two gaps of the same width, in a square of ``size`` pixels, in
+    fine samples.
 
-    The mean is subtracted: an even grey square of the same light would not be detected.
+    The mean is subtracted: a uniform grey square with the same light would have no contrast.
     """
     sample_count = round(size * _TARGET_SAMPLES)
     columns = torch.arange(sample_count, dtype=torch.float64)
@@ -316,7 +315,7 @@ def _bars(size: float) -> Tensor:
 
 
 def _edge(size: float) -> Tensor:
-    """Return a dark and a bright half of a square of ``size`` pixels, in fine samples, of mean
+    """Return a square of ``size`` pixels with a dark and a bright half, in fine samples, with mean
     0.
     """
     sample_count = round(size * _TARGET_SAMPLES)
@@ -325,7 +324,7 @@ def _edge(size: float) -> Tensor:
 
 
 def _text(size: float) -> Tensor:
-    """Return the line of text with letters ``size`` pixels high, in fine samples, of mean 0."""
+    """Return the line of text with letters ``size`` pixels high, in fine samples, with mean 0."""
     columns = [[[int(dot) for dot in row] + [0] for row in _LETTERS[letter]] for letter in TEXT]
     # a column of space after each letter but the last
     dots = torch.cat([torch.tensor(rows, dtype=torch.float64) for rows in columns], 1)[:, :-1]
@@ -339,8 +338,8 @@ def _text(size: float) -> Tensor:
 
 
 def _in_pixels(fine: Tensor) -> Tensor:
-    """Return the mean of the fine samples of each pixel, with zeros around a target that ends
-    within a pixel.
+    """Return a target in pixels: the mean of the fine samples of each pixel, padded with zeros to
+    complete pixels.
     """
     sides = [-(-n // _TARGET_SAMPLES) * _TARGET_SAMPLES for n in fine.shape]
     padded = torch.zeros(*sides, dtype=torch.float64)
@@ -354,11 +353,11 @@ def _in_pixels(fine: Tensor) -> Tensor:
 def detail_energy(
     psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, size: float
 ) -> dict[str, Tensor]:
-    """Return the sum over pixels of the squared picture of each target, by channel: (channel,)
+    """Return for each target the sum over pixels of its squared image in each channel: (channel,)
     float64.
 
-    The picture of a target is the target behind the PSF. The window of the PSF must hold the
-    target.
+    The image of a target is its convolution with the PSF. The window of the PSF must be at least as
+    large as the target.
     """
     otf = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands))
     energies = {}
@@ -375,12 +374,13 @@ def detail_energy(
 
 
 def detection_snr(energy: Tensor, amplitude: float, contrast: float, noise: Tensor) -> Tensor:
-    """Return the signal-to-noise ratio d' of the ideal observer, all channels together: the square
-    sums over pixels.
+    """Return the signal-to-noise ratio d' (noise,) of the ideal observer, for all channels
+    together.
 
     ``amplitude`` is the scene light in e- times the transmittance of a filter; ``noise`` (noise,
-    channel) in e-**2. The observer knows target and place; d' is the distance of the two answers in
-    standard deviations.
+    channel) is the noise variance in e-**2. The observer knows the target and its place. d' is the
+    distance between the means of the decision variable with and without target, in standard
+    deviations.
 
     Source: Barrett and Myers, Foundations of Image Science, section 13.2.8 (ideal observer for a
             known signal).

@@ -17,7 +17,7 @@ from neusee.nodes.values import Bands, Channels, Psf
 
 # --- saturated pixels -----------------------------------------------------------------------------
 
-# Count of pixels at the full well or at the largest output of the analogue-to-digital converter.
+# Number of pixels at the full well or at the largest output of the analogue-to-digital converter.
 
 
 class Saturated(NamedTuple):
@@ -58,13 +58,13 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
 
 # --- peak irradiance ------------------------------------------------------------------------------
 
-# Irradiance of the brightest pixel of the sensor, compared with saturation and with a multiple of
-# saturation.
+# Irradiance of the brightest pixel of the sensor, relative to saturation, and compared with a
+# multiple of saturation.
 
 
 class Peak(NamedTuple):
-    """The irradiance of the brightest pixel, in multiples of the saturation irradiance, and of
-    the lasers there.
+    """The irradiance of the brightest pixel in multiples of the saturation irradiance, and the
+    irradiance of the lasers at this pixel.
     """
 
     irradiance: Tensor  #: () float64, multiple of saturation
@@ -118,7 +118,7 @@ def peak_irradiance(
         "pixel_pitch": pixel_pitch,
         "exposure": exposure,
     }
-    # the irradiance of each pixel over what saturates it, summed over all light
+    # irradiance of each pixel / saturation irradiance, summed over scene and lasers
     wells = _in_wells(image, saturation(bands, **sensor) / level)
     for spot, line in zip(spots, lines, strict=True):
         wells = wells + _in_wells(spot, saturation(line, **sensor))
@@ -140,7 +140,7 @@ def _refuse_unpaired_spots(spots: Sequence[Tensor], lines: Sequence[Bands]) -> N
 
 
 def _exceeds(top: Tensor, multiple: float | None) -> Tensor:
-    """Return 1 where the irradiance exceeds a multiple of saturation, else 0; NaN without a
+    """Return 1 if the irradiance exceeds a multiple of saturation, otherwise 0; NaN without a
     multiple.
     """
     if multiple is None:
@@ -149,7 +149,7 @@ def _exceeds(top: Tensor, multiple: float | None) -> Tensor:
 
 
 def _laser_irradiance(spots: Sequence[Tensor], pixel: Tensor, like: Tensor) -> Tensor:
-    """Return the W/m2 that all lasers together send to a pixel, summed over their bands."""
+    """Return the irradiance (W/m2) of all lasers together at a pixel, summed over their bands."""
     total = torch.zeros_like(like)
     for spot in spots:
         total = total + spot.sum(-3).flatten().take(pixel).double()
@@ -226,7 +226,7 @@ def heat_ratio(
             " `bands` step"
         )
     y, x = psf.intensity.shape[-2:]
-    # twice the window, so that no heat wraps around; width sqrt(4 D t)
+    # twice the window, so that no heat wraps around; w = sqrt(4 D t)
     heat_kernel = _heat_kernel((2 * y, 2 * x), pixel_pitch, math.sqrt(4 * diffusivity * dwell)).to(
         psf.intensity.device
     )
@@ -241,8 +241,8 @@ def heat_ratio(
 
 
 def _heat_of(light: Tensor, spectrum: Tensor) -> Tensor:
-    """Return the heat (y, x) of light, but for a factor, by a convolution with the kernel of
-    ``spectrum``.
+    """Return the temperature rise (y, x) due to light, up to a constant factor, by convolution with
+    the kernel whose FFT is ``spectrum``.
     """
     y, x = light.shape
     convolved: Tensor = torch.fft.irfft2(
@@ -252,8 +252,8 @@ def _heat_of(light: Tensor, spectrum: Tensor) -> Tensor:
 
 
 def _heat_kernel(shape: tuple[int, int], pitch: float, reach: float) -> Tensor:
-    """Return erfc(r / w) / r over the pixels of an FFT, with the mean over a disc of one pixel's
-    area in the middle.
+    """Return the kernel erfc(r / w) / r in FFT order, with w = ``reach``; the central pixel has the
+    mean over a disc with the area of a pixel.
     """
     fy, fx = (torch.fft.fftfreq(n, 1 / n, dtype=torch.float64) * pitch for n in shape)
     distance = torch.hypot(fy[:, None], fx)
@@ -271,11 +271,11 @@ def _heat_kernel(shape: tuple[int, int], pitch: float, reach: float) -> Tensor:
 def _(
     psf: Psf, plain_psf: Psf, *, pixel_pitch: float, dwell: float, diffusivity: float = SILICON
 ) -> Tensor:
-    """Sum the heat of every pixel at every pixel, row by row of the window."""
+    """Return the ratio from a direct sum: the heat of every pixel at every pixel."""
     reach = math.sqrt(4 * diffusivity * dwell)
     disc_radius = pixel_pitch / math.sqrt(math.pi)
     fine_radii = (torch.arange(20000, dtype=torch.float64) + 0.5) * (disc_radius / 20000)
-    # 2 pi r erfc / r over the area of the disc
+    # mean of erfc(r / w) / r over the disc: integral of 2 pi r erfc / r, over the area of the disc
     middle_kernel = float(2 * torch.special.erfc(fine_radii / reach).mean() / disc_radius)
     y, x = psf.intensity.shape[-2:]
     position = torch.cartesian_prod(torch.arange(y), torch.arange(x)).double() * pixel_pitch

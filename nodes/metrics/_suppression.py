@@ -1,5 +1,5 @@
-"""Suppression ratios of a mask (LSR, BSR), their limits for any mask, and the bounds on what a mask
-gains over a grey filter or a smaller stop.
+"""Suppression ratios of a mask (LSR, BSR), their limits for any mask, and upper bounds of the
+advantage of a mask over a grey filter or a smaller stop.
 """
 
 import math
@@ -67,7 +67,7 @@ def limits(psf: Psf) -> Limits:
     """
     bounds_by_band = [_contrast_bound(kernel.double()) for kernel in psf.intensity]
     light, rms, bound = (torch.stack(column) for column in zip(*bounds_by_band, strict=True))
-    # all the contrast may lie within the band of the lens
+    # all the contrast may lie within the pass band of the lens
     lens_band_bound = bound / passed_frequency_shares(psf).to(bound).sqrt()
     return Limits(
         light * least_lsr(psf).to(light),
@@ -83,7 +83,7 @@ def _contrast_bound(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     of the contrast.
     """
     is_dark = kernel.sum() <= _DARK  # false for NaN, so that NaN reaches the result
-    kernel = kernel.where(~is_dark, 1.0)  # a root has no gradient at 0
+    kernel = kernel.where(~is_dark, 1.0)  # the gradient of sqrt is infinite at 0
     light, peak = kernel.sum(), kernel.amax()
     # Parseval: mean of |OTF|^2 = sum of PSF^2, at most peak x light
     rms, bound = kernel.square().sum().sqrt() / light, (peak / light).sqrt()
@@ -107,8 +107,8 @@ def _(result: Limits, psf: Psf) -> list[Check]:
 
 
 def least_lsr(psf: Psf) -> Tensor:
-    """Return the laser suppression ratio of light that is spread evenly over the field: (band,)
-    float64.
+    """Return the laser suppression ratio (LSR) of light that is spread uniformly over the field:
+    (band,) float64.
 
     The field has N pixels, and the clear lens puts a share p0 of the light into the brightest
     pixel. With a mask that keeps all light in the field, the brightest pixel has at least 1/N of
@@ -151,7 +151,7 @@ def most_contrast(unsuppressed: float, lsr: Tensor) -> Tensor:
 # Suppression ratios of a mask: laser suppression ratio (LSR) and background suppression ratio
 # (BSR).
 
-_ROUNDED_LIGHT = 1e-4  #: excess of light that sampling and round-off explain
+_ROUNDED_LIGHT = 1e-4  #: largest relative excess of light due to sampling and round-off
 
 
 @node(rtol=1e-6)
@@ -213,8 +213,8 @@ def bsr(psf: Psf, radiance: Tensor | None = None) -> Tensor:
 
 @bsr.reference
 def _(psf: Psf, radiance: Tensor | None = None) -> Tensor:
-    """Form the image without border, with a margin that catches all light of the PSF, and
-    compare sums of pixels.
+    """Return the ratio from sums over the pixels of an image whose margin contains all light of the
+    PSF.
     """
     kernel = psf.intensity.double()
     if radiance is None:
@@ -290,7 +290,7 @@ def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
         x.double().square().sum() for x in (pupil.amplitude, pupil.aperture)
     )
     passed_share = pupil_light / clear_light * passed_by_notches(pupil).to(pupil_light.device)
-    # a copy of one band
+    # band by band, so that only one band is copied to float64
     light_in_window = torch.stack([band.sum(dtype=torch.float64) for band in single(psf.intensity)])
     is_dark = passed_share <= _DARK  # false for NaN, so that NaN reaches the result
     share_outside: Tensor = torch.where(
@@ -309,15 +309,15 @@ def _(result: Tensor, *inputs: Any) -> list[Check]:
     ]
 
 
-# --- bounds beside a grey filter or a smaller stop ------------------------------------------------
+# --- bounds relative to a grey filter or a smaller stop -------------------------------------------
 
 #: integral of the squared MTF of a round pupil over all frequencies, divided by the peak of its PSF
 CLEAR = 0.45962
-_BOUND_ROUNDING = 1e-3  #: relative; the sampled lens band and float32
+_BOUND_ROUNDING = 1e-3  #: relative tolerance for the sampled pass band of the lens and for float32
 
 
 class ProtectionBounds(NamedTuple):
-    """Values of a mask and their bounds, by band: each value is at most the bound beside it."""
+    """Figures of merit of a mask in each band, each followed by its upper bound for any mask."""
 
     power: Tensor  #: (band,) mean of |OTF|**2 over the sampled frequencies
     power_bound: Tensor  #: (band,) LSR times the peak of the clear lens
@@ -325,10 +325,10 @@ class ProtectionBounds(NamedTuple):
     contrast_bound: Tensor  #: (band,) LSR / 0.4596
     #: (band,) mean NEQ over the lens band, relative to a grey filter of the same peak
     over_filter: Tensor
-    over_filter_bound: Tensor  #: (band,)
-    #: (band,) the same, relative to the better of the filter and the stop of the same peak
+    over_filter_bound: Tensor  #: (band,) upper bound of `over_filter`
+    #: (band,) mean NEQ relative to the better of a filter and a stop of the same peak
     over_both: Tensor
-    over_both_bound: Tensor  #: (band,)
+    over_both_bound: Tensor  #: (band,) upper bound of `over_both`
     log_neq: Tensor  #: (band,) mean over the lens band of the logarithm of the NEQ
     log_neq_bound: Tensor  #: (band,) logarithm of the largest mean NEQ
 
@@ -388,7 +388,7 @@ def protection_bounds(
     )
     lsr, noise = peak / clear_peak, electrons + glare + read_noise**2
     clear_lens = round_lens(cut_offs, sides)
-    # for points the mean over the lens band is CLEAR over 4, the exact value
+    # for point sampling, the mean over the lens band is exactly CLEAR / 4
     clear_contrast = torch.where(sides > 0, clear_lens.power, CLEAR / 4)
     stop_width_share = stop_width(lsr, cut_offs, sides)
     stop_contrast = torch.where(
@@ -396,7 +396,7 @@ def protection_bounds(
         stop_width_share**6 * round_lens(stop_width_share * cut_offs, sides).power,
         lsr**1.5 * CLEAR / 4,
     )
-    # the filter of the same peak lowers the OTF by its transmittance, LSR
+    # a filter of the same peak multiplies the OTF by its transmittance, which is the LSR
     filter_neq = _clear_pupil_neq(lsr**2 * clear_contrast, lsr, electrons, read_noise)
     stop_neq = _clear_pupil_neq(stop_contrast, stop_width_share.square(), electrons, read_noise)
     largest_contrast = lsr * clear_lens.peak / 4  # mean of |OTF|**2 over the lens band, by Parseval
@@ -427,12 +427,12 @@ def _clear_pupil_neq(power: Tensor, passed: Tensor, electrons: float, read_noise
 
 
 def stop_diameter(psf: Psf, lsr: float) -> Tensor:
-    """Compute the diameter of the round stop that lowers the brightest pixel to a share ``lsr`` of
-    that of the lens.
+    """Return the diameter of the round stop whose brightest pixel is ``lsr`` times that of the open
+    lens.
 
-    Without an average over pixels it is lsr**(1/4). Pixels average more of the lens's peak away
-    than of the wider spot of a stop, so that a stop of this diameter lowers the brightest pixel
-    less than it should.
+    For point sampling it is lsr**(1/4). The average over pixels lowers the peak of the lens more
+    than the peak of the wider spot of a stop, so that a stop of the diameter lsr**(1/4) would lower
+    the brightest pixel too little.
 
     Shapes: of psf the cut-off and the average over pixels (band,) -> (band,) float64.
     Units:  lsr 1; result 1, the diameter of the lens.
@@ -460,8 +460,8 @@ def _contrast_means(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]
 
 
 def largest_glare(lsr: float, electrons: float, read_noise: float) -> float:
-    """Return the glare in e- a pixel above which no mask of an LSR has a higher mean NEQ than a
-    filter of its peak.
+    """Return the glare in e- per pixel above which no mask with this LSR can have a higher mean NEQ
+    than a filter of the same peak.
     """
     noise = read_noise**2
     return (lsr * electrons + noise) / (CLEAR * lsr) - electrons - noise

@@ -1,4 +1,4 @@
-"""The image of the scene, band by band, and the light that stays in the field."""
+"""The image of the scene in each band, and the light that stays in the field of view."""
 
 import math
 from typing import Any, Literal
@@ -19,7 +19,8 @@ from neusee.nodes.values import Psf
 
 Border = Literal["zero", "reflect"]
 Corner = tuple[int, int]
-#: ratio of a scene's root mean square to its typical value, from which float32 is too short
+#: ratio of a scene's root mean square to its typical value, above which float32 is not precise
+#: enough
 _FLOAT32_CONTRAST = 100.0
 
 
@@ -77,10 +78,10 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
 
 
 def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor, Tensor, Corner]:
-    """Return the scene, the part of the PSF that reaches it, and the place (y, x) of the first
-    image pixel within their full convolution.
+    """Return the scene, the cropped PSF, and the place (y, x) of the first image pixel in their
+    full convolution.
 
-    The scene gets a mirrored border unless ``border`` is zero, for which it stays as it is.
+    The scene gets a mirrored border unless ``border`` is "zero".
     """
     if radiance.ndim < 3 or radiance.shape[-3] != intensity.shape[0]:
         raise ValueError(
@@ -93,9 +94,9 @@ def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor
     ).to(dtype)
     m, n = kernel.shape[-2:]
     if border == "zero":
-        # pixel (0, 0) lies half a PSF within the full convolution
+        # pixel (0, 0) of the image is half a PSF from the edge of the full convolution
         return radiance.to(dtype), kernel, (m // 2, n // 2)
-    # left, right, above, below: as far as a PSF of odd or even side reaches
+    # left, right, top, bottom: the reach of a PSF of odd or even side
     padding = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
     # `pad` needs a batch of pictures
     padded_scenes = pad(
@@ -104,14 +105,14 @@ def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor
     return (
         padded_scenes.reshape(*radiance.shape[:-2], *padded_scenes.shape[-2:]),
         kernel,
-        # half a PSF in, as above, and another half of padding
+        # half a PSF as above, plus the padding
         (m - 1, n - 1),
     )
 
 
 def within_reach(kernel: Tensor, dim: int, size: int) -> Tensor:
-    """Crop a PSF along one axis to the samples that are at most one scene width from the centre
-    of the PSF.
+    """Return a PSF, cropped along one axis to the samples whose distance from its centre is less
+    than ``size``, the side of the scene.
     """
     centre = kernel.shape[dim] // 2
     low, high = max(0, centre - size + 1), min(kernel.shape[dim], centre + size)
@@ -136,12 +137,12 @@ def _convolved_bands(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner
 
 
 def _bands_in_float64(scene: Tensor) -> list[bool]:
-    """Return, for each band of the scene, True if its bright pixels make float32 round-off hide
-    its other pixels.
+    """Return, for each band of the scene, True if the float32 round-off of bright pixels would hide
+    the other pixels.
     """
     flat = scene.detach().flatten(1)
     sampled = flat[:, :: max(1, flat.shape[1] >> 16)]
-    # mean of the roots, squared: bright pixels hardly count
+    # squared mean of square roots: a typical value that bright pixels hardly change
     typical = sampled.abs().sqrt().mean(1).square()
     root_mean_square = torch.linalg.vector_norm(flat, dim=1) / math.sqrt(flat.shape[1])
     needs_float64: list[bool] = (root_mean_square > _FLOAT32_CONTRAST * typical).tolist()
@@ -153,7 +154,7 @@ def _convolve(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Te
     wrap-around in the window.
     """
     length = [
-        # longest of the picture, the end of the window, and what would wrap around into it
+        # the largest of: scene, end of the window, length without wrap-around into the window
         fft_length(max(s, a + w, s + k - 1 - a))
         for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], corner, size, strict=True)
     ]
@@ -200,7 +201,7 @@ class _Product(torch.autograd.Function):
             grads[0],
         )
         scene_gradient = kernel_gradient = None
-        # gradient for a: correlation of grad and b, its window where a lies
+        # gradient of a: correlation of grad and b, cropped to the place of a
         if ctx.needs_input_grad[0]:
             scene_gradient = _Product.apply(
                 grad,
@@ -230,7 +231,9 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
-        """Return the change of a product: that by the first factor, and that by the second."""
+        """Return the tangent by the product rule: the change of the first factor, then of the
+        second.
+        """
         first, second = ctx.saved_tensors
         changes = []
         if a is not None:
@@ -269,8 +272,8 @@ class _Plane:
         return product
 
     def _spectrum(self, x: Tensor, corner: Corner) -> Tensor:
-        """Return the FFT of a zero-padded picture: first along the rows that hold samples, then
-        along all columns.
+        """Return the FFT of a zero-padded picture: first along its nonzero rows, then along all
+        columns.
         """
         (y, left), (height, width) = corner, x.shape
         for edge in (
@@ -296,15 +299,15 @@ class _Plane:
 
 # The light of a scene that stays in the field of view, computed without an image.
 #
-# Each PSF sample moves a box of the scene into the field of view.
+# Each PSF sample shifts the scene; the part of the scene that stays in the field is a rectangle.
 
 
-_FLOAT64_ROWS = 32  #: rows of the scene whose sums are in float64 at a time
+_FLOAT64_ROWS = 32  #: number of scene rows that are summed in float64 at a time
 
 
 def light_in_field(intensity: Tensor, radiance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the light of a scene (..., band, y, x) that its PSF leaves in the field, and all light
-    of the scene.
+    """Return the light of the image of a scene (..., band, y, x) that lies in the field, and the
+    total light of the scene.
 
     Both are sums over pixels, (..., band) float64. No light enters from outside the field. Raises
     ValueError if scene and PSF (band, any, any) have different bands.
@@ -335,14 +338,14 @@ def _in_one_type(scene: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _box_sums(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
-    """Return, for each PSF sample, the sum (m, n) of a plane over the box that the sample moves
-    into the field of view.
+    """Return, for each PSF sample, the sum (m, n) of a plane over the rectangle that the sample
+    shifts to pixels in the field of view.
 
-    The plane is rotated by 180 degrees, so that its boxes follow the order of the samples. The sums
-    are in float64, a few rows at a time, because allocating whole float64 planes takes longer than
-    the sums.
+    The plane is rotated by 180 degrees, so that the rectangles have the order of the samples. The
+    sums are in float64, a few rows at a time, because the allocation of whole float64 planes takes
+    longer than the sums.
     """
-    # the product with a lower triangle of ones is a running sum down the rows
+    # the product with a lower triangular matrix of ones is a cumulative sum over rows
     lower_triangle = torch.ones(
         _FLOAT64_ROWS, _FLOAT64_ROWS, dtype=torch.float64, device=plane.device
     ).tril()
@@ -359,10 +362,11 @@ def _box_sums(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tenso
 
 
 def _sums_along_axis(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:
-    """Return sums over the boxes along the axis ``dim``, each of which starts or ends at an edge
-    of the scene.
+    """Return sums over intervals along the axis ``dim``, from cumulative sums; each interval starts
+    or ends at an edge of the scene.
     """
-    # boxes that start at the edge grow, those that end there shrink
+    # first the intervals that start at the first edge and grow, then those that end at the last
+    # edge and shrink
     half_kernel = kernel // 2
     first = sums.narrow(dim, size - half_kernel - 1, half_kernel + 1)
     return torch.cat(

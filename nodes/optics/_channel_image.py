@@ -1,4 +1,4 @@
-"""Weighted sums over the bands of an image, summed before the convolution."""
+"""Weighted sums over the bands of an image; bands are summed before the convolution."""
 
 import math
 from typing import Annotated, Any
@@ -28,18 +28,18 @@ from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
 
 # --- convolve plan --------------------------------------------------------------------------------
 
-# The convolution of a scene with PSFs by a chosen plan, with borders, kernels and an estimate of
-# the round-off.
+# The convolution of a scene with PSFs by a chosen plan: borders, kernels, and an estimate of the
+# round-off.
 
 
-#: pixels along the side of the cells in which the largest error of a pixel is bounded
+#: side in pixels of the cells for the fast bound of the largest error of a pixel
 _CELL_SIDE = 8
-_SLAB_ROWS = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in the cache
+_SLAB_ROWS = 16  #: number of PSF rows that are summed at a time: those of 31 bands fit in the cache
 
 
 def convolved(planes: Tensor, intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
-    """Return weighted sums (row, y, x) over the bands of the image, from the basis images and
-    kernels of ``plan``.
+    """Return weighted sums (row, y, x) over the bands of the image, computed with the basis images
+    and kernels of ``plan``.
     """
     scene = bordered(planes[: plan.planes], facts, plan.window)
     return summed(
@@ -48,19 +48,19 @@ def convolved(planes: Tensor, intensity: Tensor, facts: ImageFacts, plan: Plan) 
 
 
 def _placement(facts: ImageFacts, window: tuple[int, int]) -> Placement:
-    """Return the zero padding of scene and kernel, and the window of their convolution that is
-    the image.
+    """Return the positions of scene and kernel, and the window of their convolution that is the
+    image.
     """
     (m, n), zero = window, (0, 0)
-    # first pixel of the image in the full convolution: half a PSF in, and another half where the
-    # scene is padded
+    # first pixel of the image in the full convolution: half a PSF from the edge, or a whole PSF if
+    # the scene has a mirrored border
     corner = (m - 1, n - 1) if facts.reflect else (m // 2, n // 2)
     return Placement(zero, zero, corner, facts.size, fft_lengths(facts, window))
 
 
 def majorant(scene_error: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
-    """Return an upper bound (y, x) of the image error from an error ``scene_error`` (y, x) in
-    every band of the scene.
+    """Return an upper bound (y, x) of the error of the image for an error of at most
+    ``scene_error`` (y, x) in every band of the scene.
     """
     window, kernel = (intensity.shape[1], intensity.shape[2]), _largest_weight_psf(intensity, facts)
     reached = summed(
@@ -73,11 +73,12 @@ def majorant(scene_error: Tensor, intensity: Tensor, facts: ImageFacts) -> Tenso
 
 
 def majorant_by_cell(scene_error: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
-    """Return an upper bound of `majorant` over cells of 8 x 8 pixels: (cell, cell) float64, far
-    faster.
+    """Return an upper bound of `majorant` in each cell of 8 x 8 pixels: (cell, cell) float64. It is
+    much faster.
 
-    A part of the kernel in one cell takes light to the pixels of a cell from four neighbouring
-    cells of the scene, and from none of their pixels more than from the one with the largest error.
+    The part of the kernel in one cell brings light to the pixels of an image cell from four
+    neighbouring cells of the scene. The largest error in these cells is an upper bound for each
+    pixel.
     """
     window, kernel = (
         (intensity.shape[1], intensity.shape[2]),
@@ -86,13 +87,13 @@ def majorant_by_cell(scene_error: Tensor, intensity: Tensor, facts: ImageFacts) 
     corner = _placement(facts, window).window_corner
     padding_before = [
         -k % _CELL_SIDE for k in corner
-    ]  # so that the middle of the kernel begins a cell
+    ]  # so that a cell begins at the middle of the kernel
     padding_after = [-(k + b) % _CELL_SIDE for k, b in zip(window, padding_before, strict=True)]
     padded_kernel = pad(
         kernel.double(), (padding_before[1], padding_after[1], padding_before[0], padding_after[0])
     )
     cell_light = avg_pool2d(padded_kernel[None], _CELL_SIDE)[0] * _CELL_SIDE**2
-    # the worst of two by two cells, because a shift by part of a cell touches both
+    # maximum over 2 x 2 cells, because a shift by a part of a cell overlaps two along each axis
     cell_error = max_pool2d(
         pad(cells(bordered(scene_error[None], facts, window))[None], (1, 1, 1, 1)), 2, 1
     )[0, 0].to(cell_light)
@@ -107,28 +108,28 @@ def majorant_by_cell(scene_error: Tensor, intensity: Tensor, facts: ImageFacts) 
 
 
 def cells(planes: Tensor) -> Tensor:
-    """Return the largest number in each cell of planes (k, y, x): (k, cell, cell); the last
-    cells may be smaller.
+    """Return the maximum (k, cell, cell) in each cell of planes (k, y, x); the last cells may be
+    smaller.
     """
     largest: Tensor = max_pool2d(planes[None], _CELL_SIDE, ceil_mode=True)
     return largest[0]
 
 
 def _largest_weight_psf(intensity: Tensor, facts: ImageFacts) -> Tensor:
-    """Return the PSF (1, y, x) of all bands together, each with its largest weight in any row."""
+    """Return the sum (1, y, x) of the absolute PSFs of all bands, each with its largest absolute
+    weight in any row.
+    """
     heaviest = facts.rows.abs().amax(0).to(intensity)
     weights = heaviest[None] if facts.share is None else heaviest[None] @ facts.share.to(heaviest)
     return _summed_bands(weights, intensity, facts.light.signed)
 
 
 def bordered(planes: Tensor, facts: ImageFacts, window: tuple[int, int]) -> Tensor:
-    """Return the basis images of the scene, with a mirrored border if the convolution with the
-    PSF needs a border.
-    """
+    """Return the basis images of the scene, with a mirrored border if ``facts.reflect`` is set."""
     if not facts.reflect:
         return planes
     m, n = window
-    # left, right, above, below: as far as a PSF of odd or even side reaches
+    # left, right, top, bottom: the reach of a PSF of odd or even side
     padding = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
     padded: Tensor = pad(planes, padding, mode="reflect")
     return padded
@@ -136,7 +137,7 @@ def bordered(planes: Tensor, facts: ImageFacts, window: tuple[int, int]) -> Tens
 
 def _plan_kernels(intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
     """Return the kernels (kernel, y, x) of a plan: the PSFs themselves, or weighted sums of
-    them.
+    PSFs.
     """
     stack = central_window(intensity, plan.window)
     if plan.kernels is None:
@@ -149,10 +150,9 @@ def _plan_kernels(intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
 
 
 def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:
-    """Return weighted sums (kernel, y, x) over the bands of a PSF, or over the absolute values of a
-    PSF.
+    """Return weighted sums (kernel, y, x) over the bands of a PSF, or of its absolute values.
 
-    A stack that must be copied is copied in slabs of a few rows.
+    If a copy of the PSF is needed, a few rows are copied at a time.
     """
     if stack.requires_grad or (stack.is_contiguous() and not absolute):
         return (weights @ stack.flatten(1)).view(-1, *stack.shape[1:])
@@ -177,7 +177,7 @@ def estimated_brightest(planes: Tensor, facts: ImageFacts) -> Tensor:
         unblurred[i] = torch.maximum(pixel_sum.amax(), -pixel_sum.amin())
     band_power = ((facts.basis @ facts.gram) * facts.basis).sum(1).clamp_min(0) * facts.copies
     blurred = facts.rows.abs() @ (band_power * passed_light * facts.light.peak).sqrt()
-    # a quarter and a half of two upper bounds: the estimate that the docstring names
+    # `unblurred` and `blurred` are upper bounds; 1/4 and 1/2 as in the docstring
     return torch.minimum(unblurred / 4, blurred / 2)
 
 
@@ -213,13 +213,13 @@ def fft_round_off(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) 
 # the convolution.
 
 
-Share = Annotated[float, Field(ge=0, le=1)]  #: as a share of the brightest pixel
-#: share of the error up to which the bound of the brightest pixel may come from cells of pixels
+Share = Annotated[float, Field(ge=0, le=1)]  #: relative to the brightest pixel
+#: largest bound of the brightest pixel that may come from cells, relative to the allowed error
 _CELLS_ERROR_SHARE = 0.25
 #: expected brightness of the darkest pixel; photographs have 1e-2, scenes at night 2e-5
 _DARKEST_PIXEL = 1e-3
-_LARGE_SIDE = 512  #: pixels along the sides of an image from which cells of pixels save time
-#: plans tried: with the brightest pixels estimated, then measured, then with nothing omitted
+_LARGE_SIDE = 512  #: smallest side in pixels of an image for which the bound by cells saves time
+#: number of plans tried: with estimated brightest pixels, with measured ones, with nothing omitted
 _PLANS_TRIED = 3
 
 
@@ -261,7 +261,7 @@ def image_channels(
     """
     share = (
         None
-        # every band has its PSF: no weights are needed
+        # no weights are needed if each band has its own PSF
         if few is None or few.share.shape[0] == few.share.shape[1]
         else few.share.double().cpu()
     )
@@ -279,7 +279,7 @@ def image_channels(
     )
     allowed_error = 0.0 if largest else within
     result, bound, sizes = _summed_image(planes, intensity, facts, allowed_error)
-    # relative error of the brightest pixel, where it is asked for
+    # relative error of the brightest pixel, only computed for `largest`
     brightest_error = (
         _brightest_pixel_error(result, radiance, intensity, facts, within * _CELLS_ERROR_SHARE)
         if largest
@@ -333,11 +333,12 @@ def _(
     result: TensorStats,
     **params: Any,
 ) -> float | ErrorBound:
-    """Return the error by what was left out of the PSF, which `Channels.bound` does not count.
+    """Return the error due to the light that is missing in the PSF, which `Channels.bound` does not
+    include.
 
-    The share of the PSF is that of each pixel of a picture relative to its brightest pixel, as
-    `flare.stray_light` states it. The error by few bands is in `Channels.estimated`, and is not
-    counted a second time.
+    The share of the PSF is the error of each pixel of a picture relative to its brightest pixel, as
+    in `flare.stray_light`. The error due to few bands is in `Channels.estimated` and is not counted
+    again.
     """
     if radiance.rms or (rows is not None and rows.rms):
         return math.inf
@@ -348,15 +349,15 @@ def _(
 
 @image_channels.expected_range
 def _(*inputs: Any, **params: Any) -> tuple[float, float]:
-    """Return the range of an image whose brightest pixel counts as 1, as
-    `nodes/sensor/_expected_ranges.py` says.
+    """Return the expected range of an image relative to its brightest pixel, see
+    `nodes/sensor/_expected_ranges.py`.
     """
     return _DARKEST_PIXEL, 1.0
 
 
 @image_channels.check
 def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> list[Check]:
-    # as in `Plan.kept`
+    # in the order of `Plan.kept`
     planes, kernels, bands, y, x = result.kept.tolist()
     text = (
         f"{planes} planes and {kernels} kernels of {y} x {x} for {result.rows.shape[1]} bands, "
@@ -370,8 +371,8 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
 def _planes_and_psf(
     radiance: LowRankCube, psf: Psf, rows: Tensor, share: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Return the basis images of the scene (k, y, x), and the part of the PSF that reaches the
-    scene (band, y, x), in the same precision.
+    """Return the basis images of the scene (k, y, x) and the PSF (band, y, x), cropped to its
+    largest reach within the scene, in the same precision.
     """
     psf_bands = len(psf.intensity)
     if share is not None:
@@ -404,14 +405,14 @@ def _image_facts(
     through: PsfLight,
     share: Tensor | None,
 ) -> ImageFacts:
-    """Return the facts of scene, PSF and weights from which a plan is chosen, in float64 on the
-    CPU.
+    """Return the properties of scene, PSF and weights from which a plan is chosen, in float64 on
+    the CPU.
     """
     flat_planes = planes.detach().flatten(1)
     plane_products = (flat_planes @ flat_planes.T).double().cpu()
-    # a mirrored border repeats the scene at most in 3 x 3 fields
+    # with mirrored borders, a point of the scene occurs at most 3 x 3 times
     copy_count = 9 if border == "reflect" else 1
-    # errors as root mean squares where the cube has them, else as largest values
+    # residuals as root mean squares if the cube has them, otherwise as maxima
     if radiance.residual_rms.numel():
         residual = radiance.residual_rms.double().cpu() * math.sqrt(copy_count)
         plane_norms = (
@@ -442,10 +443,10 @@ def _summed_image(
     planes: Tensor, intensity: Tensor, facts: ImageFacts, within: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the summed image, its relative error bound, and the sizes (`Plan.kept`) of the first
-    convolution plan of error at most ``within``.
+    convolution plan with an error of at most ``within``.
     """
     eps = torch.finfo(planes.dtype).eps
-    # an error relative to the true pixel is within / (1 + within) of the computed one
+    # `within` relative to the true pixel is within / (1 + within) relative to the computed pixel
     brightest, allowed_error = (
         facts.rows.new_zeros(len(facts.rows)),
         within / (1 + within) - 16 * eps,
@@ -476,11 +477,12 @@ def _brightest_pixel_error(
     """Return the largest relative error of the brightest pixel over all weighted sums of the image
     bands.
 
-    All bands together form the image of the cube's largest residual at each pixel. The true image
-    differs from the computed image by at most that image of the residual. The true maximum is
-    therefore at most the maximum of computed image plus residual. The true maximum is at least the
-    computed maximum less the residual at the same pixel, and this second error is never the larger
-    one. In a large image, a bound of at most ``quickly`` comes from cells of 8 x 8 pixels.
+    The largest residual of the cube at each pixel is convolved with the PSFs of all bands. The true
+    image differs from the computed image by at most this residual image. The true maximum is
+    therefore at most the maximum of (computed image + residual image). It is at least the computed
+    maximum minus the residual image at the same pixel, and this second error is never the larger
+    one. For a large image, the faster bound from cells of 8 x 8 pixels is returned if it is at most
+    ``quickly``.
     """
     if not radiance.residual_map.numel():
         return math.inf
@@ -518,8 +520,8 @@ def _brightest_pixel_error(
 
 
 def _largest_relative_error(error_bound: Tensor, peak: Tensor) -> float:
-    """Return the largest relative error of the brightest pixels, given computed values ``peak``
-    and error bounds ``error_bound``.
+    """Return the largest error of the brightest pixels relative to their true values, from computed
+    values ``peak`` and error bounds ``error_bound``.
     """
     relative_errors = torch.where(
         error_bound > 0,

@@ -13,7 +13,7 @@ from neusee.nodes.precision import one_by_one
 
 # --- psf energy -----------------------------------------------------------------------------------
 
-# The light of a PSF inside and outside of windows about the centre of the PSF.
+# The light of a PSF inside and outside of windows around its centre.
 
 
 _WINDOW_SHARES = (1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125, 0.015625)
@@ -36,7 +36,7 @@ class PsfLight(NamedTuple):
 
 def psf_light(intensity: Tensor) -> PsfLight:
     """Return the sums and maxima of PSFs (band, y, x), with the whole PSF as the only window."""
-    # a maximum over several dimensions takes three times as long
+    # band by band: a maximum over several dimensions takes three times as long
     extremes = [torch.aminmax(band) for band in intensity]
     low, high = (torch.stack(columns).double().cpu() for columns in zip(*extremes, strict=True))
     signed = not bool((low >= 0).all())  # True for NaN too
@@ -50,7 +50,7 @@ def psf_light(intensity: Tensor) -> PsfLight:
 def psf_light_by_window(intensity: Tensor, signed: bool) -> PsfLight:
     """Return the sums and maxima of PSFs (band, y, x) for nested windows.
 
-    The edges of the windows cut each PSF into pieces, and each piece is read once.
+    The edges of the windows divide each PSF into rectangular pieces, and each piece is read once.
     """
     m, n = intensity.shape[1:]
     windows = list(
@@ -73,8 +73,8 @@ def psf_light_by_window(intensity: Tensor, signed: bool) -> PsfLight:
 
 
 def mean_psf_light(of: PsfLight, share: Tensor | None) -> PsfLight:
-    """Return bounds for bands whose PSFs are weighted means, with weights ``share`` (band, j),
-    of the measured PSFs.
+    """Return upper bounds of the sums and maxima of PSFs that are weighted means of the PSFs
+    ``of``, with the weights ``share`` (band, j).
     """
     if share is None:
         return of
@@ -99,7 +99,7 @@ def _central_span(length: int, window: int) -> tuple[int, int]:
 
 
 def _span_edges(spans: list[tuple[int, int]]) -> list[int]:
-    """Return the edges of all spans, in rising order, once each."""
+    """Return the different edges of all spans, in rising order."""
     return sorted(set(chain.from_iterable(spans)))
 
 
@@ -111,11 +111,10 @@ def _intervals_inside(span: tuple[int, int], cuts: list[int]) -> Tensor:
 def _piece_sums_and_maxima(
     size: Tensor, rows: list[int], columns: list[int]
 ) -> tuple[Tensor, Tensor]:
-    """Return the sum, rounded up, and the maximum of each rectangular piece of a PSF, both (band,
+    """Return the sum (rounded up) and the maximum of each rectangular piece of a PSF, both (band,
     rows, columns).
 
-    A few large calls are faster than many small calls, each of which waits for other work on the
-    machine.
+    A few large calls are faster than many small ones.
     """
     row_sums_and_maxima = [(size[:, a:b].sum(1), size[:, a:b].amax(1)) for a, b in pairwise(rows)]
     row_sums, row_maxima = (
@@ -135,18 +134,17 @@ def _piece_sums_and_maxima(
 # Weighted sums of convolutions of a few pictures with a few kernels, computed in blocks of spectrum
 # columns.
 #
-# Result i is ``sum_s U[i, s] (X a)_s * (Y b)_s`` with planes a and kernels b. First all planes and
-# kernels are transformed along their rows. Then a few columns of all of them at a time are
-# transformed, multiplied and transformed back, in memory that fits in the cache. At 3072 x 3072
-# this takes 11 ms for the columns of a plane, on two cores; a transform of all columns in place
-# takes 35 ms.
+# Result i is ``sum_s U[i, s] (X a)_s * (Y b)_s`` with planes a, kernels b and the convolution *.
+# First all planes and kernels are transformed along their rows. Then a few columns of all spectra
+# at a time are transformed, multiplied and transformed back, in memory that fits in the cache. At
+# 3072 x 3072 this takes 11 ms for the columns of a plane, on two cores; a transform of all columns
+# in place takes 35 ms.
 
 
 Corner = tuple[int, int]
 
-_COLUMNS_AT_A_TIME = 16  #: columns of each spectrum at a time; on a GPU all columns
-#: rows of a picture at a time: whole pictures would take new memory, which costs more than their
-#: FFTs
+_COLUMNS_AT_A_TIME = 16  #: number of spectrum columns at a time; on a GPU all columns
+#: number of picture rows at a time: memory for whole pictures would cost more time than their FFTs
 _ROWS_AT_A_TIME = 64
 
 
@@ -158,7 +156,8 @@ class Mix(NamedTuple):
     u: Tensor | None  #: (result, s)
     x: Tensor | None  #: (s, plane)
     y: Tensor | None  #: (s, kernel)
-    #: number of results, where each has its own kernel for each plane, in this order
+    #: number of results if each has its own kernel for each plane (kernels in order of result, then
+    #: plane); otherwise 0
     results: int = 0
 
     def to(self, like: Tensor) -> "Mix":
@@ -177,12 +176,12 @@ class Placement(NamedTuple):
     window_corner: Corner
     size: Corner
     length: Corner
-    conjugate: bool = False  #: of F(b): correlation instead of convolution
+    conjugate: bool = False  #: use the conjugate spectrum of the kernel: correlation
 
 
 class Summed(torch.autograd.Function):
-    """A sum of convolutions. Its gradients are sums of convolutions too, so that derivatives of
-    all orders exist.
+    """Weighted sums of convolutions; their gradients are sums of the same kind, so that derivatives
+    of all orders exist.
     """
 
     @staticmethod
@@ -199,7 +198,7 @@ class Summed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         (a, b), (mix, where), grad = ctx.saved_tensors, ctx.settings, grads[0]
-        # the transposed matrices mix the gradients
+        # the gradients use the transposed matrices
         u, x, y = (m if m is None else m.T for m in mix[:3])
         correlation = not where.conjugate
         picture_gradient = kernel_gradient = None
@@ -235,7 +234,9 @@ class Summed(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
-        """Return the change of a product: that by the first factor, and that by the second."""
+        """Return the tangent by the product rule: the change of the first factor, then of the
+        second.
+        """
         first, second = ctx.saved_tensors
         changes = []
         if a is not None:
@@ -312,11 +313,11 @@ def _mixed_spectra(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _row_spectra(x: Tensor, left: int, wide: int, step: int) -> Tensor:
-    """Return the FFT of each picture row, shifted by ``left`` zeros, as (plane, block, row,
-    ``step`` columns).
+    """Return the FFT of each picture row after ``left`` zeros, as (plane, block, row, ``step``
+    columns).
 
-    A block of columns is contiguous: in rows 12 kB apart, each element would lie in another memory
-    page.
+    A block of columns is contiguous in memory: in rows 12 kB apart, each element would lie in
+    another memory page.
     """
     count, row_count, width = x.shape
     full_blocks, remainder = divmod(wide // 2 + 1, step)
@@ -326,7 +327,7 @@ def _row_spectra(x: Tensor, left: int, wide: int, step: int) -> Tensor:
         count, full_blocks + (remainder > 0), row_count, step, dtype=x.dtype.to_complex()
     )
     if remainder:
-        # the last block is filled up with zeros
+        # the last block is padded with zeros
         blocks[:, full_blocks, :, remainder:] = 0.0
     for plane, block in zip(x, blocks, strict=True):
         for y in range(0, row_count, chunk):
@@ -344,7 +345,7 @@ def _row_spectra(x: Tensor, left: int, wide: int, step: int) -> Tensor:
 
 
 def _pictures_of_rows(spectrum: Tensor, wide: int, columns: slice) -> Tensor:
-    """Return the wanted columns of pictures, given the spectrum of each row."""
+    """Return the given columns of pictures, from the spectrum of each row."""
     size = spectrum.shape[1]
     pixels = spectrum.real.new_empty(*spectrum.shape[:2], columns.stop - columns.start)
     chunk = _rows_at_a_time(spectrum, size)
@@ -355,7 +356,9 @@ def _pictures_of_rows(spectrum: Tensor, wide: int, columns: slice) -> Tensor:
 
 
 def _rows_at_a_time(x: Tensor, count: int) -> int:
-    """Return how many rows are transformed at a time: as many as fit in the cache; on a GPU all."""
+    """Return the number of rows that are transformed at a time: those that fit in the cache; on a
+    GPU all.
+    """
     return count if x.is_cuda else min(count, _ROWS_AT_A_TIME)
 
 
@@ -378,7 +381,7 @@ class _Columns:
 
 
 def _matrix_times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
-    """Multiply complex spectra by a real matrix."""
+    """Return the product of a real matrix and complex spectra; None is the identity."""
     if matrix is None:
         return spectra
     real_and_imaginary = torch.view_as_real(spectra)
@@ -391,13 +394,13 @@ def _matrix_times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
 
 # --- collapsed plan -------------------------------------------------------------------------------
 
-# The choice of the cheapest way to compute weighted sums over the bands of an image with a bounded
+# The choice of the fastest way to compute weighted sums over the bands of an image with a bounded
 # error.
 
 
-_WEAK_BANDS_SHARE = 0.05  #: share of the error bound that is spent on omitting weak bands
-_TRIED_PLANE_NUMBERS = 6  #: numbers of planes that are tried, from the least sufficient number on
-_TESTED_BAND_STEP = 8  #: one band of this many is tested first for a smaller window
+_WEAK_BANDS_SHARE = 0.05  #: share of the allowed error for the omission of weak bands
+_TRIED_PLANE_NUMBERS = 6  #: how many numbers of planes are tried, from the smallest sufficient one
+_TESTED_BAND_STEP = 8  #: every 8th band is tested first for a smaller window
 
 
 class ImageFacts(NamedTuple):
@@ -407,15 +410,16 @@ class ImageFacts(NamedTuple):
 
     rows: Tensor  #: (row, band)
     basis: Tensor  #: (band, k)
-    #: (k + 1, band) norm of the residual of each band after the first 0, 1, ... k planes
+    #: (k + 1, band) norm of the residual of each band if it is represented by the first 0, 1, ... k
+    #: planes; with 0 planes it is the norm of the band itself
     residual: Tensor
     norm: Tensor  #: (k,) the same norm of each plane
-    gram: Tensor  #: (k, k) products of the planes
-    copies: int  #: the largest number of copies of a scene point: 9 where the border reflects
+    gram: Tensor  #: (k, k) Gram matrix: scalar products of the planes
+    copies: int  #: largest number of copies of a scene point: 9 for a reflecting border, else 1
     light: PsfLight
     size: tuple[int, int]
     reflect: bool
-    #: (band, j) weights of the PSFs in each band, where only few bands have a PSF
+    #: (band, j) weights of the PSFs in each band, if only few bands have a PSF of their own
     share: Tensor | None = None
 
 
@@ -429,7 +433,7 @@ class Plan(NamedTuple):
     window: tuple[int, int]
     kernels: Tensor | None  #: (kernel, bands used); None: each PSF is a kernel
     mix: Mix
-    omitted_light: Tensor  #: (row,) upper bound
+    omitted_light: Tensor  #: (row,) upper bound of the light that the plan omits
     kernel_count: int
     cost: float  #: estimated seconds on two cores
     complete: bool  #: nothing but zeros is omitted
@@ -460,7 +464,7 @@ def with_windows(
     """Return ``facts`` with the light that smaller PSF windows omit, or unchanged if these
     windows omit too much.
     """
-    # a test on few bands avoids the sums of all where no window is small enough
+    # a test on few bands avoids the sums over all bands if no smaller window fits
     some_bands, signed = slice(_TESTED_BAND_STEP // 2, None, _TESTED_BAND_STEP), facts.light.signed
     if facts.share is None and len(intensity) > _TESTED_BAND_STEP:
         facts_of_some = facts._replace(
@@ -506,9 +510,10 @@ def cheapest_plan(facts: ImageFacts, brightest: Tensor, within: float) -> Plan:
 
 
 def _strong_bands(facts: ImageFacts, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
-    """Return the bands to convolve, and an upper bound of the light that the omitted bands add
-    to each weighted sum.
+    """Return the indices of the bands to convolve, and an upper bound of the light of the omitted
+    bands in each weighted sum.
     """
+    # residual[0], with no plane, is the norm of the whole band
     most_light = facts.rows.abs() * (facts.residual[0] * facts.light.total)
     share = torch.where(
         most_light > 0, most_light / brightest.clamp_min(1e-300)[:, None], 0.0
@@ -524,8 +529,8 @@ def _strong_bands(facts: ImageFacts, brightest: Tensor, within: float) -> tuple[
 def _sufficient_planes(
     facts: ImageFacts, bands: Tensor, lost: Tensor, brightest: Tensor, within: float
 ) -> list[int]:
-    """Return how many basis images each picture needs for an error of at most ``within`` times
-    the brightest pixel.
+    """Return the smallest numbers of basis images for which the omitted light is at most ``within``
+    times the brightest pixel.
     """
     omitted_light = (
         lost + (facts.residual[:, bands] * facts.light.total[bands]) @ facts.rows[:, bands].abs().T
@@ -549,8 +554,8 @@ def _plans(
     """Yield up to three convolution plans that use the first ``planes`` basis images and the PSF
     window number ``window_number``.
 
-    The kernels of the three plans are one for each plane and row, one for each PSF, and fewer
-    kernels to mix. ``weak_light`` is the light of the bands that are left out.
+    The three plans have one kernel for each plane and row, one kernel for each PSF, and a smaller
+    set of kernels that are mixed. ``weak_light`` is the light of the omitted bands.
     """
     rows, basis = facts.rows[:, bands], facts.basis[bands, :planes]
     passed_light = facts.light.total[bands]
@@ -562,7 +567,7 @@ def _plans(
     if few is not None and not bool((omitted_light <= few.limit).all()):
         return
     row_count = len(rows)
-    # terms are (row, plane): each result sums its own terms, and each term takes its plane
+    # a term is a pair (row, plane): a result sums the terms of its row
     result_of_term = torch.eye(row_count, dtype=torch.float64).repeat_interleave(planes, 1)
     plane_of_term = torch.eye(planes, dtype=torch.float64).repeat(row_count, 1)
     kernel_weights = _kernel_weights(rows, basis)
@@ -603,14 +608,14 @@ def _plans(
 def _few_kernels(
     facts: ImageFacts, bands: Tensor, k: int, brightest: Tensor, within: float
 ) -> FewKernels:
-    """Return a small set of kernels: singular vectors of the matrix that sums the bands of the
-    PSF to kernels.
+    """Return a small set of kernels: the singular vectors of the matrix of kernel weights (row x
+    plane, band).
     """
     rows, band_light = facts.rows[:, bands], facts.light.total[bands]
     plane_scale = torch.where(
         brightest[:, None] > 0, facts.norm[:k] / brightest[:, None], 0.0
     ).flatten()
-    # in units of light, so that singular values are errors of the image
+    # scaled to light, so that singular values are errors of the image
     scaled = plane_scale[:, None] * _kernel_weights(rows, facts.basis[bands, :k]) * band_light
     left_vectors, singular_values, right_vectors = torch.linalg.svd(scaled, full_matrices=False)
     omitted_light = [
@@ -625,7 +630,7 @@ def _few_kernels(
     mixed = torch.where(
         plane_scale[:, None] > 0, left_vectors * singular_values / plane_scale[:, None], 0.0
     )
-    # a row without weight above
+    # infinite for a row whose brightest pixel is 0: `plane_scale` gives it no weight
     unknown = torch.where((brightest == 0) & (rows != 0).any(1), math.inf, 0.0)
     omitted = brightest[None][:0]
     if omitted_light:
@@ -634,7 +639,7 @@ def _few_kernels(
 
 
 def _kernel_weights(rows: Tensor, basis: Tensor) -> Tensor:
-    """Return the weight of each PSF band in the convolution kernel of each weighted sum and each
+    """Return the weight (row x plane, band) of each PSF in the kernel for each weighted sum and
     basis image.
     """
     return (rows[:, None, :] * basis.T).flatten(0, 1)
@@ -644,7 +649,7 @@ def _tail_light(facts: ImageFacts, bands: Tensor, k: int, j: int) -> Tensor:
     """Return, for each band, an upper bound of the light that the PSF outside the window adds to an
     image pixel.
 
-    The bound is Young's inequality in three norms.
+    The bound is the smaller of two cases of Young's inequality.
     """
     basis = facts.basis[bands, :k]
     beyond, above = facts.light.beyond[j, bands], facts.light.above[j, bands]
@@ -657,15 +662,15 @@ def _tail_light(facts: ImageFacts, bands: Tensor, k: int, j: int) -> Tensor:
 def _expected_seconds(
     facts: ImageFacts, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix
 ) -> float:
-    """Return the seconds that a convolution plan is expected to take on two cores: FFTs,
-    products and kernel sums.
+    """Return the expected time of a convolution plan on two cores in seconds: FFTs, products and
+    kernel sums.
     """
     transform_area = math.prod(fft_lengths(facts, window))
     count = bands if kernels is None else len(kernels)
     terms = len(mix.x) if mix.x is not None else k
     products = terms * (k + len(facts.rows) + (count if mix.y is not None else 0) + 8)
     kernel_sums = 0 if kernels is None else count * bands * math.prod(window)
-    # seconds for each sample, measured: transforms, products, and sums of kernels
+    # measured seconds per sample of transforms, products and kernel sums
     return (
         transform_area * (2e-9 * (k + count + len(facts.rows)) + 3e-11 * products)
         + 1.4e-11 * kernel_sums

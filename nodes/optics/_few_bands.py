@@ -1,4 +1,4 @@
-"""The choice of few bands whose PSFs represent those of all bands."""
+"""The choice of a few bands whose PSFs represent the PSFs of all bands."""
 
 import math
 from collections.abc import Mapping
@@ -20,40 +20,41 @@ from neusee.nodes.values import FewBands, LowRankCube, Psf, Pupil
 
 # --- band thumbnail -------------------------------------------------------------------------------
 
-# Small PSFs and small parts of a scene, on which the error of fewer bands is estimated.
+# Small PSFs and small parts of a scene, with which the error of fewer bands is estimated. A cell is
+# a square of pixels.
 
 
-CELLS_ACROSS = 120  #: cells, along each side of a PSF about the axis
-#: cells, along each side of a part of the scene, with a margin for light from beside
+CELLS_ACROSS = 120  #: side of a PSF around the axis, in cells
+#: side of a part of the scene in cells, including a margin for light from outside
 _PART_CELLS = 240
-_CELL_PIXELS = (1, 2, 4)  #: pixels along the side of a cell, the least first
-#: least ratio of the area of the PSF window to that of the thumbnail, below which a choice saves
-#: nothing
+_CELL_PIXELS = (1, 2, 4)  #: sides of a cell that are tried, in pixels
+#: smallest ratio of the area of the PSF window to the area of the thumbnail for which a choice
+#: saves time
 _LEAST_AREA_RATIO = 4
-_LEAST_LIGHT_SHARE = 0.9  #: share of the light that a window of cells must hold
-#: cells, of the tiles of which the brightest and the one of the most contrast are found
+_LEAST_LIGHT_SHARE = 0.9  #: smallest share of the light that a window of cells must contain
+#: side in cells of the tiles among which the brightest and the one with most contrast are found
 _TILE_CELLS = 32
-_STRONGEST_PLANES = 4  #: strongest planes of the scene in which the error is estimated
+_STRONGEST_PLANES = 4  #: number of strongest planes of the scene for the estimate of the error
 
-Lens = Mapping[str, Any]  #: the parameters of `optics.psf` but its window
+Lens = Mapping[str, Any]  #: the parameters of `optics.psf` except its window
 
 
 class Parts(NamedTuple):
-    """Parts of a scene as spectra, and the kernels of all bands: what the estimate of each
-    choice shares.
+    """Spectra of parts of a scene, and their images with the PSFs of all bands: the common data for
+    all choices of bands.
     """
 
-    scene: Tensor  #: (part, plane, y, x) spectra
-    weights: Tensor  #: (row x plane, band)
-    kernels: Tensor  #: (row x plane, m n) of all bands
-    image: Tensor  #: (part, row, y, x) with the PSFs of all bands
-    top: Tensor  #: (row,) brightest pixel of all parts
+    scene: Tensor  #: (part, plane, y, x), spectra of the parts
+    weights: Tensor  #: (row x plane, band), weights of the PSFs in each kernel
+    kernels: Tensor  #: (row x plane, m n), kernels with the PSFs of all bands
+    image: Tensor  #: (part, row, y, x), images with the PSFs of all bands
+    top: Tensor  #: (row,), brightest pixel of all parts
 
 
 def without_gradients(
     pupil: Pupil, radiance: LowRankCube, rows: Tensor
 ) -> tuple[Pupil, LowRankCube, Tensor]:
-    """Return the inputs of a choice, which is constant for gradients."""
+    """Return the inputs without gradients, because the choice of bands counts as constant."""
     constant_pupil = pupil._replace(**{name: getattr(pupil, name).detach() for name in SCREENS})
     return (
         constant_pupil,
@@ -63,16 +64,18 @@ def without_gradients(
 
 
 class Thumbnail(NamedTuple):
-    """A thinned pupil, and the window of cells in which its PSFs are small pictures of those of
-    the whole pupil.
+    """A thinned pupil and a cell size: its PSFs, summed over cells, are small approximations of the
+    PSFs of the full pupil.
     """
 
     pupil: Pupil
-    pixels: int  #: along the side of a cell
+    pixels: int  #: side of a cell in pixels
     lens: Lens
 
     def light(self, bands: Tensor) -> Tensor:
-        """Return the PSFs (band, cell, cell) of some bands about the axis."""
+        """Return the PSFs (band, cell, cell) of the given bands around the axis, as light per
+        cell.
+        """
         pupil_of_bands = self.pupil._replace(
             index=self.pupil.index[bands], wavelengths=self.pupil.wavelengths[bands]
         )
@@ -87,12 +90,12 @@ class Thumbnail(NamedTuple):
 def thumbnail_of(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | None:
     """Return the thumbnail of the PSFs of a pupil in a window of ``shape``.
 
-    Return None if no window of cells holds the light, or if the PSFs of ``shape`` take little
+    Return None if no window of cells contains enough light, or if the PSFs of ``shape`` take hardly
     longer.
     """
-    # square pixels of a thinned pupil would be too wide
+    # point samples: the square samples of a thinned pupil would be too wide
     thinned, lens = thinned_pupil(pupil), {**lens, "pixel": "point"}
-    # the first, the middle and the last band stand for all
+    # tested with the first, the middle and the last band
     end_bands = torch.tensor(sorted({0, len(pupil.wavelengths) // 2, len(pupil.wavelengths) - 1}))
     pupil_of_ends = thinned._replace(
         index=thinned.index[end_bands], wavelengths=thinned.wavelengths[end_bands]
@@ -124,15 +127,15 @@ def psf_intensity(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Tensor:
 
 
 def cell_light(stack: Tensor, pixels: int) -> Tensor:
-    """Return the light of each cell of ``pixels`` along its side; pixels beyond the last whole
-    cell are left out.
+    """Return the light of each cell with a side of ``pixels``; pixels beyond the last complete cell
+    are left out.
     """
     return stack if pixels == 1 else avg_pool2d(stack, pixels) * pixels**2
 
 
 def pixels_per_cell(stack: Tensor) -> int:
-    """Return the least number of pixels along the side of a cell at which the cells hold the
-    light of the PSFs.
+    """Return the smallest side of a cell in pixels for which the window of cells contains enough
+    light of all PSFs.
     """
     total = stack.sum((1, 2))
     for pixels in _CELL_PIXELS:
@@ -147,8 +150,8 @@ def pixels_per_cell(stack: Tensor) -> int:
 
 
 def share_of_bands(bands: Tensor, count: int) -> Tensor:
-    """Return the weights (band, j) float64 that interpolate linearly between the bands ``bands``,
-    which rise.
+    """Return the float64 weights (band, j) of linear interpolation between the bands with the
+    indices ``bands``, in rising order.
     """
     band = torch.arange(count, dtype=torch.float64)
     if len(bands) == 1:
@@ -161,12 +164,12 @@ def share_of_bands(bands: Tensor, count: int) -> Tensor:
 
 
 def scene_parts(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) -> Parts:
-    """Return three parts of the scene, about the brightest tile, about the tile of most contrast
-    and in the middle.
+    """Return up to three parts of the scene: around the brightest tile, around the tile with most
+    contrast, and in the middle.
 
     ``light`` has the PSFs (band, m, n) of all bands in cells of ``pixels`` along each side.
     """
-    # mean over each cell: `cell_light` returns the sum
+    # mean over each cell; `cell_light` returns the sum
     planes = cell_light(radiance.planes[:_STRONGEST_PLANES], pixels) / pixels**2
     basis = radiance.basis[:, :_STRONGEST_PLANES].detach().double().cpu()
     picture = torch.tensordot((rows.sum(0) @ basis).to(planes), planes, 1)[None]
@@ -190,7 +193,7 @@ def scene_parts(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int)
 
 
 def _part_about(planes: Tensor, place: tuple[int, int]) -> Tensor:
-    """Return a part of the scene about a pixel; a smaller scene is filled up with zeros."""
+    """Return the part of the scene around a place; a smaller scene is padded with zeros."""
     part_spans = []
     for middle, size in zip(place, planes.shape[1:], strict=True):
         side = min(_PART_CELLS, size)
@@ -201,30 +204,29 @@ def _part_about(planes: Tensor, place: tuple[int, int]) -> Tensor:
 
 
 def estimated_errors(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]:
-    """Return the errors of the image if the PSF of each band is the mean of few PSFs ``light`` by
-    weights ``share``.
+    """Return two errors of the image if the PSF of each band is a weighted mean of a few PSFs
+    ``light``, with the weights ``share``.
 
-    The first is the root mean square of the worst part and row, the second the change of the
-    brightest pixel, or a quarter of the first where that is larger; both are relative to the
-    brightest pixel of all parts.
+    The first is the root mean square error of the worst part and row. The second is the change of
+    the brightest pixel, but at least a quarter of the first. Both are relative to the brightest
+    pixel of all parts.
     """
     kernel_error = (parts.weights @ share).to(light) @ light.flatten(1) - parts.kernels
     error = _image_of_parts(parts.scene, kernel_error, light)
     scale = parts.top.where(parts.top > 0, 1.0)
     rms = error.square().mean((2, 3)).sqrt() / scale
     change = ((parts.image + error).amax((0, 2, 3)) - parts.top).abs() / scale
-    # the error of the brightest pixel is taken as at least a quarter of the rms
     return float(rms.max()), max(float(rms.max()) / 4, float(change.max()))
 
 
 def _image_of_parts(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
-    """Return the image (part, row, y, x) of parts of a scene, without the margin to which light
-    comes from outside.
+    """Return the image (part, row, y, x) of parts of a scene, without the margin that receives
+    light from outside the part.
     """
     row_kernels = kernels.view(-1, spectra.shape[1], *like.shape[1:])
     size = (_PART_CELLS, _PART_CELLS)
     image = torch.fft.irfft2((spectra[:, None] * torch.fft.rfft2(row_kernels, size)).sum(2), size)
-    # what a circular convolution wraps around lies before sample m - 1
+    # the circular convolution wraps around in the samples before m - 1
     valid_spans = [slice(m - 1, _PART_CELLS) for m in like.shape[1:]]
     inner: Tensor = image[..., valid_spans[0], valid_spans[1]]
     return inner
@@ -232,14 +234,14 @@ def _image_of_parts(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
 
 # --- few bands ------------------------------------------------------------------------------------
 
-# The choice of few bands whose PSFs represent the PSFs of all bands, by an estimate of the error in
-# the picture.
+# The choice of a few bands whose PSFs represent the PSFs of all bands, from an estimate of the
+# error of the image.
 
 
-_BAND_COUNTS = (2, 3, 4, 5, 6, 8, 11, 16, 21)  #: numbers of bands that are tried, the fewest first
-_WORTHWHILE_SHARE = 0.7  #: largest share of the bands that is worth a choice
-_COMPARISON_RATIO = 3  #: least ratio of the bands of a comparison to the bands that are compared
-_ESTIMATE_FACTOR = 2.0  #: factor on the estimate, for the thumbnail is not the picture
+_BAND_COUNTS = (2, 3, 4, 5, 6, 8, 11, 16, 21)  #: numbers of bands that are tried, in this order
+_WORTHWHILE_SHARE = 0.7  #: a choice of a larger share of the bands saves too little time
+_COMPARISON_RATIO = 3  #: smallest ratio of the number of reference bands to that of chosen bands
+_ESTIMATE_FACTOR = 2.0  #: safety factor, because the thumbnail only approximates the image
 
 
 @node(rtol=1e-5)
@@ -289,7 +291,7 @@ def few_bands(
     thumb = thumbnail_of(pupil, shape, lens)
     if thumb is None:
         return _all_bands(count)
-    # PSFs of half the bands decide, unless so many are needed that all must be computed
+    # half of the bands as reference; all bands only if too many bands are needed
     half_bands = _evenly_spaced(count // 2 + 1, count)
     light_of_half = thumb.light(half_bands)
     light = _light_between_bands(light_of_half, half_bands, count)
@@ -306,7 +308,9 @@ def few_bands(
 
 
 def _same_count(pupil: Pupil, radiance: LowRankCube, rows: Tensor) -> int:
-    """Return the number of bands; raise ValueError where pupil, radiance and rows differ in it."""
+    """Return the number of bands; raise ValueError if it differs between pupil, radiance and
+    rows.
+    """
     counts = len(pupil.wavelengths), len(radiance.basis), rows.shape[-1]
     if len(set(counts)) > 1:
         text = f"{counts[0]}, {counts[1]} and {counts[2]}"
@@ -317,7 +321,7 @@ def _same_count(pupil: Pupil, radiance: LowRankCube, rows: Tensor) -> int:
 
 
 def _light_between_bands(light: Tensor, some: Tensor, count: int) -> Tensor:
-    """Return the PSFs (band, y, x) of all bands from those of some bands, linearly between the
+    """Return the PSFs (band, y, x) of all bands, by linear interpolation between those of some
     bands.
     """
     planes = share_of_bands(some, count).to(light) @ light.flatten(1)
@@ -325,7 +329,9 @@ def _light_between_bands(light: Tensor, some: Tensor, count: int) -> Tensor:
 
 
 def _light_of_all_bands(light: Tensor, some: Tensor, count: int, small: Thumbnail) -> Tensor:
-    """Return the PSFs (band, y, x) of all bands, of which those of some bands are there already."""
+    """Return the PSFs (band, y, x) of all bands; those of the bands ``some`` are given as
+    ``light``.
+    """
     other_bands = torch.tensor(sorted({*range(count)} - {*some.tolist()}))
     all_light = torch.cat([light, small.light(other_bands)])
     return all_light[torch.cat([some, other_bands]).argsort()]
@@ -334,7 +340,9 @@ def _light_of_all_bands(light: Tensor, some: Tensor, count: int, small: Thumbnai
 def _first_within(
     rungs: list[int], parts: Parts, light: Tensor, within: float, largest: bool
 ) -> FewBands | None:
-    """Return the first number of bands whose estimated error is within the limit, or None."""
+    """Return the choice with the first number of bands in ``rungs`` whose estimated error is within
+    the limit, or None.
+    """
     count = len(light)
     for few in rungs:
         computed = _evenly_spaced(few, count)
@@ -348,7 +356,7 @@ def _first_within(
 
 
 def _evenly_spaced(few: int, count: int) -> Tensor:
-    """Return ``few`` indices of ``count`` bands, the first and the last among them."""
+    """Return ``few`` evenly spaced indices of ``count`` bands, including the first and the last."""
     return torch.linspace(0, count - 1, few, dtype=torch.float64).round().long()
 
 
@@ -425,7 +433,7 @@ def few_bands_checked(
     added_light = cell_light(
         psf_intensity(pupil_of_bands(pupil, between_bands), window, lens), pixels
     )
-    # by band, those in use and those between them
+    # sorted by band: chosen bands and the bands between them
     order = sorted(range(len(computed) + len(between)), key=[*computed, *between].__getitem__)
     light = torch.cat([own_light, added_light])[order]
     finer_light = share_of_bands(torch.tensor(sorted([*computed, *between])), count).to(
@@ -464,7 +472,7 @@ def _(result: FewBands, few: FewBands, *inputs: object, **params: object) -> lis
 
 
 def _all_bands(count: int) -> FewBands:
-    """Return the choice of all bands, without an error."""
+    """Return the choice of all bands, with error 0."""
     return FewBands(
         torch.eye(count, dtype=torch.float64), torch.arange(count), _float64(0.0), _float64(0.0)
     )

@@ -18,8 +18,8 @@ from neusee.nodes.values import Bands, LaserLight, Psf
 # The direction of a laser, given in the recipe or sampled at random as in the paper.
 
 
-_LARGEST_ANGLE = 1.0  #: rad; an angle counts as its direction cosine, which is below 1
-#: relative difference of an angle and its sine, above which a note says the difference
+_LARGEST_ANGLE = 1.0  #: rad, upper limit: the model takes an angle as its direction cosine
+#: relative difference of an angle and its sine above which a note states the difference
 _SINE_DIFFERENCE = 0.01
 Rule = Literal["width_over_focal_length", "focal_length_over_width"]
 
@@ -59,16 +59,16 @@ def direction(
 def field_of_view(
     focal_length: float, pixel_pitch: float, shape: tuple[int, int]
 ) -> tuple[float, float]:
-    """Return the direction cosines (n_y, n_x) between opposite edges of the sensor: side x pitch
-    / f.
+    """Return the differences of the direction cosines (n_y, n_x) between opposite edges of the
+    sensor: side x pitch / f.
     """
     height, width = (side * pixel_pitch / focal_length for side in shape)
     return height, width
 
 
 def _drawn_within(sigma: float, edge: float, rng: Generator) -> Tensor:
-    """Sample a normal distribution of standard deviation ``sigma``, limited to absolute values
-    of at most ``edge``.
+    """Return a draw from a normal distribution of standard deviation ``sigma``, truncated at
+    -``edge`` and ``edge``.
     """
     while True:
         drawn = sigma * torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
@@ -140,11 +140,11 @@ def _(
 
 Meaning = Literal["first_channel", "irradiance"]
 
-#: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
+#: largest laser suppression ratio of a pupil that only absorbs and delays; see `zero_bound` below
 _LARGEST_LSR = 2.2
 _COARSE_GRID_AREA = (
     4 / math.pi
-)  #: largest area of the samples of a coarse pupil grid, relative to their disc
+)  #: largest area of the samples of a coarse pupil grid, relative to the disc of the stop
 _UNSEEN_RESPONSE = 1e-3  #: relative response below which a channel does not see a line
 
 
@@ -211,10 +211,10 @@ def laser_irradiance(
 def wells_at_clear_peak(
     clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | None, meaning: Meaning
 ) -> Tensor:
-    """Return the saturated pixels of one W/m2 per unit of the PSF at the peak of the clear lens: ()
-    float64.
+    """Return the exposure of the pixel at the peak of the clear lens in full wells, for an
+    irradiance of 1 W/m2 per unit of the PSF: () float64.
 
-    ``wells`` are the full wells of one W/m2 in each band.
+    ``wells`` are the full wells for an irradiance of 1 W/m2 in each band.
     """
     by_band = bands.weights * clear_peak * wells
     if meaning == "irradiance":
@@ -347,7 +347,7 @@ def _(
         meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)
     ):
         return [Check(peak_text, math.isfinite(peak))]
-    # peak of the beam over that of an even one, times the mean irradiance
+    # (peak of the beam / peak of a uniform beam) x mean irradiance
     clear_irradiance = (
         light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
     )

@@ -1,5 +1,5 @@
-"""What a lens passes: its f-number, notch filters, spatial frequencies, and the irradiance of a
-white surface on the sensor.
+"""Properties of a lens: f-number, transmission of notch filters, cut-off frequency, and the
+irradiance of a white surface on the sensor.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from neusee.nodes.values import Bands, Psf, Pupil, Stop
 
 # --- f number -------------------------------------------------------------------------------------
 
-# Refusal of lenses that are faster than any lens in air.
+# Refusal of lenses with an f-number below 0.5, which no lens in air has.
 
 
 def refuse_impossible_f_number(focal_length: float, diameter: float, parameter: str) -> None:
@@ -52,11 +52,11 @@ def refuse_impossible_f_number(focal_length: float, diameter: float, parameter: 
 
 # --- notch ----------------------------------------------------------------------------------------
 
-# The share of the light that notch filters let through at each wavelength of a pupil.
+# The transmittance of notch filters at each wavelength of a pupil.
 
 
 def passed_by_notches(pupil: Pupil) -> Tensor:
-    """Return the share of the light that the notch filters of a pupil let through: (band,) float64.
+    """Return the transmittance of the notch filters of a pupil: (band,) float64.
 
     A notch of depth d and full width at half maximum w about the centre c passes 1 - d exp(-4 ln 2
     ((x - c) / w)**2) at the wavelength x. Each band is evaluated at its centre.
@@ -73,20 +73,21 @@ def passed_by_notches(pupil: Pupil) -> Tensor:
 
 # --- lens band ------------------------------------------------------------------------------------
 
-# The spatial frequencies that the clear aperture passes, and what its pixels average away, from a
-# PSF alone.
+# The cut-off frequency of the clear aperture, and the loss of contrast by the average over pixels,
+# from a PSF alone.
 
 
-_QUADRATURE_NODES = 96  #: of the radius and of a quarter of the azimuth
-_STOP_ITERATIONS = 8  #: of the iteration for the diameter of a stop, each at least 10 times as near
+_QUADRATURE_NODES = 96  #: number of nodes in radius, and in a quarter of the azimuth
+#: iterations for the diameter of a stop; each reduces the error at least tenfold
+_STOP_ITERATIONS = 8
 
 
 def cut_off(psf: Psf) -> Tensor:
     """Return the highest spatial frequency that the clear aperture passes, in cycles per pixel:
     (band,) float64.
 
-    A PSF that does not name the frequency counts as that of a round aperture, sampled at points:
-    sqrt(4 p0 / pi).
+    A PSF without this value counts as that of a round aperture, sampled at points: sqrt(4 p0 / pi)
+    with the clear peak p0.
     """
     if psf.cut_off.numel():
         return psf.cut_off.double()
@@ -105,11 +106,11 @@ def averaged_side(psf: Psf) -> Tensor:
 
 
 class RoundLens(NamedTuple):
-    """What a round aperture without aberrations gives, on average over the frequencies that it
-    passes.
+    """Peak and contrast of a round aperture without aberrations, as means over the frequencies up
+    to its cut-off.
     """
 
-    peak: Tensor  #: brightest pixel over its value at a point
+    peak: Tensor  #: brightest pixel, relative to its value for point sampling
     power: Tensor  #: mean of the squared transfer function
 
 
@@ -126,7 +127,7 @@ def round_lens(frequency: Tensor, side: Tensor) -> RoundLens:
             pupil).
     """
     nodes, weights = unit_nodes(_QUADRATURE_NODES)
-    # a quadrature over the disc of frequencies: a quarter of it, for symmetry
+    # quadrature over a quarter of the disc of frequencies, because of the symmetry
     radius, azimuth = (nodes + 0.5)[:, None], (nodes + 0.5) * (math.pi / 2)
     # transfer function of a round pupil without aberrations
     transfer = (torch.acos(radius) - radius * (1 - radius.square()).sqrt()) * (2 / math.pi)
@@ -140,14 +141,14 @@ def round_lens(frequency: Tensor, side: Tensor) -> RoundLens:
 
 
 def stop_width(lsr: Tensor, frequency: Tensor, side: Tensor) -> Tensor:
-    """Return the diameter of the stop with the peak ``lsr``, as a share of that of the lens: (...)
-    float64.
+    """Return the diameter of the stop whose peak is ``lsr`` times the peak of the open lens,
+    relative to the diameter of the lens: (...) float64.
 
-    The brightest pixel falls with the fourth power of the diameter, but for what pixels average
-    away. ``frequency`` is the cut-off of the lens, and ``side`` that of the square over which a
-    pixel averages, as in `round_lens`.
+    The brightest pixel falls with the fourth power of the diameter, except for the average over
+    pixels. ``frequency`` is the cut-off of the lens, and ``side`` the side of the square over which
+    a pixel averages, as in `round_lens`.
     """
-    # a first guess: without an average the peak is width^4
+    # first guess: for point sampling the peak is proportional to width^4
     clear_peak, width = round_lens(frequency, side).peak, lsr**0.25
     for _ in range(_STOP_ITERATIONS):
         width = (lsr * clear_peak / round_lens(width * frequency, side).peak) ** 0.25
@@ -194,7 +195,7 @@ def white_irradiance(
         return torch.zeros((), dtype=torch.float64)
     luminance_of_white = 0.0 if luminance is None else luminance
     if illuminance is not None:
-        # a white surface that scatters evenly: luminance = illuminance / pi
+        # Lambertian white surface: luminance = illuminance / pi
         luminance_of_white = illuminance / math.pi
     widths = bands.widths.detach().cpu().double()
     radiance = luminance_of_white * luminous_share(bands, kind, temperature)

@@ -1,4 +1,4 @@
-"""The PSF averaged over square pixels: a finer grid, and a short filter behind."""
+"""The PSF averaged over square pixels: intensity on a finer grid, then a short filter."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ from neusee.nodes.values import Pupil
 
 # --- pixel filter ---------------------------------------------------------------------------------
 
-# The filter that averages an intensity over square pixels, given the intensity on a finer grid.
+# The filter that averages an intensity, sampled on a finer grid, over square pixels.
 #
-# The intensity of a pupil of finite width is band-limited. On a grid of more than twice its
-# bandwidth the intensity between the samples is known, so that its average over a pixel is a short
-# sum of samples. The weights of this sum are the average over a pixel of a low-pass filter, which
-# passes the band of the intensity and stops its repetitions.
+# The intensity of a pupil of finite width is band-limited. Sampled at more than twice its
+# bandwidth, it is known between the samples, so that its average over a pixel is a weighted sum of
+# samples. The weights are those of a low-pass filter, averaged over a pixel; the filter passes the
+# band of the intensity and stops its spectral replicas.
 
 
-#: samples a pixel are a multiple of this, and whole numbers from `_WHOLE_SAMPLES_FROM` on
+#: the number of samples per pixel is a multiple of this, or an integer above `_WHOLE_SAMPLES_FROM`
 _SAMPLES_STEP = 0.25
 _WHOLE_SAMPLES_FROM = 8
-_PLACE_PERIOD = 4  #: pixels after which the places of the pixels between the samples repeat
-_BLOCK_PIXELS = 16  #: pixels whose weights form one dense matrix
+_PLACE_PERIOD = 4  #: period in pixels of the position of a pixel relative to the samples
+_BLOCK_PIXELS = 16  #: number of pixels whose weights form one dense matrix
 
 
 @dataclass(frozen=True, slots=True)
 class FineAxis:
-    """A grid along one axis of a window, fine enough for the intensity, and the length of the
-    filter on this grid.
+    """A grid along one axis of a window that resolves the intensity, with the length of the filter
+    on this grid.
 
-    The middle of the grid is the middle of the window.
+    Grid and window have the same middle.
     """
 
     pixels: int
-    bandwidth: float  #: of the intensity, in cycles a pixel
-    per_pixel: float  #: samples a pixel
-    error: float  #: of the filter, relative to the brightest sample that it reaches
-    taps: int
+    bandwidth: float  #: bandwidth of the intensity, cycles per pixel
+    per_pixel: float  #: number of samples per pixel
+    error: float  #: error of the filter, relative to the brightest sample within its length
+    taps: int  #: number of samples that the filter weights
 
     @property
     def samples(self) -> int:
-        """Return the number of samples, which reach beyond the window by half a filter on each
+        """Return the number of samples; they extend beyond the window by half a filter on each
         side.
         """
         return math.ceil(self.per_pixel * (self.pixels - 1)) + self.taps
@@ -63,17 +63,17 @@ class FineAxis:
 
 
 def fine_axis(pixels: int, bandwidth: float, error: float) -> FineAxis:
-    """Return the grid with the fewest samples, each tap of the filter counted twice, for its
-    products.
+    """Return the grid with the smallest number of samples plus filter taps, which stand for time.
 
-    The grid has more than ``2 bandwidth`` samples a pixel, and at least one.
+    The grid has more than ``2 bandwidth`` samples per pixel, and at least one. The number of
+    samples already includes the taps once.
     """
     grids = (_grid_of(pixels, bandwidth, m, error) for m in _samples_per_pixel(2 * bandwidth))
     return min(grids, key=lambda grid: grid.samples + grid.taps)
 
 
 def _samples_per_pixel(lowest: float) -> list[float]:
-    """Return samples per pixel above ``lowest``, from the least on, that are tried for a grid."""
+    """Return the numbers of samples per pixel above ``lowest`` that are tried, in rising order."""
     step = _SAMPLES_STEP if lowest < _WHOLE_SAMPLES_FROM else 1.0
     first_multiple = max(math.floor(lowest / step) + 1, math.ceil(1 / step))
     count = 8 + math.ceil(0.5 * lowest / step)
@@ -81,8 +81,8 @@ def _samples_per_pixel(lowest: float) -> list[float]:
 
 
 def _grid_of(pixels: int, bandwidth: float, per_pixel: float, error: float) -> FineAxis:
-    """Return the grid of a window with a given number of samples per pixel; ``bandwidth`` is in
-    cycles a pixel, ``error`` that of the filter.
+    """Return the grid of a window with ``per_pixel`` samples per pixel; ``bandwidth`` is in cycles
+    per pixel, ``error`` is the error of the filter.
     """
     taps = math.ceil(per_pixel * (1 + _filter_width(per_pixel - 2 * bandwidth, error))) + 1
     return FineAxis(pixels, bandwidth, per_pixel, error, taps)
@@ -94,8 +94,8 @@ def _decibels(error: float) -> float:
 
 
 def _filter_width(gap: float, error: float) -> float:
-    """Return the width in pixels of a low-pass filter whose pass and stop band are ``gap`` cycles a
-    pixel apart.
+    """Return the width in pixels of a low-pass filter with a transition band of ``gap`` cycles per
+    pixel.
 
     Source: Kaiser, Proc. IEEE Int. Symp. Circuits and Systems (1974), the length of a filter by its
             window.
@@ -104,14 +104,14 @@ def _filter_width(gap: float, error: float) -> float:
 
 
 def _filter_weights(grid: FineAxis, away: Tensor) -> Tensor:
-    """Return the weights of samples at distances ``away`` in pixels from the middle of a pixel."""
+    """Return the weights of samples at distances ``away`` (pixels) from the centre of a pixel."""
     places, place_shares = unit_nodes(12 + math.ceil(2 * grid.per_pixel))
     width = _filter_width(grid.per_pixel - 2 * grid.bandwidth, grid.error)
-    # Kaiser's parameter for this attenuation
+    # shape parameter of the Kaiser window for this attenuation
     beta = 0.1102 * (_decibels(grid.error) - 8.7)
     distance = away[..., None] + places
     window = torch.special.i0(beta * (1 - (2 * distance / width).square()).clamp_min(0).sqrt())
-    # ideal low-pass filter times Kaiser's window, then averaged over the pixel
+    # ideal low-pass filter times Kaiser window, averaged over the pixel
     low_pass = torch.sinc(grid.per_pixel * distance) * window.where(
         distance.abs() <= width / 2, 0.0
     )
@@ -123,15 +123,15 @@ def _filter_weights(grid: FineAxis, away: Tensor) -> Tensor:
 
 def unit_nodes(count: int) -> tuple[Tensor, Tensor]:
     """Return Gauss-Legendre nodes between -1/2 and 1/2, and their weights, which sum to one."""
-    # kept as numbers, because a transform of `torch.func` wraps new tensors
+    # the cache has plain numbers, because transforms of `torch.func` wrap new tensors
     nodes, weights = _nodes(count)
     return torch.tensor(nodes, dtype=torch.float64), torch.tensor(weights, dtype=torch.float64)
 
 
 @functools.lru_cache(maxsize=64)
 def _nodes(count: int) -> tuple[list[float], list[float]]:
-    """Return Gauss-Legendre nodes between -1/2 and 1/2, and weights of sum one, as lists of
-    numbers.
+    """Return Gauss-Legendre nodes between -1/2 and 1/2, and their weights, which sum to one, as
+    lists.
     """
     import numpy as np
 
@@ -141,18 +141,18 @@ def _nodes(count: int) -> tuple[list[float], list[float]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _AxisFilter:
-    """The weights of a block of pixels, the same for every block, and the first sample of each
-    block.
+    """The filter along one axis: weights of a block of pixels, which repeat in each block, and the
+    places of the blocks.
     """
 
-    block: Tensor  #: (pixel, sample)
-    first: int  #: sample of the first block
-    stride: int  #: samples between blocks
+    block: Tensor  #: (pixel, sample) weights
+    first: int  #: first sample of the first block
+    stride: int  #: number of samples from one block to the next
     pixels: int
     samples: int
 
     def spans(self) -> list[tuple[slice, slice, Tensor]]:
-        """Return the pixels and the samples of each block, and the weights between them."""
+        """Return for each block its pixels, its samples and the weights (pixel, sample)."""
         rows = len(self.block)
         spans = []
         for index in range(-(-self.pixels // rows)):
@@ -166,7 +166,7 @@ class _AxisFilter:
 
 @functools.lru_cache(maxsize=256)
 def _axis_filter(grid: FineAxis, dtype: torch.dtype, device: torch.device) -> _AxisFilter:
-    """Return the weights of a fine grid in blocks of pixels, in a type and on a device."""
+    """Return the filter along one axis of a fine grid, in blocks of pixels."""
     pixel_offsets = torch.arange(_BLOCK_PIXELS, dtype=torch.float64) - (grid.pixels - 1) / 2
     middles = (grid.samples - 1) / 2 + grid.per_pixel * pixel_offsets
     first_samples = (middles - grid.taps / 2).ceil()
@@ -185,12 +185,12 @@ def _axis_filter(grid: FineAxis, dtype: torch.dtype, device: torch.device) -> _A
 
 
 class PixelFilter:
-    """The average over pixels of an intensity on a fine grid, along y and then along x, and its
-    adjoint.
+    """The average over pixels of an intensity on a fine grid (along y, then along x), and the
+    adjoint operator.
     """
 
     def __init__(self, rows: FineAxis, columns: FineAxis, like: Tensor) -> None:
-        """Take the weights in the type and on the device of ``like``, which no transform of
+        """Get the weights in the type and on the device of ``like``, a tensor that no transform of
         `torch.func` wraps.
         """
         self.rows, self.columns = (
@@ -233,7 +233,7 @@ def averaged(fine: Tensor, rows: FineAxis, columns: FineAxis) -> Tensor:
 
 
 class _Averaged(torch.autograd.Function):
-    """The average over pixels or its adjoint, both linear, so that each is the derivative of the
+    """The average over pixels or its adjoint; both are linear, so that the gradient of each is the
     other.
     """
 
@@ -261,40 +261,39 @@ class _Averaged(torch.autograd.Function):
 
 # --- pixel average --------------------------------------------------------------------------------
 
-# The PSF averaged over each square pixel: its intensity on a finer grid, and a short filter behind.
+# The PSF averaged over each square pixel: intensity on a finer grid, then a short filter.
 #
-# The intensity |U|^2 of a pupil that is N samples wide has a bandwidth of B = N alpha cycles a
-# pixel, with alpha the pitch of the pupil times that of the pixel over wavelength and focal length.
-# More than 2 B samples a pixel hold all of the intensity, and `_pixel_average` averages them over
-# each pixel. A window within the alias-free field has at most N / B pixels, so that the fine grid
-# has a little over 2 N samples a side in the worst case, whatever the f-number.
+# The intensity |U|^2 of a pupil that is N samples wide has a bandwidth of B = N alpha cycles per
+# pixel, with alpha = pupil pitch x pixel pitch / (wavelength x focal length). More than 2 B samples
+# per pixel determine the intensity completely, and the filter above averages them over each pixel.
+# A window within the alias-free field has at most N / B pixels. So the fine grid has at most a
+# little over 2 N samples a side, for any f-number.
 #
-# Rule: along each axis the grid has more than 2 B samples a pixel, the multiple of a quarter (a
-# whole number above 8) that needs the fewest samples, where a tap of the filter counts as one more
-# sample. It is the same
-# on every machine.
+# Rule: along each axis the grid has more than 2 B samples per pixel. The number is a multiple of
+# 1/4 (an integer above 8), the one with the fewest samples, where a tap of the filter counts as one
+# more sample. It is the same on every machine.
 # Memory: strips of pixel rows with at most `FINE_SAMPLES` samples of the fine grid, 64 MiB in
 #         float32.
 
 
-#: nominal error of the filter by the type of the PSF; a fringe errs by up to 1e-8 and 1e-12 of the
-#: clear peak
+#: nominal error of the filter for each type of the PSF; a fringe has an error of up to 1e-8 and
+#: 1e-12 of the clear peak
 FILTER_ERROR = {torch.float32: 5e-10, torch.float64: 5e-15}
-FINE_SAMPLES = 1 << 24  #: of the fine grid at a time, unless one row of pixels needs more
-_STRIPE_SAMPLES = 1 << 17  #: samples of the aperture that are converted to float64 at a time
+FINE_SAMPLES = 1 << 24  #: largest number of fine samples at a time, unless one pixel row needs more
+_STRIPE_SAMPLES = 1 << 17  #: number of aperture samples that are converted to float64 at a time
 
 
 class GridAxis(NamedTuple):
-    """Equally spaced places along one axis of the sensor."""
+    """Equally spaced points along one axis of the sensor."""
 
     samples: int
-    per_pixel: float  #: samples a pixel
-    middle: float  #: pixels from the spot to the middle of the grid
+    per_pixel: float  #: number of samples per pixel
+    middle: float  #: position of the middle of the grid relative to the spot, pixels
 
 
 def turns_per_pixel(pupil: Pupil, camera: Geometry, band: int) -> float:
-    """Return alpha, the turns of phase between neighbouring pupil samples for each pixel off the
-    axis.
+    """Return alpha: the phase difference in turns between neighbouring pupil samples, per pixel of
+    distance from the axis.
     """
     return (
         float(pupil.pitch)
@@ -319,8 +318,8 @@ def view_on_grid(
     light: float,
     dtype: torch.dtype,
 ) -> View:
-    """Return the intensity on a grid, as the share of the light in a pixel; ``light`` divides by
-    the clear pupil.
+    """Return the settings for the intensity of a band on a grid, as the share of the clear pupil's
+    light in a pixel; ``light`` is 1 over the light of the clear pupil.
     """
     alpha, wavelength = turns_per_pixel(pupil, camera, band), float(pupil.wavelengths[band])
     rows, columns = (
@@ -338,7 +337,7 @@ def view_on_grid(
 def _envelopes(
     grid: tuple[GridAxis, GridAxis], alpha: float, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return the diffraction envelope of square pupil samples along both axes."""
+    """Return the diffraction envelope (sinc^2) of square pupil samples along both axes."""
     row_envelope, column_envelope = (
         plain(
             torch.sinc((centred(axis.samples, device) / axis.per_pixel + axis.middle) * alpha)
@@ -353,8 +352,8 @@ def _envelopes(
 def fine_grid(
     pupil: Pupil, camera: Geometry, band: int, dtype: torch.dtype
 ) -> tuple[FineAxis, FineAxis]:
-    """Return the grid along each axis on which the intensity of a band is computed before it is
-    averaged.
+    """Return the fine grid along each axis on which the intensity of a band is computed before the
+    average.
     """
     alpha = turns_per_pixel(pupil, camera, band)
     return fine_axes((pupil.height.shape[0], pupil.height.shape[1]), camera.shape, alpha, dtype)
@@ -371,8 +370,8 @@ def fine_axes(
 
 
 def pixel_strips(rows: FineAxis, columns: FineAxis) -> list[tuple[int, int]]:
-    """Return the first and the last row, exclusive, of each strip of pixels whose fine grid is
-    computed at a time.
+    """Return the first row and the end row (exclusive) of each strip of pixels; the fine grid is
+    computed strip by strip.
     """
     rows_of_samples = FINE_SAMPLES // columns.samples - rows.taps
     height = max(1, math.floor(rows_of_samples / rows.per_pixel))
@@ -382,7 +381,7 @@ def pixel_strips(rows: FineAxis, columns: FineAxis) -> list[tuple[int, int]]:
 
 
 class IntensityOptions(NamedTuple):
-    """How the intensity is computed: type, method of the transform, and whether focal fields are
+    """Options for the intensity: type, method of the transform, and whether focal fields are
     stored.
     """
 
@@ -394,7 +393,9 @@ class IntensityOptions(NamedTuple):
 def band_average(
     pupil: Pupil, camera: Geometry, band: int, light: float, optics: IntensityOptions
 ) -> list[Tensor]:
-    """Return the share of the light in each pixel of one band, in strips of rows (y, x)."""
+    """Return the share of the clear pupil's light in each pixel of one band, as strips of rows (y,
+    x).
+    """
     rows, columns = fine_grid(pupil, camera, band, optics.dtype)
     # pixels from the spot to the middle of the window, along both axes
     middles = [
@@ -426,11 +427,11 @@ def clear_averages(aperture: Tensor, alphas: list[float], square_samples: bool) 
     """Return the average of |U|^2 alpha^2 over the pixel on the axis, for a pupil without phase, at
     each alpha.
 
-    Within a pixel the field is a smooth function of the pupil's coordinates. The aperture is
-    therefore projected on polynomials in these coordinates, and then summed over Gauss-Legendre
-    nodes of the pixel. Bands share a projection where their own numbers of polynomials are equal,
-    so that no result depends on the other bands. With ``square_samples`` the field has the envelope
-    of square pupil samples.
+    Within a pixel the phase is a smooth function of the pupil coordinates. The aperture is
+    therefore projected on polynomials in these coordinates, and the intensity is summed over
+    Gauss-Legendre nodes in the pixel. Bands share a projection only if they need the same number of
+    polynomials, so that no result depends on the other bands. With ``square_samples`` the field has
+    the envelope of square pupil samples.
     """
     projections: dict[tuple[int, ...], tuple[list[Tensor], Tensor]] = {}
     averages = []
@@ -448,10 +449,10 @@ def clear_averages(aperture: Tensor, alphas: list[float], square_samples: bool) 
 
 
 def _polynomial_count(samples: int, alpha: float) -> int:
-    """Return the number of polynomials that hold all phases across a pixel to 1e-13, a multiple
-    of 8.
+    """Return the number of polynomials, a multiple of 8, that represent all plane waves within a
+    pixel to 1e-13.
     """
-    # of phase, from the middle of pupil and pixel to their edges
+    # largest phase in radians, at the edge of pupil and pixel
     radians = math.pi * alpha * samples / 2
     # a plane wave of phase r needs r + O(r^(1/3)) polynomials
     return min(samples, 8 * math.ceil((radians + 5 * math.cbrt(radians) + 10) / 8))
@@ -470,8 +471,8 @@ def _polynomials(samples: int, degrees: int, device: torch.device) -> Tensor:
 
 
 def _moments(aperture: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """Return the moments (row degree, column degree) of an aperture in orthonormal polynomials, by
-    stripes of rows in float64.
+    """Return the moments (row degree, column degree) of an aperture for orthonormal polynomials,
+    summed in float64 a stripe of rows at a time.
     """
     step = max(1, _STRIPE_SAMPLES // aperture.shape[1])
     moments = rows.new_zeros(rows.shape[1], columns.shape[1])

@@ -1,4 +1,4 @@
-"""The point-spread function: lens, mask and pixel sampling, and what it refuses."""
+"""The point-spread function of lens, mask and pixel sampling, with checks of its sampling."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from neusee.nodes.values import Psf, Pupil
 
 # --- psf limits -----------------------------------------------------------------------------------
 
-# What a PSF refuses: aliases of the pupil's samples, points too far apart, and more light than the
-# pupil passes.
+# Checks of a PSF: aliases of the sampled pupil, sample points too far apart, and more light than
+# the pupil passes.
 
 
-#: relative light above that of the pupil, by the type of the PSF, that rounding may add
+#: largest relative excess of light over that of the pupil due to rounding, for each type of the PSF
 GAINED_LIGHT = {torch.float32: 1e-5, torch.float64: 1e-9}
 _FAST_F_NUMBER = 1.2  #: f-number below which the scalar theory of this PSF needs a note
 
 
 def refuse_aliases(pupil: Pupil, camera: Geometry) -> None:
-    """Raise ValueError if the PSF window includes aliases, which a sampled pupil repeats every
-    lambda f / pitch.
+    """Raise ValueError if the PSF window contains aliases: the PSF of a sampled pupil repeats with
+    the period lambda f / pitch.
 
-    With ``pixel="zoh"`` the repeated light is real, because square pillars do send light there.
+    With ``pixel="zoh"`` the repeated light is real, because square pillars diffract light there.
     """
     if camera.pixel == "zoh":
         return
@@ -72,17 +72,17 @@ def _finer_grid(pupil: Pupil, factor: float) -> str:
 
 
 def refuse_coarse_points(pupil: Pupil, camera: Geometry) -> None:
-    """Raise ValueError if the middles of the pixels are further apart than wavelength x f-number.
+    """Raise ValueError if the pixel pitch exceeds wavelength x f-number for point sampling.
 
-    The sum of equally spaced points is the light of a PSF up to that pitch, which is the period of
-    the fastest fringe.
+    Up to this pitch, the period of the finest fringe, the sum over equally spaced points is the
+    light of the PSF.
     """
     if camera.sensor != "point":
         return
     shortest = float(pupil.wavelengths.min())
     widest = float(pupil.pitch) * max(pupil.height.shape)
     if _are_coarse_points(camera, shortest, widest):
-        # the pupil may be narrower than its grid: look again, because this takes longer
+        # tested again with the width of the pupil, which may be narrower than its grid
         diameter = min(_diameter(pupil, widest), widest)
         if _are_coarse_points(camera, shortest, diameter):
             f_number = camera.focal_length / diameter
@@ -95,10 +95,9 @@ def refuse_coarse_points(pupil: Pupil, camera: Geometry) -> None:
 
 
 def spread_points_notes(pupil: Pupil, camera: Geometry) -> list[str]:
-    """Return a note for points so far apart that a peak between them is missed, as of the spot
-    behind a mask.
+    """Return a note if the sample points are so far apart that they may miss a peak between them.
 
-    The Airy pattern in the middle between four points says by how much.
+    The largest error is that of an Airy pattern centred between four points.
     """
     if camera.sensor == "integrated" or pupil.diameter.is_meta or not float(pupil.diameter) > 0:
         return []
@@ -118,13 +117,13 @@ def spread_points_notes(pupil: Pupil, camera: Geometry) -> list[str]:
 
 
 def _are_coarse_points(camera: Geometry, wavelength: float, diameter: float) -> bool:
-    """Return True if pixels are further apart than wavelength x f-number, for lengths in metres."""
+    """Return True if the pixel pitch exceeds wavelength x f-number; lengths are in metres."""
     return camera.pixel_pitch * diameter > wavelength * camera.focal_length * (1 + 1e-9)
 
 
 def _diameter(pupil: Pupil, widest: float) -> float:
-    """Return the diameter of the clear aperture, or its larger side where the pupil does not
-    name the diameter.
+    """Return the diameter of the clear aperture in m, or its larger side if the pupil does not
+    state the diameter.
     """
     stated_diameter = pupil.diameter
     if not stated_diameter.is_meta and float(stated_diameter) > 0:
@@ -137,13 +136,13 @@ def _diameter(pupil: Pupil, widest: float) -> float:
 
 
 def _open_samples(open_: Tensor) -> int:
-    """Return the number of samples from the first to the last open one, for a line of a stop."""
+    """Return the number of samples from the first to the last open sample of a line."""
     open_places = open_.nonzero()
     return int(open_places[-1] - open_places[0]) + 1 if len(open_places) else 0
 
 
 def fast_lens_notes(pupil: Pupil, camera: Geometry) -> list[str]:
-    """Return a note for a lens of f/1.2 or faster, whose light is too oblique for this model."""
+    """Return a note for a lens of f/1.2 or faster, for which scalar theory is inaccurate."""
     diameter = 0.0 if pupil.diameter.is_meta else float(pupil.diameter)
     f_number = camera.focal_length / diameter if diameter else math.inf
     if f_number > _FAST_F_NUMBER * (1 + 1e-9):
@@ -155,11 +154,11 @@ def fast_lens_notes(pupil: Pupil, camera: Geometry) -> list[str]:
 
 
 def refuse_gained_light(intensity: Tensor, lights: list[float], wavelengths: Tensor) -> None:
-    """Raise ValueError if a window holds more light than the pupil passes, beyond the error of the
-    PSF.
+    """Raise ValueError if a window contains more light than the pupil passes, beyond the error of
+    the PSF.
 
-    ``lights`` has the light that the pupil passes in each band, as a share of that of the clear
-    pupil.
+    ``lights`` is the light that the pupil passes in each band, as a share of the clear pupil's
+    light.
     """
     shares = intensity.detach().sum(-1).sum(-1, dtype=torch.float64).tolist()
     for share, light, wavelength in zip(shares, lights, wavelengths.tolist(), strict=True):
@@ -176,7 +175,7 @@ def refuse_gained_light(intensity: Tensor, lights: list[float], wavelengths: Ten
 # The point-spread function: lens, mask and pixel sampling in one scaled Fourier transform.
 
 
-_PART_SAMPLES = 1 << 15  #: samples of the pupil that are summed in the type of the pupil
+_PART_SAMPLES = 1 << 15  #: number of samples summed in the pupil's type; these sums add in float64
 
 
 class _Camera(Geometry):
@@ -316,12 +315,12 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
 def _clear_lens(
     pupil: Pupil, camera: _Camera, area: float, total: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return three values by band of the lens without mask, dirt and aberrations: the peak of its
-    PSF, its cut-off in cycles per pixel, and the side of the square over which a pixel averages, 0
-    for points.
+    """Return three values for each band of the lens without mask, dirt and aberrations: the peak of
+    the PSF, the cut-off in cycles per pixel, and the side in pixels of the square over which a
+    pixel averages (0 for point sampling).
     """
     alphas = [turns_per_pixel(pupil, camera, band) for band in range(pupil.wavelengths.numel())]
-    # |sum of the field|^2 alpha^2 over the light: the peak of a lens without phase
+    # peak of a pupil without phase: |sum of the field|^2 alpha^2 / light
     point_peaks = torch.tensor(alphas, dtype=torch.float64).square() * (total**2 / area)
     cut_off = (point_peaks * (4 / math.pi)).sqrt()
     if camera.sensor != "integrated":
@@ -359,7 +358,7 @@ def _intensity_over_pixels(
     field_bytes = 2 * fine_samples(pupil, camera, dtype) * dtype.itemsize
     optics = IntensityOptions(dtype, method, field_bytes <= KEPT_FIELD_BYTES)
     factors = (pupil.amplitude, pupil.height, pupil.path)
-    # with gradients every band is a tensor of its own; else all are written into one
+    # with gradients each band is a separate tensor; otherwise all are written into one tensor
     if transformed() or (torch.is_grad_enabled() and any(x.requires_grad for x in factors)):
         bands = [
             torch.cat(band_average(pupil, camera, band, light, optics))

@@ -1,8 +1,8 @@
-"""The PSF from its definition: every pupil sample and every pixel in float64, without any line of
-the fast transforms.
+"""The PSF from its definition: a direct sum over all pupil samples for each pixel in float64,
+without the code of the fast transforms.
 
-Phases are counted in turns and reduced to half a turn. Autograd differentiates the sums, so that
-the reference of the gradient is independent too.
+Phases are in turns, reduced to between -1/2 and 1/2. Autograd differentiates the sums, so that the
+reference of the gradient is independent too.
 """
 
 import math
@@ -40,8 +40,7 @@ def by_definition(pupil: Pupil, camera: Geometry) -> Psf:
         _intensity(clear_pupil, on_axis._replace(sensor="point"), band)[0, 0]
         for band in band_numbers
     ]
-    # peak at a point = area of the pupil in units of (wavelength x f / pixel)^2 = pi / 4 x the
-    # square of the cut-off
+    # peak of a point-sampled PSF = pupil area / (wavelength x f / pixel)^2 = pi / 4 x cut-off^2
     cut_off = (torch.stack(point_peaks) * (4 / math.pi)).sqrt()
     side = 1.0 if camera.sensor == "integrated" else 0.0
     sides = torch.full_like(cut_off, side)
@@ -63,7 +62,7 @@ def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:
         pupil.height.double() * (index / wavelength)
     ) + _without_whole_turns(pupil.path.double() / wavelength)
     field = amplitude * torch.exp(2j * math.pi * _without_whole_turns(turns))
-    # turns per sample and pixel
+    # turns of phase per pupil sample and pixel
     turns_per_sample = float(pupil.pitch) * camera.pixel_pitch / (wavelength * camera.focal_length)
     total = amplitude.new_zeros(camera.shape)
     points = (

@@ -1,4 +1,4 @@
-"""The pupil function, stored as factors: Zernike polynomials, phase screens, and whether its
+"""The pupil function, stored as factors; Zernike polynomials, phase screens, and a test whether the
 samples resolve the phase.
 """
 
@@ -26,7 +26,7 @@ from neusee.nodes.values import Bands, Dirt, Pupil, Shade, Stop, Wavefront
 
 # --- zernike --------------------------------------------------------------------------------------
 
-# Zernike polynomials over the stop, of unit root mean square, in Noll's numbering.
+# Zernike polynomials over the stop with unit root mean square, in Noll's numbering.
 
 
 _ALL = slice(None)
@@ -38,7 +38,7 @@ def noll(index: int) -> tuple[int, int]:
     """
     if index < 1:
         raise ValueError(f"Zernike index {index}: Noll numbers begin at 1 (piston)")
-    # order n begins after n (n + 1) / 2 smaller numbers
+    # n (n + 1) / 2 Noll numbers belong to radial orders below n
     n = (math.isqrt(8 * index - 7) - 1) // 2
     position = index - n * (n + 1) // 2 - 1
     m = 2 * ((position + (n + 1) % 2) // 2) + n % 2
@@ -46,8 +46,8 @@ def noll(index: int) -> tuple[int, int]:
 
 
 def _radial_coefficients(n: int, m: int) -> list[float]:
-    """Return the coefficients of the orthonormal radial polynomial R(n, m)(r) / r**m in rising
-    powers of r squared.
+    """Return the coefficients of R(n, m)(r) / r**m in rising powers of r**2, where R is the
+    orthonormal radial polynomial.
     """
     lower, upper, factorial = (n - m) // 2, (n + m) // 2, math.factorial
     norm = math.sqrt((n + 1) * (1 if m == 0 else 2))
@@ -62,8 +62,8 @@ def _radial_coefficients(n: int, m: int) -> list[float]:
 
 
 def _radial_by_azimuth(coefficients: Mapping[int, float]) -> dict[int, list[float]]:
-    """Return one radial polynomial for each signed azimuthal order, summed over the terms of
-    that order.
+    """Return for each signed azimuthal order the sum of its radial polynomials, weighted with their
+    rms coefficients.
     """
     sums: dict[int, list[float]] = {}
     for index, rms in coefficients.items():
@@ -84,11 +84,11 @@ def _polynomial(coefficients: list[float], x: Tensor) -> Tensor:
 
 
 def zernike_sum(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
-    """Return the weighted sum of Zernike polynomials at (v, u), in units of the radius; the weights
-    are by Noll number.
+    """Return the weighted sum of Zernike polynomials at (v, u), which are in units of the radius;
+    the keys of the weights are Noll numbers.
 
-    The sum is written in powers of u + iv, so neither the centre nor the cut of the azimuth needs
-    special treatment.
+    The sum is written in powers of u + iv, so that neither the centre nor the jump of the azimuth
+    at 180 degrees needs special treatment.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976), Eqs. 1 and 2.
     """
     sums = _radial_by_azimuth(coefficients)
@@ -102,7 +102,7 @@ def zernike_sum(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tens
         for m, wave in ((order, cosine), (-order, sine)):
             if m in sums and (order or wave is cosine):
                 total.addcmul_(_polynomial(sums[m], square), wave)
-        # (u + i v)^m = r^m exp(i m phi), a power more each time
+        # (u + i v)^m = r^m exp(i m phi): multiply by u + i v for the next order
         cosine, sine = cosine * u - sine * v, cosine * v + sine * u
     return total
 
@@ -122,7 +122,7 @@ def zernike_surface(
 
 # --- phase screen ---------------------------------------------------------------------------------
 
-# Smooth random phase screens over the pupil, the same at every sampling of the pupil.
+# Smooth random phase screens over the pupil, independent of the sampling of the pupil.
 
 
 def phase_screen(
@@ -145,7 +145,8 @@ def phase_screen_factors(
     lattice. The lattice does not depend on the sampling of the pupil, so the screen does not depend
     on the sampling either.
     """
-    # noise of spots exp(-x^2 / (2 w^2)) has the correlation exp(-d^2 / (4 w^2)): w = scale / 2
+    # white noise smoothed by exp(-x^2 / (2 w^2)) has the correlation exp(-d^2 / (4 w^2)):
+    # w = scale / 2
     spot_width = scale / 2
     half_width = max(0.5, grid.samples * grid.pitch / (2 * grid.diameter)) + 4 * spot_width
     count = 2 * math.ceil(half_width / spot_width) + 1
@@ -155,7 +156,7 @@ def phase_screen_factors(
         torch.arange(count, dtype=torch.float64, device=positions.device) - count // 2
     ) * spot_width
     spot_weights = torch.exp(-((positions - centres) ** 2) / (2 * spot_width**2))
-    # each sample has variance 1
+    # normalized to variance 1 at each sample
     spot_weights = spot_weights / spot_weights.square().sum(1, keepdim=True).sqrt()
     return spot_weights @ white_noise.to(positions.device), spot_weights.T
 
@@ -166,24 +167,24 @@ def phase_screen_factors(
 # phase.
 
 
-LARGE_STEPS = 0.1  #: share of steps above half a turn, from which the pupil counts as aliased
-THINNED_SAMPLES = 256  #: least number of samples across, of which a larger pupil keeps every k-th
-SCREENS = ("aperture", "amplitude", "height", "path")  #: what a pupil holds for each sample
-_MEASURED_ROWS = 256  #: the least number of pupil rows in which phase steps are measured
+LARGE_STEPS = 0.1  #: a pupil is aliased if a larger share of the steps exceeds half a turn
+THINNED_SAMPLES = 256  #: smallest number of samples across a thinned pupil
+SCREENS = ("aperture", "amplitude", "height", "path")  #: fields of `Pupil` with a value per sample
+_MEASURED_ROWS = 256  #: smallest number of rows of a large pupil in which phase steps are measured
 
 
 def phase_steps(pupil: Pupil) -> tuple[float, float]:
     """Return the median phase step between neighbouring samples, in turns, and the share of steps
     above half a turn.
 
-    Both numbers are from the band with the largest phase steps, inside the stop. In a large pupil
-    only every k-th row is measured, 256 rows or more. A wrapped or split mask has steps at its
-    edges by design, so a few large steps mean nothing. Many large steps mean that the samples
-    cannot follow the phase.
+    Both are for the band with the largest phase steps, inside the stop. In a large pupil only every
+    k-th row is measured, at least 256 rows. A wrapped or split mask has steps at its edges by
+    design, so a few large steps are no sign of an error. Many large steps mean that the sampling is
+    too coarse for the phase.
     """
     steepest_band = int((pupil.index / pupil.wavelengths).argmax())
     row_step = max(1, len(pupil.height) // _MEASURED_ROWS)
-    # height, path and whether the stop is open, each row and the next one
+    # height, path and mask of the open stop: for each sampled row, and for the row after it
     sampled_rows, rows_below = (
         [x[k::row_step] for x in (pupil.height, pupil.path, pupil.aperture > 0)] for k in (0, 1)
     )
@@ -207,18 +208,16 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
 
 
 def pupil_has_large_steps(pupil: Pupil) -> bool:
-    """Return True if so many phase steps exceed half a turn that the samples cannot follow the
-    phase.
-    """
+    """Return True if so many phase steps exceed half a turn that the pupil is aliased."""
     return phase_steps(pupil)[1] > LARGE_STEPS
 
 
 def _steps(pupil: Pupil, band: int, first: list[Tensor], second: list[Tensor]) -> Tensor:
-    """Return the absolute phase difference in turns, between neighbours that are both inside the
-    stop.
+    """Return the absolute phase difference, in turns, between neighbouring samples that are both
+    inside the stop.
 
-    Differences are taken before the phase: in float32, a phase of thousands of turns has no digits
-    left for its steps.
+    Height and path are subtracted before the conversion to phase: in float32, a phase of thousands
+    of turns is too coarse for its steps.
     """
     inside = first[2] & second[2]
     height, path = ((b - a)[inside] for a, b in zip(first[:2], second[:2], strict=True))
@@ -229,8 +228,8 @@ def _steps(pupil: Pupil, band: int, first: list[Tensor], second: list[Tensor]) -
 
 
 def thinned_pupil(pupil: Pupil) -> Pupil:
-    """Return every k-th sample of a large pupil, as long as the samples that are left can follow
-    the phase.
+    """Return every k-th sample of a large pupil, with the largest k for which the phase is not
+    aliased.
     """
     step = max(1, len(pupil.height) // THINNED_SAMPLES)
     while step > 1 and pupil_has_large_steps(_every_sample(pupil, step)):
@@ -316,8 +315,8 @@ def pupil(
 
 
 def _beam_sag(grid: PupilGrid, wavefront: Wavefront | None, device: torch.device) -> float | Tensor:
-    """Return the path (m) by which the curvature of a beam differs from a plane wave at the rim
-    of the stop.
+    """Return the optical path difference (m) between a curved beam and a plane wave at the rim of
+    the stop.
     """
     if wavefront is None or not bool(wavefront.curvature):
         return 0.0
@@ -325,7 +324,9 @@ def _beam_sag(grid: PupilGrid, wavefront: Wavefront | None, device: torch.device
 
 
 def _path(lens: Tensor | None, dirt: Dirt | None, like: Tensor) -> Tensor:
-    """Return the path of lens and dirt together; None is a lens without a path of its own."""
+    """Return the sum of the optical paths of lens and dirt; ``lens`` is None for a lens without
+    defocus and aberrations.
+    """
     if dirt is None:
         return torch.zeros_like(like) if lens is None else lens
     return dirt.path if lens is None else lens + dirt.path
@@ -338,8 +339,8 @@ def _amplitude(
     wavefront: Wavefront | None,
     shade: Shade | None,
 ) -> Tensor:
-    """Return the amplitude behind dirt, the taper of the beam and shade; ``clear`` itself where
-    none is there.
+    """Return the product of the amplitudes of stop, dirt, beam taper and shade; ``clear`` itself if
+    there are no others.
     """
     amplitude = clear
     if dirt is not None:
@@ -367,8 +368,8 @@ def _taper(grid: PupilGrid, taper: Tensor, like: Tensor) -> Tensor:
 def _lens_path(
     grid: PupilGrid, defocus: float | Tensor, aberrations: Mapping[int, float], like: Tensor
 ) -> Tensor | None:
-    """Return the optical path of defocus and aberrations, or None for a lens without both;
-    ``defocus`` is in m.
+    """Return the optical path (m) of defocus and aberrations, or None if both are 0; ``defocus`` is
+    the path at the rim in m.
     """
     has_aberrations = any(aberrations.values())
     if not bool(defocus) and not has_aberrations:
@@ -377,7 +378,7 @@ def _lens_path(
     v, u = pupil_axes(grid, like.device)
     for rows in row_stripes(grid):
         squared_radius = v[rows].square() + u.square()
-        # defocus is a paraboloid, of this path at the rim
+        # defocus is a paraboloid with the path `defocus` at the rim
         surface = defocus * squared_radius
         if has_aberrations:
             surface = surface + zernike_sum(aberrations, v[rows], u)
@@ -393,7 +394,9 @@ def _refuse_unlike_shapes(
     dirt: Dirt | None,
     shade: Shade | None,
 ) -> None:
-    """Raise ValueError unless height, index, dirt and shade have the pupil grid and the bands."""
+    """Raise ValueError unless height, dirt and shade have the size of the pupil grid, and index has
+    the bands.
+    """
     refuse_half(height=height)
     refuse_other_grid(height, grid)
     if index.shape != bands.centres.shape:
@@ -430,5 +433,7 @@ def _(
 
 
 def _squared_sum(amplitude: Tensor) -> float:
-    """Return the sum of the squared amplitude, by rows, so that float32 sums stay short."""
+    """Return the sum of the squared amplitude; rows are summed first, so that float32 sums stay
+    short.
+    """
     return float(torch.bmm(amplitude[:, None, :], amplitude[:, :, None]).sum(dtype=torch.float64))

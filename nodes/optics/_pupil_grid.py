@@ -19,8 +19,8 @@ from neusee.nodes.values import Stop
 
 
 _ALL = slice(None)
-_STRIPE_SAMPLES = 1 << 16  #: samples of the pupil worked on at a time
-_ROUNDED_LENGTH = 1e-9  #: relative difference of two lengths that counts as rounding
+_STRIPE_SAMPLES = 1 << 16  #: number of pupil samples that are processed at a time
+_ROUNDED_LENGTH = 1e-9  #: largest relative difference of two lengths that counts as rounding
 Aperture = Literal["held", "stretched", "inscribed", "clipped"]
 Number = TypeVar("Number", float, Tensor)
 
@@ -46,7 +46,7 @@ def pupil_grid(
     """Return the pupil grid of an aperture; without a ``pitch`` the grid is as wide as the
     aperture.
 
-    ``aperture`` says what happens where grid and aperture differ in width. `held`: a wider aperture
+    ``aperture`` selects what happens if grid and aperture differ in width. `held`: a wider aperture
     is refused. `stretched`: the pitch is changed so that the grid is as wide as the aperture.
     `inscribed`: a wider aperture is narrowed to the grid. `clipped`: the square grid cuts a wider
     aperture.
@@ -60,7 +60,7 @@ def pupil_grid(
     ):
         return PupilGrid(samples, diameter / samples, diameter)
     grid_width = samples * pitch
-    # an odd grid has a sample on the axis; an even one half a diagonal away
+    # distance of the nearest sample from the axis: 0 for an odd grid, half a diagonal for an even
     nearest_sample = 0.0 if samples % 2 else pitch * math.sqrt(0.5)
     if diameter < 2 * nearest_sample:
         needed = f"{2 * nearest_sample * 1e6:.3g} um"
@@ -95,15 +95,15 @@ def millimetres(length: float) -> str:
 
 
 def clear_diameter(stop: Stop) -> Tensor:
-    """Return the diameter of the clear aperture along the axes, which the grid may cut: ()
+    """Return the diameter of the clear aperture along v and u, limited by the width of the grid: ()
     float64, m.
     """
     return torch.minimum(stop.diameter.double(), stop.samples * stop.pitch.double())
 
 
 def clear_area(stop: Stop) -> float:
-    """Return the area of the clear pupil in m2: a disc, cut by the square of the grid where the
-    disc is wider.
+    """Return the area of the clear pupil in m2: a disc, cut by the square of the grid if the disc
+    is wider.
     """
     radius, half_width = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
     if half_width >= radius:
@@ -121,14 +121,14 @@ def clear_area(stop: Stop) -> float:
 def gaussian_integral(stop: Stop, width: Number) -> Number:
     """Return the integral of exp(-(r / width)^2) over the clear pupil in m2, with r from the axis.
 
-    The pupil is the disc of the stop, cut by the square of the grid where the disc is wider.
-    Integrated over r in closed form, and over one eighth of the azimuth by Gauss and Legendre, to
-    1e-13. A tensor receives its gradient.
+    The pupil is the disc of the stop, cut by the square of the grid if the disc is wider. The
+    integral over r is in closed form, the integral over one eighth of the azimuth by Gauss-Legendre
+    quadrature, to 1e-13. The gradient flows to ``width`` if it is a tensor.
     """
     radius, half_width = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
     if half_width >= radius:
         return math.pi * width**2 * _share_within(radius, width)
-    # in an eighth of the pupil: up to this angle the side of the square is nearer than the disc
+    # in one eighth of the pupil: up to this angle, the side of the square limits the pupil
     half_side_angle = min(math.acos(half_width / radius), math.pi / 4)
     straight_part = (
         half_side_angle
@@ -144,15 +144,15 @@ def gaussian_integral(stop: Stop, width: Number) -> Number:
 
 
 def _share_within(radius: float, width: Number) -> Number:
-    """Return 1 - exp(-(radius / width)^2), exact where it is small."""
+    """Return 1 - exp(-(radius / width)^2), precise for small values."""
     square = (radius / width) ** 2
     share: Number = -torch.expm1(-square) if isinstance(square, Tensor) else -math.expm1(-square)
     return share
 
 
 def _edge_distances(half: float, corner: float) -> list[tuple[float, float]]:
-    """Return the distances of a straight edge of the grid from the axis, up to a corner angle,
-    with their weights.
+    """Return the distances of a straight edge of the grid from the axis at Gauss-Legendre nodes of
+    the azimuth from 0 to ``corner``, with their weights.
     """
     import numpy as np
 
@@ -222,12 +222,11 @@ def refuse_other_grid(height: Tensor, grid: PupilGrid) -> None:
 # The stop of the lens and the grid on which the pupil is sampled.
 
 
-#: relative difference of grid and aperture that is not worth a word: a pitch written with four
-#: digits
+#: relative difference of grid and aperture without a note, as from a pitch written with four digits
 _WORTHLESS_DIFFERENCE = 1e-3
 
 
-#: samples of the pupil along an axis; fewer than four are no round aperture
+#: samples of the pupil along an axis; fewer than four cannot represent a round aperture
 Samples = Annotated[int, Field(ge=4, le=100_000)]
 
 

@@ -1,4 +1,4 @@
-"""Shapes of the results of the optical nodes, and the work of those that transform."""
+"""Shapes of the results of the optical nodes, and memory and operations of the slow ones."""
 
 from typing import Any
 
@@ -19,8 +19,8 @@ from neusee.nodes.optics._transform._sample_axis import Axis
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
 from neusee.nodes.values import Bands, Channels, FewBands, LowRankCube, Psf, Pupil, Stop, Wavefront
 
-_FILTER_SECONDS = 1.2e-9  #: of one thread, to write a sample of the intensity and to filter it
-_SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is known
+_FILTER_SECONDS = 1.2e-9  #: time of one thread to write and filter a sample of the intensity
+_SHORT, _FINE = 400e-9, 4e-6  #: m, assumed wavelength and pupil pitch if they are unknown
 
 
 @pupil.shape
@@ -71,7 +71,7 @@ def _(
     pixel_pitch: float,
     **params: Any,
 ) -> Any:
-    """Return the operations of the C++; where there is no compiler, torch takes about three
+    """Return memory and operations of the C++ code; without a compiler, torch takes about three
     times as long.
     """
     wavelength = float(pupil.wavelengths.min()) if known(pupil.wavelengths) else _SHORT
@@ -95,8 +95,8 @@ def _(
 
 
 def _field_bytes(axes: list[Axis]) -> float:
-    """Return the bytes of the field in the pupil and behind the transform along one axis, in single
-    precision.
+    """Return the bytes of the field in the pupil, and of the field after the transform along one
+    axis, in single precision.
     """
     return 8.0 * axes[0].n_in * (axes[1].n_in + axes[1].n_out)
 
@@ -120,7 +120,7 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, *, border: str = "zero", **par
 
 @few_bands.shape
 def _(pupil: Pupil, *others: Any, **params: Any) -> FewBands:
-    """Return the choice of all bands, because the number of bands in use is not known before the
+    """Return the shape of a choice of all bands: the number of chosen bands is unknown before the
     run.
     """
     count = len(pupil.wavelengths)
@@ -134,17 +134,15 @@ def _(few: FewBands, *others: Any, **params: Any) -> FewBands:
 
 @pupil_of_bands.shape
 def _(pupil: Pupil, few: FewBands) -> Pupil:
-    """Return the pupil of all bands: the number of bands in use is not known before the run, nor
-    are they.
-    """
+    """Return the pupil of all bands: the chosen bands are unknown before the run."""
     return pupil
 
 
 @few_bands.work
 @few_bands_checked.work
 def _(result: FewBands, *inputs: Any, **params: Any) -> tuple[float, float]:
-    """Return the work of PSFs of all bands in 480 x 480 pixels, which is that of a mask that
-    spreads the light.
+    """Return memory and operations of the PSFs of all bands in 480 x 480 pixels, the largest
+    thumbnail: that of a mask that spreads the light.
     """
     pixels = len(result.share) * 480.0**2
     return 16.0 * pixels, 100.0 * pixels
@@ -185,7 +183,7 @@ def _(
     kernel_bytes = 4.0 * planes_count * m * n + (
         0.0 if border == "zero" else 4.0 * planes_count * scene_height * (x + n)
     )
-    # planes, a kernel for each row and plane, and the rows back
+    # transforms of the planes, of a kernel for each row and plane, and back for each row
     transforms = planes_count + row_count * (planes_count + 1)
     operations = (
         transforms * transform_operations(transform_height, transform_width) + psf.intensity.numel()
@@ -202,8 +200,8 @@ def _(psf: Psf, bands: Bands, *others: Any, **params: Any) -> Tensor:
 def _(
     bands: Bands, stop: Stop, *, illuminance: Any = None, luminance: Any = None, **params: Any
 ) -> Tensor:
-    """Return 0 for a scene without a brightness in lux or cd/m2, because this needs no table of
-    an illuminant.
+    """Return the value 0 for a scene without a brightness in lux or cd/m2: it needs no table of an
+    illuminant.
     """
     return (
         torch.zeros((), dtype=torch.float64)
@@ -218,8 +216,8 @@ def _(*, angle: tuple[float, float] | None = None, **params: Any) -> Tensor:
 
 
 def _padded(scene: Tensor, psf: Psf, border: str) -> tuple[int, int]:
-    """Return the size of the transforms that convolve a scene with a PSF; a reflected border
-    makes the scene wider.
+    """Return the size of the transforms for the convolution of a scene with a PSF; a reflected
+    border enlarges the scene.
     """
     sides = zip(scene.shape[-2:], psf.intensity.shape[-2:], strict=True)
     y, x = (n + (2 if border == "reflect" else 1) * min(k, 2 * n - 1) for n, k in sides)

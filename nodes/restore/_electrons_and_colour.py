@@ -1,4 +1,4 @@
-"""From digital numbers to electrons and colour: the colour matrix, and the level of white."""
+"""Conversion of digital numbers to electrons and to colour: colour matrix and white level."""
 
 import math
 from typing import Annotated, Any
@@ -24,9 +24,11 @@ from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 
 Brightness = Annotated[float, Field(gt=0, le=1e18)]
-#: relative error of the colours over that of the channels, for errors that are like the light
+#: relative error of the colours over that of the channels, for errors that are proportional to the
+#: light
 _GAIN = 2.0
-#: brightest colour over largest weight and brightest channel: 0.25 to 0.6 in shipped recipes
+#: brightest colour over (largest matrix element times brightest channel): 0.25 to 0.6 in shipped
+#: recipes
 _BRIGHTEST = 0.5
 
 
@@ -128,11 +130,11 @@ def _(channels: Tensor, matrix: Tensor, *, brightness: float = 1.0) -> Tensor:
 
 @colour.propagate_error
 def _(channels: ErrorBound, matrix: ErrorBound, *, result: TensorStats, **params: Any) -> float:
-    """Return an estimate of the error, not a bound: twice that of the channels, relative to the
-    brightest element.
+    """Return an estimate of the error (not a bound): the relative errors of channels, doubled, and
+    matrix, times the brightest element.
 
-    Errors of the light are alike in all channels, so that the matrix enlarges them as it does the
-    light. The error of the matrix is one factor for the whole picture.
+    Errors of the light are similar in all channels, so that the matrix amplifies them as much as
+    the light. The error of the matrix is one factor for the whole picture.
     """
     return (_GAIN * channels.share + matrix.share) * max(abs(result.min), abs(result.max))
 
@@ -149,12 +151,13 @@ def _(
     brightness: float = 1.0,
     **params: Any,
 ) -> float:
-    """Return a bound of the error by noise in the channels, which the matrix enlarges by its
-    Frobenius norm at most.
+    """Return an error bound for noise in the channels: the matrix amplifies noise by at most its
+    Frobenius norm.
     """
     if channels.stats is None or matrix.stats is None:
         return math.inf
-    # Frobenius norm over root mean square, times the root of channels over colours
+    # Frobenius norm = rms element * sqrt(3 * channels); rms over 3 colours instead of the channels
+    # gives a further sqrt(channels / 3): together the number of channels
     return (
         brightness * matrix.stats.shape[-1] * (matrix.stats.largest_rms + matrix.rms) * channels.rms
     )
@@ -164,8 +167,8 @@ def _(
 def _(
     channels: TensorStats, matrix: TensorStats, *, brightness: float = 1.0
 ) -> tuple[float, float]:
-    """Return the brightest colour relative to matrix and channels, as in photographs in
-    daylight.
+    """Return the range from 0 to the brightest colour that is usual for photographs in daylight,
+    from the largest elements of matrix and channels.
     """
     return 0.0, brightness * _BRIGHTEST * max(channels.max, -channels.min) * max(
         matrix.max, -matrix.min
@@ -174,8 +177,8 @@ def _(
 
 # --- colour matrix --------------------------------------------------------------------------------
 
-# The colour matrix, which converts electrons of the channels to the colour of the scene in
-# daylight.
+# The colour matrix, which converts the electrons of the channels to the colour that the scene has
+# in daylight.
 
 
 @node(rtol=1e-9)
@@ -206,13 +209,13 @@ def colour_matrix(
             colour-science.
     """
     spectra = _paints(bands.centres)
-    # least squares over paints: counts = C s, colour = R s, with the mean of s s'
+    # least squares over paints: electrons A s, colour T s, with C = mean of s s^T
     spectra_products = spectra.T @ spectra / len(spectra)
     pixel = {"pixel_pitch": pixel_pitch, "exposure": exposure}
     counts = _counts(bands, illuminant, responses, level, quantum_efficiency, **pixel)
     rgb = _target(bands.centres, len(counts))
     count_products = counts @ spectra_products @ counts.T
-    # so that channels that see the same have a solution
+    # a small ridge: the system is singular if two channels have the same response
     ridge = (1e-12 * count_products.diagonal().mean()).clamp_min(1e-200) * torch.eye(
         len(count_products), dtype=torch.float64
     )
@@ -247,10 +250,9 @@ def _(
     level: ErrorBound,
     **params: Any,
 ) -> float:
-    """Return an error bound of the matrix, which is inversely proportional to the factor `level`.
+    """Return an error bound of the matrix, which is inversely proportional to the input `level`.
 
-    An error of the level that differs from band to band changes the matrix in other ways, so that
-    it has no bound.
+    There is no bound if the error of the level may differ from band to band.
     """
     result: TensorStats = params["result"]
     if any(bound.rms for bound in (bands, illuminant, responses)) or level.share >= 1.0:
@@ -262,15 +264,15 @@ def _(
 
 @colour_matrix.expected_range
 def _(*inputs: Any, **params: Any) -> tuple[float, float]:
-    """Return a range whose size does not matter: the colours are relative to the largest element
-    of the matrix.
+    """Return a nominal range of the elements; only the ratio of a colour to the largest element
+    matters.
     """
     return 0.0, 1.0
 
 
 def _target(centres: Tensor, channels: int) -> Tensor:
-    """Return the matrix (3, band) from reflectance to linear sRGB, or to grey for a sensor with
-    a single channel.
+    """Return the matrix (3, band) from reflectance to linear sRGB; for a sensor with one channel,
+    to luminance in all three colours.
     """
     rgb = to_srgb(centres)
     return rgb if channels > 1 else luminance(rgb, 0).expand(3, -1)
@@ -284,7 +286,9 @@ def _counts(
     quantum_efficiency: float,
     **pixel: float,
 ) -> Tensor:
-    """Return the electrons in each channel for one unit of reflectance in each band, on the CPU."""
+    """Return the electrons (channel, band) of each channel for reflectance 1 in each band, on the
+    CPU.
+    """
     band_light = level.cpu().double() * illuminant.cpu().double()
     weights = channel_weights(bands, responses.cpu(), band_light, **pixel)
     return weights * quantum_efficiency
@@ -299,12 +303,12 @@ def _paints(centres: Tensor) -> Tensor:
 
 # --- white level ----------------------------------------------------------------------------------
 
-# The level of a frame whose scene is not known: how bright white was.
+# The light level of a frame of an unknown scene: how bright a white surface would be.
 
 
 White = Annotated[float, Field(ge=1e-30, le=1e30)]
 _WHITE_QUANTILE = 0.995  #: quantile of the unclipped pixels that counts as white
-_QUANTILE_PIXELS = 2**22  #: pixels whose quantile is taken, at most
+_QUANTILE_PIXELS = 2**22  #: approximate number of pixels from which the quantile is estimated
 
 
 @node(rtol=1e-5)
@@ -349,10 +353,11 @@ def white_level(
         bands, responses.cpu(), equal_light, pixel_pitch=pixel_pitch, exposure=exposure
     )
     electrons_of_white = weights.sum(-1) * quantum_efficiency
-    # stated: so many full wells of the channel that sees white best
+    # stated by the user: white gives this many full wells in the most sensitive channel
     if white is not None:
         return equal_energy * (white * full_well / float(electrons_of_white.max()))
-    # by the colours of a restored picture; without one, by what each channel sees of white
+    # brightness from the colours of the restored picture; without one, from the channels of the
+    # frame, each relative to its electrons for white
     if restored is not None:
         light_of = {
             "pixel_pitch": pixel_pitch,
@@ -370,8 +375,8 @@ def white_level(
 
 
 def _bright_quantile(brightness: Tensor, clipped: Tensor) -> Tensor:
-    """Return the quantile of the unclipped pixels (y, x) that counts as white, or of all if all
-    are clipped.
+    """Return the quantile of brightness (y, x) that counts as white, over the unclipped pixels, or
+    over all pixels if all are clipped.
     """
     unclipped = ~clipped.any(-3)
     pixels = brightness[unclipped] if bool(unclipped.any()) else brightness.flatten()
@@ -380,8 +385,8 @@ def _bright_quantile(brightness: Tensor, clipped: Tensor) -> Tensor:
 
 
 def _passed(psf: Psf | MeasuredPsf, bands: Bands, illuminant: Tensor, responses: Tensor) -> Tensor:
-    """Return the share of the light that the PSF of each channel holds: 1 for one that was
-    measured.
+    """Return the sum (channel,) of the PSF of each channel: the fraction of the light in its
+    window; 1 for a measured PSF.
     """
     if isinstance(psf, MeasuredPsf):
         return torch.ones(len(responses), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The PSF of a camera by field: the most likely one for measured frames of point sources."""
+"""The field-dependent PSF of a camera, fitted to measured frames of point sources."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ from neusee.nodes.values import MeasuredPsf
 
 # --- point fit ------------------------------------------------------------------------------------
 
-# The PSF of highest likelihood for frames of point sources, and draws of its error.
+# The maximum likelihood PSF for frames of point sources, and random draws of its error.
 #
 # Places, signals, backgrounds and PSFs are fitted together by Gauss-Newton steps (Bjoerck,
 # Numerical Methods for Least Squares Problems, 1996, ch. 9), so that the error of the centring is
 # part of the error of the PSF.
 
 
-_SEARCH = 6  #: pixels by which a point may lie beside the first guess
-_STEPS = 30  #: Gauss-Newton steps, at most
-_ENOUGH = 1e-4  #: pixels by which no point moves any more at the end
-_MOST = 0.4  #: pixels by which a point may move in one step
-_HALVED = 8  #: times that a step is halved, at most
-_SURE = 4.0  #: standard deviations below saturation from which a pixel counts
-_CALM = 1e-9  #: share of the largest curvature that is added to each, in a step alone
-_ITERATIONS = 300  #: of conjugate gradients
-_RESIDUAL = 1e-8  #: squared residual over the first, at which they end
-_SHARED = 1.02  #: inflation of a variance from which points tell several PSFs
-_CORE = 2  #: pixels around the middle of a PSF, in which points are counted
-_ALONE = 1e-9  #: least eigenvalue of the products of weights, below which nodes are not told apart
-_LOCAL = 5  #: pixels a side over which chi-square is averaged
+_SEARCH = 6  #: largest distance in pixels of a point from its first guess
+_STEPS = 30  #: largest number of Gauss-Newton steps
+_ENOUGH = 1e-4  #: the fit ends when no point moves by more pixels in a step
+_MOST = 0.4  #: largest move of a point in one step, pixels
+_HALVED = 8  #: largest number of times that a step is halved
+_SURE = 4.0  #: a pixel is used if its expectation is this many standard deviations below saturation
+_CALM = 1e-9  #: damping of a step, relative to the largest curvature
+_ITERATIONS = 300  #: largest number of conjugate gradient iterations
+_RESIDUAL = 1e-8  #: the iterations end at this squared residual, relative to the first
+_SHARED = 1.02  #: inflation of a variance above which the points depend on several PSFs each
+_CORE = 2  #: radius in pixels of the core of a PSF, in which points are counted
+_ALONE = 1e-9  #: lower limit of an eigenvalue of A^T A, for nodes that cannot be separated
+_LOCAL = 5  #: side in pixels of the square over which chi-square is averaged
 
 
 class Fit(NamedTuple):
@@ -67,8 +67,8 @@ class Fit(NamedTuple):
 
 
 def fitted(pixels: Seen, layout: Layout, count: int, rng: Generator) -> Fit:
-    """Return the PSFs at the nodes and draws of them; raise ValueError where no pixel tells of a
-    part of a PSF.
+    """Return the PSFs at the nodes, and draws of them; raise ValueError if a part of a PSF is
+    measured by no pixel.
     """
     share = node_weights(pixels.middle, layout.shape, layout.zones)
     state, weight = _start(pixels, share, layout.window)
@@ -94,7 +94,7 @@ def fitted(pixels: Seen, layout: Layout, count: int, rng: Generator) -> Fit:
     local_misfit = _misfit(linear_model, weight, residual)
     draws = []
     for _ in range(count):
-        # noise of the frames, weighted, gives the slope of a drawn error
+        # the step for a random noise of the frames is a draw of the error
         noise = _normal(weight, rng) * weight.sqrt()
         slope = linear_model.slope(noise)
         slope = slope._replace(
@@ -114,13 +114,15 @@ def fitted(pixels: Seen, layout: Layout, count: int, rng: Generator) -> Fit:
 
 
 def gauged(kernels: Tensor) -> Tensor:
-    """Return kernels of sum 1 whose centres are in the middle of the window.
+    """Return the kernels, shifted so that their centres are in the middle of the window, and scaled
+    to sum 1.
 
-    The centre is the mean place, weighted by the square of the sum of the channels; noise in the
-    wings hardly moves it.
+    The centre is the mean place, weighted by the square of the sum of the channels. Noise in the
+    wings hardly changes it.
     """
     offset = kernels.new_zeros(len(kernels), 2)
     centred = kernels
+    # repeated, because the centre of a shifted kernel is again a little off the middle
     for _ in range(6):
         offset = offset - centre(centred)
         centred = moved(kernels, offset)
@@ -128,7 +130,9 @@ def gauged(kernels: Tensor) -> Tensor:
 
 
 def centre(kernels: Tensor) -> Tensor:
-    """Return the centre (node, 2) of kernels (node, channel, y, x), from the middle pixel."""
+    """Return the centre (node, 2) of kernels (node, channel, y, x), in pixels from the middle
+    pixel.
+    """
     power = kernels.mean(1).square()
     y, x = (torch.arange(n, dtype=power.dtype) - n // 2 for n in power.shape[-2:])
     power_sum = power.sum((-2, -1))
@@ -141,8 +145,9 @@ def centre(kernels: Tensor) -> Tensor:
 
 
 def _start(pixels: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State, Tensor]:
-    """Return a first guess, one PSF for all nodes from the points that are not saturated, and the
-    weight (channel, pixel) of each pixel.
+    """Return a first guess and the weight (channel, pixel) of each pixel.
+
+    The guess has the same PSF at all nodes, the mean of the unclipped points.
     """
     points, channels, nodes = len(pixels.owner), len(pixels.light), share.shape[1]
     kernels = pixels.light.new_zeros(nodes, channels, *window)
@@ -156,12 +161,12 @@ def _start(pixels: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State,
     stamps = linear_model.stamps_of(pixels.light - pixels.background.T[:, pixels.frame])
     weight = _weight(pixels, pixels.light)
     weights = linear_model.stamps_of(weight)
-    # points of which no pixel is clipped in any channel
+    # points without a clipped pixel in any channel
     unclipped_points = (
         (linear_model.stamps_of(pixels.clipped.double()) == 0).all(1).flatten(1).all(1)
     )
     valid = (weights[unclipped_points] > 0).double()
-    # mean of these points, each over its own light, at the pixels that count
+    # mean of these points at their valid pixels, each divided by its light
     guess = (stamps[unclipped_points] * valid).sum(0) / (
         valid * stamps[unclipped_points].sum((-2, -1), keepdim=True)
     ).sum(0).clamp_min(1e-9)
@@ -173,8 +178,8 @@ def _start(pixels: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State,
 
 
 def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the whole-pixel offset of each point at which the guess explains most, and the
-    signal of each channel.
+    """Return the offset of each point, in whole pixels, at which the guessed PSF fits best, and its
+    signal in each channel.
     """
     channels, search_padding = len(guess), (_SEARCH,) * 4
     product = conv2d(pad(weights * stamps, search_padding), guess[:, None], groups=channels)
@@ -197,7 +202,9 @@ def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor,
 
 
 def _weight(pixels: Seen, expected: Tensor) -> Tensor:
-    """Return 1 / variance of each pixel; 0 where it is clipped, or may be clipped by chance."""
+    """Return 1 / variance of each pixel; 0 for a pixel that is clipped, or is expected within
+    `_SURE` standard deviations of the clip level.
+    """
     background = pixels.background.T[:, pixels.frame]
     variance = pixels.floor.T[:, pixels.frame] + (expected - background).clamp_min(0.0)
     unusable = pixels.clipped | (expected > pixels.level - _SURE * variance.sqrt())
@@ -205,8 +212,8 @@ def _weight(pixels: Seen, expected: Tensor) -> Tensor:
 
 
 def _slope(near: Linear, state: State, weight: Tensor, residual: Tensor) -> State:
-    """Return the slope of the log likelihood with respect to a state, that of the backgrounds
-    included.
+    """Return the gradient of the log likelihood with respect to a state, including the measured
+    backgrounds.
     """
     slope = near.slope(weight * residual)
     pull_to_background = (near.seen.background - state.background) / near.seen.doubt
@@ -214,8 +221,8 @@ def _slope(near: Linear, state: State, weight: Tensor, residual: Tensor) -> Stat
 
 
 def _ahead(pixels: Seen, state: State, share: Tensor, weight: Tensor, step: State) -> State:
-    """Return the state after a step, halved until the frames fit better; the state itself if
-    none does.
+    """Return the state after a step, which is halved until chi-square falls; the old state if it
+    never falls.
     """
     square_before = _square(pixels, state, linear(pixels, state, share), weight)
     for _ in range(_HALVED):
@@ -229,7 +236,7 @@ def _ahead(pixels: Seen, state: State, share: Tensor, weight: Tensor, step: Stat
 
 
 def _square(pixels: Seen, state: State, near: Linear, weight: Tensor) -> Tensor:
-    """Return chi-square of the frames and of what is known of their backgrounds."""
+    """Return chi-square of the frames and of their measured backgrounds."""
     background_misfit = (pixels.background - state.background).square() / pixels.doubt
     return (
         weight * (pixels.light - near.model(state.background)).square()
@@ -237,8 +244,8 @@ def _square(pixels: Seen, state: State, near: Linear, weight: Tensor) -> Tensor:
 
 
 def _curvature(near: Linear, weight: Tensor) -> State:
-    """Return the diagonal of the matrix of the step, roughly: that of the PSFs as if no point
-    were shifted.
+    """Return an approximate diagonal of the normal matrix; for the PSFs, shifts of the points are
+    neglected.
     """
     stamps = near.stamps_of(weight)
     kernels = torch.tensordot(
@@ -254,18 +261,17 @@ def _curvature(near: Linear, weight: Tensor) -> State:
 
 
 def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
-    """Return the step for a slope, by conjugate gradients that the curvature of each entry speeds
-    up.
+    """Return the step for a gradient, by conjugate gradients with a diagonal preconditioner.
 
-    A shift of all points is a shift of the PSFs, and a factor of a PSF is one of the signals:
-    ``hold`` decides.
+    A shift of all points is equivalent to a shift of the PSFs, and a factor of a PSF to a factor of
+    the signals. ``hold`` removes this ambiguity.
     """
     diagonal = _curvature(near, weight)
     inverse_diagonal = State(*(1.0 / x for x in diagonal))
     damping = State(*(_CALM * x.amax() * torch.ones_like(x) for x in diagonal))
     x = State(*(torch.zeros_like(entry) for entry in right))
     residual = _free(right, hold)
-    # the iteration stays among changes that the frames can tell
+    # the iteration is restricted to changes that the frames determine
     direction = _free(residual.times(inverse_diagonal), hold)
     residual_norm = residual.dot(direction)
     first_norm = residual_norm
@@ -286,19 +292,21 @@ def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
 
 
 class Hold(NamedTuple):
-    """What stays where it is, because a shift of all points is a shift of the PSFs."""
+    """The changes that are excluded from a fit, because a shift of all points is equivalent to a
+    shift of the PSFs.
+    """
 
-    points: Tensor  #: (point, point), projects on the moves of the points that are left to the PSFs
-    #: (way, node, channel, y, x), changes of the PSFs that are left to the points
+    points: Tensor  #: (point, point), projection on the excluded shifts of the points
+    #: (direction, node, channel, y, x), excluded changes of the PSFs: their shifts
     ways: Tensor | None
 
 
 def _hold(near: Linear, kernels: Tensor, weight: Tensor) -> Hold:
-    """Return what stays where it is at the nodes.
+    """Return the excluded changes.
 
-    Where each point tells one PSF, the points stay, so that a PSF need not be known between pixels.
-    Where points tell several, the PSFs stay in the middle: those that lie beside one another would
-    add to a wider one.
+    If each point depends on one PSF, the points are held, so that a PSF need not be known between
+    pixels. If points depend on several PSFs, the PSFs are held in the middle of their windows: PSFs
+    with different shifts would add up to a wider PSF.
     """
     if float(_support(near, weight)[1].max()) > _SHARED:
         return Hold(torch.zeros_like(near.share @ near.share.T), _ways(kernels))
@@ -306,7 +314,9 @@ def _hold(near: Linear, kernels: Tensor, weight: Tensor) -> Hold:
 
 
 def _free(change: State, hold: Hold) -> State:
-    """Return a change without the part that does not change the frames, which would have no end."""
+    """Return a change without its part that does not change the frames, which the fit would leave
+    undetermined.
+    """
     kernels = change.kernels - change.kernels.mean((-2, -1), keepdim=True)
     for direction in () if hold.ways is None else hold.ways:
         kernels = kernels - (direction * kernels).sum((-3, -2, -1), keepdim=True) * direction
@@ -314,13 +324,13 @@ def _free(change: State, hold: Hold) -> State:
 
 
 def _ways(kernels: Tensor) -> Tensor:
-    """Return two changes (2, node, channel, y, x) of each PSF, of unit length, that move it down
-    and to the right.
+    """Return the changes (2, node, channel, y, x) of each PSF for a shift down and to the right,
+    orthogonal and of unit length.
     """
     directions = list[Tensor]()
     for direction in torch.gradient(kernels, dim=(-2, -1)):
         direction = direction - direction.mean((-2, -1), keepdim=True)
-        # orthogonal to the first, by Gram and Schmidt
+        # Gram-Schmidt: orthogonal to the first direction
         for other in directions:
             direction = direction - (direction * other).sum((-3, -2, -1), keepdim=True) * other
         directions.append(
@@ -330,7 +340,7 @@ def _ways(kernels: Tensor) -> Tensor:
 
 
 def _refuse_unseen(near: Linear, weight: Tensor) -> None:
-    """Raise ValueError where a pixel of a PSF is saturated or beyond the frame in all frames."""
+    """Raise ValueError if a pixel of a PSF is saturated, or beyond the edge, in every frame."""
     information = torch.tensordot(
         near.share.square(), (near.stamps_of(weight) > 0).double(), ([0], [0])
     )
@@ -346,7 +356,9 @@ def _refuse_unseen(near: Linear, weight: Tensor) -> None:
 
 
 def _misfit(near: Linear, weight: Tensor, residual: Tensor) -> Tensor:
-    """Return the root of chi-square around each pixel of the window (y, x), at least 1."""
+    """Return the square root of the reduced chi-square around each pixel of the window (y, x), at
+    least 1.
+    """
     squares, count = (
         near.stamps_of(x).sum((0, 1)) for x in (weight * residual.square(), (weight > 0).double())
     )
@@ -366,13 +378,15 @@ def _reduced_chi_square(weight: Tensor, residual: Tensor, near: Linear) -> Tenso
 
 
 def _support(near: Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return for each node how many points would tell its PSF as well if they lay in the middle of
-    its zone, and the inflation of its variance because points tell several PSFs at once.
+    """Return for each node the effective number of points, and the inflation of the variance of its
+    PSF.
 
-    The worst of the pixels in the middle. With A the bilinear weights of the points that show a
-    pixel, the number is 1 over the diagonal of the inverse of A^T A, and the inflation the product
-    of this diagonal and that of A^T A (Kutner et al., Applied Linear Statistical Models, 5th ed.,
-    2005, sec. 10.5): 1 for points in the middles of zones.
+    The effective number is the number of points in the middle of the zone that would determine the
+    PSF equally well. The variance is inflated because a point between nodes depends on several
+    PSFs. Both are those of the worst pixel in the core. With A the bilinear weights of the points
+    that show a pixel, the number is 1 / diag((A^T A)^-1), and the inflation is diag((A^T A)^-1)
+    diag(A^T A) (Kutner et al., Applied Linear Statistical Models, 5th ed., 2005, sec. 10.5): 1 for
+    points in the middles of zones.
     """
     pixel_shown = near.stamps_of(weight) > 0
     middle_y, middle_x = (n // 2 for n in pixel_shown.shape[-2:])
@@ -383,7 +397,7 @@ def _support(near: Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
         .flatten(1)
         .double()
     )
-    # each set of points that shows some pixel, once
+    # the different sets of points that show a pixel
     patterns = torch.unique(core_shown, dim=1).T
     weight_products = near.share.T @ (patterns[:, :, None] * near.share)
     eigenvalues, eigenvectors = torch.linalg.eigh(weight_products)
@@ -392,7 +406,7 @@ def _support(near: Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _unknowns(near: Linear) -> float:
-    """Return the number of fitted values, at most nine tenths of the pixels."""
+    """Return the number of fitted values, limited to 90 % of the number of pixels."""
     points, channels = near.signal.shape
     window = near.patterns.shape[-2] * near.patterns.shape[-1]
     number = near.share.shape[1] * channels * window + points * (channels + 2)
@@ -409,8 +423,8 @@ def _normal(like: Tensor, rng: Generator) -> Tensor:
 # The PSF of a camera by field, measured from frames of point sources.
 
 
-_GOOD = 1.5  #: chi-square per pixel above which the model is said not to fit
-#: inflation of a variance above which the deviation was seen to be smaller than the error
+_GOOD = 1.5  #: reduced chi-square above which the check of the fit fails
+#: inflation of a variance above which the deviation may be smaller than the true error
 _INFLATED = 4.0
 
 
@@ -539,8 +553,8 @@ def _(result: MeasuredPsf, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def _counted(result: MeasuredPsf) -> Check:
-    """Return how many points tell each PSF, and the zone in which they tell several PSFs at
-    once.
+    """Return a check of the effective number of points of each PSF; it fails, and names the zone,
+    if the inflation of a variance is too large.
     """
     fewest, largest_inflation = float(result.support.min()), float(result.inflation.max())
     row, column = divmod(int(result.inflation.argmax()), result.inflation.shape[1])
@@ -564,8 +578,8 @@ def _pair(numbers: Sequence[int]) -> tuple[int, int]:
 
 
 def _outside(kernels: Tensor, draws: Tensor) -> Tensor:
-    """Return  2 pi R^2  times the mean at the rim plus two deviations, the largest of all zones,
-    for each channel.
+    """Return a bound (channel,) of the light beyond the window: 2 pi R^2 times (mean at the rim
+    plus two standard deviations), the largest of all zones.
     """
     y, x = kernels.shape[-2:]
     in_rim = torch.ones(y, x, dtype=torch.bool)
@@ -574,7 +588,7 @@ def _outside(kernels: Tensor, draws: Tensor) -> Tensor:
         kernels[..., in_rim].mean(-1),
         (draws - kernels)[..., in_rim].mean(-1).square().mean(0).sqrt(),
     )
-    # light that falls as 1 / r^3 from r = R on: integral of level (R / r)^3 2 pi r dr = 2 pi R^2
-    # level
+    # light that falls as 1 / r^3 beyond r = R: the integral of level (R / r)^3 2 pi r dr is
+    # 2 pi R^2 level
     bound = 2.0 * math.pi * (min(y, x) / 2.0) ** 2 * (rim_level.clamp_min(0.0) + 2.0 * spread)
     return bound.amax((0, 1))

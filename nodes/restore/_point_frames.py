@@ -1,4 +1,6 @@
-"""Frames of point sources: how they are read, and their model as a function of the PSF."""
+"""Frames of point sources: reading the files, and modelling the frames as a function of the
+PSF.
+"""
 
 from __future__ import annotations
 
@@ -25,32 +27,33 @@ from neusee.nodes.sensor._frame_file import Curve, frame_problem, read_frame
 
 
 _SIGNIFICANT_DEVIATIONS = 8.0  #: standard deviations by which a point stands out of the noise
-#: of the brightest point of the frame: what is fainter is a lobe or a reflection
+#: fraction of the brightest point of the frame; a fainter peak is a side lobe or a reflection
 _FAINTEST_SHARE = 0.03
 _RIM_PIXELS = 3  #: pixels from the edge of the frame within which a point is not used
-_MOST_POINTS = 400  #: points of a frame
-#: pixels beyond all windows that a frame must have, because they give its background
+_MOST_POINTS = 400  #: largest number of points that are used in one frame
+#: smallest number of pixels outside all windows; the background is estimated from them
 _LEAST_BACKGROUND = 500
-#: standard deviations beyond which a pixel does not count for the background
+#: standard deviations from the mean, beyond which a pixel is left out of the background
 _OUTLIER_DEVIATIONS = 4.0
-_DARK_PREFIX = "dark"  #: beginning of the name of a file without light
+_DARK_PREFIX = "dark"  #: the names of dark frames begin with it
 Camera = tuple[float, float, float, int, float]  #: gain, offset, full well, bits, read noise
 
 
 class Seen(NamedTuple):
-    """The pixels in the windows of all points, and what is known of each frame."""
+    """The pixels in the windows of all points, and the background and noise of each frame."""
 
     light: Tensor  #: (channel, pixel) float64, e-
     clipped: Tensor  #: (channel, pixel) bool
     frame: Tensor  #: (pixel,) int64, the frame of each pixel
-    #: (point, y * x) int64, pixel of each place in a window; their number where there is none
+    #: (point, y * x) int64, index of the pixel at each place of a window; the number of all pixels
+    #: for a place beyond the frame
     pixels: Tensor
     owner: Tensor  #: (point,) int64, the frame of each point
     middle: Tensor  #: (point, 2) int64, the pixel in the middle of each window
-    background: Tensor  #: (frame, channel) float64, e-, mean beyond all windows
+    background: Tensor  #: (frame, channel) float64, e-, mean of the pixels outside all windows
     doubt: Tensor  #: (frame, channel) float64, e-2, variance of this mean
-    floor: Tensor  #: (frame, channel) float64, e-2, variance of the noise without light of points
-    level: float  #: e-, at which a pixel is clipped
+    floor: Tensor  #: (frame, channel) float64, e-2, variance of a pixel without light of points
+    level: float  #: e-, light at which a pixel clips
 
 
 def lit_and_dark(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -60,7 +63,7 @@ def lit_and_dark(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 class Layout(NamedTuple):
-    """Sizes of the PSFs that are measured, and where, (y, x) each."""
+    """Sizes (y, x) of the frames, of the measured PSFs, and of the grid of zones."""
 
     shape: tuple[int, int]  #: pixels of a frame
     window: tuple[int, int]  #: pixels of a PSF
@@ -74,8 +77,8 @@ def refuse_bad_frames(
     camera: Camera,
     curve: Curve | None = None,
 ) -> None:
-    """Raise ParameterError with the names of all frames that cannot be used, and of all zones
-    without a point.
+    """Raise ParameterError if frames cannot be used, or if zones have no sharp point; the message
+    names all of them.
     """
     lit, dark = lit_and_dark(files)
     if not lit:
@@ -95,7 +98,7 @@ def refuse_bad_frames(
 
 
 def _refuse_problems(files: Sequence[Path], problems: Sequence[str]) -> None:
-    """Raise ParameterError with the problems of all frames that have one."""
+    """Raise ParameterError with all problems that are not empty texts."""
     stated = [problem for problem in problems if problem]
     if stated:
         beginning = (
@@ -109,7 +112,7 @@ def _empty_zones(
     shape: tuple[int, int],
     zones: tuple[int, int],
 ) -> list[tuple[int, int]]:
-    """Return the zones without a sharp point, (row, column) from 1."""
+    """Return the zones without an unclipped point, as (row, column) counted from 1."""
     zones_with_points = set()
     for points in points_by_file:
         zones_with_points |= {_zone(place, shape, zones) for place, sharp in points if sharp}
@@ -125,8 +128,9 @@ def points_in(files: Sequence[Path], window: tuple[int, int], camera: Camera) ->
 
 
 def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> Seen:
-    """Read all frames and keep the pixels in the windows of their points; subtract the mean of
-    the dark frames.
+    """Return the pixels in the windows of the points of all frames, minus the mean dark frame.
+
+    Without dark frames, the offset of the camera is subtracted.
     """
     gain, offset, full_well, bits, read_noise = camera
     lit, dark = lit_and_dark(files)
@@ -159,7 +163,7 @@ def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) 
     ) = zip(*frame_pixels, strict=True)
     pixel_index, background_level = torch.cat(pixels_by_frame), torch.stack(background_by_frame)
     level = min(full_well, (2.0**bits - 1) / gain) - float(np.mean(dark_level))
-    # a mean of dark frames adds its own noise; 1 / 12 of a digital number squared is its rounding
+    # the mean dark frame adds its own read noise; rounding has the variance 1 / 12 DN2
     read_variance = read_noise**2 * (1 + (1 / len(dark) if dark else 0)) + 1 / (12 * gain**2)
     floor = torch.maximum(
         torch.stack(variance_by_frame), read_variance + background_level.clamp_min(0.0)
@@ -168,7 +172,7 @@ def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) 
         torch.cat(light_by_frame, 1),
         torch.cat(clipped_by_frame, 1),
         torch.cat(frame_by_frame),
-        # places beyond the frame: one after the last pixel
+        # a place beyond the frame gets the index after the last pixel
         torch.where(pixel_index < 0, first_pixel, pixel_index),
         torch.cat(owner_by_frame),
         torch.cat(middle_by_frame),
@@ -187,12 +191,14 @@ def _windows_of_points(
     number: int,
     first: int,
 ) -> tuple[Tensor, ...]:
-    """Return of one frame the pixels in the windows of its points: light and clipped (channel,
-    pixel), frame of each, pixels of each window, middle and frame of each point; and the background
-    beyond the windows: its mean, the variance of this mean, and that of a pixel, for each channel.
+    """Return the pixels in the windows of the points of one frame, and the background of the frame.
 
-    ``ends`` are the clipped pixels, ``number`` that of the frame, ``first`` that of its first
-    pixel.
+    The result is: light and clipped (channel, pixel), frame (pixel,), pixels of each window,
+    middle of each window, frame of each point; then for each channel the mean of the background,
+    the variance of this mean, and the variance of one background pixel.
+
+    ``ends`` marks the clipped pixels. ``number`` is the index of the frame, ``first`` the index of
+    its first pixel among the pixels of all frames.
     """
     y, x = light.shape[-2:]
     middle = torch.tensor(places, dtype=torch.int64).reshape(-1, 2)
@@ -202,7 +208,7 @@ def _windows_of_points(
     flat_place = rows.clamp(0, y - 1)[:, :, None] * x + columns.clamp(0, x - 1)[:, None]
     covered = _covered((y, x), places, window).flatten()
     widely_covered = _covered((y, x), places, (2 * window[0], 2 * window[1])).flatten()
-    # windows twice as wide leave a better background, if enough pixels remain
+    # outside windows twice as wide the background has less light of points
     near_points = widely_covered if int((~widely_covered).sum()) >= _LEAST_BACKGROUND else covered
     pixel_number = covered.cumsum(0) - 1 + first
     window_pixels = torch.where(in_frame, pixel_number[flat_place], -1).flatten(1)
@@ -233,7 +239,7 @@ def _windows_of_points(
 def _covered(
     shape: tuple[int, int], places: list[tuple[int, int]], window: tuple[int, int]
 ) -> Tensor:
-    """Return True for the pixels (y, x) in windows around places."""
+    """Return a mask (y, x) of the pixels that lie in a window around a place."""
     covered, (half_rows, half_columns) = (
         torch.zeros(shape, dtype=torch.bool),
         (n // 2 for n in window),
@@ -248,6 +254,7 @@ def _covered(
 
 def _average(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean without outliers, the variance of this mean, and the variance of a pixel."""
+    # repeated, because outliers enlarge the standard deviation of the first passes
     for _ in range(4):
         mean, spread = values.mean(), values.std()
         values = values[(values - mean).abs() <= _OUTLIER_DEVIATIONS * spread + 1e-12]
@@ -261,8 +268,8 @@ def _average(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _find_points(
     file: Path, window: tuple[int, int], camera: Camera
 ) -> list[tuple[tuple[int, int], bool]]:
-    """Return the middle pixel of each point of a frame, the brightest first, and True for one
-    that is not clipped.
+    """Return the central pixel of each point of a frame, and whether its core is unclipped; the
+    brightest point comes first.
     """
     gain, _, full_well, bits, read_noise = camera
     raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
@@ -270,13 +277,14 @@ def _find_points(
     light = (raw / gain).sum(0)
     median_picture = _median(light)
     background = median_picture.median()
-    # standard deviation of a normal law over its median absolute deviation
+    # 1.4826: standard deviation of a normal distribution over its median absolute deviation
     noise = 1.4826 * float((light - light.median()).abs().median())
     noise = max(noise, read_noise * math.sqrt(len(raw)), 1e-6)
     above = median_picture - background
     is_significant = above > max(
         _SIGNIFICANT_DEVIATIONS * noise, _FAINTEST_SHARE * float(above.max())
     )
+    # a peak is the largest of the 7 x 7 pixels around it
     is_peak = is_significant & (above >= max_pool2d(above[None], 7, 1, 3)[0])
     above = torch.where(is_peak, above, 0.0)
     points = list[tuple[tuple[int, int], bool]]()
@@ -294,13 +302,15 @@ def _find_points(
 
 
 def _is_inner(place: tuple[int, int], height: int, width: int) -> bool:
-    """Return True if a pixel (y, x) does not lie in the rim of a picture."""
+    """Return True if a pixel (y, x) is not too close to the edge of a picture."""
     y, x = place
     return _RIM_PIXELS <= y < height - _RIM_PIXELS and _RIM_PIXELS <= x < width - _RIM_PIXELS
 
 
 def _median(picture: Tensor) -> Tensor:
-    """Return the median of three by three pixels, in which a single hot pixel does not show."""
+    """Return the median over the 3 x 3 pixels around each pixel, which removes single hot
+    pixels.
+    """
     padded = pad(picture[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     return padded.unfold(0, 3, 1).unfold(1, 3, 1).flatten(-2).median(-1).values
 
@@ -311,7 +321,7 @@ def _unusable(
     shape: tuple[int, int],
     window: tuple[int, int],
 ) -> str:
-    """Return why a frame does not show points, or an empty text."""
+    """Return why the points of a frame cannot be used, or an empty text if they can."""
     if not points:
         return (
             f"{file.name} shows no point source: nothing stands out of the noise by"
@@ -349,16 +359,18 @@ def _without_point(empty: list[tuple[int, int]], zones: tuple[int, int]) -> str:
 
 # --- point model ----------------------------------------------------------------------------------
 
-# The frames of point sources as a function of the PSF at the nodes of a grid, and of each point's
-# place and signal.
+# The frames of point sources as a function of the PSF at the nodes of a grid, of the place and
+# signal of each point, and of the background.
 
 
-_KERNEL_REACH = 12  #: pixels on each side of a pixel that its interpolated value uses
-_KAISER_BETA = 8.0  #: of the Kaiser window
+_KERNEL_REACH = 12  #: half width of the interpolation kernel, pixels
+_KAISER_BETA = 8.0  #: shape parameter of the Kaiser window
 
 
 class State(NamedTuple):
-    """What is fitted: also a change of it, and a slope with respect to it."""
+    """The fitted quantities; the same type also holds a change of them, or a gradient with respect
+    to them.
+    """
 
     kernels: Tensor  #: (node, channel, y, x)
     signal: Tensor  #: (point, channel), e-
@@ -366,29 +378,31 @@ class State(NamedTuple):
     background: Tensor  #: (frame, channel), e-
 
     def plus(self, other: State, times: float | Tensor = 1.0) -> State:
-        """Return the sum of this and a multiple of another."""
+        """Return the sum of this state and ``times`` the other."""
         return State(*(a + times * b for a, b in zip(self, other, strict=True)))
 
     def dot(self, other: State) -> Tensor:
-        """Return the sum of the products of all entries."""
+        """Return the scalar product with the other state, over all entries."""
         return torch.stack([(a * b).sum() for a, b in zip(self, other, strict=True)]).sum()
 
     def times(self, other: State) -> State:
-        """Return the products of all entries."""
+        """Return the product with the other state, entry by entry."""
         return State(*(a * b for a, b in zip(self, other, strict=True)))
 
 
 def node_weights(places: Tensor, shape: tuple[int, int], zones: tuple[int, int]) -> Tensor:
-    """Return the bilinear weight of each node at places (point, 2): (point, rows * columns),
-    with a sum of 1.
+    """Return the bilinear weights (point, rows * columns) of the nodes at places (point, 2); the
+    weights of a point sum to 1.
     """
     down, right = (hats(places[:, k], shape[k], zones[k]) for k in (0, 1))
     return (down[:, :, None] * right[:, None]).flatten(1)
 
 
 def hats(position: Tensor, size: int, count: int) -> Tensor:
-    """Return the linear weights (place, node) of ``count`` nodes in the middles of equal parts
-    of ``size`` pixels.
+    """Return the weights (place, node) of linear interpolation between ``count`` nodes.
+
+    The nodes lie in the centres of equal parts of ``size`` pixels. Beyond the outer nodes, the
+    nearest node has the weight 1.
     """
     position_in_nodes = ((position.double() + 0.5) * count / size - 0.5).clamp(0, count - 1)
     return (
@@ -397,18 +411,18 @@ def hats(position: Tensor, size: int, count: int) -> Tensor:
 
 
 def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Return matrices (point, size, size) that shift samples by ``offset`` (point,), and their
-    slopes.
+    """Return matrices (point, size, size) that shift samples by ``offset`` (point,), and the
+    derivatives of these matrices with respect to the offset.
 
-    The interpolation is a sinc with a Kaiser window: its error is below 1e-4 for up to 0.4 periods
-    in a pixel. The slope of the samples is continued beyond their ends.
+    The interpolation kernel is a sinc with a Kaiser window: its error is below 1e-4 up to 0.4
+    periods per pixel. Beyond their ends the samples are continued with the same slope.
     """
     distance_in_samples = (
         torch.arange(size)[:, None] - torch.arange(size + 2 * _KERNEL_REACH) + _KERNEL_REACH
     )
     distance = distance_in_samples.double() - offset[:, None, None]
     inside_square = (1.0 - (distance / (_KERNEL_REACH + 1.0)).square()).clamp_min(0.0)
-    # Kaiser's window, i0(beta sqrt(1 - t^2)) / i0(beta), and below its derivative
+    # the Kaiser window i0(beta sqrt(1 - t^2)) / i0(beta); its derivative is `taper_change`
     root = inside_square.sqrt()
     taper = torch.special.i0(_KAISER_BETA * root) / torch.special.i0(
         torch.tensor(_KAISER_BETA, dtype=torch.float64)
@@ -419,7 +433,7 @@ def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
     sinc, x = torch.sinc(distance), math.pi * distance
     near_zero = distance.abs() < 1e-4
     sinc_slope = torch.where(
-        # near 0 the first term of the series of the derivative
+        # near 0, where the quotient loses digits: the first term of its Taylor series
         near_zero,
         -math.pi * x / 3.0,
         (torch.cos(x) - sinc) / torch.where(near_zero, 1.0, distance),
@@ -429,14 +443,16 @@ def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
     )
     is_outside = inside_square <= 0
     value = (sinc * taper).masked_fill(is_outside, 0.0)
-    # by the shift: the distance falls as the shift grows
+    # minus: the distance decreases as the shift grows
     slope = -(sinc_slope * taper + sinc * taper_change).masked_fill(is_outside, 0.0)
     return _folded(value), _folded(slope)
 
 
 def _folded(matrix: Tensor) -> Tensor:
-    """Return matrices whose columns beyond the ends act on the samples within, mirrored at the
-    ends and turned over.
+    """Return the matrices without the columns beyond the ends, whose weights are added to the
+    samples inside.
+
+    A sample beyond an end is twice the end sample minus its mirror image.
     """
     inner = matrix[..., _KERNEL_REACH:-_KERNEL_REACH].clone()
     reach = min(_KERNEL_REACH, inner.shape[-1] - 1)
@@ -444,7 +460,6 @@ def _folded(matrix: Tensor) -> Tensor:
         matrix[..., _KERNEL_REACH - reach : _KERNEL_REACH],
         matrix[..., -_KERNEL_REACH : matrix.shape[-1] - _KERNEL_REACH + reach],
     )
-    # beyond the end the samples are 2 x end - mirror image
     inner[..., 0] += 2.0 * left_columns.sum(-1)
     inner[..., 1 : reach + 1] -= left_columns.flip(-1)
     inner[..., -1] += 2.0 * right_columns.sum(-1)
@@ -460,19 +475,21 @@ def moved(kernels: Tensor, offset: Tensor) -> Tensor:
 
 
 class Linear(NamedTuple):
-    """The frames near a state: the model, and its derivative as a matrix that is never formed."""
+    """The model of the frames, linearized at a state; its Jacobian is applied and never stored."""
 
     seen: Seen
     share: Tensor  #: (point, node)
     signal: Tensor  #: (point, channel)
     down: Tensor  #: (point, y, y)
     right: Tensor  #: (point, x, x)
-    #: (3, point, channel, y, x): each point of signal 1, and its slopes with y and x times the
-    #: signal
+    #: (3, point, channel, y, x): image of each point for signal 1, then the derivatives of the
+    #: point's image with respect to y and x
     patterns: Tensor
 
     def change(self, by: State) -> Tensor:
-        """Return the change (channel, pixel) of the frames for a small change of the state."""
+        """Return the change (channel, pixel) of the frames for a small change of the state: the
+        Jacobian applied to it.
+        """
         kernels = torch.tensordot(self.share, by.kernels, 1)
         stamps = self.signal[..., None, None] * _applied(self.down, kernels, self.right)
         stamps = stamps + by.signal[..., None, None] * self.patterns[0]
@@ -480,7 +497,7 @@ class Linear(NamedTuple):
         return self._scattered(stamps) + by.background.T[:, self.seen.frame]
 
     def slope(self, pixels: Tensor) -> State:
-        """Return the transpose of `change`, applied to pixels (channel, pixel)."""
+        """Return the transposed Jacobian, applied to pixels (channel, pixel)."""
         stamps = self.stamps_of(pixels)
         signal = (stamps * self.patterns[0]).sum((-2, -1))
         offset = (stamps * self.patterns[1:]).sum((-3, -2, -1)).T
@@ -494,15 +511,19 @@ class Linear(NamedTuple):
         return State(kernels, signal, offset, background)
 
     def stamps_of(self, pixels: Tensor) -> Tensor:
-        """Return pixels (channel, pixel) as windows (point, channel, y, x); 0 beyond the frame."""
-        # one more pixel of 0 for places beyond the frame
+        """Return the values of pixels (channel, pixel) in the windows of all points (point,
+        channel, y, x); 0 beyond the frame.
+        """
+        # an extra pixel of value 0 stands for the places beyond the frame
         with_outside = torch.cat([pixels, pixels.new_zeros(len(pixels), 1)], 1)[
             :, self.seen.pixels
         ].transpose(0, 1)
         return with_outside.reshape(*with_outside.shape[:2], *self.patterns.shape[-2:])
 
     def _scattered(self, stamps: Tensor) -> Tensor:
-        """Return frames (channel, pixel) that are sums of windows (point, channel, y, x)."""
+        """Return frames (channel, pixel), to which the windows (point, channel, y, x) are added at
+        their places.
+        """
         flat_stamps = stamps.transpose(0, 1).flatten(1)
         count = self.seen.light.shape[-1]
         with_outside = flat_stamps.new_zeros(len(flat_stamps), count + 1).index_add(
@@ -519,7 +540,7 @@ class Linear(NamedTuple):
 
 
 def linear(pixels: Seen, state: State, share: Tensor) -> Linear:
-    """Return the frames near a state."""
+    """Return the model of the frames, linearized at a state."""
     y, x = state.kernels.shape[-2:]
     (row_matrix, row_slope), (column_matrix, column_slope) = (
         shifting(state.offset[:, 0], y),
@@ -537,8 +558,8 @@ def linear(pixels: Seen, state: State, share: Tensor) -> Linear:
 
 
 def _applied(down: Tensor, kernels: Tensor, right: Tensor) -> Tensor:
-    """Return kernels (point, channel, y, x), multiplied from both sides by the matrices of each
-    point.
+    """Return D k R^T for each kernel k (point, channel, y, x), with the matrices D = ``down`` and R
+    = ``right`` of its point.
     """
     products: Tensor = down[:, None] @ kernels @ right.mT[:, None]
     return products

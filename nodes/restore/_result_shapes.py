@@ -1,4 +1,4 @@
-"""Shapes of the results of the restoring nodes, and the work of those that take long."""
+"""Shapes of the results of the restoring nodes, and memory and operations of the slow ones."""
 
 from __future__ import annotations
 
@@ -60,30 +60,30 @@ from neusee.nodes.values import (
 
 # --- result shapes --------------------------------------------------------------------------------
 
-# Shapes of the results of the restoring nodes, and the work of the deconvolution and of the
-# networks.
+# Shapes of the results of the restoring nodes, and memory and operations of the deconvolution and
+# of the networks. "Operations" are those of the transforms: other work is converted to the number
+# of operations of a transform that takes the same time.
 
 
 _SYSTEM_BYTES = (
     35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 )
-#: operations of a transform that take as long as one of the cube of the side of an inverted matrix
+#: operations per n^3 for the inversion of a matrix of side n
 _INVERTED = 0.30
-#: side of a dense system that needs as much memory as an inverted matrix of side 1
+#: side of the dense system that needs as much memory as the inversion of a matrix, per side of it
 _WHITENED = 0.94
-#: operations of a transform that take as long as an element of a matrix of covariances
+#: operations for each element of a covariance matrix
 _FILLED = 790.0
-#: transforms, of the size of pupil and window together, that take as long as a band of a PSF
+#: time of one band of a PSF, in transforms of the size of pupil and window together
 _FOCUS = 2.0
-#: bytes for each pixel of a pattern that the glare may have: its copies, scaled and weighted
+#: bytes for each pixel of each ``nearby`` pattern of the glare: its scaled and weighted copies
 _MODE_BYTES = 24.0
-#: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
+#: bytes for each pixel of a frame in which lasers are sought: patterns, and derivatives of a fit
 _SEARCH_BYTES = 150.0
-_LINES_TRIED = 61  #: spectral lines that a search tries, each with five transforms
-#: bytes of inner results of a network that need as much memory as a byte of the usual work of a
-#: node
+_LINES_TRIED = 61  #: number of spectral lines that a search tries, each with five transforms
+#: bytes of the usual memory of a node that correspond to a byte of a network's intermediate results
 _KEPT = 1 / 8
-_LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
+_LAYER = 1e-3  #: operations for each operation of a layer of a network
 
 for node in (
     electrons,
@@ -172,7 +172,7 @@ def _(electrons: Tensor, *inputs: Any, most: int = 3, **params: Any) -> FoundLas
 def _(result: FoundLasers, electrons: Tensor, *others: Any, **params: Any) -> tuple[float, float]:
     # bytes of memory during the run, beside inputs and result, and number of operations
     y, x = electrons.shape[-2:]
-    # a search for each laser, and one that finds no more
+    # one search for each laser, and a last one that finds none
     rounds = 1 + len(result.direction)
     # five transforms for each line in each round
     return _SEARCH_BYTES * y * x, 5.0 * _LINES_TRIED * rounds * transform_operations(2 * y, 2 * x)
@@ -191,8 +191,8 @@ def _(found: Any, pupil: Any, electrons: Tensor, *, patterns: int = 12, **params
 def _summed(
     result: Tensor, lasers: Any, pupil: Pupil, electrons: Tensor, **params: Any
 ) -> tuple[float, float]:
-    """Return peak memory in bytes and operations of sums over all samples of the pupil, for each
-    row and column of pixels.
+    """Return peak memory in bytes, and operations, of the far field of the pupil, computed as two
+    matrix products, one for each axis.
     """
     pupil_side, (y, x) = max(pupil.height.shape), electrons.shape[-2:]
     pattern_count = len(result) if result.ndim > electrons.ndim else 1
@@ -212,11 +212,10 @@ def _(
     # bytes of memory during the run, beside inputs and result, and number of operations
     border = params.get("border", 1.0)
     y, x = _torus(electrons, psf, border)
-    # the frame is halved until it is small enough for a dense solution
+    # the frame is halved until the coarsest grid can be solved as a dense system
     coarsest_side = max(electrons.shape[-2:]) / 2 ** halvings(
         (electrons.shape[-2], electrons.shape[-1])
     )
-    # of the coarsest grid, which is solved as a dense system
     unknowns = len(electrons) * coarsest_side**2
     step_operations, lowest_side = _descent(electrons, psf, border)
     operations = step_operations + _FILLED * unknowns**2
@@ -224,13 +223,13 @@ def _(
     nearby_memory = (
         _MODE_BYTES
         * sum(
-            # others[5] is `nearby`, after illuminant, responses, bands, clipped and glare
+            # `others`: illuminant, responses, bands, clipped, glare, then `nearby` at index 5
             len(patterns_drawn)
             for patterns_drawn in (others[5] if len(others) > 5 else None) or ()
         )
         * electrons.numel()
     )
-    # 31 bytes for each pixel of the transforms, or those of the dense system
+    # 31 bytes for each pixel of the transforms, or the bytes of the dense system if more
     return max(
         31.0 * len(electrons) * y * x, _SYSTEM_BYTES * largest_system**2
     ) + nearby_memory, operations
@@ -265,7 +264,7 @@ def _(
     # bytes of memory during the run, beside inputs and result, and number of operations
     inputs_of_filter = (*others[:4], *others[5:])  # without the matrix
     memory, operations = wiener.hooks.work(result, electrons, psf, *inputs_of_filter, **params)  # type: ignore[misc]
-    # half as much memory again for draws and details; each draw is a deconvolution
+    # draws and details need half as much memory again; each draw is one deconvolution
     return 1.5 * memory, draws * operations
 
 
@@ -303,7 +302,7 @@ def _(result: WienerProblem, *inputs: Any, **params: Any) -> tuple[float, float]
 def _(electrons: Tensor, *inputs: Any, **params: Any) -> FilterFacts:
     kind = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
     frame, by_channel = tuple(electrons.shape), (len(electrons), 1, 1)
-    # `MAPS` is for three channels: each further channel has `MAPS_OF_CHANNEL` more
+    # `MAPS` is the number of maps for three channels: each further channel adds `MAPS_OF_CHANNEL`
     maps = (MAPS + MAPS_OF_CHANNEL * (len(electrons) - 3), *frame[1:])
     return FilterFacts._make(
         blank(*shape, dtype=kind) for shape in (frame, frame, maps, by_channel, by_channel)
@@ -342,7 +341,7 @@ def _(
     memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
     # bytes and operations of one network
     of_layers, layers = _layers(result, width=width)
-    # the answer and each step deconvolve; each step has its own layers
+    # one deconvolution for the start and one for each step; each step has its own layers
     return memory + of_layers, (1 + steps) * operations + steps * layers
 
 
@@ -352,8 +351,8 @@ def _(signal: Any, clipped: Any, psf: Any, bands: Bands, *others: Any, **params:
 
 
 def _descent(electrons: Tensor, psf: Psf, border: float) -> tuple[float, float]:
-    """Return the operations of the steps on all grids but the coarsest, and the side of the largest
-    matrix that speeds them up.
+    """Return the operations of the conjugate gradient steps on all grids but the coarsest, and the
+    side of the largest matrix of their preconditioners.
     """
     channels, *picture = electrons.shape
     psf_radii = [
@@ -378,15 +377,15 @@ def _(
 ) -> tuple[float, float]:
     # bytes of memory during the run, beside inputs and result, and number of operations
     y, x = _torus(electrons, psf)
-    # bytes, and four transforms of each channel in each iteration
+    # four transforms of each channel in each iteration
     return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(
         electrons
     ) * transform_operations(y, x)
 
 
 def _torus(picture: Tensor, psf: Psf, border: float = 1.0) -> tuple[int, int]:
-    """Return the size of the transforms that deconvolve a picture, whose border they extend by
-    the PSF.
+    """Return the size (y, x) of the transforms for the deconvolution of a picture: its own size
+    plus a border as wide as ``border`` times the PSF.
     """
     sides = zip(picture.shape[-2:], psf.intensity.shape[-2:], strict=True)
     y, x = (n + math.ceil(border * min(k, 2 * n)) for n, k in sides)
@@ -394,7 +393,9 @@ def _torus(picture: Tensor, psf: Psf, border: float = 1.0) -> tuple[int, int]:
 
 
 def _layers(result: Tensor, *inputs: Any, width: int = 32, **params: Any) -> tuple[float, float]:
-    """Return peak memory in bytes and operations of a network with layers of ``width`` channels."""
+    """Return peak memory in bytes, and operations, of a network whose layers have ``width``
+    channels.
+    """
     pixels = float(result[0].numel())
     return 4.0 * width * pixels, width**2 * pixels
 
@@ -418,7 +419,7 @@ def _(
     # bytes of memory during the run, beside inputs and result, and number of operations
     if architecture is None:
         return _layers(result)
-    # what one call on a small picture showed, for each pixel
+    # memory and operations per pixel were measured in a call on a small picture
     trial, pixels = tried(architecture, parameters, multiple), result[0].numel() / reduce**2
     return _KEPT * trial.memory * min(
         pixels, tile**2 if tile else math.inf
@@ -427,13 +428,13 @@ def _(
 
 # --- result shapes --------------------------------------------------------------------------------
 
-# The shape of a measured PSF, and the work of measuring it and of restoring with it.
+# The shape of a measured PSF, and memory and operations of measuring it and of restoring with it.
 
 
 _FIT_STEPS = (
-    6  #: steps of Gauss and Newton that a fit usually takes, each of as much work as a draw
+    6  #: usual number of Gauss-Newton steps of a fit, each with as many operations as a draw
 )
-#: bytes for each pixel of each window: the points, their slopes and the arrays of a step
+#: bytes for each pixel of each window: images of the points, their derivatives, arrays of a step
 _HELD = 80.0
 _POINTS_BYTES = 40.0  #: bytes for each pixel of a frame while it is searched for points
 
@@ -457,7 +458,7 @@ def _(
     kernels = rows, columns, channels, y, x
     points = points_in(files, (y, x), (gain, offset, full_well, bits, read_noise))
     per_zone = [double(rows, columns) for _ in range(2)]
-    # in the order of its fields
+    # in the order of the fields of `MeasuredPsf`
     return MeasuredPsf(
         double(*kernels),
         double(*kernels),
@@ -477,10 +478,11 @@ def _(
     shape: Sequence[int],
     **params: Any,
 ) -> tuple[float, float]:
-    """Return the bytes of the windows and a frame, and the products of the shifts of all draws and
-    fits.
+    """Return the bytes of the windows and of a frame, and the operations of the shift matrices in
+    all fits and draws.
 
-    Each node slows the iteration down, because points tell several PSFs at once.
+    The number of steps grows with the number of nodes: a point between nodes depends on several
+    PSFs at once, so that the iteration converges more slowly.
     """
     rows, columns, channels, y, x = result.kernels.shape
     windows = float(len(result.places) * channels * y * x)
@@ -499,7 +501,9 @@ def _(
     nearby: Sequence[Tensor] | None = None,
     **params: Any,
 ) -> tuple[float, float]:
-    """Return the work of the filter on the largest part, and on all parts."""
+    """Return the memory of the filter for the largest part of the frame, and its operations for all
+    parts.
+    """
     rows, columns = (
         _sides(n, count, size)
         for n, count, size in zip(
@@ -542,8 +546,8 @@ def _(
 
 
 def _sides(size: int, count: int, window: int) -> list[int]:
-    """Return the pixels that the parts around each of ``count`` nodes have along one axis, at
-    most.
+    """Return for each of ``count`` nodes the largest number of pixels that its part of the frame
+    has along one axis.
     """
     if count == 1:
         return [size]

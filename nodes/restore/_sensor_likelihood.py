@@ -1,5 +1,5 @@
-"""The likelihood of electrons that a sensor measured: noise of photons and amplifier, and pixels
-that clipped.
+"""The likelihood of the electrons that a sensor measures: photon noise, read noise and clipped
+pixels.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from neusee.nodes.restore._electrons_and_colour import electrons
 from neusee.nodes.sensor._digitization import digitize, full_well
 from neusee.nodes.sensor._noise import dark_current, dark_electrons, photon_noise, read_noise
 
-#: standard deviations; further below the expectation, the clip level costs nothing in any precision
+#: standard deviations: with the clip level this far below the expectation, a pixel clips with a
+#: probability that rounds to 1
 _CERTAIN_DEVIATIONS = -12.0
 
 
@@ -26,8 +27,8 @@ class MeasuringSensor:
     converter.
 
     The measured electrons of a pixel that is not clipped have a normal distribution with the
-    expectation as mean and the variance of all noise. Of a clipped pixel it is only known that it
-    reached the clip level.
+    expectation as mean and the total noise variance. A clipped pixel is censored: it is only known
+    to have reached the clip level.
 
     Error:  a normal distribution in place of the Poisson distribution: right above about 20 e-.
             Rounding of the converter counts as noise of variance 1/12 DN2. Numbers below 0 DN are
@@ -47,18 +48,18 @@ class MeasuringSensor:
 
     @property
     def level(self) -> float:
-        """Return the clip level, the least number of electrons without offset that
-        `restore.clipped` marks, in e-.
+        """Return the clip level in e-: the smallest signal, after subtraction of the offset, that
+        `restore.clipped` marks.
         """
         largest_number: int = max(1, min(2**self.bits - 1, int(self.well * self.gain - 0.5)))
-        # rounding sends all from half a number below it to the largest number
+        # rounding: values from 0.5 DN below the largest number are rounded up to it
         return (largest_number - 0.5) / self.gain - self.offset
 
     def variance(self, expected: Tensor, floor: float = 0.0) -> Tensor:
-        """Return the variance of the measured electrons; expectations below ``floor`` count as
-        ``floor``.
+        """Return the variance (e-2) of the measured electrons; an expectation below ``floor``
+        counts as ``floor``.
         """
-        # read noise, and 1 / 12 of a digital number squared for its rounding
+        # read noise, and rounding with the variance 1 / 12 DN2
         constant_variance = self.read_noise**2 + 1.0 / (12.0 * self.gain**2)
         return self.spread**2 * expected.clamp_min(floor) + constant_variance
 
@@ -67,10 +68,10 @@ class MeasuringSensor:
     ) -> Tensor:
         """Return the negative log-likelihood of each pixel.
 
-        Shapes: expected, measured and known broadcast against one another; the result has the
+        Shapes: expected, measured and unsaturated broadcast against one another; the result has the
                 common shape.
-        Units:  e-, with the dark electrons and without the offset; known 0 where a pixel clipped;
-                result nats.
+        Units:  e-, with the dark electrons and without the offset; unsaturated 0 where a pixel
+                clipped; result nats.
         """
         variance = self.variance(expected, floor)
         normal = (measured - expected).square() / variance + (2.0 * math.pi * variance).log()
@@ -87,7 +88,7 @@ class MeasuringSensor:
         nats/e-.
         """
         variance = self.variance(expected, floor)
-        # of the variance, relative
+        # relative change of the variance per electron
         relative_growth = self.spread**2 * (expected > floor).to(expected) / variance
         error = measured - expected
         normal = -error / variance + 0.5 * relative_growth * (1.0 - error.square() / variance)
@@ -96,8 +97,8 @@ class MeasuringSensor:
         return torch.where(unsaturated > 0, normal, _hazard(distance) * distance_slope)
 
     def measured(self, expected: Tensor, rng: Generator) -> Tensor:
-        """Return one measurement of expected electrons without dark electrons, in e- without the
-        offset.
+        """Return a simulated measurement in e-, without the offset, for expected electrons without
+        dark electrons.
         """
         charge = photon_noise(
             expected,
@@ -118,7 +119,9 @@ class MeasuringSensor:
 
 
 def _hazard(z: Tensor) -> Tensor:
-    """Return the density of the normal distribution at z over its upper tail beyond z."""
+    """Return the hazard of the standard normal distribution at z: its density over the probability
+    above z.
+    """
     hazard: Tensor = math.sqrt(2.0 / math.pi) / torch.special.erfcx(
         z.clamp_min(_CERTAIN_DEVIATIONS) * math.sqrt(0.5)
     )
@@ -136,7 +139,7 @@ def measuring_sensor(
     """Return the sensor with the parameters of `photon_noise`, `dark_current`, `read_noise`,
     `full_well`, `digitize` and `electrons`.
 
-    Raises ValueError for readings of the paper in which the mean of a measurement is not the
+    Raises ValueError for readings of the paper in which the mean of a measurement differs from the
     expected electrons.
     """
     settings = {

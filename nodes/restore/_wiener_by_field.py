@@ -151,8 +151,8 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 
 
 class _Part(NamedTuple):
-    """The part of a frame around one node: its pixels, the PSFs there, and the weight of its
-    result.
+    """The part of a frame around one node: its pixels, the PSFs there, and the blending weight of
+    its restored picture.
     """
 
     rows: slice
@@ -165,7 +165,8 @@ class _Part(NamedTuple):
 def _parts(electrons: Tensor, measured: MeasuredPsf) -> Iterator[_Part]:
     """Yield the part of a frame around each node of the measured PSF, row by row.
 
-    A part holds the pixels where the node's weight is not 0, and the reach of its PSF around them.
+    A part consists of the pixels where the node's weight is not 0, and a border as wide as the
+    radius of its PSF.
     """
     size = (electrons.shape[-2], electrons.shape[-1])
     row_weights, column_weights = (
@@ -192,9 +193,11 @@ def _glare(
     doubt: float | None,
     scatter: bool,
 ) -> Glare:
-    """Return the glare of the whole frame, with what a doubt and ``scatter`` need of it."""
+    """Return the glare of the whole frame, with the surrounding light if ``doubt`` is not 0, and
+    the smoothed patterns if ``scatter`` is set.
+    """
     kernel = _channelwise(measured.kernels[0, 0])
-    # kernel[0] is a PSF with a band per channel, kernel[2] its responses
+    # kernel[0] is a PSF with one band per channel, kernel[2] are the responses
     light = known_and_light(kernel[0], kernel[2], single(electrons), clipped, lights)[2]
     light = light if doubt == 0 else with_light_around(light)
     return with_smooth(light) if scatter else light
@@ -203,7 +206,7 @@ def _glare(
 def _problem(
     electrons: Tensor, clipped: Tensor, zone: _Part, light: Glare, settings: Settings
 ) -> Scaled:
-    """Return the deconvolution of a part of a frame."""
+    """Return the deconvolution problem of a part of a frame, scaled."""
     channels_and_part = (slice(None), zone.rows, zone.columns)
     picture = single(electrons)[channels_and_part]
     picture = picture.double() if max(picture.shape[-2:]) <= PRECISE else picture
@@ -222,14 +225,16 @@ def _problem(
 
 
 def _around(weight: Tensor, reach: int) -> slice:
-    """Return the slice of an axis where a weight is not 0, ``reach`` pixels wider on both sides."""
+    """Return the slice of an axis where a weight is not 0, extended by ``reach`` pixels on both
+    sides.
+    """
     inside = weight.nonzero()[:, 0]
     return slice(max(int(inside[0]) - reach, 0), min(int(inside[-1]) + reach + 1, len(weight)))
 
 
 def _channelwise(kernels: Tensor) -> tuple[Psf, Tensor, Tensor, Bands]:
-    """Return PSF, illuminant, responses and bands of a camera whose channels each see one band
-    with its own PSF.
+    """Return PSF, illuminant, responses and bands of a camera in which each channel sees one band,
+    and each band has its own PSF.
     """
     ones = torch.ones(len(kernels), dtype=torch.float64)
     return (

@@ -1,5 +1,5 @@
-"""OpenEXR files: written line by line, spectral ones read and written, and scene-linear pictures
-read as linear sRGB.
+"""OpenEXR files: writing line by line, reading and writing of spectral files, and reading of
+scene-linear pictures as linear sRGB.
 """
 
 import math
@@ -53,7 +53,7 @@ def write_lines(
     ``header`` has texts and numbers. Raises: ValueError for ``half`` and a value beyond the range
     of float16.
     """
-    # channels stand in alphabetical order in an OpenEXR file
+    # an OpenEXR file has its channels in alphabetical order
     channel_order = sorted(range(len(names)), key=lambda i: names[i].encode())
     planes = [cube[i].detach().cpu().float().numpy() for i in channel_order]
     if half and any(
@@ -66,8 +66,8 @@ def write_lines(
     number_type = np.dtype("<f2") if half else np.dtype("<f4")
     line_bytes = len(names) * width * number_type.itemsize
     header_bytes = _header_bytes([names[i] for i in channel_order], (height, width), header, half)
-    # each line has a number and a size of 4 bytes each before its pixels; the table of offsets has
-    # 8 bytes a line
+    # each line begins with its number and its size, 4 bytes each; the table of offsets has 8 bytes
+    # per line
     offsets = accumulate(repeat(8 + line_bytes, height - 1), initial=len(header_bytes) + 8 * height)
     with open(path, "wb") as file:
         file.write(header_bytes + np.fromiter(offsets, "<u8", height).tobytes())
@@ -87,7 +87,7 @@ def _write_pixels(file: IO[bytes], planes: Sequence[Any], size: int, kind: Any) 
         lines[:, :8].view("<i4"),
         lines[:, 8:].view(kind).reshape(rows, len(planes), width),
     )
-    # column 0 the number of the line, column 1 its size
+    # column 0: number of the line, column 1: its size in bytes
     line_headers[:, 1] = size
     for top in range(0, height, rows):
         count = min(rows, height - top)
@@ -203,7 +203,7 @@ def _part(header: dict[str, Any]) -> PartHeader:
     """Return name, header, channel names and size of a part of an OpenEXR file from its header."""
     lower_corner, upper_corner = ([int(edge) for edge in corner] for corner in header["dataWindow"])
     names = [channel.name for channel in header["channels"]]
-    # corners are (x, y), and both belong to the window
+    # corners are (x, y), and both are inside the window
     return PartHeader(
         str(header.get("name", "")),
         header,
@@ -249,7 +249,7 @@ def write_spectral(
             "give one wavelength for each band"
         )
     quantity = "S0" if kind == "emissive" else "T"
-    # a point would separate layers: the decimal mark is a comma
+    # the decimal mark is a comma, because a point separates layers
     names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
         raise ValueError(f"bands closer than 1e-6 nm would have equal channel names: {names}")
@@ -291,7 +291,7 @@ def spectral_channels(names: Sequence[str]) -> dict[float, str]:
     Reflectance channels are used only if the file has no emission channels.
     """
     matches = [match for match in map(_CHANNEL_NAME.fullmatch, names) if match]
-    # a name without a number has no wavelength
+    # names without a number are skipped: they have no wavelength
     spectral = [match for match in matches if match[2] not in ("", ",")]
     for kind in ("S0", "T"):
         channels_of_kind = [match for match in spectral if match[1] == kind]
@@ -316,7 +316,7 @@ def _wavelength(match: re.Match[str]) -> float:
 # Scene-linear OpenEXR pictures, converted to linear sRGB.
 
 White = Annotated[float, Field(ge=1e-30, le=1e30)]
-#: of a file whose header has no primaries
+#: chromaticities of a file whose header has no primaries
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
@@ -399,8 +399,8 @@ def picture_size(file: Path, part_name: str | None) -> tuple[int, int]:
 
 
 def _picture_part(file: Path, part_name: str | None) -> tuple[int, PartHeader, list[str]]:
-    """Return (number of the part, its header, names of the channels to read) of the one part of a
-    file that holds a picture.
+    """Return (number of the part, its header, names of the channels to read) for the only part of a
+    file with a picture.
 
     ``part_name`` names the part where several hold a picture. Raises ParameterError for a name that
     no part has, for several pictures without a name, and for no picture.
@@ -445,7 +445,7 @@ def _colour_channels(names: list[str]) -> list[str]:
     """Return the channels of a picture among ``names``: R, G and B, or X, Y and Z, or Y alone; an
     empty list if there is no picture.
     """
-    # RY and BY are colours at half resolution: Y is not alone then
+    # with RY and BY (colour at half resolution), Y is not a grey picture
     if {"RY", "BY"} & set(names):
         return []
     return next(
@@ -460,8 +460,8 @@ def _colour_channels(names: list[str]) -> list[str]:
 
 @once_per_version
 def _damage(file: Path, part_name: str | None) -> str:
-    """Return a message for a file that cannot be read to its end or has values that are not
-    finite, or nothing.
+    """Return a message for a file that cannot be read to its end or has values that are not finite,
+    or an empty text.
     """
     try:
         pixels = _pixels(file, part_name)[2]
@@ -500,8 +500,9 @@ def _linear_pixels(file: Path, part_name: str | None) -> tuple[NDArray[np.float3
 
 
 def _linear_srgb(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
-    """Return linear sRGB (3, y, x) of the values (y, x, channel) of a picture; without a matrix
-    its one channel is grey.
+    """Return the values (y, x, channel) of a picture as linear sRGB (3, y, x).
+
+    Without a matrix, its only channel is grey.
     """
     planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
     if matrix is None:
@@ -516,7 +517,7 @@ def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     colour = colour_science()
 
     srgb = colour.RGB_COLOURSPACES["sRGB"]
-    # the last two numbers of the chromaticities are the white point (x, y)
+    # chromaticities: the last two numbers are the white point (x, y)
     file_white = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)[6:]
     white = np.asarray(header.get("adoptedNeutral", file_white), dtype=np.float64)
     if np.allclose(white, srgb.whitepoint, atol=1e-4):
@@ -539,7 +540,7 @@ def _rgb_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     chromaticities = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)
     if np.allclose(chromaticities, _REC709, atol=1e-4) and "adoptedNeutral" not in header:
         return np.eye(3)
-    # six numbers of the primaries, two of the white point
+    # chromaticities: six numbers for the primaries, then two for the white point
     white = chromaticities[6:]
     neutral = np.asarray(header.get("adoptedNeutral", white), dtype=np.float64)
     rgb_to_xyz = colour.models.normalised_primary_matrix(chromaticities[:6].reshape(3, 2), white)

@@ -19,7 +19,7 @@ from neusee.nodes.values import Bands
 
 # --- cube files -----------------------------------------------------------------------------------
 
-# Functions that read spectral cubes from .mat, .npy and spectral OpenEXR files.
+# Reading of spectral cubes from .mat, .npy and spectral OpenEXR files.
 
 
 Layout = Literal["y x band", "band y x"]
@@ -31,7 +31,7 @@ _NUMPY_TYPES = {
     "cell": "O",
     "struct": "O",
 }
-_NUMBER_BYTES = 4  #: bytes of a number of the cube that is made
+_NUMBER_BYTES = 4  #: bytes of a number of the resulting cube (float32)
 
 
 def cube_and_wavelengths(
@@ -51,7 +51,7 @@ def cube_and_wavelengths(
         if file.suffix == ".npy"
         else _mat_values(file, _cube_name(file, variable))
     )
-    # unsigned whole numbers are shares of the largest one
+    # unsigned integers are scaled so that the largest number of their type becomes 1
     scale = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
     band_first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
     cube = torch.from_numpy(np.ascontiguousarray(band_first, dtype=np.float32)) / scale
@@ -83,8 +83,8 @@ def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], st
 
 @once_per_version
 def wrong_values(file: Path, variable: str | None) -> str:
-    """Return a message for a cube that cannot be read or has values that are not finite, else an
-    empty text.
+    """Return a message for a cube that cannot be read or has values that are not finite, otherwise
+    an empty text.
     """
     try:
         if file.suffix == ".exr":
@@ -150,7 +150,7 @@ def _cube_name(file: Path, variable: str | None) -> str:
     only cube.
     """
     variables = _mat_variables(file)
-    # only arrays of three axes
+    # candidates: arrays with three axes
     cubes = [name for name, (size, _) in variables.items() if len(size) == 3]
     if variable in variables:
         return str(variable)
@@ -243,7 +243,7 @@ def _(
 
 
 def _refuse_missing_range(file: Path, start: float | None, stop: float | None) -> None:
-    """Raise ParameterError unless the first and the last wavelength are given and rise."""
+    """Raise ParameterError unless the first wavelength is given and below the last one."""
     if start is None or stop is None or not start < stop:
         name = "stop" if start is not None else "start"
         text = f"{file.name} has no wavelengths: give start below stop, such as 400 nm and 700 nm"
@@ -275,5 +275,5 @@ def _interpolation(own: Tensor, wavelengths: Tensor) -> Tensor:
     """
     if len(own) == 1:
         return torch.ones(len(wavelengths), 1, dtype=torch.float64)
-    # the table of unit vectors at the new wavelengths is that matrix
+    # interpolation of the unit vectors gives the matrix
     return Table(own, torch.eye(len(own), dtype=torch.float64)).at(wavelengths).T

@@ -45,7 +45,7 @@ _CONVERT_REMEDY = (
     " {stem}.png"
 )
 _DAMAGED = "{name} is damaged ({error}): copy the file again, or give another picture"
-_ORIENTATION = 0x0112  #: EXIF tag
+_ORIENTATION = 0x0112  #: EXIF tag of the orientation
 _QUARTER_TURNED = range(5, 9)  #: EXIF orientations that exchange width and height
 _LINEAR_PIXEL_BYTES = 12  #: bytes of a pixel in linear light
 
@@ -119,7 +119,7 @@ def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
             _refuse_other_picture(file, image)
             picture_needs(file, image, _LINEAR_PIXEL_BYTES)
             orientation = image.getexif().get(_ORIENTATION, 1)
-            # the size of Pillow is (columns, rows)
+            # `image.size` is (columns, rows)
             return (
                 _colour_profile(image),
                 orientation,
@@ -148,9 +148,9 @@ def _png_size(file: Path) -> tuple[int, int]:
 
 @once_per_version
 def _damage(file: Path) -> str:
-    """Return a message for a picture that is truncated or damaged, else an empty text.
+    """Return a message for a picture that is truncated or damaged, otherwise an empty text.
 
-    The checksums of a PNG are compared. A JPEG is decoded at an eighth of its size, which reads all
+    The checksums of a PNG are verified. A JPEG is decoded at an eighth of its size, which reads all
     its data.
     """
     from PIL import Image
@@ -183,9 +183,7 @@ def _(result: Tensor, **params: Any) -> list[Check]:
 
 
 def _refuse_other_picture(file: Path, image: Any) -> None:
-    """Raise ParameterError for a picture that is no PNG or JPEG, that has transparency, or that is
-    not grey or RGB.
-    """
+    """Raise ParameterError unless a picture is a PNG or JPEG without transparency, grey or RGB."""
     remedy = _CONVERT_REMEDY.format(name=file.name, stem=file.stem)
     if image.format not in ("PNG", "JPEG", "MPO"):
         raise ParameterError(
@@ -228,11 +226,10 @@ def _decoded_light(codes: NDArray[Any]) -> Tensor:
 
 
 class _CodeRows:
-    """Code values (y, x, 3) of a decoded picture, copied when rows are asked for.
+    """Code values (y, x, 3) of a decoded picture; an index copies only the rows of a slice.
 
-    A whole copy beside the result adds up to 0.5 GB to the peak of 64 million pixels: the copy
-    itself, and the memory of the decoded picture, which the C library keeps or gives back as it
-    likes.
+    A copy of the whole picture would add up to 0.5 GB to the peak memory for 64 million pixels: the
+    copy itself, and the memory of the decoded picture, which the C library may not release.
     """
 
     def __init__(self, image: Any) -> None:
@@ -260,9 +257,9 @@ def _codes_to_unit(codes: Codes) -> Tensor:
 
 
 def _codes(file: Path) -> Codes:
-    """Read the sRGB code values (y, x, 3) of a photograph, turned upright.
+    """Return the sRGB code values (y, x, 3) of a photograph, turned upright.
 
-    Kornia_rs reads 16-bit colour, of which Pillow would keep 8 bits.
+    Kornia_rs reads 16-bit colour; Pillow would reduce it to 8 bits.
     """
     from PIL import Image, ImageOps
 
@@ -290,12 +287,12 @@ def _sixteen_bit_codes(file: Path, turned: int) -> NDArray[Any]:
     from kornia_rs.io import read_image_png_u16
 
     rows, columns = _png_size(file)
-    # 6 bytes of a pixel as it is read, and 12 in linear light
+    # bytes per pixel: 6 for the code values, and 12 in linear light
     needs(18.0 * rows * columns, file, f"{columns} x {rows} pixels of 16 bits")
     codes = np.asarray(read_image_png_u16(str(file), "rgb"))
     codes = codes.transpose(1, 0, 2) if turned in _QUARTER_TURNED else codes
-    # EXIF: 3 is turned by 180 degrees, 2 and 4 are mirrored, 5 to 8 have rows and columns
-    # exchanged
+    # EXIF orientations: 3 is turned by 180 degrees, 2 and 4 are mirrored, 5 to 8 have rows and
+    # columns exchanged
     flip_y, flip_x = turned in (3, 4, 7, 8), turned in (2, 3, 6, 7)
     return codes[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
 
@@ -306,7 +303,7 @@ def _sixteen_bit_codes(file: Path, turned: int) -> NDArray[Any]:
 # seed.
 
 
-__depends__ = ["unaffected:_pictures"]  #: what is in memory changes no result
+__depends__ = ["unaffected:_pictures"]  #: the pictures in memory change no result
 _PICTURE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"}
 )
@@ -314,16 +311,17 @@ _PICTURE_SUFFIXES = frozenset(
 _END_MARKS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}
 #: bytes at the end of a file that must contain the end mark: some cameras write more after it
 _TAIL_BYTES = 1 << 16
-_ORDER_STREAM, _DRAW_STREAM = 0, 2  #: random streams of one seed; the position of a part is another
-_KEPT_BYTES = 1 << 30  #: bytes of decoded photographs that a process keeps
-_BROKEN_IN_A_ROW = 100  #: broken photographs in a row, after which drawing stops with an error
+#: random streams of one seed, for order and draws; the position of a crop has a further stream
+_ORDER_STREAM, _DRAW_STREAM = 0, 2
+_KEPT_BYTES = 1 << 30  #: largest size in bytes of the decoded photographs that a process keeps
+_BROKEN_IN_A_ROW = 100  #: number of successive broken photographs that raises an error
 
 Index = int | Sequence[int]  #: the number of a scene, or (stage, number) of a picture for training
 
 
 def list_photographs(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """List the readable photographs below a folder, sorted by path, and the unreadable files with a
-    reason for each.
+    """Return the readable photographs below a folder, sorted by path, and the unreadable files with
+    a reason for each.
 
     Only the header and the end of each file are read; no picture is decoded. Hidden files, hidden
     folders and files without the suffix of a picture are ignored.
@@ -340,11 +338,11 @@ def _picture_files(root: Path) -> list[Path]:
     pictures, folders_above = list[Path](), dict[str, frozenset[tuple[int, int]]]()
     for folder, subfolders, file_names in os.walk(root, followlinks=True):
         status, ancestors = os.stat(folder), folders_above.get(os.path.dirname(folder), frozenset())
-        if (identity := (status.st_dev, status.st_ino)) in ancestors:  # a link that leads back
+        if (identity := (status.st_dev, status.st_ino)) in ancestors:  # a cycle of links
             subfolders.clear()
             continue
         folders_above[folder] = ancestors | {identity}
-        # `os.walk` goes into the folders of this list, in its order
+        # `os.walk` visits the folders of this list, in its order
         subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
         pictures += [Path(folder, name) for name in file_names if _is_picture_name(name)]
     return sorted(pictures, key=lambda path: path.relative_to(root).parts)
@@ -368,10 +366,10 @@ def _unreadable_reason(path: Path) -> str:
 
 
 def choose_photograph(paths: Sequence[Path], seed: int, index: int) -> Path:
-    """Return the photograph for scene ``index``, so that every photograph is used once before any
-    is repeated.
+    """Return the photograph for scene ``index``: every photograph is used once before any is
+    repeated.
 
-    The order of the photographs is drawn from the seed.
+    The order of the photographs is random and depends on the seed.
     """
     order: list[int] = np.random.default_rng([seed, _ORDER_STREAM]).permutation(len(paths)).tolist()
     return paths[order[index % len(paths)]]
@@ -387,24 +385,23 @@ def crop_photograph(path: Path, shape: tuple[int, int], seed: int, index: Index)
     return drawn_crop(_decoded_photograph(path), shape, seed, index)
 
 
-#: the decoded photographs by version, the last used one last
+#: decoded photographs by file version, in order of their last use
 _pictures: dict[tuple[int, ...], Tensor] = {}
 
 
 def _decoded_photograph(path: Path) -> Tensor:
-    """Return a photograph as linear sRGB (3, y, x), from memory if it is one of the last that were
-    used.
+    """Return a photograph as linear sRGB (3, y, x), from memory if it was used recently.
 
-    A photograph that has changed since is decoded again, whatever its name.
+    A file that has changed since is decoded again.
     """
     version = file_version(path)
     if version is None:
-        # a file that was written just now has no version yet
+        # a file that was written a moment ago has no version yet
         uncached: Tensor = photograph(file=path)
         return uncached
     picture: Tensor = _pictures.pop(version) if version in _pictures else photograph(file=path)
     _pictures[version] = picture
-    # the first entry is the one that was not used for longest
+    # the first entry is the least recently used one
     while len(_pictures) > 1 and sum(map(_bytes_of, _pictures.values())) > _KEPT_BYTES:
         del _pictures[next(iter(_pictures))]
     return picture
@@ -425,7 +422,7 @@ class Photographs:
     """
 
     paths: tuple[Path, ...]  #: in the order of their names
-    #: the reason why each other file cannot be read
+    #: unreadable files, each with the reason
     broken: dict[Path, str] = field(default_factory=dict)
 
     @classmethod

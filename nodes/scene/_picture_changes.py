@@ -1,5 +1,5 @@
-"""Changes of a picture: scaling and cropping to the frame of a scene, changes that give a training
-more scenes, and its luminance as a grey picture.
+"""Changes of a picture: scaling and cropping to the frame of a scene, augmentation for training,
+and luminance as a grey picture.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neusee.nodes.units import Shape
 # Scaling and central cropping of a scene to the picture size in a recipe.
 
 
-_POSITION_STREAM = 1  #: random stream of a seed, for the position of a part of a picture
+_POSITION_STREAM = 1  #: random stream of a seed for the position of a crop
 _WholeNumber = Annotated[int, Field(ge=0, lt=2**63)]
 DrawnCrop = tuple[_WholeNumber, _WholeNumber]  #: seed and number of a scene
 
@@ -80,8 +80,8 @@ def drawn_crop(
 
 
 def enlargement_notes(size: tuple[int, int], shape: Shape | None) -> list[str]:
-    """Return a note for the user if a scene of the given size must be enlarged to cover `shape`,
-    else an empty list.
+    """Return a note for the user if a scene of this size must be enlarged to cover `shape`,
+    otherwise an empty list.
     """
     if shape is None:
         return []
@@ -95,19 +95,19 @@ def enlargement_notes(size: tuple[int, int], shape: Shape | None) -> list[str]:
 
 # --- large picture --------------------------------------------------------------------------------
 
-# Linear light of a picture; a large picture is converted and scaled in bands of rows, which need
-# little memory.
+# Linear light of a picture. A large picture is converted and scaled in bands of rows, to save
+# memory.
 
 
 _LARGE_PIXELS = 4_000_000  #: pixels above which a picture is converted and scaled in bands
-_BAND_PIXELS = 1 << 20  #: pixels of a band
-#: pixels of a band beside a whole picture, so that its conversion adds little to the peak memory
+_BAND_PIXELS = 1 << 20  #: largest number of pixels of a band
+#: the same if the whole picture is in memory too, so that the band adds little to the peak
 _SMALL_BAND_PIXELS = 1 << 17
 
 
 class Codes(Protocol):
-    """Code values (y, x, channel) of a picture: an array, or what reads rows of one when they
-    are asked for.
+    """Code values (y, x, channel) of a picture: an array, or an object that reads only the rows of
+    a slice.
     """
 
     @property
@@ -136,8 +136,9 @@ def is_large(pixels: float) -> bool:
 
 
 def _in_bands(codes: Codes, linear: Decoding, shape: Shape | None) -> Tensor:
-    """Return what `linear_light` returns, for a large picture: band after band of its rows is
-    converted, and added to the rows of the result that it reaches.
+    """Return the result of `linear_light` for a large picture.
+
+    Each band of rows is converted, resampled, and added to the rows of the result that it affects.
     """
     size = (codes.shape[0], codes.shape[1])
     if shape is None or size == tuple(shape):
@@ -147,7 +148,7 @@ def _in_bands(codes: Codes, linear: Decoding, shape: Shape | None) -> Tensor:
         return picture
     scaled = covering_size(size, shape)
     antialias = max(old / new for old, new in zip(size, scaled, strict=True)) > 1
-    # matrices of resampling, of which only the lines of the central crop are needed
+    # resampling matrices; only their rows for the central crop are needed
     row_matrix, column_matrix = (
         resampling_matrix(old, new, antialias)[(new - size_of_cut) // 2 :][:size_of_cut]
         for old, new, size_of_cut in zip(size, scaled, shape, strict=True)
@@ -155,7 +156,7 @@ def _in_bands(codes: Codes, linear: Decoding, shape: Shape | None) -> Tensor:
     result = np.zeros((3, *shape), np.float32)
     for rows in row_bands(size):
         band_matrix = row_matrix[:, rows]
-        # lines of a sparse matrix that are not empty
+        # rows of the sparse matrix with nonzero elements
         reached_lines = np.flatnonzero(np.diff(band_matrix.indptr))
         if len(reached_lines):
             lines = slice(reached_lines[0], reached_lines[-1] + 1)
@@ -165,8 +166,8 @@ def _in_bands(codes: Codes, linear: Decoding, shape: Shape | None) -> Tensor:
 
 
 def row_bands(size: tuple[int, int], pixels: int | None = None) -> list[slice]:
-    """Return the rows of each band of a picture of ``size`` rows and columns, of at most
-    ``pixels`` pixels a band.
+    """Return the rows of each band of a picture of ``size`` rows and columns; a band has at most
+    ``pixels`` pixels, or one row.
     """
     step = max(1, (pixels or _BAND_PIXELS) // size[1])
     return [slice(start, start + step) for start in range(0, size[0], step)]
@@ -175,12 +176,12 @@ def row_bands(size: tuple[int, int], pixels: int | None = None) -> list[slice]:
 def resampling_matrix(old: int, new: int, antialias: bool) -> Any:
     """Return the sparse matrix (new, old) of kornia's bilinear resampling of one axis, float64.
 
-    With ``antialias`` a Gaussian precedes it, mirrored at the edges, of 4 standard deviations in
-    all.
+    With ``antialias``, a Gaussian filter is applied first; it is 4 standard deviations wide in
+    total, and the picture is mirrored at its edges.
     """
     from scipy import sparse
 
-    # middle of a new sample, counted in old samples; beyond the last ones they are repeated
+    # centre of each new sample in units of old samples; end samples are repeated beyond the ends
     centres = ((np.arange(new) + 0.5) * (old / new) - 0.5).clip(0, old - 1)
     lower_sample = np.floor(centres).astype(np.int64)
     share = centres - lower_sample
@@ -205,8 +206,8 @@ def resampling_matrix(old: int, new: int, antialias: bool) -> Any:
 
 # --- augmentation ---------------------------------------------------------------------------------
 
-# Changes of photographs that give a training more scenes: symmetries of the square, sharpness,
-# exposure and colour.
+# Augmentation of photographs for training: symmetries of the square, sharpness, exposure and
+# colour.
 
 
 @dataclass(frozen=True)
@@ -214,9 +215,9 @@ class Change:
     """One drawn change of a photograph; the default changes nothing."""
 
     quarters: int = 0  #: quarter turns, counter-clockwise
-    stops: float = 0.0  #: a scene of 2**stops times the light
-    saturation: float = 1.0  #: of the colours; 0 is grey
-    #: factor by which a part of the photograph becomes larger, and so less sharp
+    stops: float = 0.0  #: the light is multiplied by 2**stops
+    saturation: float = 1.0  #: factor of the saturation of the colours; 0 is grey
+    #: factor by which a part of the photograph is enlarged, so that it becomes less sharp
     enlarged: float = 1.0
 
     @classmethod
@@ -228,11 +229,11 @@ class Change:
         colour: float,
         enlarged: float = 1.0,
     ) -> Change:
-        """Return the change that a seed draws, at most ``darker`` stops darker and with a
-        saturation of 1 ± ``colour``.
+        """Return a random change for a seed: up to ``darker`` stops darker, with a saturation of 1
+        ± ``colour``.
 
-        The factor of size is drawn by its logarithm from 1 to ``enlarged``. If ``turned``, the
-        number of quarter turns is drawn from 0 to 3; with a mirror these are the eight symmetries.
+        The enlargement is log-uniform from 1 to ``enlarged``. With ``turned``, the number of
+        quarter turns is random from 0 to 3; with mirroring, these are the eight symmetries.
         """
         rng = np.random.default_rng(seed)
         quarters, stops, saturation = (
@@ -254,14 +255,13 @@ class Change:
         return (columns, rows) if self.quarters % 2 else (rows, columns)
 
     def of(self, picture: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Change a picture (3, y, x) in linear sRGB from 0 to 1 of the size of `frame`: colours,
-        light, place and size.
+        """Return the changed picture: colours, light, orientation and size.
 
-        The result has the rows and columns ``shape``; bicubic interpolation of a part enlarges it,
-        without negatives. The saturation is that of kornia: each encoded colour moves along the
-        line to the grey of its luma (ITU-R BT.601), and is clipped to the range from 0 to 1. The
-        random augmentations of kornia draw from the one random stream of torch, whereas these
-        values are given.
+        ``picture`` (3, y, x) is in linear sRGB from 0 to 1 and has the size of `frame`. The result
+        has the rows and columns ``shape``, by bicubic interpolation; negative values become 0. The
+        saturation is that of kornia: each encoded colour moves along the line to the grey of its
+        luma (ITU-R BT.601), and is clipped to the range from 0 to 1. The random augmentations of
+        kornia are not used, because they draw from the global random stream of torch.
         """
         if self.saturation != 1.0:
             picture = _saturated(picture, self.saturation)
@@ -286,13 +286,13 @@ def _saturated(picture: Tensor, factor: float) -> Tensor:
 
 
 def symmetry(pictures: Tensor, seed: tuple[int, ...]) -> Tensor:
-    """Turn and mirror pictures (..., y, x) by a symmetry that a seed draws: one of eight, or of
-    four if y is not x.
+    """Return pictures (..., y, x), turned and mirrored by a random symmetry for a seed: one of
+    eight, or of four if y is not x.
     """
     rng = np.random.default_rng(seed)
     quarters, mirrored = int(rng.integers(4)), bool(rng.integers(2))
     if pictures.shape[-1] != pictures.shape[-2]:
-        # only half turns keep the shape of a picture that is no square
+        # only half turns keep the shape of a picture that is not square
         quarters -= quarters % 2
     turned = pictures.rot90(quarters, (-2, -1))
     return (turned.flip(-1) if mirrored else turned).contiguous()
@@ -300,14 +300,14 @@ def symmetry(pictures: Tensor, seed: tuple[int, ...]) -> Tensor:
 
 # --- grey picture ---------------------------------------------------------------------------------
 
-# The luminance of a colour picture, as the grey picture that a mono camera can be compared with.
+# The luminance of a colour picture, as a grey picture for the comparison with a monochrome camera.
 
-_LUMINANCE = (0.2126, 0.7152, 0.0722)  #: of linear red, green and blue with the primaries of sRGB
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  #: weights of linear red, green and blue of sRGB
 
 
 def luminance(rgb: Tensor, axis: int) -> Tensor:
-    """Return the luminance of linear sRGB, whose three channels lie along ``axis`` of ``rgb``
-    and have size 1 then.
+    """Return the luminance of linear sRGB; the axis ``axis`` of the three channels then has length
+    1.
     """
     red, green, blue = (share * rgb.narrow(axis, i, 1) for i, share in enumerate(_LUMINANCE))
     return red + green + blue

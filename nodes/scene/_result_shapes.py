@@ -47,7 +47,9 @@ def _(
 
 
 def _picture(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[float, float]:
-    """Return the work of reading a picture, which is held in whole before it is cropped."""
+    """Return memory and operations of reading a picture, which is read completely before the
+    crop.
+    """
     file_bytes = float(file.stat().st_size)
     try:
         y, x = (
@@ -57,14 +59,14 @@ def _picture(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[f
         )
     except (OSError, RuntimeError, ValueError):
         return 4 * file_bytes, 4 * file_bytes + result.numel()
-    # three float32 a pixel
+    # three float32 numbers per pixel
     return 12.0 * y * x, float(3 * y * x + 3 * result.numel())
 
 
 @photograph.work
 def _(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[float, float]:
-    """Return the memory of the decoded picture, which is less for each pixel of a large one, and
-    the operations.
+    """Return the memory of the decoded picture, and the operations; a large picture needs less
+    memory per pixel.
     """
     memory, operations = _picture(result, *inputs, file=file, **params)
     pixels = memory / 12

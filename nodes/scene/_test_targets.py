@@ -12,8 +12,8 @@ from neusee.nodes.units import Fraction, Shape
 
 Kind = Literal["flat", "edge", "slanted_edge", "siemens", "points"]
 _EDGE_TILT = math.radians(5.0)  #: angle of the slanted edge to the columns
-_STAR_CYCLES = 36  #: cycles of the star over one full turn
-_POINT_SPACING = 64  #: pixels between points
+_STAR_CYCLES = 36  #: number of cycles of the star in one full turn
+_POINT_SPACING = 64  #: distance between neighbouring points in pixels
 
 
 @node(rtol=1e-5)
@@ -61,8 +61,8 @@ def _slanted(y: Tensor, x: Tensor) -> Tensor:
     cosine, sine = math.cos(_EDGE_TILT), math.sin(_EDGE_TILT)
     distance = x * cosine + y * sine
     far_corner, near_corner = (cosine + sine) / 2, (cosine - sine) / 2
-    # the area of a pixel behind the edge: sum of +-(distance of a corner)^2 / 2 over the corners
-    # that are behind it
+    # area of a pixel on the bright side: sum of +-(distance of a corner from the edge)^2 / 2 over
+    # the corners on this side
     corners = [(1, far_corner), (-1, near_corner), (-1, -near_corner), (1, -far_corner)]
     areas = [sign * (distance + offset).clamp_min(0) ** 2 / 2 for sign, offset in corners]
     return (sum(areas, torch.zeros_like(distance)) / (cosine * sine)).clamp(0, 1)
@@ -81,7 +81,7 @@ def _siemens(y: Tensor, x: Tensor) -> Tensor:
     return 0.5 + 0.5 * star_share * torch.cos(_STAR_CYCLES * torch.atan2(y, x))
 
 
-#: share of `high` in each pixel, from the distances y and x to the axis
+#: share of `high` in each pixel, as a function of its coordinates y and x from the axis
 _BRIGHT_SHARE: dict[Kind, Callable[[Tensor, Tensor], Tensor]] = {
     "flat": lambda y, x: torch.ones_like(y + x),
     "edge": lambda y, x: (x + 0.5 + 0 * y).clamp(0, 1),

@@ -17,15 +17,14 @@ from neusee.nodes.sensor._saturation import Well, refuse_below_one_electron
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor", "truncation"]
-#: pixels that are converted at a time, so that their float64 numbers stay in the cache of the
-#: processor
+#: number of pixels that are converted at a time, so that their float64 numbers fit in the cache
 _BLOCK_PIXELS = 2**18
 Bits = Annotated[int, Field(ge=1, le=16)]
 
 
 def clipping_number(full_well: float, gain: float, bits: int) -> int:
-    """Return the smallest digital number that counts as clipped: of a full well, or the largest
-    of the converter.
+    """Return the smallest digital number that counts as clipped: that of the full well, or the
+    largest of the converter if this is smaller.
     """
     return max(1, min((1 << bits) - 1, int(full_well * gain - 0.5)))
 
@@ -149,7 +148,7 @@ def _whole_numbers(
             torch.rand(electrons.shape, generator=rng, device=rng.device, dtype=torch.float32) - 0.5
         )
         dither = dither.to(electrons.device).reshape(-1)
-    # in blocks that stay in the cache of the processor
+    # in blocks that fit in the cache of the processor
     for start in range(0, flat_electrons.numel(), _BLOCK_PIXELS):
         block = slice(start, start + _BLOCK_PIXELS)
         values = flat_electrons[block].double() * gain
@@ -196,11 +195,11 @@ def _(electrons: ErrorBound, *, result: TensorStats, gain: float, **params: Any)
 def _(rms: float, *, result: TensorStats, **params: Any) -> float:
     """Return an estimate of the rms error in DN after rounding.
 
-    A small error e (DN) moves a value across the edge between two numbers with the probability e,
-    and changes its number by 1: the mean square grows by e - e^2, and by 1/4 at most. The number of
-    such pixels is that which one of 10 000 pictures exceeds. This holds where noise spreads the
-    values over at least one number. An even area without noise may change as a whole, by one number
-    more.
+    With the probability e, a small error e (DN) moves a value across the border between two
+    numbers, and changes its number by 1. The mean square grows by e - e^2, at most by 1/4. The
+    assumed number of such pixels is exceeded in one of 10 000 pictures. This holds if noise spreads
+    the values over at least one number. A uniform area without noise may change as a whole, by one
+    number more.
     """
     pixels = max(1, math.prod(result.shape))
     change_of_square = rms * (1.0 - rms) if rms < 0.5 else 0.25

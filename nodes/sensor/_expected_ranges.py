@@ -1,9 +1,9 @@
-"""Expected ranges of the results of the sensor nodes, by which a plan foresees what well and
-converter cut off.
+"""Expected ranges of the results of the sensor nodes, from which a plan predicts what full well and
+converter clip.
 
-Before a run no image is known. Its brightest pixel therefore counts as 1, and irradiance counts in
-photons of the brightest channel per second and square metre: what the rows of an image and the
-responses of a channel multiply cancels between `sensor.level` and `sensor.expose`.
+Before a run no image is known. Its brightest pixel therefore counts as 1, and irradiance is in
+photons of the brightest channel per second and square metre. The weights of the bands and the
+responses of the channels cancel between `sensor.level` and `sensor.expose`, so they are left out.
 """
 
 import math
@@ -18,7 +18,7 @@ from neusee.nodes.sensor._noise import dark_current, dark_electrons, photon_nois
 from neusee.nodes.sensor._saturation import photons_that_fill
 from neusee.nodes.units import ElectronsPerSecond
 
-_SIGMAS = 4.0  #: standard deviations of noise that the brightest of many pixels has above its mean
+_SIGMAS = 4.0  #: deviation of the brightest of many pixels from its mean, in standard deviations
 Range = tuple[float, float]
 
 
@@ -50,6 +50,7 @@ def _(
     pixel_pitch: float,
     exposure: float,
 ) -> Range:
+    # photons per unit of the image; `level` has the same value in all bands here
     photons = (1.0 if level is None else level.max) * exposure * pixel_pitch**2
     return irradiance.min * photons, irradiance.max * photons
 

@@ -31,7 +31,7 @@ def weighted_bands(image: Tensor | Channels, weights: Tensor) -> Tensor:
     the channel sums gives the weights.
     """
     if isinstance(image, Channels):
-        # the planes of the image are sums over its bands already: combine them
+        # the planes of the image are already sums over its bands
         plane_weights = _combination_of_rows(weights, image.rows).to(image.planes)
         channels: Tensor = torch.tensordot(plane_weights, image.planes, 1)
         return channels
@@ -47,7 +47,7 @@ def _combination_of_rows(weights: Tensor, rows: Tensor) -> Tensor:
     The gradient reaches the weights. Raises ValueError if no M gives the weights.
     """
     image_rows = rows.detach().cpu().double()
-    # rows of very different size would lose their digits in the inverse
+    # rows are scaled, because the inverse of rows of very different size would lose precision
     row_maxima = image_rows.abs().amax(1, keepdim=True)
     inverse_rows = (
         torch.linalg.pinv(image_rows / row_maxima.where(row_maxima > 0, 1.0))
@@ -160,11 +160,10 @@ def _(
     irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any
 ) -> float:
     """Return an error bound of the photons from the relative errors of the irradiance and of the
-    factor `level`.
+    factor `level`, including the product of both errors.
 
-    No channel has a larger relative error, because the share of `Channels` holds for each of its
-    rows. The errors of the two factors multiply too. Bands of an image have no such share: a
-    channel may see only the darker ones, and the error is unknown.
+    It holds for each channel, because the relative error of `Channels` holds for each of its rows.
+    For an image in bands the error is unknown: a channel may see only the darker bands.
     """
     if irradiance.rms and irradiance.peak is None:
         return math.inf
@@ -191,7 +190,7 @@ def channel_weights(
             f" {None if level is None else tuple(level.shape)} differ in the number of bands: use"
             " one step `bands`"
         )
-    # of one exposure in a pixel under 1 W/m2
+    # photons per pixel in one exposure at 1 W/m2
     photons = photons_per_joule(bands.centres) * (exposure * pixel_pitch**2)
     weights = responses.double() * photons.to(responses.device)
     return weights if level is None else weights * level.to(weights)
@@ -279,7 +278,7 @@ def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: A
     """Return an error bound of the scale factor `level` from the error of the brightest pixel of
     the image.
 
-    The brightest pixels of single bands may be off by more.
+    The brightest pixels of single bands may have a larger error.
     """
     if params["strength"] is None:
         return 0.0

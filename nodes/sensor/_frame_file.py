@@ -1,4 +1,4 @@
-"""A frame that somebody took, from a file, and signs that a tone curve was applied."""
+"""A frame of a real camera, from a file, and signs in the file that a tone curve was applied."""
 
 import struct
 from collections.abc import Callable, Iterator
@@ -27,26 +27,25 @@ from neusee.nodes.units import DataFile, Shape
 
 # --- tone curve -----------------------------------------------------------------------------------
 
-# Signs in a file that a tone curve was applied: 8 bits, a stated gamma or colour profile, stretched
-# numbers.
+# Signs in a file that a tone curve was applied: 8 bits, a stated gamma or colour profile, or 8 bits
+# stretched to 16.
 
 
-_DISPLAY_BITS = 8  #: bits of the pictures of displays, whose numbers have a tone curve
-_LINEAR_GAMMA = 100_000  #: value of the chunk gAMA of a PNG that is proportional to the light
+_DISPLAY_BITS = 8  #: bits of pictures for displays, which have a tone curve
+_LINEAR_GAMMA = 100_000  #: value of the gAMA chunk of a PNG whose numbers are linear in the light
 #: code point of a linear transfer characteristic in the chunk cICP (ITU-T H.273)
 _LINEAR_TRANSFER = 8
 #: factor by which numbers of 8 bits become numbers of 16
 _SIXTEEN_BIT_FACTORS = {257: "stretched", 256: "shifted"}
-_ICC_PROFILE = 34675  #: tag of a TIFF file
-_MOST_ENTRIES = 4096  #: entries of a TIFF directory that are looked at, at most
+_ICC_PROFILE = 34675  #: tag of a colour profile in a TIFF file
+_MOST_ENTRIES = 4096  #: largest number of entries of a TIFF directory that are read
 
 
 def tone_curve_sign(file: Path, values: NDArray[Any], depth: int | None, bits: int) -> str:
     """Return the sign of a tone curve in a picture file as the end of a sentence, or an empty text
-    for none.
+    if there is none.
 
-    ``depth`` are the bits of the numbers in the file, or None if it does not state them; ``bits``
-    those of the sensor.
+    ``depth`` is the number of bits in the file, None if unknown; ``bits`` is that of the sensor.
     """
     if _DISPLAY_BITS in (depth, bits) or values.dtype.itemsize == 1:
         return "has 8 bits, as pictures with a tone curve (sRGB, gamma 2.2) have"
@@ -83,7 +82,7 @@ def _png_sign(content: bytes) -> str:
 
 def _png_chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Yield the kind and the data of each chunk of a PNG before its pixels."""
-    # after the signature; a chunk has its length, its kind, the data and a checksum of 4 bytes
+    # 8: after the signature; a chunk is length, kind, data, and a checksum of 4 bytes
     offset = 8
     while offset + 8 <= len(content):
         length, kind = struct.unpack(">I4s", content[offset : offset + 8])
@@ -98,7 +97,7 @@ def _tiff_sign(content: bytes) -> str:
     or an empty text.
     """
     byte_order = {b"II": "<", b"MM": ">"}.get(content[:2])
-    # the magic number of TIFF
+    # 42 is the magic number of TIFF
     if byte_order is None or struct.unpack(f"{byte_order}H", content[2:4])[0] != 42:
         return ""
     (directory_offset,) = struct.unpack(f"{byte_order}I", content[4:8])
@@ -106,7 +105,7 @@ def _tiff_sign(content: bytes) -> str:
         f"{byte_order}H", content[directory_offset : directory_offset + 2]
     )
     for entry_number in range(min(entry_count, _MOST_ENTRIES)):
-        # entries of 12 bytes follow their number, of 2 bytes
+        # the directory: number of entries (2 bytes), then entries of 12 bytes
         entry = content[
             directory_offset + 2 + 12 * entry_number : directory_offset + 14 + 12 * entry_number
         ]
@@ -121,15 +120,15 @@ def _tiff_sign(content: bytes) -> str:
 
 # --- frame file -----------------------------------------------------------------------------------
 
-# A frame that somebody took, read from a file as the digital numbers of the camera.
+# A frame of a real camera, read from a file as digital numbers.
 
 
-#: what a user states of the tone curve of numbers that have a sign of one
+#: the user's statement that the numbers of a file with a sign of a tone curve are linear
 Curve = Literal["linear"]
 _DAMAGED = "{name} is damaged or no picture ({error}): copy the file again"
 _CURVE_STATEMENT = "frame.curve=linear"
-_PNG_CHANNELS = {0: 1, 2: 3}  #: channels of a PNG by its colour type
-_NUMBER_BYTES = 4  #: bytes of a number of the frame that is made
+_PNG_CHANNELS = {0: 1, 2: 3}  #: number of channels of a PNG for each colour type
+_NUMBER_BYTES = 4  #: bytes of a number of the resulting frame (float32)
 _ARRAY_SHAPES = "(y, x), (y, x, 3) or (3, y, x)"
 
 
@@ -195,7 +194,7 @@ class FrameNumbers(NamedTuple):
 def frame_problem(
     file: Path, channels: int | None, shape: tuple[int, int], bits: int, curve: Curve | None = None
 ) -> str:
-    """Return why a file is no frame of this sensor, in one sentence, or an empty text."""
+    """Return in one sentence why a file is not a frame of this sensor, or an empty text."""
     try:
         values, depth = read_frame(file)
     except ParameterError as error:
@@ -336,8 +335,7 @@ def _png(file: Path) -> FrameNumbers:
         raise ParameterError(
             "file", f"{file.name} is no PNG file, whatever its name says: save the frame as PNG"
         )
-    # the header has columns in bytes 16 to 19, rows in 20 to 23, bits in 24 and the colour type in
-    # 25
+    # header: columns in bytes 16 to 19, rows in 20 to 23, bits in 24, colour type in 25
     depth, channels = header[24], _PNG_CHANNELS.get(header[25], 0)
     if not channels or depth not in (8, 16):
         text = (
@@ -353,7 +351,7 @@ def _png(file: Path) -> FrameNumbers:
         file,
         f"{columns} x {rows} pixels in {channels} channels",
     )
-    # the check sums, which the reader below does not look at
+    # verifies the checksums, which the reader below does not check
     with Image.open(file) as image:
         image.verify()
     reader = io.read_image_png_u16 if depth == 16 else io.read_image_png_u8
@@ -372,7 +370,7 @@ def _tiff(file: Path) -> FrameNumbers:
         (io.read_image_tiff_u8, 8),
         (io.read_image_tiff_f32, None),
     )
-    # memory: the file once, and three float32 numbers a pixel
+    # memory: the file once, and three float32 numbers per pixel
     tiff_needs(file, 1.0, 3 * _NUMBER_BYTES, first=True)
     reason = ""
     for reader, depth in readers:
@@ -439,4 +437,4 @@ _READERS: dict[str, Callable[[Path], FrameNumbers]] = {
     ".exr": _exr,
     ".npy": _npy,
 }
-FRAME_SUFFIXES = tuple(_READERS)  #: of files that `frame` reads
+FRAME_SUFFIXES = tuple(_READERS)  #: suffixes of files that `frame` reads

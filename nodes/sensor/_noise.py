@@ -1,4 +1,4 @@
-"""Noise of the sensor: photon noise, dark current, read noise, and limits of a draw."""
+"""Noise of the sensor: photon noise, dark current, read noise, and probable limits of one draw."""
 
 import functools
 import math
@@ -24,23 +24,23 @@ from neusee.nodes.units import (
 
 # --- draw limits ----------------------------------------------------------------------------------
 
-# Limits that one draw of noise exceeds in one of 10 000 draws: counts of rare events, sums of
-# squares of noise.
+# Limits that noise exceeds in at most one of 10 000 draws: for counts of rare events, and for sums
+# of squares of noise.
 
 
 RARITY = math.log(1e4)  #: negative logarithm of the probability that a draw exceeds its limit
 
 
 def rare_events(mean: float, sure: float = RARITY) -> int:
-    """Return the count that a Poisson number of this mean exceeds with a probability of at most
-    exp(-``sure``).
+    """Return the smallest count that a Poisson number of this mean exceeds with a probability of at
+    most exp(-``sure``).
 
-    The count is exact: the smallest with this property. A sum of independent events of unequal
-    probabilities exceeds it no more often if the count is at least the mean + 1.
+    It is also a limit for a sum of independent events of unequal probabilities, if the count is at
+    least the mean + 1.
 
     Source: quantile of the Poisson distribution, whose sum of probabilities is the incomplete gamma
-            function; sums of
-    unequal events: Anderson and Samuels, Proc. 5th Berkeley Symp. 1, 1 (1967).
+            function; sums of unequal events: Anderson and Samuels, Proc. 5th Berkeley Symp. 1, 1
+            (1967).
     """
     low, high = -1, max(8, math.ceil(mean + sure + 2.0 * math.sqrt(mean * sure)))
     # bisection: `low` is exceeded too often, `high` is not
@@ -55,7 +55,8 @@ def rare_events(mean: float, sure: float = RARITY) -> int:
 
 
 def poisson_rms(mean: float, pixels: int) -> float:
-    """Return what the rms of Poisson numbers in ``pixels`` exceeds in one of 10 000 draws at most.
+    """Return a limit that the rms of Poisson numbers in ``pixels`` exceeds in at most one of 10 000
+    draws.
 
     Half of the probability is for a pixel above ``rare_number``, half for the sum of squares of the
     others, whose variance is at most the fourth moment of the distribution.
@@ -67,7 +68,7 @@ def poisson_rms(mean: float, pixels: int) -> float:
         return 0.0
     sure = RARITY + math.log(2.0)
     rare_number = rare_events(mean, sure + math.log(pixels))
-    # of a Poisson number: m + 7 m^2 + 6 m^3 + m^4
+    # fourth moment of a Poisson number of mean m: m + 7 m^2 + 6 m^3 + m^4
     fourth_moment = mean + 7 * mean**2 + 6 * mean**3 + mean**4
     # Bernstein: excess t of a sum of bounded terms solves t^2 / (2 (V + c t / 3)) = sure
     linear_term = rare_number**2 * sure / 3
@@ -89,15 +90,15 @@ def chi_square_limit(weights: float, largest: float, sure: float = RARITY) -> fl
 
 
 def amplitude_error_drawn(drawn: float, darkest: float, pixels: int) -> float:
-    """Return a bound of the rms change of one draw of the noise, if its mean changes by the rms
-    ``drawn``.
+    """Return a bound of the rms change of one draw of photon noise, if the mean counts change by
+    the rms ``drawn``.
 
-    The change of a pixel is a normal number times the root of a weight w, which is at most the
-    change of the mean e, and e**2 / ``darkest``. The weights are summed for the worst distribution
-    of the error over the pixels.
+    The change of a pixel is a normal number times the square root of a weight. For a change e of
+    the mean, the weight is at most e, and at most e**2 / ``darkest``. The weights are summed for
+    the worst distribution of the error over the pixels.
     """
     sum_of_squares = pixels * drawn**2
-    # all of the error in one pixel; a sum of absolute changes is largest if all are equal
+    # largest weight: the whole error in one pixel; largest sum: equal errors in all pixels
     largest_weight = math.sqrt(sum_of_squares)
     sum_of_weights = math.sqrt(pixels) * largest_weight
     if darkest > 0:
@@ -109,8 +110,8 @@ def amplitude_error_drawn(drawn: float, darkest: float, pixels: int) -> float:
 
 
 def amplitude_error(drawn: float, darkest: float) -> float:
-    """Return a bound of the rms change of all draws of the noise, if its mean changes by the rms
-    ``drawn``.
+    """Return a bound of the rms change of photon noise over all draws, if the mean counts change by
+    the rms ``drawn``.
     """
     return math.sqrt(drawn) if darkest <= drawn else drawn / math.sqrt(darkest)
 
@@ -121,12 +122,11 @@ def amplitude_error(drawn: float, darkest: float) -> float:
 
 
 Distribution = Literal["gaussian", "poisson"]
-#: elements; torch splits larger arrays among threads, which is slow on a busy machine
+#: elements per part; torch splits larger arrays among threads, which is slow on a busy machine
 _PART_ELEMENTS = 1 << 15
-#: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
+#: e-; smaller values count as 0, because the gradient of the square root is unbounded near 0
 _DARK_ELECTRONS = 1e-30
-#: largest ratio of a sampled mean of the dark current to the given mean, 8 standard deviations
-#: above
+#: largest ratio of a sampled mean of the dark current to ``mean``: 8 standard deviations above it
 _LARGEST_DRAWN_MEAN = 5.0
 Spread = Annotated[float, Field(ge=0, le=100)]
 
@@ -201,7 +201,9 @@ def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
 
 @photon_noise.propagate_draw
 def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
-    """Return the error bound of the electrons of one draw, which one of 10 000 draws exceeds."""
+    """Return an error bound of the electrons of one draw, which at most one of 10 000 draws
+    exceeds.
+    """
     pixels = max(1, math.prod(result.shape))
     return _electrons_error(
         photons, functools.partial(amplitude_error_drawn, pixels=pixels), **params
@@ -216,12 +218,13 @@ def _electrons_error(
     spread: float = 1.0,
     **params: Any,
 ) -> float:
-    """Return the error bound of the electrons: that of the mean and that of the noise amplitude,
-    which ``amplitude`` gives from the error of the mean and the darkest mean count.
+    """Return the error bound of the electrons: error of the mean plus error of the noise amplitude.
+
+    ``amplitude`` computes the latter from the error of the mean and the darkest mean count.
     """
     if params["distribution"] == "poisson" and photons.rms > 0:
         return math.inf
-    # in the unit in which the noise is drawn
+    # counts: electrons or photons, the unit in which the noise is drawn
     count_error = photons.rms * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
     mean_factor = params["mean_shift"] + (params["mean"] == "additive")
     electrons_per_count: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
@@ -267,7 +270,7 @@ def _by_parts(compute: Callable[[Tensor], Tensor], numbers: Tensor, rng: Generat
     ):
         return compute(numbers)
     result, flat_numbers = torch.empty(numbers.shape, dtype=numbers.dtype), numbers.reshape(-1)
-    # the last part takes the remainder, so that none is shorter than `_PART_ELEMENTS`
+    # the last part includes the remainder, so that none is shorter than `_PART_ELEMENTS`
     part_ends = [
         *range(_PART_ELEMENTS, element_count - _PART_ELEMENTS, _PART_ELEMENTS),
         element_count,
@@ -445,7 +448,7 @@ def _(electrons: TensorStats, *, offset: float, read_noise: float, **params: Any
     mean_term = abs(offset) * read_noise * math.sqrt(2.0 * sure / pixels)
     square_limit = chi_square_limit(pixels * variance, variance, sure) / pixels
     usual_rms = math.hypot(offset, read_noise)
-    # mean square of offset + noise, its limit over its usual root
+    # limit of the rms of offset + noise, relative to the usual rms
     return (
         math.sqrt(offset**2 + 2.0 * mean_term + square_limit) / usual_rms if usual_rms > 0 else 1.0
     )

@@ -83,7 +83,7 @@ def photon_transfer(
         [_mean_and_variance(frame(p), frame(p)) for p in photon_levels], dtype=torch.float64
     )
     signal = pair_statistics[:, 0] - pair_statistics[0, 0]
-    # DN2: read noise and dark current, and 1/12 of rounding or 1/6 of the dithered floor
+    # DN2: read noise, dark current, and rounding (1/12, or 1/6 with the dithered floor)
     dark_variance = gain**2 * (read_noise**2 + dark_mean) + (
         1.0 / 6.0 if rounding == "dithered_floor" else 1.0 / 12.0
     )

@@ -1,4 +1,4 @@
-"""Limits of a sensor: saturation, room for light above the dark, dynamic range."""
+"""Limits of a sensor: saturation, range between dark signal and full well, dynamic range."""
 
 import math
 from typing import Annotated, NamedTuple
@@ -43,8 +43,8 @@ def line_saturation(
 ) -> float:
     """Return the irradiance of a laser line that fills a pixel of the channel that saturates first.
 
-    A channel c of the response r turns one joule into sum over bands of r_c weight lambda / (h c)
-    times the quantum efficiency electrons. A line that no channel sees gives infinity.
+    In a channel with the response r, one joule of light gives (sum over bands of r weight lambda /
+    (h c)) x quantum efficiency electrons. The result is infinite for a line that no channel sees.
 
     Shapes: line (band,), responses (channel, band) -> ().
     Units:  electrons of a full pixel e-; pixel_pitch m; exposure s; result W/m2 of the whole line.
@@ -101,8 +101,8 @@ def _(result: Tensor, bands: Bands, **params: object) -> list[Check]:
 
 # --- room for light -------------------------------------------------------------------------------
 
-# Refusal of sensors that cannot record light: the dark signal fills the well, or the converter has
-# no steps for it.
+# Refusal of sensors that cannot record light: the dark signal fills the well, or the full well is
+# below one step of the converter.
 
 
 def refuse_without_room(
@@ -115,16 +115,16 @@ def refuse_without_room(
 ) -> None:
     """Raise ParameterError for a sensor whose pixels have no room for light.
 
-    The offset and the electrons of the dark current together must be below the full well, and so
-    must the read noise. Errors name the parameter ``well``, in which the node has its full well, or
-    read_noise.
+    The sum of the offset and the electrons of the dark current must be below the full well, and so
+    must the read noise. The error names the parameter ``well`` (the node's name of the full well)
+    or read_noise.
 
     Shapes: scalars.
     Units:  electrons.
     Source: EMVA Standard 1288, release 4.0: the saturation capacity counts from the dark value.
     """
     if offset + dark >= full_well:
-        # a list times False is empty
+        # a list times False is empty: only parts above 0 are named
         parts = [f"the offset of {offset:.6g} e-"] * (offset > 0) + [
             f"the dark current of {dark:.6g} e-"
         ] * (dark > 0)

@@ -23,7 +23,7 @@ from neusee.nodes.values import Bands as Samples
 # Spectral bands of a scene, and spectral sampling of a laser line.
 
 
-_MOST_BANDS = 100_000  #: bands, at most; 0.003 nm each from 400 to 700 nm
+_MOST_BANDS = 100_000  #: largest number of bands: 0.003 nm each from 400 to 700 nm
 #: m, spacing of the bands of a scene; the paper samples laser lines on the same grid
 _GRID_SPACING = 10e-9
 
@@ -64,7 +64,7 @@ def _(*, start: float, stop: float, count: int = 1) -> list[str]:
 
 
 def _refuse_many(count: int) -> None:
-    """Raise ParameterError for more bands than any computation here can use."""
+    """Raise ParameterError for more than `_MOST_BANDS` bands."""
     if count > _MOST_BANDS:
         raise ParameterError(
             "count", f"{count} bands exceed the limit of {_MOST_BANDS}: choose fewer bands"
@@ -158,7 +158,7 @@ def line(
     width = (3 * fwhm if span is None else span) / count
     edges = width * (torch.arange(count + 1, dtype=torch.float64) - count / 2)
     line_share = torch.erf(edges / (sigma * math.sqrt(2))).diff() / 2
-    # the floor is relative to the peak of the line's density
+    # the floor is relative to the peak density of the line
     weights = line_share + floor * width / (sigma * math.sqrt(2 * math.pi))
     centres = wavelength + (edges[1:] + edges[:-1]) / 2
     return Samples(centres, torch.full_like(centres, width), weights / weights.sum())
@@ -204,8 +204,8 @@ def _(result: Samples, *, wavelength: float, **params: Any) -> list[Check]:
 
 
 def _grid_points(wavelength: float, sigma: float, count: int, floor: float) -> Samples:
-    """Return ``count`` points of the 10 nm grid around a line, each with the power density there
-    times 10 nm.
+    """Return ``count`` points of the 10 nm grid around a line; the weight of a point is the power
+    density there times 10 nm.
     """
     first_multiple = math.floor(wavelength / _GRID_SPACING - count / 2 + 1 + 1e-9)
     centres = _GRID_SPACING * (first_multiple + torch.arange(count, dtype=torch.float64))
@@ -229,9 +229,9 @@ _COLUMNS = (
     " (mW/nm) for a spectrum, then two columns"
 )
 _PER_LENGTH = re.compile(r"(?:/|per )\s*(?:nm|um|µm|μm|m)\)?$")  #: end of a unit of spectral power
-#: share of the energy of a spectrum that its bands leave out, half of it on each side
+#: share of the energy of a spectrum outside its bands, half of it on each side
 _OMITTED_ENERGY = 1e-3
-_MANY_LINES = 50  #: lines; each of them takes a PSF of its own
+_MANY_LINES = 50  #: number of lines above which a note warns: each line needs its own PSF
 
 
 @node(rtol=1e-9, before_run=True)
@@ -291,7 +291,7 @@ class LaserTable(NamedTuple):
     """The spectrum of a laser from a file."""
 
     power: Curves  #: one curve
-    widths: Numbers | None  #: m, of each separate line; None for a spectrum
+    widths: Numbers | None  #: widths of separate lines in m; None for a continuous spectrum
 
 
 def laser_table(file: Path) -> LaserTable:
@@ -339,7 +339,7 @@ def _widths(table: Curves) -> Numbers:
 
 
 def _divided_spectrum(table: Table, count: int) -> Bands:
-    """Divide a spectrum into equal bands that hold all but `_OMITTED_ENERGY` of its energy."""
+    """Return equal bands that together contain all but `_OMITTED_ENERGY` of a spectrum's energy."""
     lowest, highest = (
         _wavelength_of_share(table, _OMITTED_ENERGY / 2),
         _wavelength_of_share(table, 1 - _OMITTED_ENERGY / 2),
@@ -352,7 +352,9 @@ def _divided_spectrum(table: Table, count: int) -> Bands:
 
 
 def _wavelength_of_share(table: Table, share: float) -> float:
-    """Return the wavelength up to which a spectrum has a share of its energy, by bisection."""
+    """Return the wavelength below which a spectrum has a given share of its energy, by
+    bisection.
+    """
     first, low, high = (float(table.wavelengths[i]) for i in (0, 0, -1))
     total = _energy(table, first, high)
     # bisection to the last digit of float64

@@ -21,10 +21,10 @@ from neusee.nodes.values import Bands
 
 
 Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
-#: of the largest sensitivity; a band that every channel sees less counts as unseen
+#: a band is unseen if every channel has less than this share of the largest sensitivity
 _UNSEEN_SHARE = 1e-3
-#: nm, ends of the range in which some channel has more than `_UNSEEN_SHARE`, with a margin; found
-#: without the table
+#: nm, range in which some channel exceeds `_UNSEEN_SHARE`, with a margin; constants, so that the
+#: tables need not be read
 _SEEN_RANGE: dict[str, tuple[float, float]] = {
     "CIE 1931": (375.0, 720.0),
     "Nikon 5100": (405.0, 690.0),
@@ -34,7 +34,7 @@ _COLUMNS = (
     "write a header, then wavelength in nm, red, green and blue, separated by commas, or one column"
     " for a mono camera"
 )
-#: V m; responsivity in A/W is QE times m over this
+#: V m; responsivity (A/W) = QE x wavelength (m) / this constant
 _ELECTRON_VOLT_METRES = PLANCK * SPEED_OF_LIGHT / ELEMENTARY_CHARGE
 
 
@@ -90,7 +90,7 @@ def _(
         return notes
     centres = bands.centres * 1e9
     if shortest_nm <= float(centres.min()) and float(centres.max()) <= longest_nm:
-        return notes  # most recipes: colour-science, whose import takes a second, is not needed
+        return notes  # the usual case: no import of colour-science, which takes a second
     strongest = responses(bands, camera=camera).amax(0)
     unseen = centres[strongest < _UNSEEN_SHARE]
     if not len(unseen):
@@ -204,10 +204,10 @@ def _above_one(value: float, unit: str) -> str:
 
 
 def _peak_note(file: Path, quantum_efficiency: float | None) -> list[str]:
-    """Return a note on the largest QE of a file: responses are relative to it, or the QE of the
-    sensor does not count.
+    """Return a note on the largest QE of a file, and on the QE that counts for electrons.
 
-    Without a quantum efficiency of the sensor, responses are relative.
+    With a quantum efficiency of the sensor, the QE of the table counts. Without it, the responses
+    are relative to the largest QE.
     """
     table, absolute = camera_curves(file)
     if not absolute:

@@ -20,7 +20,7 @@ Kind = Literal[
     "LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", "LED-RGB1", "LED-V1", "LED-V2",
 ]  # fmt: skip
 _COLUMNS = "write a header such as wavelength (nm),power (W/nm), then two columns"
-#: share of the luminous efficiency that a table of light must hold, for lux
+#: smallest share of the luminous efficiency function within the range of a table, for lux
 _LEAST_EFFICIENCY_SHARE = 0.99
 _LUMENS_PER_WATT = 683.0  #: lm/W at 555 nm
 _LONGER_TABLE = "give a longer table, or choose bands inside that range"
@@ -98,16 +98,16 @@ def _(
 
 
 def luminous_share(bands: Bands | None, kind: str | Path, temperature: float) -> float:
-    """Return the mean radiance in one band of a light of 1 cd/m2, in W/(m2 sr).
+    """Return the mean radiance in one band of a light of 1 cd/m2, in W/(m2 sr); 0 without bands.
 
-    Raises ParameterError for a table of light that does not hold 99 % of the luminous efficiency,
-    and 0 for no bands.
+    Raises ParameterError for a table of light whose range contains less than 99 % of the luminous
+    efficiency function.
     """
     table, observer_table = _light(kind, temperature), observer()
     in_range = (observer_table.wavelengths >= table.wavelengths[0]) & (
         observer_table.wavelengths <= table.wavelengths[-1]
     )
-    # the second function of the observer is the luminous efficiency
+    # `values[1]`: the second colour-matching function is the luminous efficiency
     efficiency = observer_table.values[1] * in_range
     if float(efficiency.sum() / observer_table.values[1].sum()) < _LEAST_EFFICIENCY_SHARE:
         low, high = float(table.wavelengths[0]) * 1e9, float(table.wavelengths[-1]) * 1e9
@@ -123,14 +123,14 @@ def luminous_share(bands: Bands | None, kind: str | Path, temperature: float) ->
             efficiency * table.at(observer_table.wavelengths)[0], observer_table.wavelengths
         )
     )
-    # before the run only the checks above count
+    # without bands (before the run), only the checks above are needed
     if bands is None or bands.centres.is_meta:
         return 0.0
     if not lumens > 0:
         raise ParameterError(
             "kind", f"{_name(kind)} gives no visible light: state sensor.background in place of lux"
         )
-    # mean W in a band over the lumens of the same light
+    # mean power of a band / lumens of the same light
     return float((table.over(bands)[0] * bands.widths.cpu()).mean()) / lumens
 
 

@@ -139,7 +139,7 @@ def lift_checks(
 
     A large picture is sampled at some 100 000 pixels.
     """
-    # a sample of the pixels is enough
+    # about 65536 pixels are enough
     step = max(1, rgb[0].numel() // 65536)
     colours, spectra = (t.detach().flatten(1)[:, ::step].double().cpu() for t in (rgb, result))
     scale = max(float(colours.abs().max()), 1e-30)
@@ -249,7 +249,7 @@ def lift_matrix(measured: Tensor, centres: Tensor) -> Tensor:
             f"{ends} cannot distinguish three colours: use more bands, such as 31 from 400 to"
             " 700 nm"
         )
-    # least mean square error: E[s c'] E[c c']^-1 for colours c of spectra s
+    # least mean square error: E[s c^T] E[c c^T]^-1 for colours c of spectra s
     weights: Tensor = torch.linalg.solve(rgb_products, rgb_of_spectra @ spectra_products).T
     return weights
 
@@ -299,7 +299,7 @@ class Stage(nn.Module):
     """
 
     def __init__(self, dim: int) -> None:
-        """Build a stage for ``dim`` channels, which each of two halvings of the size doubles."""
+        """Build a stage with ``dim`` channels, doubled at each of two halvings of the size."""
         super().__init__()
         self.embedding = _conv(dim, dim)
         self.encoder_layers = nn.ModuleList(

@@ -15,8 +15,8 @@ from neusee.nodes.values import LowRankCube
 # Principal components of a spectral cube, computed and verified in blocks of pixels.
 
 
-_PIECE_PIXELS = 4096  #: pixels of a block: 31 bands in float64 take 1 MB and stay in the cache
-_LEAST_ROUND_OFFS = 8  #: round-off units of the planes; no smaller error can be guaranteed
+_PIECE_PIXELS = 4096  #: pixels of a block: 31 bands in float64 take 1 MB and fit in the cache
+_LEAST_ROUND_OFFS = 8  #: smallest error that can be guaranteed, in round-off units of the planes
 #: relative resolution of a root mean square that is computed from products in float64
 _RMS_RESOLUTION = 2e-7
 
@@ -30,7 +30,7 @@ class Source(NamedTuple):
     part: Callable[[slice], Tensor]
     bands: int
     pixels: int
-    dtype: torch.dtype  #: of the planes
+    dtype: torch.dtype  #: type of the planes
 
     def pieces(self) -> list[slice]:
         return [
@@ -48,7 +48,7 @@ def few_planes(source: Source, within: float) -> LowRankCube:
     """
     largest, band_products = _largest_and_products(source)
     scale = float(largest.max())
-    # products near the ends of float64 are computed anew from the cube over its largest element
+    # products near the limits of float64 are computed again from the cube / its largest element
     scaled = scale > 0 and not 1e-280 < float(band_products.amax()) < 1e280
     if scaled:
         band_products = _largest_and_products(source, scale)[1]
@@ -67,7 +67,7 @@ def few_planes(source: Source, within: float) -> LowRankCube:
     )
     planes, largest_by_band, largest_by_pixel = _projection(source, axes[:, :count])
     residual = bound_by_planes(largest, planes, axes[:, :count], largest_by_band)
-    # no more than was measured
+    # the estimated rms error cannot exceed the measured largest error
     spread = torch.cat([spread[:count], torch.minimum(spread[count], residual[count])[None]])
     return LowRankCube(planes, axes[:, :count], residual, spread, largest_by_pixel)
 
@@ -96,10 +96,11 @@ def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, T
 
 
 def _projection(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Project a spectral cube on the axes (band, k) of principal components, block by block.
+    """Return the projection of a spectral cube on the axes (band, k) of principal components,
+    computed block by block.
 
-    Return the basis images (k, pixel) in the precision of the source, and the largest error of what
-    they leave out, by band and by pixel.
+    The result is the basis images (k, pixel) in the precision of the source, and the largest error
+    of each band and of each pixel.
     """
     planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
     largest_by_band, largest_by_pixel = (
@@ -112,7 +113,7 @@ def _projection(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         block_errors = block.sub_(axes @ planes[:, piece].double()).abs_()
         largest_by_band = torch.maximum(largest_by_band, block_errors.amax(1))
         largest_by_pixel[piece] = block_errors.amax(0)
-    # errors by pixel are rounded up, because they are bounds
+    # the errors of the pixels are bounds, so they are rounded up
     return planes, largest_by_band, largest_by_pixel.mul_(1 + 2 * torch.finfo(source.dtype).eps)
 
 
@@ -146,7 +147,7 @@ def bound_by_planes(largest: Tensor, planes: Tensor, basis: Tensor, last: Tensor
     by_plane = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
     # round-off of the measurement
     last = last + 4 * torch.finfo(torch.float64).eps * (largest + by_plane.sum(1))
-    # row k: at most the sum of the planes from the k-th on
+    # row k: upper bound of the sum of the planes from the k-th on
     plane_bounds = by_plane.flip(1).cumsum(1).flip(1).T
     return torch.cat([largest[None], last + plane_bounds[1:], last[None]])
 
@@ -266,16 +267,16 @@ def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list
 
 _LINEAR_PIECE_PIXELS = (
     1 << 14
-)  #: pixels of a block: 31 bands in float32 take 2 MB and stay in the cache
+)  #: pixels of a block: 31 bands in float32 take 2 MB and fit in the cache
 _SAMPLED_PIXELS = (
     1 << 14
-)  #: pixels that tell beforehand whether the clipped light is within the error
-_LEAST_ERROR = 1e-5  #: least error that is tried: float32 alone leaves a few 1e-7
+)  #: pixels of a sample from which the error due to clipping is estimated first
+_LEAST_ERROR = 1e-5  #: smallest allowed error: float32 alone has an error of a few 1e-7
 
 
 class _Axes(NamedTuple):
-    """Orthonormal spectra of the unclipped cube, the strongest first, and what makes the planes
-    from the picture.
+    """Orthonormal spectra of the unclipped cube, the strongest first, and the weights that compute
+    the planes from the picture.
     """
 
     basis: Tensor  #: (band, k) float64
@@ -284,13 +285,13 @@ class _Axes(NamedTuple):
 
 
 def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube | None:
-    """Return the cube ``matrix @ picture``, clipped at 0, as its fewest components with an rms
-    error of ``within``.
+    """Return the cube ``matrix @ picture``, clipped at 0, with the smallest number of components
+    for an rms error of at most ``within``.
 
-    Shapes: picture (channel, pixel) float32, matrix (band, channel) float64. The error is relative
-            to the largest
-    element. Return None where more components are needed than the picture has channels, or
-    ``within`` is below 1e-5.
+    The error is relative to the largest element. The result is None if more components are needed
+    than the picture has channels, or if ``within`` is below 1e-5.
+
+    Shapes: picture (channel, pixel) float32, matrix (band, channel) float64.
     """
     if (
         picture.dtype != torch.float32
@@ -309,7 +310,7 @@ def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube
         ),
         0,
     )
-    # clipped light alone would exceed the error
+    # the clipped light alone would exceed the allowed error
     if not count or float(sampled_cube.clamp_max(0).square().mean(1).max()) >= allowed_error**2:
         return None
     cube = _measured_cube(picture, matrix, axes, count)
@@ -334,8 +335,8 @@ def _axes(picture: Tensor, matrix: Tensor) -> _Axes:
 
 
 def _omitted_rms(axes: _Axes, count: int) -> Tensor:
-    """Return the rms of each band of the unclipped cube that is not in its first ``count``
-    components.
+    """Return the rms error of each band of the unclipped cube if only its first ``count``
+    components are kept.
     """
     return (axes.basis[:, count:].square() @ axes.power[count:]).sqrt()
 
@@ -360,13 +361,13 @@ def _measured_cube(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> 
         planes[:, columns] = weights @ block.double()
         bands = matrix_of_all @ block
         block_maxima.append(bands.amax(1))
-        # with all components the unclipped cube is exact: errors are where it was negative
-        if matrix_of_components is None:  # what is clipped is all that is lost
+        # with all components the unclipped cube is exact: only clipped (negative) light is an error
+        if matrix_of_components is None:
             clipped_light = bands.amin(0).neg_().clamp_min_(0)
             largest_by_pixel[columns], clipped_pixels = clipped_light, clipped_light.nonzero()[:, 0]
             errors = bands[:, clipped_pixels].clamp_max_(0)
         else:
-            # the clipped cube less its components
+            # clipped cube minus its components
             errors = bands.clamp_min_(0).sub_(matrix_of_components @ block)
             largest_by_pixel[columns] = errors.abs().amax(0)
         if errors.shape[1]:
@@ -378,10 +379,10 @@ def _measured_cube(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> 
 
 
 class _BandErrors(NamedTuple):
-    """What was measured of each band of a cube, block by block of pixels."""
+    """Largest elements and errors of each band of a cube, measured in blocks of pixels."""
 
     block_maxima: Tensor  #: (block, band) largest element
-    block_errors: list[Tensor]  #: largest error (band,) of each block with any
+    block_errors: list[Tensor]  #: largest error (band,) of each block with an error
     rms: Tensor  #: (band,) error of the whole cube
 
 

@@ -75,7 +75,7 @@ def metamers(
         bands,
     )
     normal = torch.randn(count, 1, generator=rng, device=rng.device, dtype=torch.float64)
-    # in proportion to the brightness of each mixture
+    # proportional to the brightness of each mixture
     share = blacks * normal * mixture.mean(1, keepdim=True) / measured.mean()
     least_share, greatest_share = _factor_limits(mixture, black)
     return (mixture + share.maximum(least_share).minimum(greatest_share) * black).clamp(0.0, 1.0)
@@ -118,14 +118,14 @@ def metameric_blacks(spectra: Tensor, measured: Tensor, bands: Bands) -> Tensor:
 def _mixtures(
     measured: Tensor, count: int, mixed: int, thickness: tuple[float, float], rng: torch.Generator
 ) -> Tensor:
-    """Mix measured spectra at random, and apply a random layer thickness to each mixture (Beer and
-    Lambert).
+    """Return random mixtures of measured spectra, each with a random layer thickness (Beer-Lambert
+    law).
 
     The thickness is log-uniform. One spectrum dominates most mixtures.
     """
     options = {"generator": rng, "device": rng.device, "dtype": torch.float64}
     weights = -torch.rand(count, mixed, **options).clamp_min(1e-12).log()  # type: ignore[call-overload]
-    # squares of exponential numbers differ widely: one dominates
+    # squares of exponential random numbers differ widely, so that one dominates
     weights = weights.square()
     weights = weights / weights.sum(1, keepdim=True)
     mixtures = (
@@ -133,7 +133,7 @@ def _mixtures(
     ).sum(1)
     uniform: Tensor = torch.rand(count, 1, **options)  # type: ignore[call-overload]
     layer_thickness: Tensor = thickness[0] * (thickness[1] / thickness[0]) ** uniform
-    # Beer and Lambert: the transmission of a layer to the power of its thickness
+    # Beer-Lambert law: transmittance of a layer to the power of its thickness
     layers: Tensor = mixtures.clamp(_DARKEST_LAYER, 1.0) ** layer_thickness
     return layers
 
@@ -351,7 +351,7 @@ def _mat_spectra(file: Path) -> tuple[Numbers, Numbers]:
         raise ValueError(
             f"the file is not a .mat file of version 7 or older: {read_error}"
         ) from None
-    # variables S_name (start, step, count) and sur_name, as the Psychtoolbox has them
+    # variables of the Psychtoolbox: S_name (start, step, count) and sur_name
     name = next(
         name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_")
     )

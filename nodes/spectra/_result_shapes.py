@@ -21,7 +21,7 @@ from neusee.nodes.spectra._plausible_spectra import metamers
 from neusee.nodes.spectra._synthetic_pictures import _SAMPLES_PER_PIXEL, grain, leaves, render
 from neusee.nodes.values import Bands, LowRankCube
 
-_MOST_LINE_BANDS = 20  #: bands of a laser line, at most
+_MOST_LINE_BANDS = 20  #: fewer bands than this count as those of a laser line
 
 
 @illuminant.shape
@@ -31,8 +31,8 @@ def _(bands: Bands, **params: Any) -> Tensor:
 
 @responses.shape
 def _(bands: Bands, *, camera: str | Path = "CIE 1931", **params: Any) -> Tensor:
-    """Return the responses to bands that no channel sees, which a laser must know before the
-    run, or their shape.
+    """Return the shape of the responses; for a laser line that no channel may see, return the
+    responses themselves, which are needed before the run.
     """
     if known(bands.centres) and _may_be_unseen(bands, camera):
         channels: Tensor = responses(bands, camera=camera, **params)
@@ -41,9 +41,7 @@ def _(bands: Bands, *, camera: str | Path = "CIE 1931", **params: Any) -> Tensor
 
 
 def _may_be_unseen(bands: Bands, camera: str | Path) -> bool:
-    """Return True for the few bands of a laser if some channel may not see them; no table is
-    read for others.
-    """
+    """Return True for the few bands of a laser line outside the sensitive range of the camera."""
     shortest_nm, longest_nm = seen_range(camera)
     return (
         len(bands.centres) < _MOST_LINE_BANDS
@@ -92,8 +90,8 @@ lift_mallett_mixture.shape(_mixture)
 
 @compress.shape
 def _(cube: Tensor, **params: Any) -> LowRankCube:
-    """Return the shape for as many planes as a cube can need, because only the values tell how
-    many it needs.
+    """Return the shape for the largest possible number of planes; the true number depends on the
+    values.
     """
     return _low_rank(len(cube), len(cube), cube)
 
@@ -116,7 +114,9 @@ def _(spectra: Tensor, bands: Bands, *, shape: tuple[int, int], **params: Any) -
 
 @leaves.work
 def _(result: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
-    """Return the work of a picture that is drawn several times as fine, in all bands at once."""
+    """Return memory and operations of a picture that is drawn on a finer grid, in all bands at
+    once.
+    """
     sample_count = float(_SAMPLES_PER_PIXEL**2 * result.numel())
     return 4.0 * sample_count, sample_count
 

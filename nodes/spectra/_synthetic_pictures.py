@@ -1,5 +1,5 @@
-"""Synthetic spectral pictures of overlapping ellipses, and how a camera shows a spectral picture:
-as sRGB, with noise.
+"""Synthetic spectral pictures of overlapping ellipses, and the conversion of a spectral picture to
+sRGB with noise.
 """
 
 from typing import Annotated, Any
@@ -17,7 +17,7 @@ from neusee.nodes.values import Bands
 
 #: samples per pixel along each axis, so that a pixel on an edge mixes spectra
 _SAMPLES_PER_PIXEL = 2
-#: pixels between the random numbers from which texture and shade are interpolated
+#: spacing in pixels of the random numbers from which texture and shade are interpolated
 _TEXTURE_PIXELS = 8
 _WARMEST_DAYLIGHT, _COOLEST_DAYLIGHT, _DAYLIGHT_COUNT = (
     4000.0,
@@ -87,8 +87,8 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Generator) -> Tensor:
-    """Draw random overlapping ellipses, and return the index of the topmost ellipse at each
-    sample (y, x).
+    """Return the index of the topmost of ``count`` random overlapping ellipses at each sample (y,
+    x).
     """
     largest = max(min(size) / 2, smallest)
     uniform = _uniform(rng, count)
@@ -111,7 +111,7 @@ def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Gene
 
 
 def _smooth_field(size: tuple[int, int], rng: torch.Generator) -> Tensor:
-    """Draw a random field (y, x) of numbers from 0 to 1 that vary slowly over the picture."""
+    """Return a random field (y, x) from 0 to 1 that varies slowly over the picture."""
     grid_shape = (
         max(2, size[0] // (_SAMPLES_PER_PIXEL * _TEXTURE_PIXELS)),
         max(2, size[1] // (_SAMPLES_PER_PIXEL * _TEXTURE_PIXELS)),
@@ -128,7 +128,7 @@ def _daylight_ratio(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
     centres = bands.centres
     if chance >= share:
         return torch.ones_like(centres)
-    # evenly in 1 / temperature, as eyes see it
+    # uniform in 1 / temperature, which is perceptually more even
     per_kelvin = 1 / _WARMEST_DAYLIGHT + (1 / _COOLEST_DAYLIGHT - 1 / _WARMEST_DAYLIGHT) * int(
         light_fraction * _DAYLIGHT_COUNT
     ) / (_DAYLIGHT_COUNT - 1)
@@ -141,7 +141,7 @@ def _uniform(rng: torch.Generator, count: int) -> Tensor:
     return torch.rand(count, generator=rng, device=rng.device)
 
 
-# --- as a camera shows it -------------------------------------------------------------------------
+# --- rendering and noise --------------------------------------------------------------------------
 
 GrainDeviation = Annotated[float, Field(ge=0, le=1)]
 

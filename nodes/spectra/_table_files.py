@@ -25,7 +25,7 @@ LENGTHS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "m": 1.0}
 _SHORTEST_WAVELENGTH, _LONGEST_WAVELENGTH = (
     100e-9,
     20e-6,
-)  #: m, ends of the wavelengths that a recipe can have
+)  #: m, range of wavelengths in a recipe
 _HEADING = re.compile(r"(?P<quantity>[^(\[]*?)\s*(?:[(\[](?P<unit>.*)[)\]])?")
 
 
@@ -117,7 +117,7 @@ def _refuse_only_numbers(file: Path, line: int, header: Sequence[str]) -> None:
 
 
 def _refuse_other_length(file: Path, line: int, row: Sequence[str], length: int) -> None:
-    """Raise ValueError for a row that has not one number for each heading."""
+    """Raise ValueError for a row whose length differs from the number of headings."""
     if len(row) != length:
         count = f"{len(row)} column{'s' * (len(row) != 1)} in place of {length}"
         raise ValueError(
@@ -160,8 +160,8 @@ def curves(file: Path, units: Sequence[str] | None, assumed: str = "", fewest: i
 
 
 def table_error(parameter: str, form: str, error: Exception) -> ParameterError:
-    """Return the error of a parameter whose file is no table of the needed form, which ``form``
-    says.
+    """Return the error for a parameter whose file is not a valid table; ``form`` describes the
+    required table.
     """
     return ParameterError(parameter, f"{error}; {form}")
 
@@ -214,7 +214,7 @@ def _refuse_unit(file: Path, number: int, column: Column, units: Sequence[str]) 
 
 
 def _wavelength_problems(file: Path, lines: Sequence[int], nm: Numbers) -> Iterator[str]:
-    """Yield what is wrong with the wavelengths of a file, in nm."""
+    """Yield a message for each error in the wavelengths (nm) of a file."""
     for line, previous, here in zip(lines[1:], nm, nm[1:], strict=False):
         if here == previous:
             yield (

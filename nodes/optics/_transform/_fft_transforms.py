@@ -1,4 +1,6 @@
-"""The scaled Fourier transform by FFTs: chirps (Bluestein), or Kaiser-Bessel windows."""
+"""The scaled Fourier transform by FFTs: chirp transform (Bluestein), or Kaiser-Bessel
+interpolation.
+"""
 
 import copy
 import functools
@@ -23,12 +25,13 @@ from neusee.nodes.optics._transform._sample_axis import (
 
 # --- chirp transform ------------------------------------------------------------------------------
 
-# The scaled Fourier transform by chirps (Bluestein): two FFTs for each line, exact up to round-off.
+# The scaled Fourier transform as a chirp transform (Bluestein): two FFTs for each line, exact up to
+# round-off.
 
 
 class _Chirps(NamedTuple):
-    """The phase factors of the chirp transform, from ``jk = (j^2 + k^2 - (j - k)^2) / 2``, one
-    for each term.
+    """The factors of the chirp transform, from ``jk = (j^2 + k^2 - (j - k)^2) / 2``: one for each
+    term.
     """
 
     before: Tensor
@@ -92,8 +95,8 @@ def _convolve(lines: Tensor, chirps: _Chirps, axis: Axis, work: Workspace) -> Te
 
 @functools.lru_cache(maxsize=256)
 def fft_length(n: int, even: bool = False) -> int:
-    """Return the smallest FFT length of at least ``n`` without prime factors above 5, for which
-    FFTs are fast.
+    """Return the smallest FFT length >= ``n`` without prime factors above 5; FFTs of this length
+    are fast.
     """
     n += even and n % 2
     while _has_large_factors(n):
@@ -115,18 +118,16 @@ def _has_large_factors(n: int) -> bool:
 # product.
 
 
-_SLACK_COLUMNS = 8  #: columns of zeros that let blocks of unequal spacing share one stride
+_SLACK_COLUMNS = 8  #: extra columns of zeros, so that unequally spaced blocks can share one stride
 
 
 class _Run(NamedTuple):
-    """A range of matrix blocks whose first columns are equally spaced: start, start + stride and
-    so on.
-    """
+    """A range of matrix blocks with equally spaced first columns: start, start + stride, ..."""
 
-    first: int
-    blocks: int
-    start: int
-    stride: int
+    first: int  #: index of the first block
+    blocks: int  #: number of blocks
+    start: int  #: first column of the first block
+    stride: int  #: columns from one block to the next
 
     @property
     def starts(self) -> list[int]:
@@ -137,16 +138,16 @@ class Banded:
     """A banded matrix, whose row ``i`` is nonzero only in the columns within ``reach`` of ``origin
     + step i``.
 
-    ``n_rows`` is rounded up to whole blocks; the extra rows are finite and meaningless. The other
-    factor of a product needs ``margin`` zeros before and behind its ``n_columns`` samples, so that
-    all blocks have the same size.
+    ``n_rows`` is rounded up to complete blocks; the extra rows are finite, but have no meaning. The
+    other factor of a product needs ``margin`` zeros before and after its ``n_columns`` samples, so
+    that all blocks have the same size.
     """
 
     def __init__(
         self, n_rows: int, n_columns: int, origin: float, step: float, reach: float, block: int
     ) -> None:
-        """Lay out a matrix of ``n_rows`` x ``n_columns`` in blocks of about ``block`` rows, without
-        its weights.
+        """Define the blocks of a matrix of ``n_rows`` x ``n_columns``, with about ``block`` rows
+        each; `fill` sets the weights.
         """
         self.n_columns, self.reach = n_columns, reach
         self.count = -(-n_rows // block)
@@ -166,7 +167,7 @@ class Banded:
             [z + 1 - self.width for z in last_columns], first_columns, step * self.block
         )
         block_starts = list(chain.from_iterable(run.starts for run in self.runs))
-        # columns beyond the ends that blocks of equal width reach
+        # number of columns by which blocks of equal width extend beyond the ends
         self.margin = max(0, -min(block_starts), max(block_starts) + self.width - n_columns)
         self.weights = torch.empty(0)
 
@@ -248,8 +249,8 @@ class Banded:
 
 
 def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
-    """Multiply two batches of matrices; fewer than 8 products run one after another, each on all
-    threads.
+    """Write the products of two batches of matrices to ``out``; fewer than 8 products run one after
+    another, each on all threads.
     """
     if len(a) >= 8:
         torch.bmm(a, b, out=out)
@@ -259,8 +260,8 @@ def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
 
 
 def _equal_runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
-    """Return a few runs of matrix blocks with equally spaced first columns, each column from
-    ``low`` to ``high``.
+    """Return a small number of runs of matrix blocks whose first columns are equally spaced and lie
+    between ``low`` and ``high``.
     """
     runs: list[_Run] = []
     first = 0
@@ -278,8 +279,8 @@ def _equal_runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
 
 
 def _longest_run(low: list[int], high: list[int], first: int, stride: int) -> _Run:
-    """Return the longest run from block ``first`` on with a stride, whose columns stay from ``low``
-    to ``high``.
+    """Return the longest run with a given stride from block ``first`` on whose first columns lie
+    between ``low`` and ``high``.
     """
     least_start, greatest_start, count = low[first], high[first], 0
     while first + count < len(low):
@@ -298,10 +299,10 @@ def _longest_run(low: list[int], high: list[int], first: int, stride: int) -> _R
 # The scaled Fourier transform by Kaiser-Bessel interpolation before and after a short FFT, with a
 # chosen accuracy.
 #
-# The window needs only ``alpha n_in n_out`` samples of information (800 for 2160 -> 2048 at 550
-# nm). The pupil is therefore gathered onto a grid 1.75 times finer than that, and the FFT is longer
-# by another factor of 1.75; a chirp transform needs n_in + n_out. All weights are real, since signs
-# centre both grids.
+# The window has only ``alpha n_in n_out`` independent samples (800 for 2160 -> 2048 at 550 nm). The
+# pupil is therefore interpolated to a grid 1.75 times finer than that, and the FFT is longer by
+# another factor of 1.75; a chirp transform needs the length n_in + n_out. All weights are real,
+# because alternating signs centre both grids.
 
 
 class Kernel(NamedTuple):
@@ -314,7 +315,7 @@ class Kernel(NamedTuple):
 
     @property
     def peak(self) -> float:
-        """Return the divisor that brings the interpolation weights near one."""
+        """Return the divisor that scales the interpolation weights to about one."""
         return self.width * math.sinh(self.beta) / self.beta
 
     @property
@@ -332,18 +333,17 @@ class Kernel(NamedTuple):
 
 
 _BLOCK_ROWS = 16
-#: the grid divides the input into at least this many parts, however few the window needs
+#: smallest number of grid intervals across the input, even if the window needs fewer
 _LEAST_PARTS = 8
 _COLUMN_BLOCKS = 8
 SINGLE, DOUBLE = Kernel(9, 1.75), Kernel(18, 2.0)
-#: work along the last axis for each independent sample of the result, where a pupil sample has work
-#: 1
+#: time along the last axis for each independent sample of the result, relative to a pupil sample
 _LAST_AXIS_WORK = 10.0
 
 
 class Plan(NamedTuple):
-    """The transform along one axis: interpolate to ``points``, FFT of ``length``, crop to
-    ``kept``, interpolate.
+    """The transform along one axis: interpolation to ``points`` samples, FFT of ``length``, crop to
+    ``kept`` frequencies, interpolation to the output.
     """
 
     gather: Banded
@@ -383,7 +383,7 @@ def plan(
         math.ceil(max(point_count, 2 * _BLOCK_ROWS) * kernel.oversampling), even=True
     )
     spread = _spread(axis, kernel, point_pitch, length)
-    # the output must lie within the frequencies of the FFT, margins included
+    # a longer FFT, until its frequencies contain the output and the margins
     while spread.n_columns + 2 * spread.margin > length:
         length = fft_length(length + length // 4, even=True)
         spread = _spread(axis, kernel, point_pitch, length)
@@ -469,8 +469,8 @@ def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: W
 
 
 def work_by_axis(rows: Axis, columns: Axis) -> tuple[float, float]:
-    """Return the work along the first and along the last axis, where that of a sample of the
-    pupil is 1.
+    """Return the time along the first and along the last axis, in units of the time for a pupil
+    sample.
     """
     return rows.n_in * columns.n_in, _LAST_AXIS_WORK * rows.bandwidth * columns.bandwidth
 
@@ -535,7 +535,7 @@ def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
     columns[: y.padded] = 0
     columns[y.padded + y.points :] = 0
     spectrum = work.take("spectrum", column_count, y.kept, dtype=half.dtype)
-    # small chunks keep the memory that the FFT allocates small
+    # in chunks, so that the FFT allocates little memory
     for start, stop in row_chunks(column_count, y.length):
         lines = _fft(columns[:, start:stop].T, y.sign)
         spectrum[start:stop] = lines[:, y.cropped : y.cropped + y.kept]

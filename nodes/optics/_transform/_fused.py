@@ -1,4 +1,4 @@
-"""The PSF of a pupil and its gradient in C++, and the grids that the C++ reads."""
+"""The PSF of a pupil and its gradient in C++, and the grids in the layout of the C++ code."""
 
 import ctypes
 import functools
@@ -31,20 +31,22 @@ from neusee.nodes.optics._transform._sample_axis import (
 
 # --- fused plan -----------------------------------------------------------------------------------
 
-# The grids and weights of one axis of the fused transform, in the layout that the C++ reads.
+# The grids and weights of one axis of the fused transform, in the layout of the C++ code.
 #
-# As in `_fft_transforms`, but each row has a band of weights of its own, in place of dense
-# blocks for many rows: the C++ multiplies a third of the numbers that a product of blocks does.
+# As in `_fft_transforms`, but each row has its own band of weights, in place of dense blocks for
+# several rows: the C++ code needs a third of the multiplications.
 
 
-#: the grid divides the input into at least this many parts, however few the window needs
+#: smallest number of grid intervals across the input, even if the window needs fewer
 _LEAST_PARTS = 8
-_SHORTEST_FFT = 32  #: samples of the shortest FFT
-_PASS_FACTORS = (8, 5, 3, 4, 2)  #: of the passes of the FFT
+_SHORTEST_FFT = 32  #: length of the shortest FFT
+_PASS_FACTORS = (8, 5, 3, 4, 2)  #: factors of the FFT length for the passes, in order of preference
 
 
 class CAxis(ctypes.Structure):
-    """The structure ``Axis`` of ``_fft.h``; ``held`` keeps the arrays that it points to."""
+    """The structure ``Axis`` of ``_fft.h``; ``held`` has references to the arrays that it points
+    to.
+    """
 
     _fields_ = (
         *(
@@ -62,9 +64,9 @@ class CAxis(ctypes.Structure):
 
 @functools.lru_cache(maxsize=64)
 def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torch.dtype) -> CAxis:
-    """Return the plan of one axis with the accuracy of ``dtype``, kept for later calls.
+    """Return the plan of one axis with the accuracy of ``dtype``; it is cached.
 
-    The weights in front of the FFT are of the type ``gathered``, all else of the type ``kind``.
+    The weights before the FFT have the type ``gathered``, all other numbers the type ``kind``.
     """
     kernel = SINGLE if dtype == torch.float32 else DOUBLE
     point_pitch, point_count, length, frequencies_per_output, frequency_count = _axis_grids(
@@ -134,16 +136,15 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
 
 
 def expected_seconds(rows: Axis, columns: Axis) -> float:
-    """Return the expected seconds of one PSF in single precision on one thread, without a large
-    fixed cost.
+    """Return the expected time in seconds of one PSF in single precision on one thread.
 
-    Measured for 128 to 2160 samples and 96 to 2048 pixels a side: within 20 %. The terms are the
-    samples of the pupil with their phase, the FFTs along both axes, and the interpolation behind
-    the FFTs.
+    It agrees with measurements for 128 to 2160 samples and 96 to 2048 pixels a side within 20 %.
+    The terms are for the pupil samples and their phase, for the FFTs along both axes, and for the
+    interpolation after the FFTs.
     """
     transforms = columns.n_in * _fft_steps(rows) + rows.n_out * _fft_steps(columns)
     last_products = rows.n_out * (columns.n_in + columns.n_out)
-    # seconds for each sample, measured: phase and gathering, FFTs, last interpolation
+    # measured seconds per sample: phase and first interpolation, FFTs, last interpolation
     return (
         0.11e-3
         + 2.3e-9 * rows.n_in * columns.n_in
@@ -153,14 +154,14 @@ def expected_seconds(rows: Axis, columns: Axis) -> float:
 
 
 def _fft_steps(axis: Axis) -> float:
-    """Return the operations of one FFT along an axis, but for a factor."""
+    """Return the number of operations of one FFT along an axis, up to a constant factor."""
     length = _axis_grids(axis, SINGLE)[2]
     return length * math.log2(length)
 
 
 def _axis_grids(axis: Axis, kernel: Kernel) -> tuple[float, int, int, float, int]:
-    """Return pitch and number of the points before the FFT, the length of the FFT, its samples for
-    each output sample, and the number of frequencies that are kept of it.
+    """Return pitch and number of the points before the FFT, the length of the FFT, its number of
+    frequencies per output sample, and the number of frequencies that are kept.
     """
     pitch = min(
         1 / (axis.alpha * axis.n_out * kernel.oversampling),
@@ -171,8 +172,8 @@ def _axis_grids(axis: Axis, kernel: Kernel) -> tuple[float, int, int, float, int
 
 
 def _length(axis: Axis, kernel: Kernel, pitch: float, shortest: int) -> tuple[int, float, int]:
-    """Return the FFT length, its samples for each output sample, and the frequencies that are
-    kept of it.
+    """Return the FFT length, its number of frequencies per output sample, and the number of
+    frequencies that are kept.
     """
     length = fft_length(max(shortest, _SHORTEST_FFT), even=True)
     while True:
@@ -193,8 +194,8 @@ def _band_of_rows(
     reach: float,
     weigh: Callable[[Tensor, Tensor], Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """Return the first column and the weights of each row, whose band reaches ``reach`` from
-    ``origin + step row``.
+    """Return the first column and the weights of each row; the band of a row are the columns within
+    ``reach`` of ``origin + step row``.
     """
     width = min(math.floor(2 * reach) + 1, n_columns)
     rows = torch.arange(n_rows, dtype=torch.float64)[:, None]
@@ -225,11 +226,11 @@ def address_of(x: Tensor | None) -> Any:
 # The PSF of a pupil and its gradient in C++: phase, interpolation and FFT in one pass over the
 # data.
 #
-# `_intensity` computes the same in torch where there is no compiler, from parts that each pass over
-# all samples.
+# Without a compiler, `_intensity` computes the same in torch, with a pass over all samples for each
+# part.
 
 
-#: what the code reads: the C++ sources decide a result; no result depends on the number of threads
+#: a result depends on the C++ sources, and not on the number of threads
 __depends__ = (
     "_fused.cpp",
     "_field.h",
@@ -238,17 +239,18 @@ __depends__ = (
     "unaffected:torch.get_num_threads",
 )
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("_fused.cpp", "_field.h", "_fft.h"))
-#: digest of the sources: keys of cached results depend on this file, and so on the sources; a test
-#: compares both
+#: digest of the C++ sources. The keys of cached results depend on this file, and through the digest
+#: on the C++ sources; a test compares both
 DIGEST = "885df4bca23da036"
 _NAMES = {
     (torch.float32, torch.float32): "single",
     (torch.float32, torch.float64): "mixed",
     (torch.float64, torch.float64): "double",
 }
-#: share of the work of the first axis, up to which all from the first FFT on is float64
+#: if the last axis takes less than this share of the time of the first, all steps from the first
+#: FFT on are float64
 _FLOAT64_WORK_SHARE = 0.3
-#: samples for each further thread: to wake a thread takes as long as to transform a few thousand
+#: samples per further thread: starting a thread takes as long as the transform of a few thousand
 _SAMPLES_PER_THREAD = 1 << 18
 
 
@@ -280,14 +282,14 @@ class _Gradients(ctypes.Structure):
 
 
 def operators() -> ctypes.CDLL:
-    """Return the library of the C++, compiled if needed; raise `NoCompilerError` if it cannot be
+    """Return the C++ library, compiled if needed; raise `NoCompilerError` if it cannot be
     compiled.
     """
     return _cpp_library.load(*SOURCES, rounding=_cpp_library.UNFUSED)
 
 
 def available(device: torch.device) -> bool:
-    """Return True if the C++ can compute on this device; on a CPU without a compiler warn once
+    """Return True if the C++ code can run on this device; on a CPU without a compiler, warn once
     and return False.
     """
     return device.type == "cpu" and _cpp_library.compiled(
@@ -296,17 +298,17 @@ def available(device: torch.device) -> bool:
 
 
 class FusedPupil:
-    """The factors of the pupil as the C++ reads them, and the transforms of their field to and
-    from a focal plane.
+    """The factors of the pupil in the layout of the C++ code, with the transforms of the field to
+    and from a focal plane.
     """
 
     def __init__(self, screens: Screens, dtype: torch.dtype, work: Workspace) -> None:
-        """Convert the factors of the pupil to one type; ``dtype`` is that of the intensity."""
+        """Convert the factors of the pupil to one type; ``dtype`` is the type of the intensity."""
         double = dtype == torch.float64 or any(x.dtype == torch.float64 for x in screens[:3])
         self.kind = torch.float64 if double else torch.float32
         screens_of_kind = [x.detach().to(self.kind).contiguous() for x in screens[:3]]
         self.amplitude, self.height = screens_of_kind[:2]
-        # null where there is no path, which the C++ then does not read
+        # a null pointer if the path is 0: the C++ code then skips it
         self.path = screens_of_kind[2] if screens.longest > 0 else None
         self.dtype, self.work = dtype, work
 
@@ -394,13 +396,13 @@ class FusedPupil:
             for s in (row_axis, column_axis, *arguments)
         ]
         samples = rows.n_in * columns.n_in + rows.n_out * columns.n_out
-        # one thread alone for few samples
+        # a single thread for few samples
         threads = min(torch.get_num_threads(), 1 + samples // _SAMPLES_PER_THREAD)
         operator(*structures[:2], ctypes.c_int64(threads), *tiles, *structures[2:])
 
     def _tiles(self, label: str, y: CAxis, n: int, kind: torch.dtype) -> Any:
-        """Return the address of memory for all frequencies along y of ``n`` columns, aligned to
-        vectors.
+        """Return the address of memory for all frequencies along y of ``n`` columns, aligned to the
+        vector registers.
         """
         vector = operators().neusee_psf_vector_bytes()
         numbers_per_vector, columns_per_vector = (
@@ -408,7 +410,7 @@ class FusedPupil:
             vector // self.dtype.itemsize,
         )
         size = 2 * _rounded_up(y.kept, numbers_per_vector) * _rounded_up(n, columns_per_vector)
-        # one vector more than needed, to align its start
+        # one extra vector, so that the start can be aligned
         memory = self.work.take(label, size + numbers_per_vector, dtype=kind)
         return ctypes.c_void_p(_rounded_up(memory.data_ptr(), vector))
 
@@ -429,5 +431,5 @@ def _focal_structure(
 
 
 def _rounded_up(n: int, step: int) -> int:
-    """Return a whole number, rounded up to a multiple of ``step``."""
+    """Return ``n``, rounded up to a multiple of ``step``."""
     return -(-n // step) * step

@@ -1,5 +1,5 @@
-"""Intensity of the PSF with a hand-written gradient, which computes the field in the pupil again
-to save memory.
+"""Intensity of the PSF with an explicit gradient, which recomputes the field in the pupil to save
+memory.
 """
 
 import math
@@ -19,7 +19,7 @@ from neusee.nodes.precision import one_by_one, transformed
 _NO_SECOND_DERIVATIVE = (
     "the PSF has no second derivative here: differentiate without create_graph=True"
 )
-KEPT_FIELD_BYTES = 1 << 30  #: bytes; focal fields up to this size are kept for back-propagation
+KEPT_FIELD_BYTES = 1 << 30  #: largest size in bytes of focal fields stored for back-propagation
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +36,13 @@ class Sampling:
 
     @property
     def by_torch(self) -> Method:
-        """Return the method of torch, for what the fused transform does not compute."""
+        """Return the transform method in torch, for computations without the fused C++ code."""
         return "auto" if self.method == "fused" else self.method
 
     def fused(self, device: torch.device) -> bool:
-        """Return True if the C++ computes intensity and gradient; raise NoCompilerError if only
-        C++ may and cannot.
+        """Return True if the C++ code computes intensity and gradient.
+
+        Raise NoCompilerError if the method is "fused" and the C++ code cannot be compiled.
         """
         if self.method == "fused":
             operators()
@@ -58,7 +59,7 @@ def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Samp
 
 
 class PupilIntensity(torch.autograd.Function):
-    """The PSF intensity ``sum over views of weight * envelope * |U|^2``, whose gradient is an
+    """The PSF intensity ``sum over views of weight * envelope * |U|^2``; its gradient uses the
     adjoint transform.
     """
 
@@ -68,8 +69,7 @@ class PupilIntensity(torch.autograd.Function):
     ) -> Tensor:
         screens = Screens.of(amplitude, height, path)
         intensity, fields = _intensity_and_fields(screens, sampling, any(ctx.needs_input_grad))
-        # as saved tensors the fields are freed with the graph, even where a result still holds this
-        # node
+        # saved tensors are freed with the graph, even if a result still refers to this node
         ctx.save_for_backward(
             amplitude, height, path, *(field for field in fields if field is not None)
         )
@@ -117,7 +117,7 @@ class _Transformed(torch.autograd.Function):
 
 
 class _FirstDerivative(torch.autograd.Function):
-    """A first derivative for `torch.func`, of which a further derivative raises an error."""
+    """A first derivative for `torch.func`; a second derivative raises an error."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -168,21 +168,21 @@ class _Gradient(_FirstDerivative):
 def _intensity_and_fields(
     screens: Screens, sampling: Sampling, keep: bool
 ) -> tuple[Tensor, list[Tensor | None]]:
-    """Return the PSF intensity, and the focal field of each view, or None instead of fields that
-    are not stored.
+    """Return the PSF intensity, and the focal field of each view, or None for a field that is not
+    stored.
     """
     refuse_too_many_turns(screens, sampling.views)
     views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
     device, fields, last_band = screens.height.device, list[Tensor | None](), -1
     intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=device)
-    # re and im of each view: twice the bytes of its intensity
+    # real and imaginary part: twice the bytes of the intensity of each view
     keep = keep and sampling.keep and 2 * len(views) * intensity[0].nbytes <= KEPT_FIELD_BYTES
     fused = sampling.fused(device)
     with borrowed(sampling.dtype, device) as work:
         pupil = FusedPupil(screens, sampling.dtype, work) if fused else None
         for view in views:
             focal_field = (
-                # torch keeps the field transposed, the C++ does not
+                # torch stores the field transposed, the C++ code does not
                 torch.empty(2, *shape[:: 1 if fused else -1], dtype=sampling.dtype, device=device)
                 if keep
                 else None
@@ -349,7 +349,7 @@ def _add_gradient(
     pupil.
     """
     view, all_rows = field.view, slice(0, planes.shape[2])
-    # one copy; by slabs of a power of two it is slow
+    # copied at once: slabs with a power of two as side are slow
     transposed_weight = work.take("gain", *planes.shape[1:]).copy_(weight.T)
 
     def source(start: int, stop: int, out: Tensor) -> None:

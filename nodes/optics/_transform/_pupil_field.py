@@ -13,15 +13,16 @@ from torch import Tensor
 from neusee.nodes.optics._transform._sample_axis import Axis, Source, Workspace, centred
 from neusee.nodes.precision import refuse_not_finite
 
-_MOST_TURNS = 1e9  #: turns of phase that float64 holds to 2e-7 turn
-#: below this many turns a float32 phase is exact to 5e-7 rad, like a float64 phase after a cast
+_MOST_TURNS = 1e9  #: largest phase in turns, which float64 represents to 2e-7 turns
+#: below this number of turns, a float32 phase is exact to 5e-7 rad, like a float64 phase after a
+#: cast
 _FLOAT32_TURNS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A grid of focal points in one band, whose intensity |U|^2 is multiplied by ``weight`` and
-    by two envelopes.
+    """A grid of focal points in one band; the intensity |U|^2 is multiplied by ``weight`` and by
+    two envelopes.
     """
 
     band: int
@@ -29,7 +30,7 @@ class View:
     columns: Axis
     turns_height: float  #: turns of phase per metre of height
     turns_path: float  #: turns of phase per metre of path
-    tilt: tuple[float, float]  #: turns per pupil sample (v, u) that move the window onto the spot
+    tilt: tuple[float, float]  #: turns per pupil sample (v, u) that shift the window
     weight: float
     envelope: tuple[Tensor, Tensor] | None = None
 
@@ -56,7 +57,7 @@ class Screens(NamedTuple):
 
 
 def refuse_too_many_turns(screens: Screens, views: Sequence[View]) -> None:
-    """Raise ValueError if the phase has more turns than float64 can hold to 1e-6 turn."""
+    """Raise ValueError if the phase has more turns than float64 can represent to 1e-6 turns."""
     turns = max(
         screens.highest * abs(view.turns_height) + screens.longest * view.turns_path
         for view in views

@@ -1,4 +1,4 @@
-"""What all transforms share: axes, phasors with an exact phase, reusable buffers."""
+"""Common parts of all transforms: axes, phasors with a precise phase, reusable buffers."""
 
 import contextlib
 import math
@@ -71,7 +71,7 @@ Sink = Callable[[slice, slice, Tensor], None]
 #: takes a patch (2, ..., columns) of the result, re and im; the dimensions between are the rows,
 #: unflattened
 
-#: share of the work of the first axis, up to which the last axis is transformed in float64
+#: the last axis is transformed in float64 if it takes less than this share of the time of the first
 FLOAT64_WORK_SHARE = 1 / 10
 
 
@@ -83,7 +83,7 @@ class Axis:
 
     n_in: int
     n_out: int
-    #: turns per input sample and output sample: pitch times pitch over wavelength and focal length
+    #: turns per input and output sample: pitch x pitch / (wavelength x focal length)
     alpha: float
     sign: int = -1
 
@@ -93,9 +93,7 @@ class Axis:
 
     @property
     def bandwidth(self) -> float:
-        """Return the time-bandwidth product, the number of independent samples that the
-        transform carries.
-        """
+        """Return the time-bandwidth product: the number of independent samples of the transform."""
         return self.alpha * self.n_in * self.n_out
 
 
@@ -120,12 +118,13 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
 def last_type(
     first: float, last: float, dtype: torch.dtype, little: float = FLOAT64_WORK_SHARE
 ) -> torch.dtype:
-    """Return the number type of the transform along the last axis, given the work along the first
-    and the last axis.
+    """Return the type of the transform along the last axis, from the times along the first and the
+    last axis.
 
-    The type is float64 where this costs little. The round-off of the first axis averages out along
-    the last axis; that of the last axis does not. In float32 the last axis errs by about 2^-24 of
-    the brightest field, which is 1.2e-3 of an intensity that is 1e-8 of the brightest pixel.
+    The type is float64 if this costs little time. The round-off of the first axis averages out
+    along the last axis; the round-off of the last axis does not. In float32, the error of the last
+    axis is about 2^-24 of the brightest field. This is 1.2e-3 of an intensity that is 1e-8 of the
+    brightest pixel.
     """
     return torch.float64 if last <= little * first else dtype
 
@@ -137,6 +136,6 @@ def patch_view(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:
 
 
 def row_chunks(rows: int, columns: int, elements: int = 1 << 19) -> list[tuple[int, int]]:
-    """Split the rows of an array into ranges that each fit in the CPU's cache."""
+    """Return ranges of rows of an array, each of which fits in the CPU's cache."""
     step = max(1, min(rows, elements // max(columns, 1)))
     return [(start, min(start + step, rows)) for start in range(0, rows, step)]

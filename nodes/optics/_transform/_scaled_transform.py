@@ -1,4 +1,4 @@
-"""The scaled Fourier transform: matrix products, and the choice of the fastest method."""
+"""The scaled Fourier transform by matrix products, and the choice of the fastest method."""
 
 from typing import Literal, NamedTuple
 
@@ -27,9 +27,7 @@ from neusee.nodes.optics._transform._sample_axis import (
 
 
 def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform the field by complex matrix products with the full kernel, without use of
-    symmetry.
-    """
+    """Transform the field by complex matrix products with the full kernel; symmetry is not used."""
     last_kind = last_type(columns.n_in, rows.n_out, work.dtype)
     column_kernel, row_kernel = (
         _kernel(columns, work.dtype, work.device),
@@ -53,7 +51,7 @@ def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspac
 
 
 def folded(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform the even and odd parts of the field by real matrix products, in a quarter of the
+    """Transform the even and odd parts of the field by real matrix products, with a quarter of the
     operations of `direct`.
     """
     last_kind = last_type(columns.n_in, rows.n_out, work.dtype)
@@ -132,7 +130,7 @@ def _write_halves(even: Tensor, odd: Tensor, axis: Axis, out: Tensor) -> None:
 
 
 Method = Literal["auto", "direct", "folded", "bluestein", "kaiser_bessel"]
-#: with fewer samples than this the banded products are too few and too long to be fast
+#: below this time-bandwidth product the banded products are too few and too long to be fast
 _FEW_SAMPLES = 60.0
 _METHODS = {
     "direct": direct,
@@ -174,7 +172,7 @@ def _expected_seconds(rows: Axis, columns: Axis) -> dict[str, float]:
     information = rows.bandwidth * columns.bandwidth
     few_samples = min(rows.bandwidth, columns.bandwidth) < _FEW_SAMPLES
     return {
-        # a fixed cost, and seconds for each product or sample, measured
+        # measured: a constant, plus seconds for each product or sample
         "direct": 0.15e-3 + 57e-12 * products,
         "folded": 0.3e-3 + 0.3e-9 * n_in + 14e-12 * products,
         "bluestein": 0.15e-3 + 3.5e-9 * chirp_samples,
@@ -186,12 +184,12 @@ def _expected_seconds(rows: Axis, columns: Axis) -> dict[str, float]:
 
 
 class Grids(NamedTuple):
-    """How the grids of a field and of its transform lie to each other, along both axes."""
+    """Pitch and centres of the grids of a field and of its transform, along both axes."""
 
-    alpha: tuple[float, float]  #: turns per input sample and output sample
-    centre_in: tuple[float, float]  #: samples, of the field; also between or beyond its samples
-    centre_out: tuple[float, float]  #: samples, of the transform
-    sign: int = -1  #: of the exponent
+    alpha: tuple[float, float]  #: turns of phase per input sample and output sample
+    centre_in: tuple[float, float]  #: centre of the field in samples; any real number
+    centre_out: tuple[float, float]  #: centre of the transform in samples; any real number
+    sign: int = -1  #: sign of the exponent
 
 
 def transform(
@@ -211,7 +209,7 @@ def transform(
         Axis(n, k, a, grids.sign) for n, k, a in zip(field.shape, shape, grids.alpha, strict=True)
     ]
     real_type = field.real.dtype
-    # shifts of both centres are phases before and after the transform about the middles
+    # the shifts of both centres are phase factors before and after a transform about the middles
     phasors_before, phasors_after = _centre_phasors(axes, grids, real_type, field.device)
     out = torch.empty(shape, dtype=field.dtype, device=field.device)
 
@@ -233,8 +231,8 @@ def transform(
 def _centre_phasors(
     axes: list[Axis], grids: Grids, real: torch.dtype, device: torch.device
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Return the phasors along each axis that move the centre of a Fourier transform to the
-    given centres.
+    """Return the phasors before and after a Fourier transform about the middles that shift its
+    centres to the given ones.
     """
     before, after = [], []
     for axis, input_centre, output_centre in zip(

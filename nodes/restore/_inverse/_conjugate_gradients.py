@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients, exact at the lowest frequencies of a picture."""
+"""Conjugate gradients with a preconditioner that is exact at the lowest frequencies."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from neusee.nodes.restore._inverse._masked_blur import (
 
 # The exact inverse of the normal matrix at the lowest frequencies of a picture, as a dense matrix.
 #
-# Seen pixels constrain unseen pixels (beyond the edge and in holes) through the lowest frequencies,
-# where the signal is up to 1e8 times the noise. There the inverse for a picture without edges is
-# wrong by that factor; this inverse is right.
+# Known pixels determine unknown pixels (beyond the edge and in holes) through the lowest
+# frequencies, where the signal is up to 1e8 times the noise. There, the inverse for a picture
+# without edges is wrong by this factor. The dense inverse is exact.
 
 
-#: times the largest diagonal number of the matrix: its round-off in float64
+#: added to the diagonal, relative to its largest element: the rounding error in float64
 _LEAST_DIAGONAL = 1e-11
-#: real unknowns of each channel for up to three channels; more channels share the total of three.
-MODES = 500
-#: The time of the matrix grows with its cube: 1000 took three quarters of the filter and left
+#: number of real unknowns of each channel, for up to three channels; more channels share the total
+#: of three. Time grows with the cube: 1000 took three quarters of the time of the filter, and left
 #: nearly the same error
-_INVERSE_ROWS = 256  #: rows of the inverse that are read at a time
-SHARE = 24  #: grid points for each unknown, at least, on a small torus
+MODES = 500
+_INVERSE_ROWS = 256  #: number of rows of the inverse that are read at a time
+SHARE = 24  #: smallest number of grid points for each unknown, on a small torus
 
 
 class Lowest:
@@ -43,8 +43,8 @@ class Lowest:
     """
 
     def __init__(self, problem: Blurred, gain: Tensor, modes: int = MODES) -> None:
-        """Build the inverse; `gain` (channel, fy, fx), an approximate inverse's diagonal, scales
-        the normal matrix.
+        """Build the inverse; the normal matrix is scaled by `gain` (channel, fy, fx), the diagonal
+        of an approximate inverse.
         """
         self.torus = problem.torus
         # each frequency has two unknowns, real and imaginary
@@ -63,7 +63,7 @@ class Lowest:
         matrix = self._matrix(problem).mul_(root_gain[:, None]).mul_(root_gain)
         matrix.diagonal().add_(_LEAST_DIAGONAL * matrix.diagonal().max())
         inverse_factor = _inverse(torch.linalg.cholesky(matrix)).mul_(root_gain)
-        # lower triangular: numbers beyond `end` are 0
+        # the factor is lower triangular: elements beyond `end` are 0
         ends = range(_INVERSE_ROWS, len(inverse_factor) + _INVERSE_ROWS, _INVERSE_ROWS)
         self.whiten = [
             inverse_factor[end - _INVERSE_ROWS : end, :end].to(gain, copy=True) for end in ends
@@ -86,21 +86,21 @@ class Lowest:
         real_step = real_step.reshape(len(slope), -1)
         real, imag = real_step[:, : len(self.fy)], pad(real_step[:, len(self.fy) :], (1, 0))
         step = torch.complex(real, imag)
-        # the mean, which is its own mirror image
+        # the mean is its own mirror image, see `inverse_power` in `_matrix`
         step[:, 0] *= 2.0
         onto[:, self.fy, self.fx] += step
         in_first_column = (self.fx == 0) & (self.fy > 0)
-        # in the column fx = 0, half a spectrum holds both mirror images
+        # the column fx = 0 of a half spectrum contains both frequencies of a mirror pair
         onto[:, -self.fy[in_first_column], 0] += step[:, in_first_column].conj()
         return inner_product * (2.0 / (self.torus[0] * self.torus[1]))
 
     def _matrix(self, problem: Blurred) -> Tensor:
-        """Return the float64 normal matrix of prior, noise and glare, for real and imaginary parts
-        of each channel: (channel and part, channel and part).
+        """Return the float64 normal matrix of prior, noise and glare; rows and columns are the real
+        and imaginary parts of the lowest frequencies, channel by channel.
         """
         transfer = problem.transfer[:, self.fy, self.fx].to(torch.complex128)
         inverse_power = 1.0 / problem.power[self.fy, self.fx].double().clamp_min(1e-30)
-        # real part of the mean, real parts of the others, their imaginary parts
+        # order: real part of the mean, real parts of the other frequencies, their imaginary parts
         inverse_power = torch.cat([2.0 * inverse_power[:1], inverse_power[1:], inverse_power[1:]])
         own_factor, shared_factor = inverse_colour(len(transfer), problem.grey)
         colours = (
@@ -124,8 +124,10 @@ class Lowest:
 
     def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
         """Return the part of the normal matrix from the noise of one channel, for all pairs of
-        frequencies; ``weight`` is the spectrum of the weights, ``through`` the transfer at the
-        lowest frequencies.
+        frequencies.
+
+        ``weight`` is the spectrum of the weights, ``through`` the transfer function at the lowest
+        frequencies.
         """
         difference_part, sum_part = (
             self._at_frequency_pairs(weight, s) * through.conj()[:, None] for s in (-1, 1)
@@ -148,7 +150,7 @@ class Lowest:
         """
         y, x = self.torus
         fy, fx = self.fy[:, None] + sign * self.fy, (self.fx[:, None] + sign * self.fx) % x
-        # the other half of the spectrum: conjugate of the mirror frequency
+        # other half of the spectrum: complex conjugate at the mirror frequency
         beyond_half = fx > x // 2
         values = spectrum[
             torch.where(beyond_half, -fy, fy) % y, torch.where(beyond_half, x - fx, fx)
@@ -156,8 +158,8 @@ class Lowest:
         return torch.where(beyond_half, values.conj(), values)
 
     def _without_glare(self, matrix: Tensor, problem: Blurred, transfer: Tensor) -> Tensor:
-        """Subtract from the normal matrix the information lost to unknown glare strengths, and
-        return the matrix.
+        """Subtract from the normal matrix the information that is lost to the unknown strengths of
+        the glare; return the matrix.
         """
         if not problem.glare:
             return matrix
@@ -177,8 +179,8 @@ class Lowest:
 
 
 def _inverse(lower: Tensor) -> Tensor:
-    """Return the inverse of a lower triangular matrix by recursive halving, faster than a solve
-    for the unit matrix.
+    """Return the inverse of a lower triangular matrix, by recursion: faster than
+    `solve_triangular` with the unit matrix.
     """
     inverse = torch.zeros_like(lower)
     _invert(lower, inverse)
@@ -186,8 +188,8 @@ def _inverse(lower: Tensor) -> Tensor:
 
 
 def _invert(lower: Tensor, inverse: Tensor) -> None:
-    """Write the inverse of a lower triangular matrix to ``inverse``, by the inverses of its
-    diagonal quarters A and B: [[A, 0], [C, B]]^-1 = [[A^-1, 0], [-B^-1 C A^-1, B^-1]].
+    """Write the inverse of a lower triangular matrix to ``inverse``, from the inverses of its
+    diagonal blocks A and B: [[A, 0], [C, B]]^-1 = [[A^-1, 0], [-B^-1 C A^-1, B^-1]].
     """
     middle = len(lower) // 2
     if middle < 128:
@@ -209,14 +211,14 @@ def _real(spectrum: Tensor) -> Tensor:
 
 
 def _lowest(size: Size, count: int) -> tuple[Tensor, Tensor]:
-    """Return the `count` lowest frequencies (fy, fx), the mean first, with one frequency of each
-    mirror pair.
+    """Return the indices (fy, fx) of the `count` lowest frequencies, the mean first, with one
+    frequency of each mirror pair.
     """
     reach = (size[0] - 1) // 2
     fy = torch.arange(-reach, reach + 1)[:, None]
     fx = torch.arange((size[1] - 1) // 2 + 1)
     squared = (fy / size[0]).square() + (fx / size[1]).square()
-    # of each mirror pair in the column fx = 0, the one with negative fy is left out
+    # in the column fx = 0, the frequency of a mirror pair with negative fy is left out
     squared[:reach, 0] = torch.inf
     order = squared.flatten().argsort(stable=True)[: min(count, squared.numel() - reach)]
     return order // len(fx) - reach, order % len(fx)
@@ -224,22 +226,22 @@ def _lowest(size: Size, count: int) -> tuple[Tensor, Tensor]:
 
 # --- conjugate gradients --------------------------------------------------------------------------
 
-# Preconditioned conjugate gradients, which find the most likely picture in place, in little memory.
+# Preconditioned conjugate gradients for the most likely picture, in place, with little memory.
 
 
-LOWEST = 512  #: pixels a side, up to which each step solves the lowest frequencies exactly
-_PIECE_NUMBERS = 2**18  #: numbers of a spectrum worked on at a time, which fit in the cache
+LOWEST = 512  #: largest side in pixels for which each step solves the lowest frequencies exactly
+_PIECE_NUMBERS = 2**18  #: number of elements that are processed at a time and fit in the cache
 
 
 def descend(
     problem: Blurred, x: Tensor, steps: int, enough: float, inverse: Preconditioner | None = None
 ) -> Tensor:
-    """Improve the half spectrum `x` of a picture in place by at most `steps` conjugate-gradient
+    """Improve the half spectrum `x` of a picture in place by at most `steps` conjugate gradient
     steps, and return `x`.
 
-    The steps end early when the squared distance from the solution, in units of the posterior, is
-    about `enough`. `inverse` is the preconditioner of the problem, where the caller has it: it
-    depends on no pixel of the picture.
+    The steps end early if the squared distance from the solution, in the norm of the inverse
+    posterior covariance, is about `enough`. `inverse` is the preconditioner of the problem, if the
+    caller has it; it does not depend on the pixels of the picture.
     """
     if steps < 1:
         return x
@@ -247,7 +249,7 @@ def descend(
     # gradient at the start, search direction, and normal matrix times direction
     residual, direction, product = normal.slope(x), torch.empty_like(x), torch.empty_like(x)
     residual_norm = inverse(residual, direction)
-    # below 1e-20 of the first norm all is rounding
+    # below 1e-20 of the first norm, only rounding errors are left
     enough = max(enough, 1e-20 * float(residual_norm))
     for _ in range(steps):
         if not float(residual_norm) > enough:
@@ -257,27 +259,27 @@ def descend(
             x[:, rows].add_(direction[:, rows], alpha=step)
             residual[:, rows].sub_(product[:, rows], alpha=step)
         new_norm = inverse(residual, product)
-        # Fletcher and Reeves: the next direction is conjugate to the last ones
+        # Fletcher-Reeves: the next direction is conjugate to the earlier ones
         direction.mul_(float(new_norm / residual_norm)).add_(product)
         residual_norm = new_norm
     return x
 
 
 def pieces(spectrum: Tensor) -> Iterator[slice]:
-    """Return slices that cut half a spectrum into blocks of a few rows, which fit in the cache."""
+    """Return slices of the rows of a half spectrum; each block fits in the cache."""
     return _cache_blocks(spectrum.shape[-2], len(spectrum) * spectrum.shape[-1])
 
 
 def _cache_blocks(count: int, numbers: int) -> Iterator[slice]:
-    """Return slices that divide `count` array lines of `numbers` values each into blocks that
-    fit in the cache.
+    """Return slices of `count` lines of `numbers` values each; each block of lines fits in the
+    cache.
     """
     step = max(1, _PIECE_NUMBERS // numbers)
     return (slice(i, i + step) for i in range(0, count, step))
 
 
 def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
-    """Write the top left corner of the inverse FFT of half a spectrum (fy, fx) to `pixels`,
+    """Write the top left corner of the inverse FFT of a half spectrum (fy, fx) to `pixels`; this is
     faster than `irfft2`.
     """
     rows, columns = pixels.shape
@@ -294,8 +296,8 @@ class _Normal:
     """
 
     def __init__(self, problem: Blurred) -> None:
-        """Prepare the products of a problem; its plane and pixels are memory that each product uses
-        again.
+        """Prepare the products for a problem; each product reuses the memory `plane` and
+        `pixels`.
         """
         self.seen, self.weigh = problem, weighing(problem)
         self.inverse = 1.0 / problem.power.clamp_min(1e-30)
@@ -322,14 +324,14 @@ class _Normal:
         return result if self.seen.pull is None else result.add_(self.seen.pull)
 
     def _blurred(self, x: Tensor, room: Tensor) -> Tensor:
-        """Return the blurred picture of spectrum x, in `self.pixels`; ``room`` is overwritten."""
+        """Return the blurred picture of spectrum x in `self.pixels`; ``room`` is working memory."""
         for channel, transfer in enumerate(self.seen.transfer):
             torch.mul(transfer, x[channel], out=room[channel])
             corner(room[channel], self.seen.torus, self.pixels[channel])
         return self.pixels
 
     def _gather(self, pixels: Tensor, result: Tensor) -> None:
-        """Write the spectrum of each channel of a picture to `result`; `_finish` applies the
+        """Write the spectrum of each channel of a picture to `result`; then `_finish` applies the
         adjoint of the blur.
         """
         rows, columns = pixels.shape[-2:]
@@ -338,7 +340,7 @@ class _Normal:
             torch.fft.rfft2(self.plane, out=result[channel])
 
     def _hold(self, x: Tensor, result: Tensor, sign: float) -> None:
-        """Add `sign` times the precision of the further prior in the frame, times x, to
+        """Add `sign` times the precision of the second prior (`Blurred.held`), times x, to
         `result`.
         """
         if self.seen.held is None:
@@ -365,8 +367,8 @@ class Preconditioner:
     """
 
     def __init__(self, problem: Blurred, modes: int = MODES) -> None:
-        """Build the inverse of (prior + mean weight x |transfer|^2) for each frequency; the lowest
-        frequencies of pictures that are not too wide are exact.
+        """Build the inverse of (inverse prior + mean weight x |transfer|^2) for each frequency; up
+        to `LOWEST` pixels a side, the lowest frequencies are exact.
         """
         own_factor, shared_factor = inverse_colour(len(problem.picture), problem.grey)
         count = (problem.weight > 0).sum((-2, -1)).clamp_min(1)
@@ -386,7 +388,7 @@ class Preconditioner:
             transfer = problem.transfer[:, rows]
             information = mean_weight * (transfer.real.square() + transfer.imag.square())
             self.gain[:, rows] = 1.0 / (own_factor * inverse_power + information + mean_held)
-            # Sherman and Morrison: the prior couples all channels by one shared term
+            # Sherman-Morrison: the prior couples all channels by a term of rank one
             self.shared[rows] = (
                 shared_factor
                 * inverse_power
@@ -409,12 +411,12 @@ class Preconditioner:
 
 
 def inner(a: Tensor, b: Tensor, torus: Size) -> Tensor:
-    """Return the inner product of two pictures, given half of their Fourier transforms."""
+    """Return the inner product of two pictures, from their half spectra."""
     total_over_halves = (
         torch.stack([torch.vdot(p.flatten(), q.flatten()) for p, q in zip(a, b, strict=True)]).sum()
         * 2.0
     )
-    # columns that the whole spectrum has only once
+    # columns that occur only once in the whole spectrum
     for column in (0,) if torus[1] % 2 else (0, -1):
         total_over_halves = (
             total_over_halves - torch.linalg.vecdot(a[..., column], b[..., column]).sum()

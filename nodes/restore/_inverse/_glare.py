@@ -1,4 +1,4 @@
-"""The glare of lasers in a picture: its strength, scatter, doubt and other likely patterns."""
+"""The glare of lasers in a picture: strength, scattered light, uncertainty and nearby patterns."""
 
 from __future__ import annotations
 
@@ -21,42 +21,42 @@ from neusee.nodes.values import Bands, Pupil
 
 # --- glare ----------------------------------------------------------------------------------------
 
-# The glare of lasers in a picture: strength, variance of the pattern, and other patterns that are
-# as likely.
+# The glare of lasers in a picture: its strength, the variance of its pattern, and alternative
+# patterns that are as likely ("nearby" patterns).
 
 
-#: pixels; radii of the squares around a pixel, an octave's light of counting alike
+#: radii in pixels of the squares around a pixel over which the light of a pattern is averaged
 _REACH = (1, 4, 16, 64)
-_ROWS = 64  #: rows of a picture at a time, so that their float64 copies fit in the cache
+_ROWS = 64  #: number of rows at a time, so that their float64 copies fit in the cache
 
 
 class Glare(NamedTuple):
-    """Patterns of glare whose strengths are unknown, and for some of them other patterns that
-    are as likely.
+    """Patterns of glare with unknown strengths, and for some of them alternative patterns that are
+    as likely.
     """
 
-    patterns: list[Tensor]  #: (channel, y, x), of maximum 1
-    nearby: list[Tensor | None]  #: (pattern, channel, y, x), in the same unit
-    #: (channel, y, x), of each pattern; by `with_light_around`, for a doubt
+    patterns: list[Tensor]  #: (channel, y, x), each with maximum 1
+    nearby: list[Tensor | None]  #: (pattern, channel, y, x), alternatives, in the same unit
+    #: (channel, y, x), light around each pixel of each pattern, from `with_light_around`
     around: list[Tensor] | None = None
-    peaks: Sequence[float] = ()  #: by which patterns were divided
-    #: (channel, y, x), of each pattern spread over each radius that is tried
+    peaks: Sequence[float] = ()  #: original maxima of the patterns, by which they are divided
+    #: (channel, y, x), each pattern smoothed over each of `RADII`, from `with_smooth`
     smooth: list[list[Tensor]] | None = None
 
 
 class Light(NamedTuple):
-    """An estimate of the glare in a picture, with what is not known about it."""
+    """An estimate of the glare in a picture, with its uncertainty."""
 
-    sum: Tensor  #: (channel, y, x) e-
-    variance: Tensor  #: (channel, y, x) e-^2, of each pixel by itself
-    #: (channel, y, x) e-; the sum of their outer products is the rest of the covariance
+    sum: Tensor  #: (channel, y, x), e-, estimate of the glare
+    variance: Tensor  #: (channel, y, x), e-^2, variance that is independent in each pixel
+    #: (channel, y, x), e-; the sum of their outer products is the rest of the covariance
     modes: list[Tensor]
 
 
 def visible(
     patterns: Sequence[Tensor], nearby: Sequence[Tensor | None], unclipped: Tensor
 ) -> Glare:
-    """Return the glare patterns that are nonzero at some known pixel, each scaled to a maximum
+    """Return the glare patterns that are not 0 at every unclipped pixel, each scaled to a maximum
     of 1.
     """
     peaks = [float((pattern.detach().abs() * unclipped).max()) for pattern in patterns]
@@ -73,16 +73,16 @@ def visible(
 
 
 def with_light_around(glare: Glare) -> Glare:
-    """Return the glare with the light around each pixel of its patterns."""
+    """Return the glare with the field ``around``: the light around each pixel of its patterns."""
     return glare._replace(around=[light_around(pattern) for pattern in glare.patterns])
 
 
 def light_around(pattern: Tensor) -> Tensor:
-    """Return the light around each pixel of a pattern (channel, y, x), in its unit.
+    """Return the light around each pixel of a pattern (channel, y, x), in the unit of the pattern.
 
-    The mean over squares of 3, 9, 33 and 129 pixels a side, each over its radius and summed: a
-    point of light spreads as 1 / distance^3, like the rings of a lens and the light that edges,
-    dirt and defocus move. Beyond the picture is no light.
+    It is the sum of the means over squares of 3, 9, 33 and 129 pixels a side, each divided by the
+    radius of its square. A point of light thus spreads as 1 / distance^3, like the rings of a lens
+    and the light that edges, dirt and defocus scatter. There is no light beyond the picture.
     """
     exact = pattern.double()
     total = sum((square_mean(exact, radius) / radius for radius in _REACH), torch.zeros_like(exact))
@@ -90,12 +90,14 @@ def light_around(pattern: Tensor) -> Tensor:
 
 
 def square_mean(picture: Tensor, radius: int) -> Tensor:
-    """Return the mean over a square around each pixel, by running sums."""
+    """Return the mean over a square of 2 x ``radius`` + 1 pixels a side around each pixel, by
+    cumulative sums.
+    """
     for dim in (-2, -1):
         size = picture.shape[dim]
         sums = torch.cat([torch.zeros_like(picture.narrow(dim, 0, 1)), picture.cumsum(dim)], dim)
         index = torch.arange(size, device=picture.device)
-        # pixels beyond the picture are dark: the divisor stays the whole square
+        # pixels beyond the picture count as dark, so that the divisor is that of the whole square
         upper, lower = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
         picture = (sums.index_select(dim, upper) - sums.index_select(dim, lower)) / (2 * radius + 1)
     return picture
@@ -108,12 +110,12 @@ def doubted(
     doubt: float,
     noise: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Light, Tensor]:
-    """Return the weights of pixels, an estimate of the glare, and the mean variance of its pattern
-    by these weights.
+    """Return the weights of pixels, an estimate of the glare, and the variance of the glare,
+    averaged with these weights.
 
-    A ``doubt`` above 0 needs the light around the patterns. If they are uncertain, the estimate is
-    made twice: a pixel then weighs noise / (noise + variance of the glare). ``noise`` returns the
-    variance of the noise for the mean of the picture without glare.
+    A ``doubt`` above 0 needs ``glare.around``. For uncertain patterns the estimate is repeated with
+    the weights noise / (noise + variance of the glare). ``noise`` returns the noise variance of
+    each pixel, from the mean of the picture without glare.
     """
     light = _estimated(electrons, unclipped, glare, doubt)
     if not (doubt or light.modes) or not glare.patterns:
@@ -127,8 +129,8 @@ def doubted(
 
 
 def _estimated(electrons: Tensor, weights: Tensor, glare: Glare, doubt: float) -> Light:
-    """Return the glare whose strengths fit a picture best, and its uncertainty at these strengths:
-    by pixel for ``doubt``, by modes for nearby patterns.
+    """Return the glare at its fitted strengths, with its uncertainty: a variance of each pixel from
+    ``doubt``, and modes from the nearby patterns.
     """
     zeros = torch.zeros_like(electrons)
     strength_of_patterns = strengths(electrons, weights, glare.patterns)
@@ -148,13 +150,13 @@ def _estimated(electrons: Tensor, weights: Tensor, glare: Glare, doubt: float) -
         strength_of_patterns, glare.patterns, glare.nearby, strict=True
     ):
         if others is not None:
-            # their outer products add up to the mean over the nearby patterns, a covariance
+            # the sum of the outer products of the modes is the covariance of the nearby patterns
             modes += [strength * (other - pattern) / len(others) ** 0.5 for other in others]
     return Light(sum(patterns_in_picture, zeros), pixel_variance, modes)
 
 
 def _total(light: Light) -> Tensor:
-    """Return the variance of each pixel from all that is uncertain about the glare."""
+    """Return the total variance of the glare in each pixel."""
     return sum((mode.square() for mode in light.modes), light.variance)
 
 
@@ -165,12 +167,12 @@ def average(picture: Tensor, weights: Tensor) -> Tensor:
 
 
 def strengths(electrons: Tensor, weights: Tensor, glare: Sequence[Tensor]) -> Tensor:
-    """Return the strength of each glare pattern by a weighted least-squares fit of all patterns
-    and a constant.
+    """Return the strength of each glare pattern, from a weighted least-squares fit of all patterns
+    and a constant in each channel.
     """
     if not glare:
         return electrons.new_zeros(0)
-    # patterns without their weighted means: that fits the constant too
+    # subtraction of the weighted means is equivalent to a fit of the constants
     pattern_means = [average(pattern, weights) for pattern in glare]
     normal_equations = torch.zeros(
         len(glare), len(glare) + 1, dtype=torch.float64, device=electrons.device
@@ -185,7 +187,7 @@ def strengths(electrons: Tensor, weights: Tensor, glare: Sequence[Tensor]) -> Te
             patterns_and_picture = torch.stack(
                 [*centred_patterns, electrons[block].flatten()]
             ).double()
-            # the last column is the right side: products of patterns and picture
+            # the last column is the right-hand side: products of patterns and picture
             normal_equations += (patterns_and_picture[:-1] * weight) @ patterns_and_picture.T
     fitted: Tensor = (
         torch.linalg.pinv(normal_equations[:, :-1], hermitian=True) @ normal_equations[:, -1]
@@ -195,14 +197,15 @@ def strengths(electrons: Tensor, weights: Tensor, glare: Sequence[Tensor]) -> Te
 
 # --- glare doubt ----------------------------------------------------------------------------------
 
-# How far a glare pattern is to be doubted: the light around it that it may get wrong, and the
-# likeliest such doubt.
+# The uncertainty of a glare pattern ("doubt"): its standard deviation relative to the light around
+# each pixel, and the most likely value of this ratio.
 
 
-DOUBTS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  #: that are tried
-#: variances of the scene that are tried for each doubt, each half of an octave below the other
+DOUBTS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  #: doubts that are tried
+#: number of variances of the scene that are tried for each doubt, in steps of sqrt(2)
 _STEPS = 30
-#: pixels of a channel from which the variance of the scene is chosen; all decide on the doubt
+#: approximate number of pixels of a channel from which the variance of the scene is chosen; the
+#: doubt is chosen from all pixels
 _SAMPLE = 1 << 16
 
 
@@ -213,23 +216,22 @@ def likeliest_doubt(
     noise: Callable[[Tensor], Tensor],
     smallest: float = 0.0,
 ) -> float:
-    """Return the doubt of highest likelihood, at least ``smallest``, for a picture of which
-    ``unclipped`` pixels count.
+    """Return the doubt with the highest likelihood for the ``unclipped`` pixels of a picture, at
+    least ``smallest``.
 
-    Likelihood: what is left of the picture without glare, less the mean of the 3 x 3 pixels around,
-            is Gaussian in each
-    pixel by itself, with the variance of the noise, of the doubted glare and of a scene that is the
-    same in all pixels of a channel. Errors of a pattern are sharper than scenes, so that little of
-    the scene hides them.
+    The data are the picture without glare, minus its mean over 3 x 3 pixels. They count as
+    independent Gaussian numbers. Their variance is the sum of the variances of noise, of uncertain
+    glare, and of a scene, which is the same in all pixels of a channel. The subtraction of the mean
+    removes most of the scene, but little of the errors of a pattern, which are sharper.
     """
     if not glare.patterns:
         return 0.0
-    interior = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are known
+    interior = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are unclipped
 
     def likelihood(doubt: float) -> float:
         trusted, light, _ = doubted(electrons, unclipped, glare, doubt, noise)
         remainder = electrons - light.sum
-        # 8 / 9: the variance of white noise less its mean over 3 x 3 pixels
+        # 8 / 9: variance of white noise minus its mean over 3 x 3 pixels
         variance = 8 / 9 * (noise(average(remainder, trusted)) + light.variance)
         for mode in light.modes:
             variance = variance + _sharp(mode).square()
@@ -245,8 +247,8 @@ def likeliest_doubt(
 
 
 def _profile(squares: Tensor, variance: Tensor) -> float:
-    """Return the log likelihood of squared Gaussian errors, with the likeliest constant added to
-    their variance.
+    """Return the log likelihood of squared Gaussian errors, maximized over a constant that is added
+    to their variance.
     """
     sample = slice(None, None, max(1, len(squares) // _SAMPLE))
     mean_square = float(squares.mean())
@@ -271,51 +273,51 @@ def _mean_around(picture: Tensor) -> Tensor:
 
 # --- scattered glare ------------------------------------------------------------------------------
 
-# The glare of a laser behind a lens that is not quite its recipe's: part of its light is scattered
-# around it.
+# The glare of a laser behind a lens that deviates from its recipe: part of its light is scattered
+# around the pattern.
 #
-# Dirt, edges and defocus take light out of a pattern and spread it over some pixels (defocus,
-# edges) or many (grains of dirt, each like a hole of its size). Laser light is coherent: where
-# scattered light of mean d meets light c of the pattern, the intensity has the mean c + d and the
-# variance d^2 + 2 c d, speckle. Smooth light may be scene, speckle is not, and it has the colour of
-# the laser: speckle tells how much is scattered. Source: Goodman, Speckle Phenomena in Optics,
-# 2007, ch. 3 (speckle with a known phasor).
+# Dirt, edges and defocus take light out of a pattern and spread it over few pixels (defocus, edges)
+# or many (a grain of dirt diffracts like a hole of its size). Laser light is coherent: where
+# scattered light of mean d is added to light c of the pattern, the intensity is speckle with the
+# mean c + d and the variance d^2 + 2 c d. Smooth light may belong to the scene. Speckle does not,
+# and it has the colour of the laser, so that the amount of scattered light is estimated from it.
+# Source: Goodman, Speckle Phenomena in Optics, 2007, ch. 3 (speckle with a known phasor).
 
 
-RADII = (4, 16, 64)  #: pixels, over which light is scattered
-_RUNNING_MEANS = 3  #: running means one after another, which are nearly a Gaussian
-#: of the light of a pattern, scattered over each radius, in the median of lenses
+RADII = (4, 16, 64)  #: radii in pixels over which light is scattered
+_RUNNING_MEANS = 3  #: number of successive running means, which together are nearly a Gaussian
+#: share of the light of a pattern that is scattered over each radius, for the median lens
 _SHARES = (0.1, 0.01, 0.02)
-_FACTORS = (3.0, 3.0, 2.0)  #: of one standard deviation of these shares
-_STRENGTH_DEVIATION = 0.5  #: standard deviation of the logarithm of a strength that was found
-#: part of the variance of speckle two pixels wide that differs from the mean of the 3 x 3 pixels
-#: around
+_FACTORS = (3.0, 3.0, 2.0)  #: factor of one standard deviation of each share (lognormal)
+_STRENGTH_DEVIATION = 0.5  #: prior standard deviation of the logarithm of the strength
+#: share of the variance of speckle (grains of two pixels) that remains after subtraction of the
+#: mean over 3 x 3 pixels
 _SHARP = 0.5
-#: pixels that share a grain of speckle, so that a likelihood of pixels counts too much
+#: number of pixels in a grain of speckle: the log likelihood of the pixels is divided by it
 _ALIKE = 4.0
-#: variance of a pixel over that of its speckle, because grains of speckle are wider than pixels
+#: factor of the variance of a pixel by speckle, because grains are wider than pixels
 _GRAINY = 2.0
-#: standard deviations of scattered light and of a pattern, over their light
+#: relative standard deviations of the scattered light and of the strength of a pattern
 _SMOOTH, _SIZE = 1.0, 0.3
-_SPECKLE_COLOUR = 0.1  #: variance of speckle that differs between channels, over that of all
-_FILLED_BY_OTHERS = 0.01  #: probability that something else than the patterns fills a pixel
-_GLARE_SAMPLE = 1 << 15  #: pixels of a frame that tell of speckle
-_FEW_PIXELS = 300  #: pixels known in all channels, fewer of which do not tell
-_EVALUATIONS = 160  #: of the likelihood
+_SPECKLE_COLOUR = 0.1  #: variance of speckle independent in each channel, over the common variance
+_FILLED_BY_OTHERS = 0.01  #: probability that another source than the patterns clips a pixel
+_GLARE_SAMPLE = 1 << 15  #: approximate number of pixels of a frame in the likelihood
+_FEW_PIXELS = 300  #: smallest number of known pixels for an estimate
+_EVALUATIONS = 160  #: largest number of evaluations of the likelihood
 
 
 def scattered(
     electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> tuple[Tensor, Light, Tensor]:
-    """Return what `doubted` returns, for glare in electrons of which a part that the picture
-    tells is scattered.
+    """Return the result of `doubted` (weights, light, mean variance) for glare of which a part is
+    scattered; this part is estimated from the picture.
     """
     if glare.smooth is None:
         glare = with_smooth(glare)
     strength, *shares = _likeliest(electrons, unclipped, glare, noise)
     light = _light(glare, strength, shares)
     light_variance = sum((mode.square() for mode in light.modes), light.variance)
-    # a channel without known pixels has a mean
+    # all pixels of a fully clipped channel count, so that it has a mean
     unclipped = torch.where(unclipped.amax((-2, -1), keepdim=True) > 0, unclipped, 1.0)
     trusted = unclipped
     for _ in range(2):
@@ -327,7 +329,9 @@ def scattered(
 def speckle(
     electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """Return the variance of each pixel by the likeliest speckle of glare: (channel, y, x) e-^2."""
+    """Return the variance (channel, y, x) of each pixel due to the most likely speckle of the
+    glare, in e-^2.
+    """
     if not glare.patterns:
         return torch.zeros_like(electrons)
     glare = with_smooth(glare)
@@ -336,14 +340,18 @@ def speckle(
 
 
 def with_smooth(glare: Glare) -> Glare:
-    """Return the glare with each of its patterns spread over each of the `RADII`."""
+    """Return the glare with the field ``smooth``: each pattern, smoothed over each of the
+    `RADII`.
+    """
     return glare._replace(
         smooth=[[_spread(pattern, radius) for radius in RADII] for pattern in glare.patterns]
     )
 
 
 def _spread(pattern: Tensor, radius: int) -> Tensor:
-    """Return a pattern spread over about ``radius`` pixels; beyond the picture is no light."""
+    """Return a pattern, smoothed over about ``radius`` pixels; there is no light beyond the
+    picture.
+    """
     spread = pattern.double()
     for _ in range(_RUNNING_MEANS):
         spread = square_mean(spread, max(1, round(radius / _RUNNING_MEANS**0.5)))
@@ -351,8 +359,10 @@ def _spread(pattern: Tensor, radius: int) -> Tensor:
 
 
 def _light(glare: Glare, strength: float, shares: Sequence[float]) -> Light:
-    """Return the light of all patterns, with its uncertainty, for patterns of ``strength`` times
-    the light that is told, of which ``shares``, one for each of the `RADII`, are scattered.
+    """Return the light of all patterns, with its uncertainty.
+
+    The patterns have ``strength`` times their stated light. ``shares`` are the light that is
+    scattered over each of the `RADII`, relative to the stated light.
     """
     light_sum = variance = torch.zeros_like(glare.patterns[0])
     modes: list[Tensor] = []
@@ -375,37 +385,38 @@ def _light(glare: Glare, strength: float, shares: Sequence[float]) -> Light:
     return Light(light_sum, variance, modes)
 
 
-# --- what a picture tells of the shares -----------------------------------------------------------
+# --- estimate of the shares -----------------------------------------------------------------------
 
 
 class _Pixels(NamedTuple):
-    """Pixels that are known with all around them, one a column: of all channels (channel, pixel) or
-    of any (1, pixel).
+    """A sample of the pixels whose 3 x 3 neighbours are all known.
 
-    Sharp pictures lack the mean of the 3 x 3 pixels around.
+    The shape is (channel, pixel) if the pixels are known in all channels, or (1, pixel) with each
+    channel of a pixel counted separately. "Sharp" pictures are without their mean over 3 x 3
+    pixels.
     """
 
-    picture: Tensor  #: sharp
-    parts: Tensor  #: sharp patterns: straight, and over each radius (part, channel, pixel)
-    light: Tensor  #: as ``parts``, not sharp
+    picture: Tensor  #: sharp picture
+    parts: Tensor  #: (part, channel, pixel), sharp patterns: straight, then smoothed by each radius
+    light: Tensor  #: the same patterns, not sharp
     noise: Tensor  #: variance of the noise in the dark
     whole: Tensor  #: the picture, not sharp
-    hidden: _Hidden
+    hidden: _Hidden  #: the clipped pixels
 
 
 class _Hidden(NamedTuple):
-    """Pixels that are not known, because their light is at least full."""
+    """A sample of the clipped pixels, whose light is only known to be at least the clip level."""
 
-    light: Tensor  #: (part, pixel)
-    full: Tensor  #: (pixel,)
-    channel: Tensor  #: (pixel,), the row of `_Pixels`
+    light: Tensor  #: (part, pixel), patterns: straight, then smoothed by each radius
+    full: Tensor  #: (pixel,), clip level
+    channel: Tensor  #: (pixel,), row of the pixel's channel in `_Pixels`
 
 
 def _likeliest(
     electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> tuple[float, ...]:
-    """Return the likeliest strength of the patterns over that told, and then the light scattered
-    over each of the `RADII`, over the light told.
+    """Return the most likely strength of the patterns, and the light scattered over each of the
+    `RADII`, both relative to the stated light.
     """
     from scipy.optimize import minimize
 
@@ -427,7 +438,7 @@ def _likeliest(
 
 
 def _prior(logs: Sequence[float]) -> float:
-    """Return the log prior density of the logarithms of the strength and of what is scattered."""
+    """Return the log prior density of the logarithms of the strength and of the scattered light."""
     ratios = [
         (log - logs[0] - math.log(share)) / math.log(factor)
         for log, share, factor in zip(logs[1:], _SHARES, _FACTORS, strict=True)
@@ -438,8 +449,8 @@ def _prior(logs: Sequence[float]) -> float:
 def _likelihood(
     electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> Callable[[Sequence[float]], float] | None:
-    """Return the log likelihood of logarithms of the strength and of what is scattered; None
-    where nothing tells.
+    """Return the log likelihood, a function of the logarithms of the strength and of the scattered
+    light; None for too few known pixels.
     """
     pixels = _pixels(electrons, unclipped, glare, noise)
     if pixels is None:
@@ -460,13 +471,13 @@ def _likelihood(
         )
         arguments = (
             pixels.picture - (strength_and_shares * pixels.parts).sum(0),
-            # 8 / 9: the variance of white noise less its mean over 3 x 3 pixels
+            # 8 / 9: variance of white noise minus its mean over 3 x 3 pixels
             8 / 9 * torch.maximum(pixels.noise, mean),
             _SHARP * speckle,
             mean / mean.norm(),
         )
         mean_square = float(arguments[0].square().mean())
-        # around the variance of the last call, because the search moves little
+        # close to the variance of the last call, because a step of the search is small
         scene_variances = (
             [last_scene_variance[-1] * f for f in (0.5, 0.7, 1.0, 1.4, 2.0)]
             if last_scene_variance
@@ -484,7 +495,7 @@ def _likelihood(
 
 
 def _light_by_kind(glare: Glare, electrons: Tensor) -> list[Tensor]:
-    """Return the light of all patterns as told: straight, and scattered over each radius."""
+    """Return the stated light of all patterns: straight, then smoothed over each radius."""
     smooth, zeros = glare.smooth or (), torch.zeros_like(electrons)
     patterns_by_kind = [glare.patterns]
     for number in range(len(RADII)):
@@ -499,9 +510,7 @@ def _light_by_kind(glare: Glare, electrons: Tensor) -> list[Tensor]:
 def _hidden_pixels(
     electrons: Tensor, unclipped: Tensor, lights: Sequence[Tensor], joint: bool
 ) -> _Hidden:
-    """Return a sample of the clipped pixels; ``joint`` says that the rows of `_Pixels` are
-    channels.
-    """
+    """Return a sample of the clipped pixels; with ``joint``, the rows of `_Pixels` are channels."""
     sample_indices = tuple(
         indices[:: max(1, len(indices) // _GLARE_SAMPLE)]
         for indices in (unclipped == 0).nonzero(as_tuple=True)
@@ -515,12 +524,14 @@ def _hidden_pixels(
 def _pixels(
     electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> _Pixels | None:
-    """Return the pixels of a frame that tell of speckle; None for too few."""
+    """Return the pixels of a frame from which speckle is estimated; None for too few known
+    pixels.
+    """
     lights = _light_by_kind(glare, electrons)
-    use = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are known
+    use = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are unclipped
     dark_noise = noise(torch.zeros_like(average(electrons, torch.ones_like(electrons))))
     known_in_all_channels = use.all(0)
-    # pixels known in all channels tell more, by their colour; else those of any channel
+    # pixels known in all channels are better, because speckle has the colour of the laser
     joint = int(known_in_all_channels.sum()) >= _FEW_PIXELS
     if not joint and int(use.sum()) < _FEW_PIXELS:
         return None
@@ -546,15 +557,15 @@ def _log_density(
 ) -> float:
     """Return the log density of sharp pictures (channel, pixel).
 
-    Speckle is that of one colour, the root of its variance. A scene has the variance ``scene`` in
-    each channel, and details of any strength that have the colour ``grey`` in all channels, which
-    therefore count for nothing.
+    Speckle has one colour, the square root of its variance in each channel. A scene has the
+    variance ``scene`` in each channel, and details of unknown strength with the colour ``grey``,
+    which are projected out.
     """
     if len(error) == 1:
         variance = noise + scene + speckle
         return -0.5 * float((variance.log() + error.square() / variance).sum())
-    # covariance of a pixel's channels: D + s s', for s the root of the speckle's variance. Its
-    # inverse by Sherman and Morrison: D^-1 - D^-1 s s' D^-1 / (1 + s' D^-1 s)
+    # covariance of the channels of a pixel: D + s s^T, with s = sqrt(variance of speckle). Its
+    # inverse (Sherman-Morrison): D^-1 - D^-1 s s^T D^-1 / (1 + s^T D^-1 s)
     inverse_variance, colour = 1.0 / (noise + _SPECKLE_COLOUR * speckle + scene), speckle.sqrt()
     grey = grey.expand_as(error)
 
@@ -563,7 +574,7 @@ def _log_density(
 
     colour_square, colour_grey = products(colour, colour), products(colour, grey)
     colour_error, speckle_gain = products(colour, error), 1.0 / (1.0 + products(colour, colour))
-    # products through this inverse; then the grey part of the error is projected out
+    # products with this inverse; then the grey part of the error is projected out
     grey_square = products(grey, grey) - speckle_gain * colour_grey.square()
     grey_error = products(grey, error) - speckle_gain * colour_grey * colour_error
     error_square = (
@@ -579,8 +590,10 @@ def _log_density(
 
 
 def _log_full(hidden: _Hidden, amounts: Tensor, mean: Tensor) -> float:
-    """Return the log probability that the pixels which are not known are full, for ``amounts``
-    (part, 1) of the straight and scattered light and the ``mean`` of each channel's scene.
+    """Return the log probability that the clipped pixels reach the clip level.
+
+    ``amounts`` (part, 1) are the factors of straight and scattered light, ``mean`` is the mean of
+    the scene in each channel.
     """
     straight, scattered = amounts[0] * hidden.light[0], (amounts[1:] * hidden.light[1:]).sum(0)
     scene = mean[hidden.channel]
@@ -592,17 +605,17 @@ def _log_full(hidden: _Hidden, amounts: Tensor, mean: Tensor) -> float:
 
 
 def _average(values: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted mean of each channel of pixels, (channel, 1), at least 1 e-."""
+    """Return the weighted mean (channel, 1) of the pixels of each channel, at least 1 e-."""
     return ((values * weights).sum(-1, keepdim=True) / weights.sum(-1, keepdim=True)).clamp_min(1.0)
 
 
 # --- nearby glare ---------------------------------------------------------------------------------
 
-# Other patterns that the glare of a laser may have if its direction, wavelength and focus are known
-# roughly.
+# Random patterns of the glare of a laser whose direction, wavelength and focus are known only
+# approximately.
 
 
-Shift = Annotated[Length, Field(ge=0, le=100e-9)]  #: of the wavelength
+Shift = Annotated[Length, Field(ge=0, le=100e-9)]  #: standard deviation of the wavelength
 Patterns = Annotated[int, Field(ge=1, le=256)]
 Pixels = Annotated[float, Field(ge=0, le=100)]
 
@@ -662,7 +675,7 @@ def nearby_glare(
         return channels
 
     drawn_light = pattern_of(pupil, direction).sum(dtype=torch.float64)
-    # so that the pattern drawn without errors has the light of the glare
+    # scaled so that the pattern without errors has as much light as the glare
     unit = (glare.sum(dtype=torch.float64) / drawn_light.where(drawn_light > 0, 1.0)).to(share)
     defocus_shape, patterns_drawn = _bowl(pupil), []
     for y, x, wavelength_step, defocus_step in _normal(patterns, rng).tolist():
@@ -710,8 +723,8 @@ def _agree(glare: Tensor, pupil: Pupil, line: Bands, responses: Tensor) -> None:
 
 
 def _bowl(pupil: Pupil) -> Tensor:
-    """Return the square of the distance from the axis, 1 at the rim of the disc with the area of
-    the clear aperture.
+    """Return the squared distance from the axis: the shape of defocus. It is 1 at the rim of a disc
+    with the area of the clear aperture.
     """
     side = pupil.aperture.shape[-1]
     offset_from_axis = (
@@ -726,11 +739,11 @@ def _bowl(pupil: Pupil) -> Tensor:
 
 
 def _normal(count: int, rng: Generator) -> Tensor:
-    """Return (count, 4) normal numbers, one in each of ``count`` equally likely parts of each of
-    the four axes (a Latin hypercube).
+    """Return a Latin hypercube sample (count, 4) of the standard normal distribution: on each axis,
+    one number lies in each of ``count`` equally probable intervals.
     """
     shape = (4, count)
-    # ranks of random numbers: a random order of the parts, for each axis
+    # ranks of random numbers are a random order of the intervals, for each axis
     order = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64).argsort(-1)
     even_probabilities = (
         order + torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64)

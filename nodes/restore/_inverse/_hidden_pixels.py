@@ -1,4 +1,4 @@
-"""The most likely picture before a blur, given only some pixels of the blurred picture."""
+"""The most likely picture before a blur, from a blurred picture with unknown pixels."""
 
 from __future__ import annotations
 
@@ -30,34 +30,35 @@ from neusee.nodes.restore._inverse._masked_blur import (
 
 # --- hidden pixels --------------------------------------------------------------------------------
 
-# The most likely picture before a blur, given only some pixels of the blurred picture.
+# The most likely picture before a blur, from a blurred picture with unknown pixels.
 #
 # Linear least squares with a Gaussian prior (Kaipio and Somersalo, Statistical and Computational
-# Inverse Problems, 2005, ch. 3), in which pixels beyond the edge are as unknown as pixels within.
-# Light from beyond the edge mixes with the seen light, so conjugate gradients converge too slowly
-# from a bad start. The problem is therefore solved exactly on a coarse grid, each finer grid starts
-# from the solution of the coarser grid, and on the coarser grids each step also solves the lowest
+# Inverse Problems, 2005, ch. 3). The unknowns include the pixels beyond the edge. Light from beyond
+# the edge mixes with the light of the frame, so conjugate gradients converge too slowly from a bad
+# start. The problem is therefore solved exactly on a coarse grid, and each finer grid starts from
+# the solution of the coarser grid. On the coarser grids, each step also solves the lowest
 # frequencies exactly.
 
 
-#: the most steps on the finest grid; each coarser grid may take four times as many, up to MOST
+#: largest number of steps on the finest grid; each coarser grid may take four times as many, up to
+#: `MOST`
 STEPS = 20
 MOST = 100
-#: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
+#: squared distance from the solution at which the iteration ends, per known pixel, in the norm of
+#: the inverse posterior covariance. The residual underestimates this distance by a factor of 10 to
+#: 30, because it underestimates the slowest modes
 ENOUGH = 1e-6
-#: residual underestimates this distance by a factor of 10 to 30, because it underestimates the
-#: slowest modes
-#: norm of the covariance of the scene over that of the noise, whose rounding is 1e-6 of the noise
+#: ratio of the covariances of scene and noise (in norm), at which rounding is 1e-6 of the noise
 _NOISELESS = 1e10
 _ONCE = "the deconvolution has no second derivative: differentiate without create_graph=True"
-CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
+CAREFUL = 8.0  #: each coarser grid has a tolerance smaller by this factor: its steps are cheap
 
 
 class Inverses:
-    """What solves the grids of a deconvolution and depends on no pixel of the picture: for several
-    pictures of it.
+    """The factors and preconditioners of a deconvolution, which do not depend on the pixels of the
+    picture and can be reused for further pictures.
 
-    The preconditioners of grids beyond `LOWEST` pixels a side are large and cheap to make, and are
+    The preconditioners of grids beyond `LOWEST` pixels a side are large and quickly built; they are
     not kept.
     """
 
@@ -87,18 +88,18 @@ def most_likely(
     coarser: bool = True,
     inverses: Inverses | None = None,
 ) -> Tensor:
-    """Return half the spectrum of the most likely picture before the blur, given the seen pixels
+    """Return the half spectrum of the most likely picture before the blur, from the known pixels
     and the prior.
 
-    Without ``coarser`` grids the steps start from a picture without contrast, which suits a narrow
-    PSF alone. ``inverses`` are those of a problem that differs in the picture alone; missing ones
-    are made and added.
+    Without ``coarser`` grids the steps start from a picture without contrast, which is good enough
+    only for a narrow PSF. ``inverses`` may come from a problem that differs only in the picture;
+    missing ones are computed and added.
     """
     inverses = inverses or Inverses()
     tensors = (problem.picture, problem.weight, problem.transfer, *problem.glare)
     with torch.no_grad():
         constant_problem = fixed(problem)
-        # empty: the picture is too large for a dense factor
+        # an empty factor: the picture is too large for a dense solution
         lower = (
             problem.picture.new_empty(0)
             if halvings(_size(problem))
@@ -109,7 +110,7 @@ def most_likely(
             x = _solved(constant_problem, lower, steps, enough, inverses)
         else:
             x = descend(constant_problem, torch.zeros_like(constant_problem.transfer), MOST, enough)
-    # derivatives go through the residual of the linear problem, which is 0 in value
+    # the derivatives flow through the residual of the linear problem, whose value is 0
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if not (followed or transformed()):
         return x
@@ -125,7 +126,7 @@ def most_likely(
 
 
 def fixed(problem: Blurred) -> Blurred:
-    """Return the problem without gradients and tangents."""
+    """Return the problem with detached tensors, without gradients and tangents."""
     detached = {
         name: getattr(problem, name).detach() for name in ("picture", "weight", "transfer", "power")
     }
@@ -136,7 +137,7 @@ def fixed(problem: Blurred) -> Blurred:
 
 
 class _Frame(NamedTuple):
-    """The numbers of a deconvolution problem that are no tensors."""
+    """The parameters of a deconvolution problem that are not tensors."""
 
     torus: Size
     grey: float
@@ -170,8 +171,8 @@ class _Followed(torch.autograd.Function):
 
 
 class _Solved(torch.autograd.Function):
-    """The solution of the linear problem for a given right side, with which forward and reverse
-    mode differentiate.
+    """The solution of the linear problem for a right-hand side; forward and reverse mode
+    differentiation use it.
     """
 
     @staticmethod
@@ -190,7 +191,7 @@ class _Solved(torch.autograd.Function):
             pull,
             frame.bounded,
         )
-        # relative to the squared norm of the right side in units of the posterior
+        # relative to the squared norm of the right-hand side in the prior covariance
         enough = 1e-10 * float(inner(pull, _spread(problem, pull), problem.torus))
         solution: Tensor = torch.fft.irfft2(
             _solved(problem, lower, frame.steps, enough, Inverses()), s=problem.torus
@@ -213,8 +214,8 @@ class _Solved(torch.autograd.Function):
 def _solved(
     problem: Blurred, lower: Tensor, steps: int, enough: float, inverses: Inverses
 ) -> Tensor:
-    """Solve a small problem exactly with the Cholesky factor `lower` of its matrix, and a larger
-    problem by steps.
+    """Return the solution: exact for a small problem with the Cholesky factor `lower`, iterative
+    for a larger problem (empty `lower`).
     """
     return (
         _by_factor(problem, lower) if lower.numel() else _nested(problem, steps, enough, inverses)
@@ -222,8 +223,8 @@ def _solved(
 
 
 def _nested(problem: Blurred, steps: int, enough: float, inverses: Inverses) -> Tensor:
-    """Solve a problem, from the answer on a grid half as fine; a grid small enough is solved
-    exactly.
+    """Return the iterative solution, which starts from the solution on a grid half as fine; the
+    coarsest grid is solved exactly.
     """
     if not halvings(_size(problem)):
         return _by_factor(problem, inverses.factor(problem))
@@ -242,8 +243,8 @@ def _size(problem: Blurred) -> Size:
 
 
 def halved(problem: Blurred) -> Blurred:
-    """Return the deconvolution problem on pixels twice as wide, where lost variance of the
-    picture counts as noise.
+    """Return the deconvolution problem on pixels twice as wide; the variance at the lost
+    frequencies counts as noise.
     """
     weight = _pooled(problem.weight)
     picture, *glare = (
@@ -272,9 +273,9 @@ def halved(problem: Blurred) -> Blurred:
         ]
     )
     transfer = narrowed(problem.transfer, half_size) * y_transfer[:, None] * x_transfer[:columns]
-    # 4: the variance is the mean over a quarter as many frequencies
+    # 4: the variance is the mean over a quarter of the frequencies
     power = narrowed(problem.power, half_size) / 4.0
-    # variance of the blurred picture at the frequencies that the coarser grid has not
+    # variance of the blurred picture at the frequencies that are missing on the coarser grid
     lost_variance = (
         lost_variance - variance(transfer.abs().square() * power, half_size)
     ).clamp_min(0.0)[:, None, None]
@@ -308,15 +309,15 @@ def _pooling(size: int, like: Tensor) -> Tensor:
 
 
 def _factor(problem: Blurred) -> Tensor:
-    """Return the Cholesky factor, in float64, of the whitened covariance of the seen pixels of a
-    small picture.
+    """Return the float64 Cholesky factor of the whitened covariance of the known pixels of a small
+    picture.
 
-    The noise has the covariance 1. Rounding of the covariance of the scene acts as further noise of
-    1e-16 of its norm, so that a picture with less noise than that has the factor of a square root
-    of the covariance: ten times slower.
+    Whitened, the noise has the covariance 1. The rounding error of the covariance of the scene acts
+    as additional noise of 1e-16 of its norm. For a picture with less noise, the factor is computed
+    from a square root of the covariance, which is ten times slower.
     """
     precise, root_weight, colour_correlation = _fine(problem), _root(problem), _colours(problem)
-    # blocks of the covariance of the blurred pixels of channels i and j
+    # block (i, j): covariance of the blurred pixels of channels i and j
     rows = [
         torch.cat(
             [
@@ -339,12 +340,12 @@ def _factor(problem: Blurred) -> Tensor:
 
 
 def _factor_of_root(fine: Blurred, patterns: list[Tensor]) -> Tensor:
-    """Return the Cholesky factor of A A^T + 1 by QR decompositions of [A 1]^T, without the product
-    A A^T.
+    """Return the Cholesky factor of A A^T + I from QR decompositions of [A I]^T, without the
+    product A A^T.
 
-    A (seen pixel, unknown) is the response of the whitened pixels to independent unknowns: those of
-    the scene, channel by channel, and the strengths of the glare ``patterns``. The factor has the
-    rounding of A, not that of its square.
+    A (known pixel, unknown) is the response of the whitened pixels to independent unknowns: those
+    of the scene, channel by channel, and the strengths of the glare ``patterns``. The rounding
+    error is that of A, not that of A A^T.
     """
     root_weight, colour_factor = _root(fine), torch.linalg.cholesky(_colours(fine))
     responses = [_response(fine, transfer) for transfer in fine.transfer]
@@ -363,8 +364,8 @@ def _factor_of_root(fine: Blurred, patterns: list[Tensor]) -> Tensor:
 
 
 def _response(problem: Blurred, transfer: Tensor) -> Tensor:
-    """Return the blurred pixels of a channel for a unit of each independent unknown of the
-    prior, (pixel, unknown).
+    """Return the response (pixel, unknown) of the blurred pixels of a channel to each independent
+    unknown of the prior.
     """
     impulse = torch.fft.irfft2(transfer * problem.power.sqrt(), s=problem.torus)
     rows, columns = (torch.arange(count, device=impulse.device) for count in _size(problem))
@@ -378,7 +379,7 @@ def _response(problem: Blurred, transfer: Tensor) -> Tensor:
 
 
 def _colours(problem: Blurred) -> Tensor:
-    """Return the correlations of the channels of the scene."""
+    """Return the correlation matrix (channel, channel) of the scene."""
     channels = len(problem.picture)
     colours = torch.full(
         (channels, channels), problem.grey, dtype=torch.float64, device=problem.weight.device
@@ -387,14 +388,14 @@ def _colours(problem: Blurred) -> Tensor:
 
 
 def _spread_patterns(problem: Blurred) -> list[Tensor]:
-    """Return the whitened glare patterns (pixel,), times the standard deviation of their
-    strengths.
+    """Return the whitened glare patterns (pixel,), each times the prior standard deviation of its
+    strength.
     """
     root_weight, patterns = _root(problem), []
     for number, pattern in enumerate(problem.glare):
         whitened = root_weight * pattern.double().flatten()
         is_free = number < len(problem.glare) - problem.bounded
-        # a strength of any value: of a deviation of 1e4 in whitened units
+        # an unknown strength has a standard deviation of 1e4 in whitened units
         patterns.append(
             whitened * (1e4 / whitened.norm().clamp_min(1e-15)) if is_free else whitened
         )
@@ -402,11 +403,11 @@ def _spread_patterns(problem: Blurred) -> list[Tensor]:
 
 
 def _by_factor(problem: Blurred, lower: Tensor) -> Tensor:
-    """Return the exact deconvolution of a small picture, given the factor of its matrix that
-    `_factor` returns.
+    """Return the half spectrum of the exact deconvolution of a small picture, from the Cholesky
+    factor of `_factor`.
     """
     precise, root_weight = _fine(problem), _root(problem)
-    # the answer to `problem.pull` alone, without pixels
+    # solution for `problem.pull` alone, without known pixels
     pulled_picture = (
         torch.zeros_like(precise.transfer)
         if problem.pull is None
@@ -423,22 +424,22 @@ def _by_factor(problem: Blurred, lower: Tensor) -> Tensor:
 
 
 def _fine(problem: Blurred) -> Blurred:
-    """Return the problem with transfer and power in double precision."""
+    """Return the problem with transfer function and power spectrum in double precision."""
     return replace(
         problem, transfer=problem.transfer.to(torch.complex128), power=problem.power.double()
     )
 
 
 def _root(problem: Blurred) -> Tensor:
-    """Return the square roots of the weights of all pixels in a row, float64."""
+    """Return the square roots of the weights of all pixels, (channel * y * x,) float64."""
     weight = problem.weight.double().flatten()
     # the gradient of sqrt is infinite at 0
     return weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)
 
 
 def _covariance(problem: Blurred, passed: Tensor) -> Tensor:
-    """Return the prior covariance of all pairs of picture pixels, given the product of two
-    transfer functions.
+    """Return the prior covariance of all pairs of blurred pixels; ``passed`` is the product of the
+    transfer functions of the two channels.
     """
     covariance_by_lag = torch.fft.irfft2(passed * problem.power, s=problem.torus)
     rows, columns = (
@@ -455,23 +456,28 @@ def _covariance(problem: Blurred, passed: Tensor) -> Tensor:
 
 
 def _spread(problem: Blurred, spectrum: Tensor) -> Tensor:
-    """Return the prior covariance of the picture, multiplied by half a spectrum."""
+    """Return the product of the prior covariance and a half spectrum."""
     return problem.power * mixed(spectrum, 1.0 - problem.grey, problem.grey)
 
 
 # --- pulled answer --------------------------------------------------------------------------------
 
-# The filter's answer pulled towards another picture, as far as the seen pixels leave room.
+# The answer of the filter with a second prior, which pulls it towards another picture, as far as
+# the known pixels allow.
 #
-# The filter's answer x0 is the most likely picture under the seen pixels y and the prior. A second
-# prior says that the pixels of x in the frame are those of a picture c, with a precision R for
-# each: the most likely picture x under both minimises |y - B x|^2 W + x' P^-1 x + (x - c)' R (x -
-# c), where B is the blur, W the weights of the noise and P the first prior. With the normal matrix
-# A = B' W B + P^-1 + R the change is x - x0 = A^-1 R (c - x0).
+# The answer x0 of the filter is the most likely picture under the known pixels y and the prior. The
+# second prior is normal: in the frame, x has the mean c and the precision R for each pixel. The
+# most likely picture x under both priors minimises (y - B x)^T W (y - B x) + x^T P^-1 x +
+# (x - c)^T R (x - c), where B is the blur, W the weights of the noise and P the covariance of the
+# first prior. With the normal matrix A = B^T W B + P^-1 + R, the change is x - x0 =
+# A^-1 R (c - x0).
 
 
-PULLED_STEPS = 10  #: of conjugate gradients, which leave 2e-3 to 4e-3 of a change behind half-rings
-#: of each channel, which the preconditioner has exactly: 500 take five times as long in all
+#: number of conjugate gradient steps; they leave an error of 2e-3 to 4e-3 of a change behind
+#: half-rings
+PULLED_STEPS = 10
+#: number of unknowns of each channel that the preconditioner solves exactly: 500 take five times as
+#: long in all
 _MODES = 100
 
 
@@ -480,9 +486,9 @@ def pulled(
 ) -> tuple[Tensor, Tensor]:
     """Return the change of the filter's answer in the frame, and the blur of this change.
 
-    `towards` (channel, y, x) is c - x0, and `precision` of the same shape the diagonal of R. Both
-    results are exactly 0 where all of `towards` is. They have derivatives of first order, also with
-    respect to the problem itself.
+    `towards` (channel, y, x) is c - x0, and `precision`, of the same shape, the diagonal of R. Both
+    results are exactly 0 if all of `towards` is 0. They have first derivatives, also with respect
+    to the problem itself.
     """
     y, x = problem.picture.shape[-2:]
     right_side = precision * towards
@@ -499,7 +505,7 @@ def pulled(
             ),
             s=problem.torus,
         )
-    else:  # what else is in the residual is constant
+    else:  # the other terms of the residual are constant
         residual = pad(
             right_side - precision * problem.first(change),
             (0, problem.torus[1] - x, 0, problem.torus[0] - y),
@@ -510,8 +516,8 @@ def pulled(
 
 
 class _Solver:
-    """The product of the inverse normal matrix A^-1 and half a spectrum, by conjugate gradients
-    from 0.
+    """The product of the inverse normal matrix A^-1 and a half spectrum, by conjugate gradients
+    that start from 0.
     """
 
     def __init__(self, problem: Blurred, steps: int) -> None:
@@ -519,9 +525,7 @@ class _Solver:
         self._inverse: Preconditioner | None = None
 
     def __call__(self, right: Tensor) -> Tensor:
-        """Return A^-1 times half a spectrum; the preconditioner is built once, when it is first
-        needed.
-        """
+        """Return A^-1 times a half spectrum; the first call builds the preconditioner."""
         start = torch.zeros_like(right)
         if not right.any():
             return start

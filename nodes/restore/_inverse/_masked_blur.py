@@ -1,4 +1,4 @@
-"""The blur of a camera on a periodic grid, with hidden pixels and the prior of the picture."""
+"""The blur of a camera on a periodic grid, with unknown pixels and the prior of the picture."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from neusee.nodes.values import Bands, Psf
 
 # --- grey psf -------------------------------------------------------------------------------------
 
-# What the channels of a sensor see of a grey scene: the PSF of each, shares of the bands, and the
-# white.
+# Properties of the sensor channels for a grey scene: the PSF and signal of each channel, and the
+# share of each band in the signal.
 
 
 def effective_psf(
@@ -27,8 +27,9 @@ def effective_psf(
     bands: Bands,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Return the PSF of each channel of the sensor for a grey scene, (channel, y, x), in the more
-    precise of the types of the PSF and ``dtype``.
+    """Return the PSF (channel, y, x) of each channel of the sensor for a grey scene.
+
+    Its type is that of the PSF or ``dtype``, whichever is more precise.
     """
     counts = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
     if len(counts) > 1:
@@ -52,8 +53,8 @@ def effective_psf(
 
 
 def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the share of each band in the signal of each channel from a grey scene: (channel,
-    band), float64.
+    """Return the share (channel, band) of each band in the signal that a grey scene gives in each
+    channel, in float64; the shares of a channel sum to 1.
     """
     share = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
     blind = share.sum(-1, keepdim=True) <= 0  # a channel without response gets equal shares
@@ -62,8 +63,8 @@ def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 
 
 def grey_white(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return what each channel sees of a grey scene, (channel, 1, 1) float64, over what the best
-    channel sees.
+    """Return the signal (channel, 1, 1) that a grey scene gives in each channel, relative to the
+    channel with the largest signal, in float64.
     """
     light = (responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()).sum(-1)
     return (light / light.max().clamp_min(1e-30)).clamp_min(1e-3)[:, None, None]
@@ -71,20 +72,21 @@ def grey_white(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 
 # --- psf on grid ----------------------------------------------------------------------------------
 
-# A PSF on the periodic grid of a picture, and how far it reaches.
+# A PSF on the periodic grid of a picture, and its radius.
 
 
-#: share of the light that the unknown border around the picture is wide enough for
+#: fraction of the light of the PSF within the radius that determines the border of the picture
 _BORDER_LIGHT = 0.999
 
 
 def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
-    """Return the radii (y, x) that hold 99.9 % of the PSF, at most the larger of 256 pixels and
-    half the picture.
+    """Return the radii (y, x) that contain 99.9 % of the light of the PSF.
+
+    A radius is limited to 256 pixels or half the picture, whichever is larger, and to the picture.
     """
     radii = []
     for dim, size in ((-1, picture[0]), (-2, picture[1])):
-        # light of each row (then column) of all channels; added up from the middle outwards
+        # light of each row (then column), summed over channels and from the middle outwards
         profile = kernels.detach().sum((0, dim)).double()
         radius = (torch.arange(len(profile), device=profile.device) - len(profile) // 2).abs()
         light_within = (
@@ -101,7 +103,7 @@ def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
 
 
 def bordered(reach: tuple[int, int], border: float) -> tuple[int, int]:
-    """Return the width (y, x) of the unknown border around a picture, ``border`` times the reach
+    """Return the width (y, x) of the unknown border around a picture: ``border`` times the radius
     of the PSF.
     """
     return math.ceil(border * reach[0]), math.ceil(border * reach[1])
@@ -112,30 +114,30 @@ def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
     wraps around.
     """
     (m, n), (y, x) = kernels.shape[-2:], size
-    # whole grids that cover the PSF, rounded up
+    # number of grids that cover the PSF along each axis, rounded up
     grids_down, grids_across = -(-m // y), -(-n // x)
     padded = pad(kernels, (0, grids_across * x - n, 0, grids_down * y - m))
     if grids_down * grids_across > 1:
-        # the samples that fall on the same place of the grid are added
+        # samples at the same place of the grid are added
         padded = padded.reshape(-1, grids_down, y, grids_across, x).sum((1, 3))
     return padded.roll((-(m // 2), -(n // 2)), (-2, -1))
 
 
 # --- masked blur ----------------------------------------------------------------------------------
 
-# The model of a blurred picture of which only some pixels are seen, and the prior of the picture
+# The model of a blurred picture of which only some pixels are known, and the prior of the picture
 # before the blur.
 #
-# All spectra are half spectra of a torus: (channel, fy, fx) with fx >= 0, as `torch.fft.rfft2`
-# returns them.
+# All spectra are half spectra on a periodic grid ("torus"): (channel, fy, fx) with fx >= 0, as
+# `torch.fft.rfft2` returns them.
 
 
 Size = tuple[int, int]
 Map = Callable[[Tensor], Tensor]
 
-#: added to products of patterns of norm 1, so that equal patterns have a Cholesky factor
+#: added to the diagonal of the Gram matrix of unit patterns, so that equal patterns can be factored
 _ALIKE = 1e-13
-_PIECE_PIXELS = 2**18  #: pixels of all patterns that are converted to float64 at a time
+_PIECE_PIXELS = 2**18  #: number of pixels that are converted to float64 at a time
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,9 @@ class Blurred:
     """The model  picture = (blur of x) + noise,  where x has mean 0 and correlated channels."""
 
     picture: Tensor  #: (channel, y, x)
-    weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where a pixel is not seen
-    #: (channel, fy, fx), half a spectrum of the torus, with the picture in its first corner
+    weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 for an unknown pixel
+    #: (channel, fy, fx), transfer function of the blur on the torus; the picture is the top left
+    #: corner of the torus
     transfer: Tensor
     #: (fy, fx), power spectrum of x; the mean over the whole spectrum is the variance of x
     power: Tensor
@@ -153,32 +156,31 @@ class Blurred:
     #: (channel, y, x) patterns of unknown strength that are added to the picture
     glare: tuple[Tensor, ...] = ()
     pull: Tensor | None = None  #: (channel, fy, fx), a further term of the log posterior's gradient
-    #: how many patterns, the last ones, have strengths of mean 0 and variance 1, not any strength
+    #: number of patterns at the end of ``glare`` whose strengths have a prior with mean 0 and
+    #: variance 1; the other strengths have no prior
     bounded: int = 0
-    #: (channel, y, x), precision of a further prior of x in the frame, of mean 0
+    #: (channel, y, x), precision of a second prior of x in the frame, with mean 0
     held: Tensor | None = None
 
     def blur(self, spectrum: Tensor) -> Tensor:
-        """Return the blurred picture, given half the spectrum of x."""
+        """Return the blurred picture, from the half spectrum of x."""
         y, x = self.picture.shape[-2:]
         return blurred(self.transfer, spectrum, self.torus, (y, x))
 
     def first(self, spectrum: Tensor) -> Tensor:
-        """Return the pixels of x in the frame of the picture, given half the spectrum of x."""
+        """Return the pixels of x in the frame of the picture, from the half spectrum of x."""
         y, x = self.picture.shape[-2:]
-        # one batch takes twice as long
+        # channel by channel: one batch of all takes twice as long
         pictures = [torch.fft.irfft2(s, s=self.torus)[:y, :x] for s in spectrum]
         return torch.stack(pictures)
 
     def gathered(self, pixels: Tensor) -> Tensor:
-        """Return half the spectrum that results from the adjoint of `blur`, applied to a
-        picture.
-        """
+        """Return the half spectrum of the adjoint of `blur`, applied to a picture."""
         return gathered(self.transfer, pixels, self.torus)
 
     def slope(self, x: Tensor) -> Tensor:
-        """Return the gradient of the log posterior at the picture of spectrum x; the most likely
-        picture has 0.
+        """Return the gradient of the log posterior at the picture with spectrum x; it is 0 at the
+        most likely picture.
         """
         own_factor, shared_factor = inverse_colour(len(x), self.grey)
         prior = mixed(x, own_factor, -shared_factor) / self.power.clamp_min(1e-30)
@@ -189,8 +191,8 @@ class Blurred:
 
 
 def blurred(transfer: Tensor, spectrum: Tensor, torus: Size, size: Size) -> Tensor:
-    """Return the first corner (..., channel, *size) of blurred pictures, given half their
-    spectra (..., fy, fx).
+    """Return the top left corner (..., channel, *size) of blurred pictures, from their half spectra
+    (..., fy, fx).
     """
     spectra = spectrum.expand(*spectrum.shape[:-3], *transfer.shape)
     # one batch of all channels takes twice as long
@@ -201,16 +203,16 @@ def blurred(transfer: Tensor, spectrum: Tensor, torus: Size, size: Size) -> Tens
 
 
 def gathered(transfer: Tensor, pixels: Tensor, torus: Size) -> Tensor:
-    """Return half the spectra that result from the adjoint of `blurred`, applied to pictures
-    (..., channel, y, x).
+    """Return the half spectra of the adjoint of `blurred`, applied to pictures (..., channel, y,
+    x).
     """
     spectrum: Tensor = transfer.conj() * torch.fft.rfft2(pixels, s=torus)
     return spectrum
 
 
 def weighing(problem: Blurred) -> Map:
-    """Return a function that multiplies residuals by the pixel weights and removes the fitted
-    glare patterns.
+    """Return a function that multiplies a residual by the pixel weights and subtracts the glare
+    patterns at their fitted strengths.
     """
     if not problem.glare:
         return lambda residual: problem.weight * residual
@@ -218,7 +220,7 @@ def weighing(problem: Blurred) -> Map:
     weighted_patterns = problem.weight.flatten() * flat_patterns
     products = with_bounds(weighted_patterns.double() @ flat_patterns.double().T, problem.bounded)
     if problem.bounded:  # similar patterns: differences of large sums would lose digits in float32
-        # the outer products of these combinations hold the inverse already
+        # these combinations of patterns already include the square root of the inverse
         weighted_patterns, inverse = _whitened_patterns(weighted_patterns, products), None
     else:
         inverse = torch.linalg.pinv(products, hermitian=True).to(flat_patterns)
@@ -238,8 +240,8 @@ def weighing(problem: Blurred) -> Map:
 
 
 def with_bounds(products: Tensor, bounded: int) -> Tensor:
-    """Return the products of all pairs of glare patterns, plus the precisions of their
-    strengths: 1 if bounded.
+    """Return the Gram matrix of the glare patterns, plus the prior precision of their strengths: 1
+    for the last ``bounded`` patterns.
     """
     if not bounded:
         return products
@@ -249,10 +251,10 @@ def with_bounds(products: Tensor, bounded: int) -> Tensor:
 
 
 def _whitened_patterns(weighted: Tensor, products: Tensor) -> Tensor:
-    """Return combinations of patterns whose outer products add up to those of the ``weighted``
-    patterns through the inverse of their ``products``.
+    """Return L^-1 P, where the rows of P are the ``weighted`` patterns and L is the Cholesky factor
+    of their ``products`` G.
 
-    The combinations are the rows of L^-1 for the Cholesky factor L of the products, computed in
+    The sum of the outer products of the rows of L^-1 P is P^T G^-1 P. The result is computed in
     float64 piece by piece.
     """
     scale = products.diagonal().detach().clamp_min(1e-300).rsqrt()
@@ -281,23 +283,21 @@ def mixed(spectrum: Tensor, own: float, shared: float) -> Tensor:
 
 
 def inverse_colour(channels: int, grey: float) -> tuple[float, float]:
-    """Return (own, shared) such that  own I - shared  is the inverse of  (1 - grey) I + grey  over
-    the channels.
+    """Return (own, shared) such that  own I - shared J  is the inverse of  (1 - grey) I + grey J,
+    where I is the unit matrix of the channels and J the matrix of ones.
     """
     return 1.0 / (1.0 - grey), grey / ((1.0 - grey) * (1.0 - grey + channels * grey))
 
 
 def variance(power: Tensor, size: Size) -> Tensor:
-    """Return the variance of pictures with a given power spectrum, which is the mean over all
-    frequencies.
+    """Return the variance of pictures with a given power spectrum (a half spectrum): its mean over
+    all frequencies.
     """
     return (power.sum(-2) * times(size, power)).sum(-1) / (size[0] * size[1])
 
 
 def times(size: Size, like: Tensor) -> Tensor:
-    """Return the number of times that each column of half a spectrum occurs in the whole
-    spectrum.
-    """
+    """Return how many times each column of a half spectrum occurs in the whole spectrum: 1 or 2."""
     count = torch.full((size[1] // 2 + 1,), 2.0, dtype=like.real.dtype, device=like.device)
     # the mean and, of an even size, the Nyquist frequency have no mirror image
     count[0] = 1.0
@@ -307,7 +307,7 @@ def times(size: Size, like: Tensor) -> Tensor:
 
 
 def narrowed(spectrum: Tensor, size: Size) -> Tensor:
-    """Return half a spectrum cropped to the frequencies of a coarser grid `size`; the Nyquist
+    """Return a half spectrum, cropped to the frequencies of a coarser grid `size`; its Nyquist
     frequencies are 0.
     """
     nonnegative_rows, negative_rows, columns = (
@@ -324,8 +324,8 @@ def narrowed(spectrum: Tensor, size: Size) -> Tensor:
 
 
 def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
-    """Return half a spectrum of a grid `size`, extended by zeros to a grid `wide` that is twice
-    as fine.
+    """Return a half spectrum of a grid `size`, padded with zeros to a grid `wide` that is twice as
+    fine.
     """
     nonnegative_rows, negative_rows, columns = (
         (size[0] + 1) // 2,
@@ -333,7 +333,7 @@ def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
         (size[1] + 1) // 2,
     )
     wide_spectrum = spectrum.new_zeros(*spectrum.shape[:-2], wide[0], wide[1] // 2 + 1)
-    # 4: a grid twice as fine has four times the pixels in each FFT sum
+    # 4: a transform on the finer grid sums over four times as many pixels
     wide_spectrum[..., :nonnegative_rows, :columns] = (
         4.0 * spectrum[..., :nonnegative_rows, :columns]
     )
@@ -345,11 +345,11 @@ def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
 
 # --- fft grid -------------------------------------------------------------------------------------
 
-# Size of the periodic grid on which a picture is deblurred: unknown pixels around the picture, and
-# fast FFTs.
+# The size of the periodic grid for a deconvolution: the picture with unknown pixels around it,
+# rounded up to a size with a fast FFT.
 
 
-DENSE = 20  #: pixels a side, up to which a picture is solved exactly
+DENSE = 20  #: largest side in pixels of a picture that is solved exactly, as a dense system
 
 
 def torus(picture: Size, edge: Size) -> Size:
@@ -362,26 +362,24 @@ def torus(picture: Size, edge: Size) -> Size:
 
 
 def _smooth(n: int) -> int:
-    """Return the least whole number of at least ``n`` without prime factors above 7, for which
-    FFTs are fast.
+    """Return the smallest integer >= ``n`` without prime factors above 7; FFTs of this length are
+    fast.
     """
-    # 210 = 2 x 3 x 5 x 7
+    # 210 = 2 x 3 x 5 x 7: its power is a multiple of n if n has no other prime factors
     while 210**32 % n:
         n += 1
     return n
 
 
 def halvings(picture: Size) -> int:
-    """Return how often the grid of a picture is halved until the picture is small enough to be
-    solved exactly.
-    """
+    """Return how many times a picture is halved until it is small enough for an exact solution."""
     return max(0, math.ceil(math.log2(max(picture) / DENSE)))
 
 
 # --- frame blur -----------------------------------------------------------------------------------
 
-# The blur of a camera as a linear operator, from a scene wider than the frame to the frame, and its
-# adjoint.
+# The blur of a camera as a linear operator from a scene, which is wider than the frame, to the
+# frame; and the adjoint operator.
 
 
 class FrameBlur(NamedTuple):
@@ -400,7 +398,9 @@ class FrameBlur(NamedTuple):
     frame: Size
 
     def seen(self, scene: Tensor) -> Tensor:
-        """Return the frame that the camera sees of a scene: blurred, and cropped to the sensor."""
+        """Return the frame that the camera records of a scene: blurred, then cropped to the
+        sensor.
+        """
         spectrum = torch.fft.rfft2(scene.roll([-n for n in self.corner()], (-2, -1)))
         return blurred(self._transfer(scene), spectrum, self.scene, self.frame)
 
@@ -416,17 +416,19 @@ class FrameBlur(NamedTuple):
         return scene[..., top : top + y, left : left + x]
 
     def corner(self) -> Size:
-        """Return the place of the first pixel of the frame in the scene."""
+        """Return the place (y, x) of the first pixel of the frame in the scene."""
         y, x = ((wide - n) // 2 for wide, n in zip(self.scene, self.frame, strict=True))
         return y, x
 
     def gain(self) -> float:
-        """Return the largest gain at any frequency, which the norm of the blur does not exceed."""
+        """Return the largest absolute value of the transfer function: an upper bound of the norm of
+        the blur.
+        """
         return float(self.transfer.abs().max())
 
     def _transfer(self, like: Tensor) -> Tensor:
-        """Return the transfer function in the precision of a picture, which the result then has
-        too.
+        """Return the transfer function in the precision of a picture, so that the result keeps this
+        precision.
         """
         return self.transfer.to(like.dtype.to_complex())
 

@@ -1,4 +1,4 @@
-"""What a deconvolved picture does not know: the standard deviation of each pixel."""
+"""The standard deviation of each pixel of a deconvolved picture."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ from neusee.nodes.values import Bands, Psf
 
 # --- frame deviation ------------------------------------------------------------------------------
 
-# The error of the filter on scenes like that of a frame: with its power spectrum, and details where
-# it has any.
+# The error of the filter for scenes like the scene of a frame: scenes with the power spectrum of
+# the frame, and with details where the frame has details.
 
 
-_DETAIL_SIDE = 5  #: pixels a side; what differs from its mean over such a square is a detail
-_NEAR_SIDE = 11  #: pixels a side of the square around a pixel whose details tell of this pixel
-_SMOOTH_SIDE = 7  #: pixels a side of the square over which the variance of few draws is averaged
-#: share of known pixels around a pixel, below which nothing around it tells of details
+_DETAIL_SIDE = 5  #: side in pixels of a square; a detail is the difference from the mean over it
+_NEAR_SIDE = 11  #: side in pixels of the square over which the energy of details is averaged
+_SMOOTH_SIDE = 7  #: side in pixels of the square over which the variance of few draws is averaged
+#: smallest share of known pixels around a pixel for which the energy of details is used
 _KNOWN = 0.02
-#: mean square of errors of photographs averaged over 11 x 11 pixels, over that of scenes of their
-#: law
+#: mean square of errors averaged over 11 x 11 pixels: of photographs, relative to drawn scenes with
+#: their power spectrum
 _COARSE = 2.0
-_SHOWN = 0.2  #: part of the energy of details that is restored, from which on a lack of them tells
-_DARK = 1e-30  #: added to energies
+_SHOWN = 0.2  #: restored share of the energy of details, above which a lack of details has meaning
+_DARK = 1e-30  #: added to energies, which may be 0 in a ratio
 
 
 def frame_deviation(
@@ -61,18 +61,19 @@ def frame_deviation(
     """Return the root mean square error (colour, y, x) of the filter for scenes and noise like
     those of its frame.
 
-    Scenes and noise are drawn apart by the law of the frame, each half of ``draws``, one of which
-    is the frame itself. The variance of details (errors of a scene less their mean over 11 x 11
-    pixels) grows and falls with the energy of the details of the restored picture around a pixel,
-    relative to that of the restored draws: an edge has larger errors than a sky. Where the picture
-    has more details than the draws, the rest of the variance grows as well. Low frequencies of
-    photographs vary about a power law, by `_COARSE`, and are not below those of the prior. What is
-    not known of a scene behind glare is drawn too. ``kernels`` (any, channel, y, x) are PSFs that
-    blur the drawn scenes in turn, in place of the PSF of the filter.
+    Scenes and noise are drawn separately from the model fitted to the frame. Each has half of
+    ``draws``; one draw of the noise is the frame itself. The variance of details (errors minus
+    their mean over 11 x 11 pixels) is scaled by a ratio: the energy of the details around a pixel
+    of the restored picture, relative to the energy in the restored draws. So an edge has larger
+    errors than a sky. Where this ratio exceeds 1, it scales the rest of the variance too. The low
+    frequencies of photographs vary more than a power law predicts, by the factor `_COARSE`, and are
+    not below those of the prior. The uncertainty of a scene behind glare is drawn too. ``kernels``
+    (any, channel, y, x) are PSFs that blur the drawn scenes in turn, in place of the PSF of the
+    filter.
     """
     problem, inverses = scaled.problem, Inverses()
     scenes = max(1, draws // 2)
-    # one draw of noise is the frame itself
+    # minus 1: one draw of the noise is the frame itself
     noises = max(1, draws - scenes - 1)
     with torch.no_grad():
         law = fitted_law(problem, scaled.doubt)
@@ -84,7 +85,7 @@ def frame_deviation(
         noise_square = noise_square + _square(scaled.scale / scaled.share * error, matrix) / noises
         drawn_details = drawn_details + _details(error) / noises
     detail_ratio = _ratio(frame_details, drawn_details, problem.weight)
-    # a lack of details means little where none could be seen
+    # a lack of details has little meaning where the filter could not restore them
     detail_ratio = detail_ratio.where(detail_ratio > 1.0, detail_ratio**scenes_found.told)
     coarse_square = _COARSE * law.low * scenes_found.coarse + noise_square
     total: Tensor = detail_ratio * _around(
@@ -94,19 +95,19 @@ def frame_deviation(
 
 
 class _Scenes(NamedTuple):
-    """Mean squares over drawn scenes, (colour, y, x) of errors and (y, x) of details."""
+    """Mean squares over drawn scenes: errors (colour, y, x) and details (y, x)."""
 
-    coarse: Tensor  #: of errors averaged over the pixels near
-    fine: Tensor  #: of the rest of the errors
-    restored: Tensor  #: of restored details
-    #: from 0 to 1, how far a lack of restored details near a pixel tells of a lack of details
+    coarse: Tensor  #: mean square of the errors averaged over `_NEAR_SIDE` pixels
+    fine: Tensor  #: mean square of the rest of the errors
+    restored: Tensor  #: mean square of the restored details
+    #: from 0 to 1: how reliably a lack of restored details shows that the scene has few details
     told: Tensor
 
     @classmethod
     def of(
         cls, drawn: Iterator[tuple[Tensor, Tensor]], count: int, scaled: Scaled, matrix: Tensor
     ) -> _Scenes:
-        """Return the mean squares of drawn errors and restored scenes."""
+        """Return the mean squares over ``count`` pairs of (error of the filter, restored scene)."""
         # tensors are never changed in place, so that both may start from the same zeros
         coarse_square = fine_square = scaled.problem.picture.new_zeros(
             len(matrix), *scaled.problem.picture.shape[-2:]
@@ -127,8 +128,8 @@ class _Scenes(NamedTuple):
 
 
 def drawn_scene(problem: Blurred, power: Tensor, rng: Generator) -> Tensor:
-    """Return the spectrum of a drawn scene with a power spectrum, and with the colours of the
-    prior.
+    """Return the half spectrum of a random scene with the given power spectrum and the colour
+    correlation of the prior.
     """
     white = _normal((len(problem.picture), *problem.torus), problem.picture, rng)
     own_factor, shared_factor = _root_of_colour(len(white), problem.grey)
@@ -136,8 +137,8 @@ def drawn_scene(problem: Blurred, power: Tensor, rng: Generator) -> Tensor:
 
 
 def drawn_noise(problem: Blurred, rng: Generator) -> Tensor:
-    """Return drawn noise of a picture (channel, y, x): of its pixels, and of the patterns of
-    bounded strength.
+    """Return random noise of a picture (channel, y, x): noise of the pixels, and glare patterns
+    with normal strengths.
     """
     noise = _normal(problem.picture.shape, problem.picture, rng)
     unclipped = problem.weight > 0
@@ -153,8 +154,8 @@ def _normal(shape: tuple[int, ...], like: Tensor, rng: Generator) -> Tensor:
 
 
 def _transfer(scaled: Scaled, kernels: Tensor | None, number: int) -> Tensor:
-    """Return the transfer that blurs a drawn scene: of the PSF of this number in turn, or that
-    of the filter.
+    """Return the transfer function that blurs drawn scene ``number``: that of one of ``kernels`` in
+    turn, or that of the filter.
     """
     if kernels is None:
         return scaled.problem.transfer
@@ -171,8 +172,8 @@ def _of_scenes(
     kernels: Tensor | None,
     inverses: Inverses,
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Draw the error of the filter without noise, in e-, and the contrast of the picture that it
-    restores.
+    """Yield for each drawn scene without noise the error of the filter in e-, and the restored
+    contrast.
     """
     problem = scaled.problem
     size = (problem.picture.shape[-2], problem.picture.shape[-1])
@@ -188,7 +189,7 @@ def _of_scenes(
 def _of_noise(
     scaled: Scaled, factor: float, draws: int, rng: Generator, inverses: Inverses
 ) -> Iterator[Tensor]:
-    """Draw the contrast that the filter restores from noise alone."""
+    """Yield for each draw of noise the contrast that the filter restores from the noise alone."""
     for _ in range(draws):
         with torch.no_grad():
             noise = factor * drawn_noise(scaled.problem, rng)
@@ -201,22 +202,22 @@ def _of_noise(
 
 
 def _square(error: Tensor, matrix: Tensor) -> Tensor:
-    """Return the square of an error (channel, y, x) after ``matrix`` (colour, channel): (colour, y,
-    x).
+    """Return the square (colour, y, x) of an error (channel, y, x) that ``matrix`` (colour,
+    channel) converts to colour.
     """
     square: Tensor = torch.tensordot(matrix.to(error), error, 1).square()
     return square
 
 
 def _details(contrast: Tensor) -> Tensor:
-    """Return the energy (y, x) of details of a picture, in the mean of its channels."""
+    """Return the energy (y, x) of the details of a picture, averaged over its channels."""
     energy: Tensor = (contrast - _around(contrast, _DETAIL_SIDE)).square().mean(0)
     return energy
 
 
 def _ratio(energy: Tensor, drawn: Tensor, weight: Tensor) -> Tensor:
-    """Return the energy of details (y, x) around each pixel over that of drawn pictures; 1 where
-    nothing tells.
+    """Return the energy of the details (y, x) around each pixel, relative to the drawn pictures; 1
+    where too few pixels are known.
     """
     unclipped = (weight > 0).all(0).to(energy)
     ratio = (_around(energy * unclipped, _NEAR_SIDE) + _DARK) / (
@@ -226,7 +227,9 @@ def _ratio(energy: Tensor, drawn: Tensor, weight: Tensor) -> Tensor:
 
 
 def _around(pictures: Tensor, side: int) -> Tensor:
-    """Return the mean over a square of odd side around each pixel, of the pixels in the picture."""
+    """Return the mean over a square of odd side around each pixel; pixels beyond the edge are left
+    out.
+    """
     averaged = pictures.reshape(1, -1, *pictures.shape[-2:])
     for window in ((side, 1), (1, side)):
         padding = (window[0] // 2, window[1] // 2)
@@ -235,18 +238,17 @@ def _around(pictures: Tensor, side: int) -> Tensor:
 
 
 def _root_of_colour(channels: int, grey: float) -> tuple[float, float]:
-    """Return (own, shared) such that  own I + shared  is the root of the correlation  (1 - grey) I
-    + grey.
+    """Return (own, shared) such that  own I + shared J  is the square root of the correlation
+    matrix  (1 - grey) I + grey J, where J is the matrix of ones.
     """
     own_factor = (1.0 - grey) ** 0.5
-    # the eigenvalue of the grey colour is 1 - grey + channels x grey, that of others 1 - grey
+    # eigenvalues: 1 - grey + channels x grey for the grey colour, 1 - grey for the others
     return own_factor, ((1.0 - grey + channels * grey) ** 0.5 - own_factor) / channels
 
 
 # --- posterior spread -----------------------------------------------------------------------------
 
-# What a deconvolved picture does not know: the standard deviation of each pixel under the model of
-# the filter.
+# The standard deviation of each pixel of a deconvolved picture, under the model of the filter.
 
 
 Draws = Annotated[int, Field(ge=2, le=4096)]

@@ -17,11 +17,10 @@ from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
-#: share of the light of a scene pixel that reaches known pixels, below which the share counts as
-#: this
+#: lower limit of the share of a scene pixel's light that reaches known pixels: it is a divisor
 _UNSEEN = 1e-3
-_LEAST_EXPECTED = 1e-6  #: e-, least expected count, because the expectation is a divisor
-#: e-, light below which a scene pixel stays dark; its gradient would grow with each step and
+_LEAST_EXPECTED = 1e-6  #: e-, smallest expected count, because the expectation is a divisor
+#: e-: a scene pixel with less light becomes 0, because its gradient would grow with each step and
 #: overflow
 _GONE = 1e-30
 
@@ -78,14 +77,14 @@ def richardson_lucy(
     grid = torus(frame, edge(kernels, frame))
     psf_sum = kernels.sum((-2, -1), keepdim=True)
     psf_sum = torch.where(psf_sum > 0, psf_sum, 1.0)
-    # of sum 1, so that no scale of the PSF overflows
+    # PSFs of sum 1, so that a PSF of any scale cannot overflow
     blur = _Blur(torch.fft.rfft2(wrapped(kernels / psf_sum, grid)), grid)
     return _climb(electrons, unclipped, blur, patterns, iterations, read_noise**2) / psf_sum
 
 
 @richardson_lucy.check
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
-    # inputs[4] is `clipped`, after psf, illuminant, responses and bands
+    # `inputs`: psf, illuminant, responses, bands, then `clipped` at index 4
     share = float(inputs[4].any(-3).double().mean())
     ratio = float(result.mean() / electrons.mean())
     return [
@@ -97,8 +96,8 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Ch
 
 
 def _unclipped_weight(clipped: Tensor, like: Tensor) -> Tensor:
-    """Return 1 for each pixel that is not clipped and 0 for the others; a channel without known
-    pixels has only 1.
+    """Return 1 for unclipped pixels and 0 for clipped ones; 1 for all pixels of a channel in which
+    every pixel is clipped.
     """
     unclipped = (~clipped).to(like)
     return torch.where(unclipped.amax((-2, -1), keepdim=True) > 0, unclipped, 1.0)
@@ -130,10 +129,11 @@ def _climb(
     iterations: int,
     variance: float,
 ) -> Tensor:
-    """Return the scene after ``iterations`` steps from an even scene of the mean of the picture.
+    """Return the scene after ``iterations`` steps, which start from a uniform scene with the mean
+    of the picture.
 
-    Each step also finds the strengths of the ``patterns`` of glare. The ``variance`` of the read
-    noise is added to data and expectation, which makes a Gaussian noise nearly Poisson.
+    Each step also updates the strengths of the ``patterns`` of glare. The ``variance`` of the read
+    noise is added to data and expectation, so that their total noise is nearly Poisson.
     """
     y, x = electrons.shape[-2:]
     shifted_counts = (electrons + variance).clamp_min(0) * unclipped
@@ -147,7 +147,7 @@ def _climb(
         expected = blur.picture(scene)[..., :y, :x].clamp_min(0) + variance
         for strength, pattern in zip(strengths, patterns, strict=True):
             expected = expected + strength * pattern
-        # the step of Richardson and Lucy: scene times the blurred-back ratio of data to model
+        # Richardson-Lucy step: scene times the adjoint blur of the ratio of data to model
         ratio = shifted_counts / expected.clamp_min(_LEAST_EXPECTED)
         scene = torch.where(
             scene <= _GONE, 0.0, scene * (blur.gathered(ratio) / seen_share).clamp_min(0)

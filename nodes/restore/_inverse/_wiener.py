@@ -1,4 +1,6 @@
-"""Wiener deconvolution with a known PSF: the filter, its problem, and what it knows."""
+"""Wiener deconvolution with a known PSF: the filter, its linear problem, and maps of its
+certainty.
+"""
 
 import math
 from collections.abc import Callable
@@ -49,25 +51,27 @@ from neusee.nodes.values import Bands, FilterFacts, Psf, WienerProblem
 
 # --- wiener ---------------------------------------------------------------------------------------
 
-# Wiener deconvolution with a known PSF, a baseline that needs no training.
+# Wiener deconvolution with a known PSF: a baseline that needs no training.
 
 
 GREY = 0.95  #: correlation between the channels of pictures
-#: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time
-#: there
+#: largest side in pixels of a picture that is computed in float64 throughout: up to this size the
+#: dense algebra, which is float64 anyway, takes most of the time
 PRECISE = 256
 
 
-#: standard deviation of a glare pattern in each pixel over its light around there; None: the
-#: likeliest for the picture
+#: standard deviation of a glare pattern in each pixel, relative to the light of the pattern around
+#: it; None: the most likely value for the picture
 Doubt = Annotated[float, Field(ge=0, le=10)] | None
-LeastDoubt = Annotated[float, Field(ge=0, le=10)]  #: of a doubt that is found
-#: of unknown pixels around a picture, over the reach of its PSF
+LeastDoubt = Annotated[float, Field(ge=0, le=10)]  #: lower limit for a doubt that is estimated
+#: width of the unknown border around a picture, relative to the radius of its PSF
 Border = Annotated[float, Field(ge=1, le=4)]
 
 
 class Settings(NamedTuple):
-    """What the filter is told besides the picture and the camera; as the parameters of `wiener`."""
+    """Settings of the filter besides picture and camera; the names are those of the parameters of
+    `wiener`.
+    """
 
     balance: float
     read_noise: float
@@ -157,7 +161,7 @@ def wiener(
 
 
 class View(NamedTuple):
-    """The PSF of a camera by band, and what its channels see of a grey scene."""
+    """The PSF of a camera in each band, with the illuminant, channel responses and bands."""
 
     psf: Psf
     illuminant: Tensor
@@ -176,8 +180,8 @@ class LaserLight(NamedTuple):
 def known_and_light(
     psf: Psf, responses: Tensor, electrons: Tensor, clipped: Tensor, light: LaserLight
 ) -> tuple[Tensor, Tensor, Glare]:
-    """Return a picture in the type of the computation, 1 for each pixel that is not clipped, and
-    the visible glare.
+    """Return a picture in the precision of the computation, a mask of the unclipped pixels (1 or
+    0), and the visible glare.
 
     Raises ValueError for inputs that differ in shape or are not finite.
     """
@@ -198,7 +202,7 @@ def known_and_light(
         unclipped,
         visible(
             [*patterns, *ghost_patterns],
-            # None where nothing is known of other patterns, as for ghosts
+            # None: no nearby patterns, as for ghosts
             [
                 *nearby_patterns,
                 *[None] * (len(patterns) + len(ghost_patterns) - len(nearby_patterns)),
@@ -210,7 +214,7 @@ def known_and_light(
 
 @wiener.check
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[Check]:
-    # inputs[4] is `clipped`, after psf, illuminant, responses and bands
+    # `inputs`: psf, illuminant, responses, bands, then `clipped` at index 4
     share = float(inputs[4].any(-3).double().mean())
     finite = math.isfinite(float(result.sum()))
     return [
@@ -223,8 +227,8 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
 
 
 def _refuse_other_glare(glare: list[Tensor], nearby: list[Tensor] | None) -> None:
-    """Raise ValueError unless each glare (channel, y, x) has one nearby (pattern, channel, y, x) of
-    its shape, where any is given.
+    """Raise ValueError if there are nearby patterns, unless each glare (channel, y, x) has one
+    tensor of them (pattern, channel, y, x).
     """
     if nearby and [x.shape[-3:] for x in nearby] != [x.shape for x in glare]:
         nearby_shapes, glare_shapes = (
@@ -253,7 +257,7 @@ def refuse_other_pictures(
         "psf": [psf.intensity],
         "glare": glare or (),
     }.items():
-        # a sum is NaN or infinite if any of its pixels is: cheaper than a test of each
+        # a sum is not finite if one of its pixels is not: cheaper than a test of each pixel
         for x in values:
             refuse_not_finite(
                 "the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)}
@@ -261,28 +265,26 @@ def refuse_other_pictures(
 
 
 class Scaled(NamedTuple):
-    """A deconvolution whose scene has mean 0 and variance 1, and what gives the result its scale
-    and mean back.
+    """A deconvolution problem whose scene has mean 0 and variance 1, with the factors and means
+    that convert its result to electrons.
     """
 
     problem: Blurred
     scale: Tensor  #: (channel, 1, 1)
-    mean: Tensor  #: (channel, 1, 1), of the scene
-    share: Tensor  #: (channel, 1, 1), powers of two by which the PSF was divided
+    mean: Tensor  #: (channel, 1, 1), mean of the scene, e-
+    share: Tensor  #: (channel, 1, 1), power of two by which the PSF of each channel is divided
     kernels: Tensor  #: (channel, any, any), the PSF of each channel, divided by ``share``
-    doubt: SceneDoubt | None = None  #: of a scene behind glare
+    doubt: SceneDoubt | None = None  #: uncertainty of mean and contrast of a scene behind glare
 
     def pixels(self, spectrum: Tensor) -> Tensor:
-        """Return the contrast of a scene in e-, given its spectrum."""
+        """Return the deviation of a scene from its mean in e-, from its half spectrum."""
         return self.problem.first(spectrum) * self.scale / self.share
 
 
 def pose(
     electrons: Tensor, clipped: Tensor, view: View, light: LaserLight, settings: Settings
 ) -> Scaled:
-    """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings`
-    says.
-    """
+    """Return the linear problem of a deconvolution for the inputs of `wiener`; it is not solved."""
     picture, unclipped, glare = known_and_light(view.psf, view.responses, electrons, clipped, light)
     kernels = effective_psf(
         view.psf, view.illuminant, view.responses, view.bands, picture.dtype
@@ -299,19 +301,20 @@ def posed(
     settings: Settings,
     white: Tensor | None = None,
 ) -> Scaled:
-    """Return the deconvolution of a picture as a linear problem; ``settings`` as `Settings` says.
+    """Return the linear problem of the deconvolution of a picture.
 
-    With `Settings.scatter` and ``white``, what the channels (channel, 1, 1) see of a grey scene,
-    channels that glare covers take mean and contrast of others.
+    ``white`` (channel, 1, 1) is the signal of a grey scene in each channel. With it and
+    `Settings.scatter`, a channel that glare covers takes its mean and contrast from the others.
     """
     frame = (electrons.shape[-2], electrons.shape[-1])
     read_noise, scatter = settings.read_noise, settings.scatter
-    # 1 for a channel with any unclipped pixel; a blind channel counts as unclipped, so that its
-    # averages below are not 0 / 0
+    # `has_unclipped` is 1 for a channel with an unclipped pixel. A fully clipped channel counts as
+    # unclipped, so that its averages below are not 0 / 0
     unclipped_or_blind, has_unclipped = unclipped, unclipped.amax((-2, -1), keepdim=True)
     unclipped = torch.where(has_unclipped > 0, unclipped, 1.0)
     share = power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
-    # the same bits, and the floors below concern the shape of the PSF, not a grey filter
+    # division by a power of two is exact; the lower limits below then depend on the shape of the
+    # PSF alone, not on its total transmittance
     kernels = kernels / share
 
     free, trusted, light, glare_error = _found_light(
@@ -321,13 +324,13 @@ def posed(
     mean = average(picture, trusted)
     picture_variance = average((picture - mean).square(), trusted)
     size, transfer, power, variance_factor = _on_torus(kernels, frame, settings.border)
-    # variance of a scene = (variance of the picture - photons - read noise - glare) / what the
-    # blur leaves of the variance 1; photon noise has the variance of the mean
+    # variance of the scene = (variance of the picture - photon noise - read noise - glare) /
+    # (variance after the blur of a scene of variance 1); photon noise has the variance `mean`
     mean_and_variance = (
         mean,
         (picture_variance - mean - read_noise**2 - glare_error) / variance_factor,
     )
-    # at least a hundredth of the picture's variance, where noise exceeds it
+    # at least 1 % of the variance of the picture, in case noise exceeds it
     scale = (
         torch.maximum(mean_and_variance[1], 0.01 * picture_variance / variance_factor)
         .clamp_min(1e-6)
@@ -341,7 +344,7 @@ def posed(
         )
         mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
     noise = settings.balance * picture_noise(electrons, mean, read_noise) + light.variance
-    # inverse noise variance, in units of the scaled picture
+    # inverse variance of the noise, in units of the scaled picture
     weight = unclipped * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*free, *light.modes))
     problem = Blurred(
@@ -352,10 +355,10 @@ def posed(
         size,
         GREY,
         scaled,
-        # the last patterns, the modes, have strengths of variance 1
+        # the modes come last; their strengths have variance 1
         bounded=len(light.modes),
     )
-    # mean of the scene: that of the picture over the sum of the PSF, `kernels` x `share`
+    # mean of the scene = mean of the picture / sum of the PSF, which is `kernels` x `share`
     scene_mean = mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share
     if not scatter:
         return Scaled(problem, scale, scene_mean, share, kernels)
@@ -378,8 +381,9 @@ def posed(
 
 
 def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor, Tensor, Tensor]:
-    """Return the torus of a picture, the transfer of the PSF, the prior's power spectrum, and the
-    variance (channel, 1, 1) that a picture of a scene of variance 1 then has.
+    """Return the size of the torus of a picture, the transfer function of the PSF, the power
+    spectrum of the prior, and the variance (channel, 1, 1) of the blurred picture of a scene of
+    variance 1.
     """
     size = torus(frame, bordered(edge(kernels, frame), border))
     transfer, wider_than_reach = torch.fft.rfft2(wrapped(kernels, size)), border > 1
@@ -391,12 +395,11 @@ def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor
 def _found_light(
     electrons: Tensor, unclipped: tuple[Tensor, Tensor], glare: Glare, settings: Settings
 ) -> tuple[list[Tensor], Tensor, Light, Tensor]:
-    """Return the patterns of unknown strength, then the weights of pixels, the estimate of the
-    glare and the mean variance of its pattern, as `doubted` returns them; ``unclipped`` is with
-    blind channels counted as unclipped, and without.
+    """Return the patterns of unknown strength, then the result of `doubted`: weights of the pixels,
+    estimate of the glare, mean variance of the glare.
 
-    With `Settings.scatter` the strengths are found too, so that no pattern of unknown strength is
-    left.
+    ``unclipped`` are two masks: in the first, a fully clipped channel counts as unclipped. With
+    `Settings.scatter` the strengths are estimated, so that no pattern of unknown strength remains.
     """
 
     def own_noise(mean: Tensor) -> Tensor:
@@ -416,8 +419,10 @@ def _doubted(
     doubts: tuple[float | None, float],
     noise: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Light, Tensor]:
-    """Return what `doubted` returns (weights, light, mean variance), for ``doubts``: a doubt, or
-    None for the likeliest one, and the least doubt that may be found.
+    """Return the result of `doubted` (weights, light, mean variance).
+
+    ``doubts`` are the doubt, None for the most likely one, and the lower limit of the most likely
+    one.
     """
     doubt, smallest = doubts
     if doubt != 0 and glare.around is None:
@@ -430,8 +435,8 @@ def _doubted(
 
 # --- wiener problem -------------------------------------------------------------------------------
 
-# The problem that the Wiener filter solves, as a value: for the training of restorers that begin
-# with its answer.
+# The linear problem of the Wiener filter as the result of a node, for the training of networks that
+# start from its answer.
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
@@ -478,7 +483,7 @@ def _(result: WienerProblem, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def packed(scaled: Scaled) -> WienerProblem:
-    """Return a posed deconvolution and its answer as a value."""
+    """Return a deconvolution problem and its solution as a `WienerProblem`."""
     problem = scaled.problem
     free_count = len(problem.glare) - problem.bounded
     no_patterns = problem.picture.new_zeros(0, *problem.picture.shape)
@@ -504,7 +509,7 @@ def packed(scaled: Scaled) -> WienerProblem:
 
 
 def unpacked(value: WienerProblem) -> Blurred:
-    """Return the linear problem of a value."""
+    """Return the linear problem that a `WienerProblem` contains."""
     frame = (value.picture.shape[-2], value.picture.shape[-1])
     size = torus(frame, edge(value.psf, frame))
     transfer, power = torch.fft.rfft2(wrapped(value.psf, size)), fall(size).to(value.psf)
@@ -516,15 +521,15 @@ def unpacked(value: WienerProblem) -> Blurred:
 
 # --- filter facts ---------------------------------------------------------------------------------
 
-# What the Wiener filter finds in a picture and knows of it, as maps for a network that goes on from
-# its answer.
+# The result of the Wiener filter for a picture, with its residual and certainty, as maps for a
+# network that improves the result.
 
 
-_OCTAVES = 5  #: of frequency, below half a cycle per pixel
-_GLARE_GAIN = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
-_DISPLAY_GAMMA = 1 / 2.2  #: of a display, so that dark parts are seen
-MAPS_OF_CHANNEL = 9  #: maps of each channel
-MAPS = 3 * MAPS_OF_CHANNEL + _OCTAVES  #: of a picture of three channels
+_OCTAVES = 5  #: number of octaves of frequency, from half a cycle per pixel down
+_GLARE_GAIN = 1e3  #: factor of a glare pattern of maximum 1, so that its outer rings are visible
+_DISPLAY_GAMMA = 1 / 2.2  #: exponent of a display, so that dark parts are visible
+MAPS_OF_CHANNEL = 9  #: number of maps of each channel
+MAPS = 3 * MAPS_OF_CHANNEL + _OCTAVES  #: number of maps of a picture with three channels
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
@@ -578,7 +583,7 @@ def _(result: FilterFacts, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def facts(scaled: Scaled) -> FilterFacts:
-    """Return the answer of a posed deconvolution and its maps."""
+    """Return the solution of a deconvolution problem, and its maps."""
     problem, scale = scaled.problem, scaled.scale / scaled.share
     spectrum = most_likely(problem)
     answer = problem.first(spectrum)
@@ -589,19 +594,21 @@ def facts(scaled: Scaled) -> FilterFacts:
 def maps(
     problem: Blurred, answer: Tensor, brightness: Tensor, blurred: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the predicted deviation and all maps of an answer, its value above black, and its
-    blur by the camera.
+    """Return the predicted standard deviation of an answer, and all maps.
+
+    ``brightness`` is the answer above black, and ``blurred`` the answer after the blur of the
+    camera.
     """
     unclipped = (problem.weight > 0).to(answer)
-    # the slope of sqrt is infinite at 0
+    # `where` before `sqrt`, whose derivative is infinite at 0
     inverse_deviation = torch.where(problem.weight > 0, problem.weight, 1.0).sqrt() * unclipped
     free_count = len(problem.glare) - problem.bounded
-    # the first patterns have any strength, the last are modes of the doubt
+    # the first patterns have unknown strengths, the last are modes of the uncertainty
     glare = sum(problem.glare[:free_count], torch.zeros_like(answer))
     doubt = sum((mode.square() for mode in problem.glare[free_count:]), torch.zeros_like(answer))
     # 1 / (noise variance + doubt): the weight of a pixel whose glare is uncertain
     deviation, octaves = _predicted(problem, problem.weight / (1.0 + problem.weight * doubt))
-    # divisors bring each map to about 1 for a network
+    # the divisors scale each map to about 1, as a network needs
     channel_maps = [
         answer,
         brightness.sign() * brightness.abs().clamp_min(1e-12).pow(_DISPLAY_GAMMA),
@@ -617,12 +624,12 @@ def maps(
 
 
 def _predicted(problem: Blurred, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the deviation (channel, y, x) of the answer from the scene that the filter expects,
-    and a map (octave, y, x) of the share that the frame tells, for each octave.
+    """Return the standard deviation (channel, y, x) of the scene from the answer that the filter
+    predicts, and maps (octave, y, x) of the share of the variance that the frame determines.
 
-    The mean square over the frame follows from the share of each frequency that the frame tells. It
-    is divided over the pixels by the inverse of 1 + I, where I is the diagonal of B' W B: a pixel
-    behind a clipped one is less certain.
+    The mean square over the frame follows from the share of each frequency that the frame
+    determines. It is distributed over the pixels in proportion to 1 / (1 + I), where I is the
+    diagonal of B^T W B: a pixel behind a clipped one is less certain.
     """
     signal_to_noise = (
         problem.transfer.abs().square() * weight.mean((-2, -1), keepdim=True) * problem.power
@@ -638,18 +645,18 @@ def _predicted(problem: Blurred, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _whole_mean(half: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the means over whole spectra (..., 1, 1), given their halves."""
+    """Return the means (..., 1, 1) over whole spectra, from their half spectra."""
     return (variance(half, size))[..., None, None]
 
 
 def _information(problem: Blurred, weight: Tensor) -> Tensor:
-    """Return the diagonal of B' W B for the blur B: the information of the frame on each pixel
-    of the scene.
+    """Return the diagonal of B^T W B for the blur B: the Fisher information of the frame on each
+    pixel of the scene.
     """
     squared_psf_transfer = torch.fft.rfft2(
         torch.fft.irfft2(problem.transfer, s=problem.torus).square()
     )
-    # (B' W B) at pixel i = sum over j of psf(j - i)^2 W(j), a correlation
+    # diagonal element i = sum over j of psf(j - i)^2 W(j), a correlation
     information: Tensor = torch.fft.irfft2(
         squared_psf_transfer.conj() * torch.fft.rfft2(weight, s=problem.torus), s=problem.torus
     )
@@ -657,11 +664,13 @@ def _information(problem: Blurred, weight: Tensor) -> Tensor:
 
 
 def _octaves(shares: Tensor, problem: Blurred) -> Tensor:
-    """Return for each octave of frequency a map of the mean of the shares (channel, fy, fx)."""
+    """Return the mean of the shares (channel, fy, fx) in each octave of frequency, as constant maps
+    (octave, y, x).
+    """
     mean_share = shares.mean(0)
     rows = torch.fft.fftfreq(problem.torus[0], dtype=mean_share.dtype, device=mean_share.device)
     columns = torch.fft.rfftfreq(problem.torus[1], dtype=mean_share.dtype, device=mean_share.device)
-    # octave k holds the frequencies from 0.5 / 2^(k + 1) to 0.5 / 2^k; the last all below
+    # octave k: frequencies from 0.5 / 2^(k + 1) to 0.5 / 2^k; the last octave: all lower ones too
     octave = (
         (-torch.hypot(rows[:, None], columns).clamp(1e-9, 0.5).log2() - 1.0)
         .floor()

@@ -16,31 +16,32 @@ from neusee.nodes.restore._inverse._masked_blur import variance as variance_of
 
 # --- picture scale --------------------------------------------------------------------------------
 
-# What scales a picture before its deconvolution: the variance of its noise, the prior, and what the
-# prior expects.
+# Scaling of a picture before its deconvolution: variance of its noise, power spectrum of the prior,
+# and the variance that the prior predicts.
 
 
-#: the power spectrum of pictures falls with frequency to this power, like that of edges
+#: the power spectrum of pictures falls as 1 / frequency to this power, like that of edges
 _FALL = 3.0
-_NO_LIGHT = 1e-12  #: share of the light below which a PSF counts as one without light
-#: trust in a channel, at which its own level counts as much as that of the other channels
+_NO_LIGHT = 1e-12  #: a PSF with a smaller sum counts as a PSF without light
+#: trust in a channel at which its own level has the same weight as that of the other channels
 _TOLD = 0.05
 
 
 def picture_noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
-    """Return the noise variance of each pixel, from the larger of the local mean and the mean of
-    the picture.
+    """Return the noise variance (e-^2) of each pixel: photon noise plus read noise.
+
+    The variance of photon noise is the local mean or the mean of the picture, whichever is larger.
     """
     local_mean = electrons[None]
-    # mean over 9 x 9 pixels, first down, then across
+    # mean over 9 x 9 pixels, one axis after the other
     for window, rim in (((9, 1), (4, 0)), ((1, 9), (0, 4))):
         local_mean = avg_pool2d(local_mean, window, stride=1, padding=rim, count_include_pad=False)
     return (torch.maximum(local_mean[0], mean) + read**2).clamp_min(1e-3)
 
 
 def expected_variance(transfer: Tensor, power: Tensor, size: Size) -> Tensor:
-    """Return the expected variance (channel, 1, 1) of a blurred picture, summed over a few
-    spectrum rows at a time.
+    """Return the expected variance (channel, 1, 1) of a blurred picture; the sum over frequencies
+    takes a few rows at a time.
     """
     total = power.new_zeros(len(transfer))
     for rows in pieces(transfer):
@@ -52,9 +53,10 @@ def expected_variance(transfer: Tensor, power: Tensor, size: Size) -> Tensor:
 
 
 def fall(size: Size, period: Size | None = None) -> Tensor:
-    """Return the power spectrum that the prior of the scene assumes, as half a spectrum of mean 1.
+    """Return the power spectrum of the prior of the scene, as a half spectrum of mean 1.
 
-    Below one cycle in ``period`` pixels, those of the torus without a number, it hardly rises.
+    Below one cycle in ``period`` pixels it is nearly constant; the default is the size of the
+    torus.
     """
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
     squared = (
@@ -68,11 +70,11 @@ def fall(size: Size, period: Size | None = None) -> Tensor:
 
 
 def about_mean(power: Tensor, frame: Size, torus: Size) -> Tensor:
-    """Return half a power spectrum on a periodic grid, without the variance that the mean over a
-    frame has.
+    """Return a half power spectrum on a periodic grid, without the variance of the mean over a
+    frame.
     """
     rows, columns = (torch.ones(n, dtype=power.dtype, device=power.device) / n for n in frame)
-    # share of each frequency that the mean over the frame holds: |FFT of 1 / size|^2
+    # share of each frequency in the variance of the mean: |FFT of a window of height 1 / size|^2
     share = (
         torch.fft.fft(rows, torus[0]).abs().square()[:, None]
         * torch.fft.rfft(columns, torus[1]).abs().square()
@@ -82,18 +84,18 @@ def about_mean(power: Tensor, frame: Size, torus: Size) -> Tensor:
 
 
 def power_of_two(x: Tensor) -> Tensor:
-    """Return the powers of two nearest to ``x`` by ratio; 1 for a PSF without light, whose
-    slopes overflow.
+    """Return the powers of two nearest to ``x`` in ratio; 1 for a PSF without light, whose
+    derivatives would overflow.
     """
     return torch.where(x > _NO_LIGHT, x, 1.0).log2().round().exp2()
 
 
 def shared_level(level: Tensor, trust: Tensor, white: Tensor) -> Tensor:
-    """Return the mean or the contrast of each channel, (channel, 1, 1), with that of others where
-    trust is small.
+    """Return the mean or the contrast (channel, 1, 1) of each channel, taken from the other
+    channels where ``trust`` is small.
 
-    ``trust`` is the share of a channel that noise, not glare, rules; ``white`` what the channels
-    see of a grey scene.
+    ``trust`` is the share of the pixels of a channel in which noise exceeds the uncertainty of the
+    glare. ``white`` is the signal of a grey scene in each channel.
     """
     grey = level / white
     weight = trust.clamp_min(1e-12)
@@ -105,51 +107,53 @@ def shared_level(level: Tensor, trust: Tensor, white: Tensor) -> Tensor:
 
 # --- scene level ----------------------------------------------------------------------------------
 
-# What is not known of a scene behind glare besides its details: its mean, its contrast, and
-# blotches of the glare.
+# Uncertainty of a scene behind glare, besides its details: its mean, its contrast, and blotches
+# (correlated errors over some pixels) of the glare.
 #
-# The mean of a picture without its estimated glare is wrong by the light that the glare is wrong
-# by, of the same sign in all pixels. Where glare covers most pixels, this is more than the light of
-# the scene. Then a prior decides: a camera is mostly exposed such that the mean is a seventh of the
-# fullest pixel, to a factor of three, and the standard deviation of a scene is 0.8 of its mean, to
-# a factor of 1.6. Channels see nearly a grey scene.
+# The glare is estimated and subtracted. Its error has the same sign in all pixels, and is an error
+# of the mean of the picture. Where glare covers most pixels, this error exceeds the light of the
+# scene. Then a prior decides: the mean of a scene is usually a seventh of the brightest pixel
+# (within a factor of three), and its standard deviation is 0.8 of its mean (within a factor of
+# 1.6). The colour of the mean is nearly grey.
 
 
-#: mean of a scene over the fullest pixel, and deviation of its logarithm
+#: median of (mean of a scene / brightest pixel), and standard deviation of its logarithm
 _EXPOSED, _EXPOSURE = 0.15, math.log(3.0)
-#: deviation of a scene over its mean, and deviation of the logarithm of this ratio
+#: median of (standard deviation of a scene / mean), and standard deviation of its logarithm
 _CONTRAST, _CONTRASTS = 0.8, 0.5
-_COLOUR = 0.3  #: deviation of the mean of a channel, over what it sees of a grey scene
-_TINT = 0.2  #: deviation of the contrast of a channel, over what it sees of a grey scene
-_ONE_CHANNEL_SHARE = 0.1  #: part of the variance of an error that is not the same in all channels
+_COLOUR = 0.3  #: standard deviation of the mean of a channel, relative to that of a grey scene
+_TINT = 0.2  #: standard deviation of the contrast of a channel, relative to that of a grey scene
+_ONE_CHANNEL_SHARE = 0.1  #: share of the variance of an error that is independent in each channel
 _VARIANCE_ERROR = 0.1  #: relative error of a variance that is estimated from one picture
-_GRID_POINTS = 241  #: logarithms that are tried
-_GRID_DEVIATIONS = 4.0  #: deviations of the prior, over which they are tried
-_BLOTCHES = 0.3  #: deviation of scattered light over blotches, over that of a pixel of it
-_BLOTCH_PIXELS = 16  #: pixels from one blotch to the next
+_GRID_POINTS = 241  #: number of grid points in the shared logarithm
+_GRID_DEVIATIONS = 4.0  #: half width of this grid, in standard deviations of the prior
+_BLOTCHES = 0.3  #: standard deviation of a blotch, relative to that of scattered light in a pixel
+_BLOTCH_PIXELS = 16  #: distance between neighbouring blotches in pixels
 
 
 class Told(NamedTuple):
-    """What a picture tells of a quantity of its channels."""
+    """An estimate of a quantity of each channel from a picture, with its errors."""
 
     value: Tensor  #: (channel, 1, 1)
-    #: (error, channel, 1, 1), deviations; each error has the same sign in all channels
+    #: (error, channel, 1, 1), standard deviations; each error has the same sign in all channels
     errors: Tensor
 
 
 class Level(NamedTuple):
-    """Mean or variance of each channel of a scene, (channel, 1, 1) each."""
+    """Mean or variance of each channel of a scene, with its standard deviation: (channel, 1, 1)
+    each.
+    """
 
     value: Tensor
     deviation: Tensor
 
 
 class SceneDoubt(NamedTuple):
-    """What a filter does not know of a scene behind glare, in units of its own scale."""
+    """The uncertainty of a scene behind glare, in units of the scale of the filter."""
 
     mean: float  #: expected square of the error of the mean
     contrast: float  #: expected variance of the scene
-    blotches: Tensor  #: (channel, y, x), deviation of light that is the same over some pixels
+    blotches: Tensor  #: (channel, y, x), standard deviation of light correlated over some pixels
 
 
 @torch.no_grad()
@@ -160,12 +164,12 @@ def scene_doubt(
     full: float,
     light: Light,
 ) -> SceneDoubt | None:
-    """Return what is not known of a scene of which the filter uses a mean and a scale; None where
-    glare is known.
+    """Return the uncertainty of mean, contrast and glare of a scene; None if the glare is known
+    exactly.
 
-    ``mean_and_scale`` (channel, 1, 1) are those of the filter, ``evidence`` is that of the picture
-    on mean and variance. Without ``white``, what the channels see of a grey scene, mean and scale
-    count as known.
+    ``mean_and_scale`` (channel, 1, 1) are those of the filter, ``evidence`` the estimates of mean
+    and variance from the picture. ``white`` is the signal of a grey scene in each channel; without
+    it, mean and scale count as known.
     """
     if not light.modes:
         return None
@@ -183,10 +187,11 @@ def scene_doubt(
 def told_of_scene(
     mean: Tensor, variance: Tensor, wrong: Tensor, light: Light, weights: Tensor, unseen: Tensor
 ) -> tuple[Told, Told]:
-    """Return what a picture without glare tells of the mean and the variance of its scene.
+    """Return the estimates of the mean and the variance of a scene, from a picture without glare.
 
-    ``wrong`` (channel, 1, 1) is the variance that may be glare, ``weights`` those of the pixels in
-    the mean, and ``unseen`` the light that a channel may have of which no pixel is known.
+    ``wrong`` (channel, 1, 1) is the part of the variance that may be glare, ``weights`` are the
+    weights of the pixels in the mean, and ``unseen`` is the possible light of a channel without
+    known pixels.
     """
     errors = torch.stack([*(average(mode, weights) for mode in light.modes), unseen])
     return Told(mean, errors), Told(variance, (wrong + unseen.square())[None])
@@ -195,16 +200,16 @@ def told_of_scene(
 def level_and_variance(
     mean: Told, variance: Told, white: Tensor, full: float
 ) -> tuple[Level, Level]:
-    """Return the mean and the variance of a scene in each channel, with what is not known of both.
+    """Return the mean and the variance of a scene in each channel, with their standard deviations.
 
-    ``white`` (channel, 1, 1) is what channels see of a grey scene, ``full`` the light of the
-    fullest pixel.
+    ``white`` (channel, 1, 1) is the signal of a grey scene in each channel, ``full`` the light of
+    the brightest pixel.
     """
     grey = white.flatten().double()
     level, log_exposure, log_deviation = _likely(
         mean, grey, math.log(_EXPOSED * full), _EXPOSURE, _COLOUR
     )
-    # the logarithm of a variance is twice that of a deviation
+    # log(variance) = 2 log(standard deviation)
     log_variance = 2.0 * (log_exposure + math.log(_CONTRAST))
     log_variance_deviation = 2.0 * math.hypot(log_deviation, _CONTRASTS)
     variance_level, _, _ = _likely(
@@ -214,7 +219,7 @@ def level_and_variance(
 
 
 def drawn_blotches(blotches: Tensor, rng: Generator) -> Tensor:
-    """Return a draw of light (channel, y, x) that is nearly the same over some pixels, and of
+    """Return a random field of light (channel, y, x) that is correlated over some pixels and has
     one colour.
     """
     y_hats, x_hats = (_hats(n).to(blotches) for n in blotches.shape[-2:])
@@ -226,10 +231,10 @@ def drawn_blotches(blotches: Tensor, rng: Generator) -> Tensor:
 
 
 def _hats(size: int) -> Tensor:
-    """Return the weights (blotch, pixel) of blotches in the pixels of an axis, whose squares add
-    up to 1.
+    """Return the weights (blotch, pixel) of the blotches along one axis; the squares of the weights
+    of a pixel sum to 1.
     """
-    # triangles, 1 at the middle of a blotch and 0 at the next ones
+    # triangle functions: 1 at the centre of a blotch, 0 at the centres of its neighbours
     position = torch.arange(size) / _BLOTCH_PIXELS
     hats = (1.0 - (position - torch.arange(size // _BLOTCH_PIXELS + 2)[:, None]).abs()).clamp_min(
         0.0
@@ -240,17 +245,17 @@ def _hats(size: int) -> Tensor:
 def _likely(
     evidence: Told, grey: Tensor, middle: float, width: float, own: float, rough: float = 0.0
 ) -> tuple[Level, float, float]:
-    """Return a quantity of each channel, and mean and deviation of the logarithm of what the
-    channels share.
+    """Return the posterior of a quantity in each channel, and the posterior mean and standard
+    deviation of the logarithm of its shared value.
 
-    The shared logarithm is normal, of mean ``middle`` and deviation ``width``; a channel differs
-    from ``grey`` times the shared quantity by a relative deviation ``own``. ``rough`` is the
-    relative error of the evidence. The posterior is a sum over a grid of shared logarithms.
+    The prior of the logarithm is normal with mean ``middle`` and standard deviation ``width``. A
+    channel has ``grey`` times the shared value, with the relative standard deviation ``own``.
+    ``rough`` is the relative error of the evidence. The posterior is a sum over a grid of the
+    logarithm.
     """
     value, errors = evidence.value.flatten().double(), evidence.errors.flatten(1).double()
     error_covariance = errors.T @ errors
-    # a part of each error is that of its channel alone; 1 e- so that the matrix has a Cholesky
-    # factor
+    # a share of the variance is independent in each channel; 1 keeps the matrix positive definite
     error_covariance = (
         error_covariance + (_ONE_CHANNEL_SHARE * error_covariance.diagonal() + 1.0).diag()
     )
@@ -274,7 +279,7 @@ def _likely(
     log_prior = -0.5 * ((logs - middle) / width).square() - lower_factor.diagonal(
         dim1=-2, dim2=-1
     ).log().sum(-1)
-    # posterior probability of each logarithm: log of the Gaussian density of the evidence
+    # posterior probability of each grid point: prior times Gaussian density of the evidence
     probability = torch.softmax(log_prior - 0.5 * (deviation * solved_deviation).sum(-1), 0)[
         :, None
     ]
@@ -294,43 +299,46 @@ def _likely(
 
 # --- frame spectrum -------------------------------------------------------------------------------
 
-# The power spectrum of a scene, fitted to a blurred and noisy frame of it: how fast it falls, and
-# how strong it is.
+# The power spectrum of a scene, fitted to a blurred and noisy frame: its exponent and its strength.
 
 
-#: first, last and number of the exponents that are tried; scenes have 2 to 4
+#: smallest, largest and number of the exponents that are tried; scenes have 2 to 4
 _SLOPES = (2.0, 4.0, 9)
-_POWERS = (-7.0, 1.0, 25)  #: of e, times the variance that explains the whole frame
-#: times the variance of the noise that the filter assumes
+#: smallest, largest and number of the logarithms of the strength that are tried, relative to the
+#: strength that explains the whole frame
+_POWERS = (-7.0, 1.0, 25)
+#: factors of the noise variance that are tried, relative to the assumption of the filter
 _NOISES = tuple(2.0**n for n in range(8))
-_MOST_FREQUENCIES = 20_000  #: frequencies that count, at most
-_LOWEST = 3.0  #: cycles in the picture, below which the window mixes frequencies
-_FULL_WEIGHT_QUANTILE = 0.75  #: quantile of the weights of pixels, above which a pixel counts fully
-_QUANTILE_PIXELS = 1 << 20  #: pixels from which this quantile is taken, at most
-#: standard deviation of the logarithm of the variance of a scene, over that of the filter
+_MOST_FREQUENCIES = 20_000  #: approximate number of frequencies in the likelihood
+#: lowest frequency in the likelihood, cycles in the picture: the window mixes lower ones
+_LOWEST = 3.0
+#: quantile of the weights of pixels: a pixel with a much larger weight has the full window
+_FULL_WEIGHT_QUANTILE = 0.75
+_QUANTILE_PIXELS = 1 << 20  #: approximate number of pixels from which this quantile is estimated
+#: prior standard deviation of the logarithm of the variance of a scene
 _PRIOR = 1.0
-_LIKE_FREQUENCIES = 4.0  #: frequencies of a window that tell the same
+_LIKE_FREQUENCIES = 4.0  #: number of neighbouring frequencies that the window correlates
 
 
 class FrameLaw(NamedTuple):
-    """The law of a frame: the power spectrum of its scene, and its noise."""
+    """The fitted model of a frame: the power spectrum of its scene, and its noise."""
 
-    power: Tensor  #: half a spectrum of the torus
-    noise: float  #: variance of the noise over the variance that the filter assumes
-    #: factor of the power, at least 1, by which the variance is not below that of the prior
+    power: Tensor  #: (fy, fx), half spectrum on the torus
+    noise: float  #: variance of the noise, relative to the assumption of the filter
+    #: factor >= 1 that raises the power to the variance that the prior expects
     low: float = 1.0
 
 
 def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
-    """Return the law of a frame of the highest debiased Whittle likelihood.
+    """Return the power spectrum and noise of a frame with the highest debiased Whittle likelihood.
 
-    The power of the scene is A (f^2 + 1 / pixels)^(-b / 2), as the prior of the filter, whose b is
-    3. The likelihood compares the periodogram of the frame with its exact expectation: the
-    correlation of the blurred scene times that of the window. So light that the window or a hole
-    moves to other frequencies, such as the zeros of a PSF, is expected there. The window falls to
-    the edges and, with the weight of a pixel, near glare that is not known. ``doubt`` says what is
-    not known of mean and variance of the scene; without it the variance is nearly 1 before the
-    frame is seen.
+    The power of the scene is A (f^2 + 1 / pixels)^(-b / 2), as in the prior of the filter, whose b
+    is 3. The likelihood compares the periodogram of the frame with its exact expectation: the
+    Fourier transform of the correlation of the blurred scene times the correlation of the window.
+    So it includes the light that the window or a hole moves to other frequencies, for example to
+    the zeros of a PSF. The window falls to 0 at the edges, and where the weight of a pixel is low
+    because of uncertain glare. ``doubt`` is the uncertainty of mean and variance of the scene;
+    without it the prior of the variance is near 1.
     Source: Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 251 (2019).
     """
     window = _window(problem)
@@ -340,7 +348,7 @@ def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
     contrast = picture - (picture * window).sum((-2, -1), keepdim=True) / window.sum(
         (-2, -1), keepdim=True
     )
-    # without the frequencies that the window mixes with the mean
+    # low frequencies are left out, because the window mixes them with the mean
     counted = _squared(size).to(window) > (_LOWEST / min(size)) ** 2
     step = max(1, int(counted.sum()) * len(window) // _MOST_FREQUENCIES)
     periodogram = _sampled(torch.fft.rfft2(contrast * window).abs().square() / area, counted, step)
@@ -370,22 +378,24 @@ def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
             )
     power = strength * _law(problem, slope)
     low = max(1.0, math.exp(_expected_strength(problem, doubt, slope)) / max(strength, 1e-30))
-    # the mean of the scene has its own doubt
+    # the uncertainty of the mean is added at frequency 0
     power[0, 0] += doubt.mean * problem.torus[0] * problem.torus[1] if doubt else 0.0
     return FrameLaw(power, factor, low)
 
 
 def _expected_strength(problem: Blurred, doubt: SceneDoubt | None, slope: float) -> float:
-    """Return the logarithm of the strength of a law that gives a scene the variance it is
-    expected to have.
+    """Return the logarithm of the strength A for which a scene with the exponent ``slope`` has its
+    expected variance.
     """
     expected = doubt.contrast if doubt else 1.0
     return math.log(expected / float(variance_of(_law(problem, slope), problem.torus)))
 
 
 def _window(problem: Blurred) -> Tensor:
-    """Return the window (channel, y, x) of the periodogram: it falls to 0 at the edges and where
-    the weight of a pixel is far below the quantile `_FULL_WEIGHT_QUANTILE` of its channel.
+    """Return the window (channel, y, x) of the periodogram.
+
+    It falls to 0 at the edges, and where the weight of a pixel is far below the quantile
+    `_FULL_WEIGHT_QUANTILE` of its channel.
     """
     y, x = problem.picture.shape[-2:]
     weight = problem.weight.detach()
@@ -404,8 +414,8 @@ def _window(problem: Blurred) -> Tensor:
 
 
 def _expected(problem: Blurred, slope: float, lags: Tensor) -> Tensor:
-    """Return the expected periodogram of a blurred scene of power 1 / f^slope, given the
-    correlation of the window.
+    """Return the expected periodogram of a blurred scene with the power 1 / f^slope; ``lags`` is
+    the autocorrelation of the window.
     """
     squared_transfer = problem.transfer.detach().abs().square()
     scene_correlation = torch.fft.irfft2(_law(problem, slope) * squared_transfer, s=problem.torus)
@@ -416,12 +426,12 @@ def _expected(problem: Blurred, slope: float, lags: Tensor) -> Tensor:
     spectrum: Tensor = torch.fft.rfft2(
         scene_correlation[:, row_lags[:, None], column_lags] * lags
     ).real
-    # lags on a grid twice as wide: every second frequency is one of the window's
+    # the grid of lags is twice as wide, so every second frequency is one of the periodogram
     return spectrum[:, ::2, ::2].clamp_min(0.0)
 
 
 def _lags(size: int) -> Tensor:
-    """Return the lags (size,) in FFT order: 0 and up, then negative ones."""
+    """Return the lags (size,) in FFT order: from 0 upwards, then the negative ones."""
     return (torch.arange(size) + size // 2) % size - size // 2
 
 
@@ -433,8 +443,8 @@ def _law(problem: Blurred, slope: float) -> Tensor:
 
 
 def _sampled(spectrum: Tensor, far: Tensor, step: int) -> Tensor:
-    """Return every ``step``-th of the frequencies in ``far`` of all channels, as one row in
-    float64.
+    """Return every ``step``-th of the frequencies in the mask ``far``, of all channels, as one
+    float64 row.
     """
     sampled: Tensor = spectrum[:, far].flatten()[::step].double()
     return sampled
@@ -443,11 +453,11 @@ def _sampled(spectrum: Tensor, far: Tensor, step: int) -> Tensor:
 def _likeliest(
     periodogram: Tensor, law: Tensor, noise: Tensor, middle: float
 ) -> tuple[float, float, float]:
-    """Return the least loss of a law, its strength, and the factor of the noise, which grows while
-    the loss falls.
+    """Return the smallest loss, with its strength and factor of the noise; larger factors are tried
+    as long as the loss falls.
 
-    The logarithm of the strength has the mean ``middle`` before the frame is seen. The loss is
-    Whittle's, the mean of log(expected) + periodogram / expected, plus the prior of the strength.
+    The loss is the mean of log(expected) + periodogram / expected (Whittle), plus the prior of the
+    strength, whose logarithm has the prior mean ``middle``.
     """
     best_of_all = (float("inf"), 0.0, 1.0)
     independent_count = len(periodogram) / _LIKE_FREQUENCIES
@@ -465,7 +475,7 @@ def _likeliest(
 
 
 def _squared(size: Size) -> Tensor:
-    """Return the squared frequencies in cycles per pixel, half a spectrum."""
+    """Return the squared frequencies (fy, fx) of a half spectrum, in (cycles per pixel)^2."""
     fy, fx = torch.fft.fftfreq(size[0]), torch.fft.rfftfreq(size[1])
     squared: Tensor = fy[:, None].square() + fx.square()
     return squared

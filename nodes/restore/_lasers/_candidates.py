@@ -1,4 +1,4 @@
-"""Where a pattern may lie: its likelihood at every place, and the best place near one."""
+"""Candidates for lasers and lamps: likelihood at every place of a frame, and local refinement."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ from neusee.nodes.values import Bands, Pupil
 
 # --- candidates -----------------------------------------------------------------------------------
 
-# Where a pattern may lie: its likelihood at every place of the frame at once, by fast correlations.
+# The likelihood of a pattern at every place of the frame at once, by correlation with FFTs.
 
 
 _WAVELENGTH_STEP = 5e-9  #: m between the wavelengths that are tried
-_PATTERN_REACH = 192  #: pixels from the spot, as far as a pattern is compared before it is fitted
-_CLIPPED_RATIOS = (1.0, 2.0)  #: clipped pixels of a pattern that are tried, over those of the frame
-_LEAST_SEPARATION = (1.5, 8e-9)  #: pixels and m, by which two candidates differ at least
+_PATTERN_REACH = 192  #: largest distance from the spot in pixels at which patterns are compared
+_CLIPPED_RATIOS = (1.0, 2.0)  #: numbers of clipped pixels that are tried, relative to the frame
+_LEAST_SEPARATION = (1.5, 8e-9)  #: pixels, m: two candidates differ by more in one of these
 
 
 class Candidate(NamedTuple):
-    """A place and a wavelength, and the log likelihood that one pattern there gains, roughly."""
+    """A place, a wavelength and a strength, with the approximate gain in log likelihood of such a
+    pattern.
+    """
 
     gain: float
     spot: tuple[float, float]  #: pixels from the middle of the frame
@@ -37,8 +39,8 @@ class Candidate(NamedTuple):
 
 
 class Templates(NamedTuple):
-    """Patterns on the axis, in windows of odd sides about the spot, with the response of each
-    channel to them.
+    """Patterns of spots on the optical axis, in windows of odd sides around the spot, with the
+    response of each channel.
     """
 
     wavelengths: Tensor  #: (line,) float64, m; 0 for light of many wavelengths
@@ -54,7 +56,7 @@ def line_templates(pupil: Pupil, responses: Tensor, bands: Bands, lens: Lens) ->
     line_responses = torch.stack(
         [response_at(x, responses.cpu().double(), bands) for x in wavelengths]
     )
-    # lines that the camera hardly sees tell nothing
+    # lines to which the camera hardly responds are left out
     wavelengths, line_responses = (
         wavelengths[line_responses.amax(1) > 0.01 * line_responses.max()],
         line_responses[line_responses.amax(1) > 0.01 * line_responses.max()],
@@ -85,7 +87,7 @@ def candidates(
     """Return the most likely places and wavelengths of one more pattern in a filtered residual,
     the best first.
     """
-    residual = residual.float()  # a start needs no more
+    residual = residual.float()  # precise enough for the start of a fit
     weights = Weights(*(x.float() for x in weights))
     white_residual, frame = weights(residual), residual.shape[-2:]
     peaks: list[Candidate] = []
@@ -120,14 +122,14 @@ def candidates(
 def clipped_candidates(
     picture: Tensor, full: float, use: Filter, weights: Weights, templates: Templates, count: int
 ) -> list[Candidate]:
-    """Return candidates for a pattern that the sensor clips, in a frame with clipped pixels at
-    ``full``.
+    """Return candidates for a pattern that the sensor clips, the best first; clipped pixels of the
+    frame have the value ``full``.
 
-    Each pattern is so strong that as many of its pixels are clipped as in the frame, or
-    `_CLIPPED_RATIOS` times as many, of which some lie beyond the frame. Each channel is clipped by
-    itself: those that hardly see a wavelength show more of its pattern.
+    The number of clipped pixels determines the strength of a pattern: the number in the frame times
+    each of `_CLIPPED_RATIOS` is tried, because some may lie beyond the frame. Each channel is
+    clipped separately: a channel with a low response shows more of the pattern.
     """
-    # the pattern must clip about as many pixels: that tells its strength
+    # clipped pixels from which hardly any light of known parts has been subtracted
     clipped = int((picture >= 0.98 * full).any(0).sum())
     picture, frame = picture.float(), picture.shape[-2:]
     weights = Weights(*(x.float() for x in weights))
@@ -135,7 +137,7 @@ def clipped_candidates(
     pairs = list(itertools.combinations_with_replacement(range(len(picture)), 2))
     weighted_spectra = torch.fft.rfft2(weights.twice(use.sharp(picture)), s=size)
     pair_spectra = torch.fft.rfft2(
-        # pairs of different channels count twice in a quadratic form
+        # a pair of different channels occurs twice in the quadratic form
         torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]),
         s=size,
     )
@@ -147,7 +149,7 @@ def clipped_candidates(
             (line_response / line_response.max()).to(picture),
             _level(pattern, round(margin * clipped)),
         )
-        # the pattern as a sensor would show it whose full well lies at the clip value
+        # the pattern as shown by a sensor that clips at 1
         sharp_pattern = use.sharp(
             (relative_response[:, None, None] * pattern.to(picture) / clip_value).clamp_max(1.0)
         )
@@ -171,12 +173,14 @@ def clipped_candidates(
 
 
 def _size(frame: torch.Size, pattern: Tensor) -> list[int]:
-    """Return the size of a periodic grid on which a frame and a pattern do not wrap around."""
+    """Return the size of the FFT for which the correlation of frame and pattern does not wrap
+    around.
+    """
     return [fft_length(n + k - 1) for n, k in zip(frame, pattern.shape[-2:], strict=True)]
 
 
 def _gain(product: Tensor, norm: Tensor) -> Tensor:
-    """Return the log likelihood that a pattern of the best strength >= 0 gains: product^2 / (2
+    """Return the gain in log likelihood of a pattern with its best strength >= 0: product^2 / (2
     norm).
     """
     return 0.5 * product.clamp_min(0.0).square() / (norm + 1e-6 * norm.max() + 1e-30)
@@ -188,8 +192,8 @@ def _level(pattern: Tensor, count: int) -> float:
 
 
 def _correlated(picture: Tensor, pattern: Tensor, size: list[int]) -> Tensor:
-    """Return the sum of picture x shifted pattern for every shift of the spot that lies in the
-    frame or near it.
+    """Return the cross-correlation of picture and pattern, for every place of the spot in the frame
+    or near it.
     """
     product = torch.fft.rfft2(picture, s=size) * torch.fft.rfft2(pattern, s=size).conj()
     result: Tensor = torch.fft.irfft2(product, s=size)
@@ -199,14 +203,14 @@ def _correlated(picture: Tensor, pattern: Tensor, size: list[int]) -> Tensor:
 def _peaks(
     gain: Tensor, strength: Tensor, line: float, pattern: Tensor, frame: torch.Size, count: int
 ) -> list[Candidate]:
-    """Return the largest gains with the spot within the frame."""
+    """Return the candidates of the largest gains whose spot lies within the frame."""
     rows, columns = (
-        # spot of the pattern in each row: its middle, wrapped around the grid
+        # a spot in row r has the shift r - k // 2, because the spot is the middle of the pattern
         (torch.arange(n, device=gain.device) - k // 2) % s
         for n, k, s in zip(frame, pattern.shape[-2:], gain.shape, strict=True)
     )
     gain_within, strength_within = gain[rows[:, None], columns], strength[rows[:, None], columns]
-    # more than asked for, because neighbours of a peak are left out
+    # 3 times as many, because neighbours of a peak are dropped
     best = torch.topk(gain_within.flatten(), min(3 * count, gain_within.numel()))
     spots = []
     for value, index in zip(best.values.tolist(), best.indices.tolist(), strict=True):
@@ -239,25 +243,25 @@ def _differ(a: Candidate, b: Candidate) -> bool:
 
 # --- nearest --------------------------------------------------------------------------------------
 
-# Where around a rough candidate a pattern gains most, with the clipped pixels left out as in the
-# fit.
+# The place and wavelength near a rough candidate at which a pattern gains most. Clipped pixels are
+# left out, as in the fit.
 
 
-#: pixels and nm around a candidate
+#: offsets from a candidate: in pixels (y and x), and in nm
 _HALVES, _NEAR = (-0.6, -0.3, 0.0, 0.3, 0.6), (-3.0, -1.5, 0.0, 1.5, 3.0)
-#: nm around a laser whose colours do not fit its wavelength
+#: offsets in nm from a laser whose responses are improbable at its wavelength
 FAR = tuple(1.5 * n for n in range(-10, 11))
-#: pixels around a tile, and of the tiles
+#: offsets in pixels from the centre of a tile, and of the tiles from a candidate
 _COARSE, _TILES = (-0.5, 0.0, 0.5), (-3.0, -1.5, 0.0, 1.5, 3.0)
-_COMPARED_SIDE = 256  #: pixels a side of the window in which these are compared
+_COMPARED_SIDE = 256  #: side in pixels of the window in which candidates are compared
 
 
 def nearest_of_many(camera: Camera, data: Data, residual: Tensor, start: Candidate) -> Candidate:
     """Return the best candidate within 3.5 pixels and 3 nm of a rough one; ``residual`` is
     filtered.
 
-    Clipped pixels tell the place of a wide pattern to a few pixels, and a pattern of fine rings
-    gains nothing where it is half a pixel off.
+    Clipped pixels give the place of a wide pattern only to a few pixels, and a pattern of fine
+    rings gains nothing if it is half a pixel off.
     """
     y, x = start.spot
     tiles = [
@@ -277,12 +281,12 @@ def nearest(
     halves: tuple[float, ...] = _HALVES,
     near: tuple[float, ...] = _NEAR,
 ) -> Candidate:
-    """Return the best of the candidates around one, because the rings far from a clipped spot are
-    narrow.
+    """Return the best candidate on a grid around ``start``: offsets ``halves`` (pixels) in y and x,
+    and ``near`` (nm).
 
-    Candidates are ``halves`` (pixels) away along y and along x, and ``near`` (nm); ``residual`` is
-    filtered. All channels count with the responses of the camera, so that a wrong wavelength gains
-    less than in a fit.
+    The grid is fine, because the rings far from a clipped spot are narrow. ``residual`` is
+    filtered. The channels have the exact responses of the camera, so that a wrong wavelength gains
+    less than in a fit, which has errors of responses.
     """
     window, middle = _window(residual, start.spot)
     local_filter = Filter(data.use.seen[..., *window], data.use.kernel)
@@ -312,7 +316,7 @@ def nearest(
             (light * white).sum((1, 2, 3)),
             light.square().sum((1, 2, 3)).clamp_min(1e-30),
         )
-        # log likelihood that a pattern of the best strength >= 0 gains
+        # gain in log likelihood of a pattern with its best strength >= 0
         gain = 0.5 * numerator.clamp_min(0.0).square() / denominator
         best_number = int(gain.argmax())
         if float(gain[best_number]) > best_candidate.gain:
@@ -328,8 +332,8 @@ def nearest(
 def _window(
     frame: Tensor, spot: tuple[float, float]
 ) -> tuple[tuple[slice, slice], tuple[int, int]]:
-    """Return the rows and columns of a frame around a spot that tell the candidates apart, and the
-    pixels (y, x) from the middle of the frame to that of this window.
+    """Return the rows and columns of the window around a spot, and the offset (y, x) in pixels from
+    the middle of the frame to the middle of the window.
     """
     window, middle = [], []
     for n, spot_place in zip(frame.shape[-2:], spot, strict=True):

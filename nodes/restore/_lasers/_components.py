@@ -1,4 +1,4 @@
-"""What adds light to a frame beside the scene: a laser of one line, a lamp of many bands."""
+"""Light sources in a frame besides the scene: a laser (one line) and a lamp (many bands)."""
 
 from __future__ import annotations
 
@@ -26,41 +26,41 @@ from neusee.nodes.values import Bands, Pupil
 
 # --- lamp light -----------------------------------------------------------------------------------
 
-# The light that a point source of many wavelengths adds to each channel, over the whole frame.
+# The light of a point source with a broad spectrum in each channel, over the whole frame.
 
 
-_TILT_SCALE = 50e-9  #: m, the scale of the tilt and the bend of a lamp's spectrum
+_TILT_SCALE = 50e-9  #: m, unit of the wavelength in the linear and quadratic spectra of a lamp
 _FINEST_SAMPLING, _MOST_SAMPLES = (
     4,
     4096,
-)  #: samples a pixel, and samples a side of a pattern, at most
-#: pixels beyond the farthest of the frame, over which a pattern fades, for a step rings when it is
-#: moved
+)  #: largest number of samples per pixel, and of samples along a side of a pattern
+#: pixels beyond the frame over which a pattern fades to 0: a sharp edge would ring when the pattern
+#: is shifted
 _RIM = 10
 
 
 class LampLight(NamedTuple):
-    """Patterns of a point source of many wavelengths: even, tilted and bent spectra, as each
-    channel sees them.
+    """Patterns of a broadband point source in each channel, for three kinds of spectrum: constant,
+    linear and quadratic in wavelength, relative to the illuminant.
     """
 
-    #: (kind, channel, fy, fx), half spectra on a torus, with the spot in its first sample
+    #: (kind, channel, fy, fx), Fourier transforms (`rfft2`) of the patterns on a periodic grid; the
+    #: spot is at its first sample
     spectra: Tensor
-    torus: tuple[int, int]  #: samples
-    finer: int  #: samples a pixel along each axis, enough for the finest detail of a pattern
+    torus: tuple[int, int]  #: size of the periodic grid in samples
+    finer: int  #: samples per pixel along each axis, for the finest fringe within the limits
     #: (channel,), electrons of each channel from the illuminant, relative to the largest
     colour: Tensor
-    patterns: Tensor  #: (channel, y, x) of the even spectrum, in pixels
+    patterns: Tensor  #: (channel, y, x), patterns of the constant spectrum, sampled in pixels
 
 
 def lamp_light(view: View, pupil: Pupil, lens: Lens, dtype: torch.dtype) -> LampLight:
-    """Return what a lamp adds to each channel, from a spot anywhere in the frame to every pixel.
+    """Return the patterns of a lamp in each channel, large enough for a spot anywhere in the frame.
 
-    A lamp that clips the sensor adds light farther from its spot than the window of the PSF
-    reaches, and its spot lies between pixels, where a pattern that is sampled by pixels cannot be
-    moved to. So the pattern is computed from ``pupil``, as that of a laser is, over the whole frame
-    and on a finer grid. What the PSF has beyond it within its window, such as stray light, is
-    added.
+    A lamp that clips the sensor adds light beyond the window of the PSF, and its spot lies between
+    pixels: a pattern that is sampled in pixels cannot be shifted there. So the pattern is computed
+    from ``pupil``, as for a laser, over the whole frame and on a finer grid. The difference between
+    the PSF and this pattern in the window of the PSF, such as stray light, is added.
     """
     psf, illuminant, responses, bands = view
     kinds = _kinds(illuminant, responses, bands).to(psf.intensity.device, dtype)
@@ -68,7 +68,7 @@ def lamp_light(view: View, pupil: Pupil, lens: Lens, dtype: torch.dtype) -> Lamp
     torus = (fft_length(2 * y + 1), fft_length(2 * x + 1))  # pixels
     fine_torus = (finer * torus[0], finer * torus[1])
     spectra = torch.fft.rfft2(_fine_patterns(kinds, pupil, lens, finer), s=fine_torus)
-    # the spot from the middle of the window to the first sample
+    # shift the spot from the middle of the window to the first sample
     spectra = spectra * phases(
         fine_torus, torch.tensor([-float(finer * y), -float(finer * x)]).to(kinds)
     )
@@ -97,7 +97,9 @@ def lamp_light(view: View, pupil: Pupil, lens: Lens, dtype: torch.dtype) -> Lamp
 
 
 def phases(torus: tuple[int, int], move: Tensor) -> Tensor:
-    """Return the factor of a half spectrum that moves a picture by (y, x) samples."""
+    """Return the phase factor (fy, fx) of an `rfft2` spectrum that shifts a picture by (y, x)
+    samples.
+    """
     y, x = torus
     fy, fx = torch.fft.fftfreq(y).to(move), torch.fft.rfftfreq(x).to(move)
     turns = fy[:, None] * move[0] + fx * move[1]
@@ -105,7 +107,7 @@ def phases(torus: tuple[int, int], move: Tensor) -> Tensor:
 
 
 def _kinds(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the share of each band in each channel for the three kinds of spectra: (kind,
+    """Return the weight of each band in each channel for the three kinds of spectrum: (kind,
     channel, band).
     """
     shares, centres = grey_shares(illuminant, responses, bands), bands.centres.cpu()
@@ -114,8 +116,8 @@ def _kinds(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 
 
 def _finer(pupil: Pupil, lens: Lens) -> int:
-    """Return how many samples a pixel the finest fringe of the lens asks for, within limits of
-    time and memory.
+    """Return the number of samples per pixel that the finest fringe of the lens needs, limited to
+    save time and memory.
     """
     pupil_width = max(int((pupil.aperture.amax(axis) > 0).sum()) for axis in (0, 1)) * float(
         pupil.pitch
@@ -133,8 +135,8 @@ def _finer(pupil: Pupil, lens: Lens) -> int:
 
 
 def _fine_patterns(kinds: Tensor, pupil: Pupil, lens: Lens, finer: int) -> Tensor:
-    """Return the patterns (kind, channel, y, x) with the spot in the middle sample, as the light
-    in each sample.
+    """Return the patterns (kind, channel, y, x) on the finer grid, as light per sample, with the
+    spot at the middle sample.
     """
     window_sides = tuple(2 * finer * (n + _RIM) + 1 for n in lens.shape)
     pitch = lens.pixel_pitch / finer
@@ -143,7 +145,7 @@ def _fine_patterns(kinds: Tensor, pupil: Pupil, lens: Lens, finer: int) -> Tenso
         band_pupil = pupil._replace(
             wavelengths=pupil.wavelengths[band][None], index=pupil.index[band][None]
         )
-        # samples
+        # width of the alias-free field in samples
         alias_free = (
             float(band_pupil.wavelengths[0]) * lens.focal_length / (float(pupil.pitch) * pitch)
         )
@@ -160,22 +162,22 @@ def _fine_patterns(kinds: Tensor, pupil: Pupil, lens: Lens, finer: int) -> Tenso
 
 
 def _fading(pixels: int, finer: int) -> Tensor:
-    """Return the factor of the samples along one axis, 1 as far as the frame reaches from any
-    spot in it.
+    """Return the fading factor of the samples along one axis: 1 up to the largest distance between
+    two pixels of the frame, then falling to 0.
     """
     distance = torch.arange(-finer * (pixels + _RIM), finer * (pixels + _RIM) + 1).abs() / finer
     return 0.5 + 0.5 * torch.cos(torch.pi * ((distance - pixels - 1) / (_RIM - 1)).clamp(0.0, 1.0))
 
 
 def _pixel(fine: tuple[int, int], finer: int, lens: Lens) -> Tensor:
-    """Return the factor of a half spectrum of the light in samples that makes it the light in
-    the pixel around each.
+    """Return the factor of an `rfft2` spectrum that converts light per sample to light per pixel
+    around each sample.
     """
-    if lens.sensor != "integrated":  # a pixel has the light of its middle, times its area
+    if lens.sensor != "integrated":  # irradiance at the centre of the pixel, times its area
         return torch.tensor(float(finer**2))
     sample_offsets = torch.arange(finer, dtype=torch.float64) - (finer - 1) / 2
     fy, fx = torch.fft.fftfreq(fine[0]).double(), torch.fft.rfftfreq(fine[1]).double()
-    # sum of the phases of the samples in a pixel, symmetric about its middle
+    # transfer function of the sum over the samples in a pixel, symmetric about its centre
     row_factor, column_factor = (
         torch.cos(2 * torch.pi * f[:, None] * sample_offsets).sum(1) for f in (fy, fx)
     )
@@ -183,8 +185,8 @@ def _pixel(fine: tuple[int, int], finer: int, lens: Lens) -> Tensor:
 
 
 def _beyond_pupil(inner: Tensor, coarse: Tensor) -> Tensor:
-    """Return what patterns have in their window beyond others of odd sides, in the size of the
-    latter.
+    """Return the patterns ``inner`` minus the patterns ``coarse``, in the size of ``coarse``; 0
+    outside the window of ``inner``.
     """
     sides = coarse.shape[-2:]
     inside = _framed(torch.ones_like(inner), sides) > 0
@@ -192,8 +194,8 @@ def _beyond_pupil(inner: Tensor, coarse: Tensor) -> Tensor:
 
 
 def _between_pixels(spectra: Tensor, torus: tuple[int, int], finer: int) -> Tensor:
-    """Return half spectra of pictures in pixels as those of the smoothest pictures on the finer
-    grid.
+    """Return `rfft2` spectra on the finer grid, from those of pictures in pixels (Fourier
+    interpolation).
     """
     (y, x), columns = torus, (torus[1] + 1) // 2
     fine_spectra = spectra.new_zeros(*spectra.shape[:-2], finer * y, finer * x // 2 + 1)
@@ -201,16 +203,16 @@ def _between_pixels(spectra: Tensor, torus: tuple[int, int], finer: int) -> Tens
     fine_spectra[..., finer * y - (y - 1) // 2 :, :columns] = spectra[
         ..., y - (y - 1) // 2 :, :columns
     ]
-    # an FFT on a finer grid sums over so many more samples
+    # a transform on the finer grid sums over finer^2 times as many samples
     return fine_spectra * finer**2
 
 
 def _framed(picture: Tensor, sides: tuple[int, ...]) -> Tensor:
-    """Return pictures (..., y, x), cropped or continued with 0, whose middle pixel stays in the
-    middle.
+    """Return pictures (..., y, x), cropped or padded with 0 to the given sides; the middle pixel
+    stays in the middle.
     """
     rims = []
-    # `pad` counts from the last axis
+    # `pad` starts with the last axis
     for n, side in zip(picture.shape[:-3:-1], sides[::-1], strict=True):
         rims += [side // 2 - n // 2, side - side // 2 - (n - n // 2)]
     return pad(picture, rims)
@@ -218,21 +220,22 @@ def _framed(picture: Tensor, sides: tuple[int, ...]) -> Tensor:
 
 # --- components -----------------------------------------------------------------------------------
 
-# What adds light to a frame beside the scene: a laser, of one spectral line, and a lamp, of light
-# in many bands.
+# The light sources in a frame besides the scene: a laser (one spectral line) and a lamp (many
+# bands).
 
 
 NANOMETRE = 1e-9
-#: nm^2, standard deviation of the variance of a line, or that variance itself where it is more
+#: nm^2, smallest prior standard deviation of the variance of a line; it is the nominal variance
+#: itself if that is larger
 _WIDTH = 0.5
-_WIDEST_VARIANCE = 50.0  #: nm^2, most that is added to the variance of a line
+_WIDEST_VARIANCE = 50.0  #: nm^2, largest addition to the variance of a line
 _RESPONSE_ERROR = 0.03  #: relative standard deviation of the response of a channel to one line
-#: the same as a share of the largest response, for a channel that hardly sees the line
+#: further standard deviation relative to the largest response, for channels with a low response
 _BLIND = 0.003
 
 
 class Camera(NamedTuple):
-    """What is known of the camera, on one device in float64."""
+    """The known properties of the camera."""
 
     pupil: Pupil
     responses: Tensor  #: (channel, band)
@@ -243,24 +246,27 @@ class Camera(NamedTuple):
 
 @dataclass(frozen=True)
 class Laser:
-    """A laser: place (y, x) of the spot in pixels from the middle, wavelength in nm, strength,
-    width, errors.
+    """A laser: place of the spot, wavelength, strength, width of the line, and errors of the
+    channel responses.
     """
 
     camera: Camera
-    #: (5 + channel,): y, x, nm, electrons at response 1, nm^2 of the variance of the line beyond
-    #: that of the camera's ``fwhm``, and the errors of the responses over their spread
+    #: (5 + channel,): y and x (pixels from the middle), wavelength (nm), electrons at response 1,
+    #: variance of the line minus the variance for the camera's ``fwhm`` (nm^2), and the errors of
+    #: the responses in standard deviations
     values: Tensor
 
     @property
     def precision(self) -> Tensor:
-        """Return the prior precision of each value."""
+        """Return the prior precision (1 / variance) of each value; 0 for a value without a
+        prior.
+        """
         width = torch.tensor([max(self._variance(), _WIDTH) ** -2])
         return torch.cat([torch.zeros(4), width, torch.ones(len(self.values) - 5)]).to(self.values)
 
     @property
     def fwhm(self) -> Tensor:
-        """Return the width of the line in m, at half maximum: () float64."""
+        """Return the full width at half maximum of the line in m: () float64."""
         variance = (self._variance() + self.values[4].double()).clamp_min(0.0)
         return self.camera.fwhm * (variance / self._variance()).sqrt()
 
@@ -272,18 +278,18 @@ class Laser:
         return self.channels()[:, None, None] * self._pattern(self.values[:3])
 
     def channels(self) -> Tensor:
-        """Return the electrons of each channel over the whole pattern."""
+        """Return the electrons (channel,) of the whole pattern in each channel."""
         response, spread = self._response(self.values[2])
         return self.values[3] * (response + spread * self.values[5:])
 
     def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return ``of`` of the change of the light for a unit change of each value: (value,
+        """Return ``of`` applied to the derivative of the light with respect to each value: (value,
         channel, ...).
 
-        ``of`` is linear, treats each channel by itself, and takes pictures (picture, 1 or channel,
-        y, x).
+        ``of`` is linear, acts on each channel separately, and takes pictures (picture, 1 or
+        channel, y, x).
         """
-        # one picture for all channels before, one for each after
+        # the patterns are the same in all channels; `of` returns one result for each channel
         filtered = of(self._slopes()[:, None])
         ones = (1,) * (filtered.ndim - 2)
         channels = self.channels().view(-1, *ones)
@@ -306,8 +312,8 @@ class Laser:
         return torch.stack(columns)
 
     def _slopes(self) -> Tensor:
-        """Return the pattern and its change with y, x (pixels), wavelength (nm) and variance
-        (nm^2): (5, y, x).
+        """Return the pattern and its derivatives with respect to y, x (pixels), wavelength (nm) and
+        variance of the line (nm^2): (5, y, x).
         """
         camera, place = self.camera, self.values[:3].double()
         moves = line_moves(camera.pupil, place[:2], place[2] * NANOMETRE, camera.lens, self.fwhm)
@@ -315,10 +321,11 @@ class Laser:
         return torch.stack(list(moves)).to(self.values)
 
     def moved(self, step: Tensor) -> Laser:
-        """Return the laser after a step, which stays in the range of the bands and near the
-        frame.
+        """Return the laser after a step; its wavelength is limited to the bands, and its spot to
+        the frame and 1 pixel around it.
         """
         centres, shape = self.camera.bands.centres / NANOMETRE, self.camera.lens.shape
+        # pixels, pixels and nm: the linear model of a Gauss-Newton step holds only near the fit
         longest_step = torch.tensor([1.0, 1.0, 5.0]).to(step)
         step = torch.cat(
             [torch.maximum(torch.minimum(step[:3], longest_step), -longest_step), step[3:]]
@@ -332,8 +339,8 @@ class Laser:
         return replace(self, values=values)
 
     def channel_slopes(self) -> Tensor:
-        """Return the change of the electrons of each channel for a unit change of each value:
-        (channel, value).
+        """Return the derivatives (channel, value) of the electrons of each channel with respect to
+        each value.
         """
         response, spread = self._response(self.values[2])
         slopes = torch.zeros(len(response), len(self.values)).to(self.values)
@@ -348,16 +355,18 @@ class Laser:
         return response, _RESPONSE_ERROR * response + _BLIND * self.camera.responses.max()
 
     def _response_slope(self) -> Tensor:
-        """Return the change of each channel's electrons with wavelength, by nm: a central
-        difference.
+        """Return the derivative of the electrons of each channel with respect to wavelength, per
+        nm, as a central difference.
         """
         responses = [self._response(self.values[2] + sign)[0] for sign in (1, -1)]
         return self.values[3] * (responses[0] - responses[1]) / 2.0
 
     def _pattern(self, place: Tensor) -> Tensor:
-        """Return the share (y, x) of the light in each pixel, for y, x in pixels and nm."""
+        """Return the fraction (y, x) of the light in each pixel, for a place (y and x in pixels,
+        wavelength in nm).
+        """
         lens = self.camera.lens
-        place = place.double()  # phases need that
+        place = place.double()  # phases of many turns need float64
         direction = place[:2] * (lens.pixel_pitch / lens.focal_length)
         pattern = line_pattern(self.camera.pupil, direction, place[2] * NANOMETRE, lens, self.fwhm)
         return pattern.to(self.values)
@@ -365,17 +374,17 @@ class Laser:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp: place (y, x) of its spot in pixels from the middle, and electrons in each channel
-    by kind of spectrum.
-    """
+    """A lamp: place of its spot, and electrons in each channel for each kind of spectrum."""
 
     light: LampLight
     shape: tuple[int, int]
-    values: Tensor  #: (2 + kind x channel,)
+    #: (2 + kind x channel,): y and x (pixels from the middle), then the electrons of each kind and
+    #: channel
+    values: Tensor
 
     @property
     def precision(self) -> Tensor:
-        """Return the prior precision of each value: none."""
+        """Return the prior precision of each value: 0, because a lamp has no prior."""
         return torch.zeros_like(self.values)
 
     def electrons(self) -> Tensor:
@@ -383,10 +392,10 @@ class Lamp:
         return self._pictures(self._spectra())
 
     def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return ``of`` of the change of the light for a unit change of each value: (value,
+        """Return ``of`` applied to the derivative of the light with respect to each value: (value,
         channel, ...).
 
-        ``of`` is linear, treats each channel by itself, and takes pictures (picture, channel, y,
+        ``of`` is linear, acts on each channel separately, and takes pictures (picture, channel, y,
         x).
         """
         kinds, channels = self.light.spectra.shape[:2]
@@ -394,13 +403,14 @@ class Lamp:
         amounts = filtered.new_zeros(kinds * channels, *filtered.shape[1:])
         for k in range(kinds):
             for c in range(channels):
-                # an amount of a kind changes its own channel alone; the first two are y and x
+                # the amount of a kind in a channel changes only this channel; indices 0 and 1 are
+                # the derivatives with respect to y and x
                 amounts[k * channels + c, c] = filtered[2 + k, c]
         return torch.cat([filtered[:2], amounts])
 
     def _slopes(self) -> Iterator[Tensor]:
-        """Yield the spectra of the changes with y, x (pixels) and each kind, one after another
-        to save memory.
+        """Yield the spectra of the derivatives with respect to y, x (pixels) and each kind, one by
+        one to save memory.
         """
         (y, x), spectra = self.light.torus, self._spectra()
         fy, fx = (
@@ -413,25 +423,29 @@ class Lamp:
             yield kind * self._phase()
 
     def moved(self, step: Tensor) -> Lamp:
-        """Return the lamp after a step of at most a pixel."""
+        """Return the lamp after a step; its spot moves by at most 1 pixel along each axis."""
         values = self.values + torch.cat([step[:2].clamp(-1.0, 1.0), step[2:]])
         for i in range(2):
             values[i] = values[i].clamp(-0.5 * self.shape[i] - 1, 0.5 * self.shape[i] + 1)
         return replace(self, values=values)
 
     def _spectra(self) -> Tensor:
-        """Return the spectra (channel, fy, fx) of the lamp's light, with its spot in place."""
+        """Return the `rfft2` spectra (channel, fy, fx) of the light of the lamp, with its spot in
+        place.
+        """
         amount_by_kind = self.values[2:].view(len(self.light.spectra), -1, 1, 1)
         return (amount_by_kind * self.light.spectra).sum(0) * self._phase()
 
     def _phase(self) -> Tensor:
-        """Return the factor (fy, fx) that moves a spot from the first sample to its place."""
+        """Return the phase factor (fy, fx) that shifts a spot from the first sample to its
+        place.
+        """
         middle_pixel = torch.tensor([self.shape[0] // 2, self.shape[1] // 2]).to(self.values)
         return phases(self.light.torus, self.light.finer * (self.values[:2] + middle_pixel))
 
     def _pictures(self, spectra: Tensor) -> Tensor:
-        """Return the pictures (..., y, x) of half spectra on the torus of fine samples: one sample
-        of each pixel of the frame.
+        """Return the pictures (..., y, x) in pixels, from `rfft2` spectra on the finer grid: every
+        ``finer``-th sample.
         """
         samples_per_pixel, (y, x) = self.light.finer, self.light.torus
         rows = torch.fft.ifft(spectra, n=y, dim=-2)[

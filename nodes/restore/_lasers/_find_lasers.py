@@ -1,4 +1,4 @@
-"""The nodes that find lasers in a frame of a known camera, and the glare of those found."""
+"""Nodes that find lasers in a frame of a known camera, and compute the glare of these lasers."""
 
 from __future__ import annotations
 
@@ -23,37 +23,40 @@ from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 
 # --- lost light -----------------------------------------------------------------------------------
 
-# The light of a laser at the aperture, from the light that follows its pattern: dirt scatters and
-# absorbs the rest.
+# Estimates the light of a laser at the aperture from the light that is found in its diffraction
+# pattern ("straight" light). Dirt scatters and absorbs the rest.
 #
-# No lens is as its recipe says. Dust, scratches, grease, dents and defocus take light out of the
-# pattern, and what they scatter makes the frame differ from the pattern. A fit then finds less
-# light in the pattern, and even less where bright pixels are clipped, because the pixels that are
-# seen are those that happen to be dark. The same difference makes the electrons of a fit scatter
-# more between parts of the frame than noise and scene do, and so tells of the light that is lost.
+# A real lens deviates from its recipe. Dust, scratches, grease, dents and defocus take light out of
+# the pattern, and the scattered light makes the frame differ from the pattern. A fit then finds
+# less light in the pattern, and even less where bright pixels are clipped, because the unclipped
+# pixels are those that happen to be dark. For the same reason, the fitted electrons vary more
+# between parts of the frame than noise and scene explain. This excess variation ("scatter" below)
+# is a measure of the lost light.
 #
-# The law: every second lens is as its recipe says. In the others the logarithm of light at the
-# aperture over light that follows the pattern is lognormal, about a power of that scatter and an
-# exponential of the clipped share. Power, exponential and width were learnt from fits in frames of
-# lenses with the dirt of `recipes/flare/dirty_windshield.yaml` (dust, scratches, grease and dents,
-# each 3 to 100 % of it) and the defocus of `recipes/mismatch/usual.yaml`. An even attenuation, as
-# by smudges, changes no pattern and is not part of it.
+# The prior distribution: half of the lenses are as their recipe says. For the others, let L be the
+# logarithm of (light at the aperture / light in the pattern). L has a lognormal distribution. Its
+# median is a power of the scatter, times an exponential of the clipped fraction. Power, exponential
+# and width were fitted to frames of lenses with the dirt of `recipes/flare/dirty_windshield.yaml`
+# (dust, scratches, grease and dents, each 3 to 100 % of it) and the defocus of
+# `recipes/mismatch/usual.yaml`. An even attenuation, as by smudges, changes no pattern and is not
+# included.
 
 
-#: growth of a standard deviation by the scatter of a residual, up to which a clean lens explains it
+#: largest ratio of the robust to the ideal standard deviation that a clean lens explains
 _CLEAN_LENS_GROWTH = 1.05
-#: pixels a side of the frame for which a scatter counts, and of the largest frame of which all
-#: pixels tell of it
+#: side (pixels) of the frame to which a scatter is scaled, and side of the largest frame whose
+#: pixels all add to the estimate of the scatter
 _SCATTER_SIDE, _SAMPLED_SIDE = 64, 128
-#: relative scatter of electrons behind a dirty lens: median, factor of one deviation
+#: relative scatter of the electrons behind a dirty lens: median, and factor of one standard
+#: deviation (lognormal)
 _USUAL_SCATTER, _SCATTER_FACTOR = 0.004, 2.0
-#: of the median logarithm that is lost: its value at scatter 1, the power of scatter, and its
-#: growth with clipping
+#: median of L: its value at scatter 1 without clipping, its power of the scatter, and its
+#: exponential growth with the clipped fraction
 _LOST_LOGARITHM, _SCATTER_POWER, _CLIPPING_GROWTH = 2.10, 0.74, 2.15
-#: standard deviations of the logarithm of it, where the frame tells the scatter, and where not
+#: standard deviations of log L: if the scatter is measurable, and if not
 _LOST_DEVIATIONS = (0.7, 1.2)
-_ALL_LOST = 10.0  #: logarithm, beyond which nothing of a laser follows its pattern
-_LAW_QUANTILES = 256  #: quantiles that stand for a law
+_ALL_LOST = 10.0  #: largest L: above it, hardly any light of a laser is in its pattern
+_LAW_QUANTILES = 256  #: number of quantiles that represent a distribution
 #: probabilities of an estimate and of the ends of a 90 % interval
 _INTERVAL_PROBABILITIES = (0.5, 0.05, 0.95)
 _HALVINGS = 60
@@ -62,24 +65,25 @@ _HALVINGS = 60
 def at_the_aperture(
     straight: Tensor, spread: Tensor, ideal: Tensor, unclipped: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the electrons that a laser would leave behind a clean lens, and the ends of a 90 %
-    interval.
+    """Return an estimate of the electrons that a laser would give behind a clean lens, and the ends
+    of its 90 % interval.
 
-    ``straight`` are those that follow the pattern, with the standard deviation ``spread``; that of
-    a lens which is as its recipe says would be ``ideal``.
+    ``straight`` are the electrons in the pattern, and ``spread`` is their standard deviation.
+    ``ideal`` is the standard deviation for a lens that is as its recipe says.
 
-    Shapes: each (channel,), seen (channel, y, x), 0 for clipped pixels -> (channel,), (channel, 2).
+    Shapes: each (channel,), unclipped (channel, y, x), 0 for clipped pixels -> (channel,),
+            (channel, 2).
     Units:  e-.
     """
-    # the scatter is a mean over the frame, so that it falls as 1 / side
+    # the scatter is that of a mean over the frame, so that it falls as 1 / side
     side = min(unclipped[0].numel() ** 0.5, _SAMPLED_SIDE)
     clipped = 1.0 - unclipped.mean((-2, -1)).to(straight)
     electrons = torch.maximum(straight, spread).clamp_min(1e-30) * (_SCATTER_SIDE / side)
     scatter = (spread.square() - ideal.square()).clamp_min(0.0).sqrt() / electrons
-    # the least scatter that shows: it lets the deviation grow by `_CLEAN_LENS_GROWTH`
+    # the smallest measurable scatter: it increases the deviation by `_CLEAN_LENS_GROWTH`
     least_scatter = math.sqrt(_CLEAN_LENS_GROWTH**2 - 1.0) * ideal / electrons
     measurable = scatter > least_scatter
-    # a dirty lens whose scatter does not show, over a clean one; both as likely before
+    # odds of a dirty lens whose scatter is not measurable against a clean lens; prior odds are 1
     dirty_odds = torch.special.ndtr(
         (least_scatter / _USUAL_SCATTER).log() / math.log(_SCATTER_FACTOR)
     )
@@ -88,7 +92,7 @@ def at_the_aperture(
     )
     scatter = torch.where(measurable, scatter, least_scatter.clamp_max(_USUAL_SCATTER))
     width = torch.where(measurable, _LOST_DEVIATIONS[0], _LOST_DEVIATIONS[1])
-    # see the law above: a power of the scatter, an exponential of the clipped share
+    # see above: a power of the scatter, times an exponential of the clipped fraction
     log_of_median = (
         math.log(_LOST_LOGARITHM) + _SCATTER_POWER * scatter.log() + _CLIPPING_GROWTH * clipped
     )
@@ -108,13 +112,13 @@ def _normal_quantiles() -> Tensor:
 def _quantiles(
     straight: Tensor, spread: Tensor, lost: Tensor, dirty: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the median and a 90 % interval of straight light with its error, times the exponential
-    of what is lost.
+    """Return the median and a 90 % interval of the light at the aperture: ``straight`` times
+    exp(loss), with the normal error ``spread``.
 
-    ``lost`` (channel, node) are equally likely values for a dirty lens, ``dirty`` (channel,) is its
-    probability.
+    ``lost`` (channel, node) are equally probable losses of a dirty lens; a clean lens has no loss.
+    ``dirty`` (channel,) is the probability of a dirty lens.
     """
-    # the first strength is that of a clean lens: nothing is lost
+    # the first strength is that of a clean lens, without loss
     strengths = straight[:, None] * torch.cat([torch.ones_like(lost[:, :1]), lost.exp()], 1)
     probability_of_strength = torch.cat(
         [1.0 - dirty[:, None], (dirty / lost.shape[1])[:, None].expand_as(lost)], 1
@@ -122,7 +126,7 @@ def _quantiles(
     probabilities = torch.tensor(_INTERVAL_PROBABILITIES).to(strengths).expand(len(strengths), -1)
     low = (strengths.amin(1) - 8.0 * spread)[:, None].expand_as(probabilities)
     high = (strengths.amax(1) + 8.0 * spread)[:, None].expand_as(probabilities)
-    # bisection: the distribution is a mixture of normal ones, without an inverse
+    # bisection: the distribution function of a mixture of normals has no closed inverse
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         share_below = torch.special.ndtr(
@@ -141,15 +145,17 @@ def _quantiles(
 # The node that finds lasers in one frame of a known camera, without any knowledge of the lasers.
 
 
-_WIDEST_INTERVAL = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
-#: log likelihood by which the fit exceeds one at another place or wavelength, to identify
+#: pixels and nm: largest half width of an interval for which a laser counts as identified
+_WIDEST_INTERVAL = (0.5, 10.0)
+#: smallest lead in log likelihood over a fit at another place or wavelength, for which a laser
+#: counts as identified
 _RIVAL = 5.0
 _CHANNELS, _SMALLEST = (1, 3), 20
 _COLOURS = (
     "lasers are found in a frame of 3 colour channels (3, y, x), or of one: give such a camera, or"
     " restore without a search, as `restore=wiener_blind` does"
 )
-_PRECISE_SIDE = 256  #: pixels a side, up to which all is computed in float64
+_PRECISE_SIDE = 256  #: largest side in pixels of a frame that is computed in float64
 
 
 Widths = Annotated[tuple[PositiveLength, ...], Field(min_length=1, max_length=8)]
@@ -244,9 +250,7 @@ def find_lasers(
 
 @find_lasers.preflight
 def _(*, responses: Any = None, **_: Any) -> list[str]:
-    """Refuse a camera of another number of channels, where its responses are known before the
-    run.
-    """
+    """Refuse a camera unless it has 1 or 3 channels, if its responses are known before the run."""
     if responses is not None and len(responses) not in _CHANNELS:
         raise ParameterError(
             "responses.camera", f"the camera has {_channel_count(len(responses))}: {_COLOURS}"
@@ -286,8 +290,8 @@ def _(
 def _refuse(
     electrons: Tensor, clipped: Tensor, psf: Psf, pupil: Pupil, responses: Tensor, bands: Bands
 ) -> None:
-    """Raise ValueError unless frame, camera and bands fit each other, are finite, and are of a kind
-    in which lasers can be found.
+    """Raise ValueError unless shapes and bands of frame and camera agree, the pupil is finite, and
+    the frame has 1 or 3 channels and enough pixels.
     """
     if electrons.ndim != 3 or len(electrons) not in _CHANNELS:
         raise ValueError(f"electrons {tuple(electrons.shape)}: {_COLOURS}")
@@ -312,7 +316,7 @@ def _channel_count(channels: int) -> str:
 
 
 def _table(search_result: Found, frame: Known, rows: int) -> FoundLasers:
-    """Return what was found in SI units, the laser of the largest gain first."""
+    """Return the found lasers in SI units, in the order of decreasing gain."""
     laser_indices = [
         n for n, component in enumerate(search_result.fit.parts) if isinstance(component, Laser)
     ]
@@ -325,7 +329,7 @@ def _table(search_result: Found, frame: Known, rows: int) -> FoundLasers:
     for row, n in enumerate(rows_by_gain):
         laser = search_result.fit.parts[laser_indices[n]]
         assert isinstance(laser, Laser)
-        # y and x in pixels, wavelength in nm, electrons of each channel
+        # values: y and x in pixels, wavelength in nm, then the electrons of each channel
         values = torch.cat([laser.values[:3], laser.channels()]).cpu().double()
         covariance = spread[n].covariance.cpu().double()
         half_interval = NORMAL * covariance.diagonal().sqrt()
@@ -348,7 +352,7 @@ def _table(search_result: Found, frame: Known, rows: int) -> FoundLasers:
         result.strength[row], result.strength_interval[row] = at_the_aperture(
             *strength_and_deviations, frame.seen.cpu()
         )
-        # the intervals of place and wavelength must also be narrow, see `_WIDEST_INTERVAL`
+        # identified: no rival, and narrow intervals of place and wavelength
         choice = search_result.choices[laser_indices[n]]
         without_rival = choice.rival > _RIVAL
         result.identifiable[row, 0] = (
@@ -365,7 +369,7 @@ def _table(search_result: Found, frame: Known, rows: int) -> FoundLasers:
 
 
 def _empty(rows: int, channels: int) -> FoundLasers:
-    """Return a table of ``rows`` lasers, none of which is found: all 0."""
+    """Return a table with ``rows`` empty rows: all values are 0 and no laser is found."""
     shapes = ((2,), (), (), (channels,), (2, 2), (2,), (channels, 2))
     tables = [torch.zeros(rows, *shape, dtype=torch.float64) for shape in shapes]
     identifiable = torch.zeros(rows, 2, dtype=torch.bool)
@@ -402,7 +406,7 @@ def _empty(rows: int, channels: int) -> FoundLasers:
 
 # --- found glare ----------------------------------------------------------------------------------
 
-# The glare of a laser that was found in a frame, and other patterns that it may have.
+# The glare of a laser that was found in a frame, and random patterns from its distribution.
 
 
 Rank = Annotated[int, Field(ge=1, le=8)]
@@ -501,8 +505,8 @@ def _(
 
 
 def _drawn(lasers: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
-    """Return draws (draw, value) of direction, wavelength and the strength of each channel of
-    one found laser.
+    """Return draws (draw, value) of direction, wavelength and electrons of each channel from the
+    normal distribution of a found laser.
     """
     most_likely = torch.cat(
         [lasers.direction[row], lasers.wavelength[row][None], lasers.straight[row]]
@@ -510,12 +514,12 @@ def _drawn(lasers: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
     intervals = (lasers.direction_interval[row], lasers.wavelength_interval[row][None])
     spread = torch.cat(
         [
-            # a 90 % interval is `NORMAL` deviations wide on each side
+            # a 90 % interval extends `NORMAL` standard deviations to each side
             *((ends[:, 1] - ends[:, 0]) / (2 * NORMAL) for ends in intervals),
             lasers.straight_spread[row],
         ]
     )
-    # the factor reads one triangle alone
+    # `cholesky` reads one triangle alone; 1e-9 lets a singular matrix be factored
     symmetric = (lasers.correlation[row] + lasers.correlation[row].mT) / 2
     lower_factor = torch.linalg.cholesky(symmetric + 1e-9 * torch.eye(len(symmetric)).to(symmetric))
     normal_numbers = torch.randn(
@@ -526,7 +530,7 @@ def _drawn(lasers: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
 
 
 def _agree(lasers: FoundLasers, electrons: Tensor) -> None:
-    """Raise ValueError unless the frame has the channels of the lasers that were found in it."""
+    """Raise ValueError unless the frame has as many channels as the found lasers."""
     if electrons.ndim != 3 or len(electrons) != lasers.strength.shape[-1]:
         raise ValueError(
             f"electrons {tuple(electrons.shape)} and found lasers of {lasers.strength.shape[-1]}"

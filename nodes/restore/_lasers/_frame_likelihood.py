@@ -1,5 +1,5 @@
-"""The likelihood of a frame given lasers and lamps: whitened residual, clipped pixels, and the most
-likely values with their intervals.
+"""The likelihood of a frame given lasers and lamps: whitened residual, clipped pixels, maximum
+likelihood fit and intervals.
 """
 
 from __future__ import annotations
@@ -16,39 +16,42 @@ from neusee.nodes.restore._lasers._components import NANOMETRE, Lamp, Laser
 
 # --- whitening ------------------------------------------------------------------------------------
 
-# A linear filter that makes the residual of a frame nearly white, so that squares of it can be
-# compared.
+# A linear filter that makes the residual of a frame nearly white, so that half its sum of squares
+# is a negative log likelihood.
 #
 # Clipped pixels are filled from their neighbours, a short filter removes the smooth part of the
-# scene, and each pixel is divided by what its neighbourhood says of noise and of details of the
-# scene. The same filter acts on every pattern, so that filling makes no error of its own.
+# scene, and each pixel is divided by a local standard deviation of noise and of details of the
+# scene. The same filter acts on every pattern, so that the filling causes no error of the model.
+# "Seen" pixels are those that are not clipped.
 
-_FILTER_RADIUS = 8  #: pixels, of the filter
-_DETAIL_WINDOW = 9  #: pixels a side, over which the variance of details is averaged
-_NOISE_WINDOW = 5  #: pixels a side, over which the mean that photon noise follows is averaged
-_UNSEEN_VARIANCE = 1e12  #: e-^2, variance that stands for a pixel that is not seen
-FILLED_VARIANCE = 0.3  #: variance of a filled pixel, as a share of that of the channel
-_LEAST_DETAIL = 0.05  #: variance of details at a pixel, as a share of that of the frame
+_FILTER_RADIUS = 8  #: radius of the filter, pixels
+_DETAIL_WINDOW = 9  #: side in pixels of the window for the local variance of details
+_NOISE_WINDOW = 5  #: side in pixels of the window for the local mean, the variance of photon noise
+_UNSEEN_VARIANCE = 1e12  #: e-^2, variance of a clipped pixel, which gives it no weight
+FILLED_VARIANCE = 0.3  #: variance of a filled pixel, relative to the variance of its channel
+_LEAST_DETAIL = 0.05  #: smallest variance of details at a pixel, relative to the mean of the frame
 
 
 class Weights(NamedTuple):
-    """The inverse root of the covariance of the three channels in each pixel: diagonal, and one
-    colour of details.
+    """The inverse square root of the covariance of the channels in each pixel.
+
+    The covariance is a diagonal matrix (noise) plus a matrix of rank one: details of the scene that
+    all channels share, in one colour.
     """
 
-    diagonal: Tensor  #: (channel, y, x), 1 / standard deviation of each channel by itself
-    grey: Tensor  #: (channel, y, x), details that all channels share, over the former
-    share: Tensor  #: (1, y, x), factor of the product of the two
+    diagonal: Tensor  #: (channel, y, x), 1 / standard deviation of the diagonal part
+    grey: Tensor  #: (channel, y, x), standard deviation of the shared details, times ``diagonal``
+    share: Tensor  #: (1, y, x), factor of the matrix ``grey grey^T`` in the inverse square root
 
     def __call__(self, filtered: Tensor) -> Tensor:
-        """Return filtered pictures (..., channel, y, x) as numbers of mean 0 and variance 1."""
+        """Return filtered pictures (..., channel, y, x), scaled to mean 0 and variance 1."""
         scaled = self.diagonal * filtered
-        # (D^2 + s s')^(-1/2) applied for all channels, up to a rotation: one shared colour s
+        # (D^2 + s s^T)^(-1/2), up to a rotation: D is diagonal, s is the shared colour
         return scaled - self.grey * (self.share * (self.grey * scaled).sum(-3, keepdim=True))
 
     def twice(self, filtered: Tensor) -> Tensor:
-        """Return the product of these weights' transpose and of what they make of filtered
-        pictures.
+        """Return W^T W applied to filtered pictures, where W are these weights: the inverse
+        covariance.
         """
         white = self(filtered)
         return self.diagonal * (
@@ -56,7 +59,7 @@ class Weights(NamedTuple):
         )
 
     def pair(self, first: int, other: int) -> Tensor:
-        """Return the element (y, x) of the inverse covariance for two channels."""
+        """Return the element of the inverse covariance for two channels, for each pixel (y, x)."""
         shared_square = self.grey.square().sum(0)
         shared_part = (
             (2.0 - self.share[0] * shared_square)
@@ -68,31 +71,31 @@ class Weights(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """Fill the pixels that are not seen from their neighbours, then remove what is smooth."""
+    """A filter that fills clipped pixels from their neighbours, then removes the smooth part."""
 
     seen: Tensor  #: (channel, y, x), 1 or 0
     kernel: Tensor  #: (side, side), symmetric
 
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return pictures (..., channel, y, x), or (..., 1, y, x) of the same values in each
-        channel, filtered.
+        """Return filtered pictures (..., channel, y, x); a picture (..., 1, y, x) has the same
+        values in each channel.
         """
         return self.sharp(filled(pictures, self.seen))
 
     def sharp(self, pictures: Tensor) -> Tensor:
-        """Return whole pictures (..., y, x) of any size without what is smooth."""
+        """Return pictures (..., y, x) of any size without their smooth part; no pixel is filled."""
         return _convolved(pictures, self.kernel.to(pictures))
 
     def squared(self, variances: Tensor) -> Tensor:
-        """Return the variance of filtered pictures, given that of independent pixels: (channel,
-        y, x).
+        """Return the variance (channel, y, x) of the filtered pixels, from the variance of
+        independent pixels.
         """
         return _convolved(variances, self.kernel.to(variances).square())
 
 
 def _convolved(pictures: Tensor, kernel: Tensor) -> Tensor:
-    """Return pictures (..., y, x), continued as in a mirror, convolved with a symmetric kernel
-    of odd sides.
+    """Return the convolution of pictures (..., y, x) with a symmetric kernel of odd sides; the
+    pictures are mirrored at their edges.
     """
     flat = pictures.reshape(-1, *pictures.shape[-2:])
     rim = len(kernel) // 2
@@ -100,7 +103,7 @@ def _convolved(pictures: Tensor, kernel: Tensor) -> Tensor:
     size = [fft_length(n) for n in padded.shape[-2:]]
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
     y, x = pictures.shape[-2:]
-    # the kernel's middle is `rim` in, and the padding another `rim`
+    # the offset of the result is `rim` for the middle of the kernel and `rim` for the padding
     inner: Tensor = torch.fft.irfft2(product, s=size)[
         :, 2 * rim : 2 * rim + y, 2 * rim : 2 * rim + x
     ]
@@ -108,8 +111,8 @@ def _convolved(pictures: Tensor, kernel: Tensor) -> Tensor:
 
 
 def filled(pictures: Tensor, unclipped: Tensor) -> Tensor:
-    """Return pictures (..., channel, y, x) in which pixels that are not seen follow the pixels
-    around them.
+    """Return pictures (..., channel, y, x) in which clipped pixels are interpolated from the
+    pixels around them.
     """
     pictures_by_channel = pictures.expand(*pictures.shape[:-3], *unclipped.shape)
     if bool(unclipped.all()):
@@ -120,8 +123,8 @@ def filled(pictures: Tensor, unclipped: Tensor) -> Tensor:
 
 
 def _from_coarse(pictures: Tensor, unclipped: Tensor) -> Tensor:
-    """Return pictures (picture, channel, y, x) whose clipped pixels are filled from the means over
-    two by two pixels; where none of these is seen, from the means over four by four, and so on.
+    """Return pictures (picture, channel, y, x) whose clipped pixels are filled from the means of
+    2 x 2 pixels; if all of these are clipped, from the means of 4 x 4 pixels, and so on.
     """
     y, x = unclipped.shape[-2:]
     if bool(unclipped.all()) or max(y, x) < 2:
@@ -136,8 +139,8 @@ def _from_coarse(pictures: Tensor, unclipped: Tensor) -> Tensor:
 
 
 def square_means(pictures: Tensor, side: int) -> Tensor:
-    """Return the mean over squares of ``side`` pixels, an odd number; beyond the edge there is
-    nothing.
+    """Return the mean over a square of ``side`` (odd) pixels around each pixel; pixels beyond the
+    edge are left out.
     """
     flat = pictures.reshape(-1, 1, *pictures.shape[-2:])
     for window, rim in (((side, 1), (side // 2, 0)), ((1, side), (0, side // 2))):
@@ -146,8 +149,8 @@ def square_means(pictures: Tensor, side: int) -> Tensor:
 
 
 def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
-    """Return the filter that makes a scene with the spectrum of this picture, and its noise,
-    nearly white.
+    """Return the filter that whitens a scene with the power spectrum of this picture, and its
+    noise.
     """
     grey = filled(picture, unclipped).mean(0)
     y_window, x_window = (
@@ -161,13 +164,13 @@ def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
     frequency = torch.hypot(fy[:, None], fx)
     noise_level = noise.mean() / len(noise)
     middle_frequencies = (frequency > 0.05) & (frequency < 0.2)
-    # a scene has the power strength / f^3, and the powers of a periodogram are exponential, with a
-    # median of ln 2 times the mean
+    # model of the scene: power = strength / f^3; the powers of a periodogram have an exponential
+    # distribution, whose median is 0.69 (ln 2) times its mean
     scene_strength = ((power - noise_level) * frequency**3)[middle_frequencies].median() / 0.69
     side = 2 * _FILTER_RADIUS + 1
     kernel_frequencies = torch.fft.fftfreq(64).to(grey)
     kernel_frequency = torch.hypot(kernel_frequencies[:, None], torch.fft.rfftfreq(64).to(grey))
-    # 1 / sqrt(strength / f^3 + noise): what makes the sum white
+    # whitening: 1 / sqrt(strength / f^3 + noise)
     spectrum = (
         kernel_frequency**3
         / (scene_strength.clamp_min(1e-6 * noise_level) + noise_level * kernel_frequency**3)
@@ -178,19 +181,21 @@ def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
     taper = torch.hann_window(side + 2, periodic=False, dtype=grey.dtype, device=grey.device)[1:-1]
     taper = taper[:, None] * taper
     kernel = kernel * taper
-    # of sum 0, so that it passes no mean
+    # sum 0, so that the mean of a picture is removed
     kernel = kernel - taper * (kernel.sum() / taper.sum())
     return Filter(unclipped, kernel / kernel.square().sum().sqrt())
 
 
 def noise_of(electrons: Tensor, unclipped: Tensor, read_noise: float) -> Tensor:
-    """Return the variance of the noise of each pixel: its local mean, and the read noise."""
+    """Return the noise variance (e-^2) of each pixel: photon noise of its local mean, plus read
+    noise.
+    """
     return square_means(filled(electrons, unclipped), _NOISE_WINDOW).clamp_min(1.0) + read_noise**2
 
 
 def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) -> Weights:
-    """Return what each pixel of a filtered residual is divided by: noise, and the details around
-    that pixel.
+    """Return the weights of a filtered residual, from the noise and from the details around each
+    pixel.
     """
     unclipped = use.seen
     spread = masked_variance(picture, unclipped)
@@ -201,12 +206,12 @@ def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) ->
     ]
     seen_precision = unclipped / noise_variance
     precision = (scene_colour.square() * seen_precision).sum(0, keepdim=True)
-    # the most likely detail that has the scene's colour in all channels
+    # the most likely detail in each pixel, if its colour is that of the scene
     grey_details = (scene_colour * seen_precision * filtered).sum(
         0, keepdim=True
     ) / precision.clamp_min(1e-30)
     any_seen = (precision > 0).to(unclipped)
-    # their mean square, less the variance that noise gives them
+    # local variance of the details: their mean square minus the variance due to noise
     detail_variance = _around(grey_details.square(), any_seen) - _around(
         1.0 / precision.clamp_min(1e-12), any_seen
     )
@@ -222,20 +227,20 @@ def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) ->
     diagonal = variance.rsqrt()
     shared_deviation = scene_colour * detail_variance.sqrt() * diagonal
     shared_square = shared_deviation.square().sum(0, keepdim=True)
-    # (1 + s s')^(-1/2) = 1 - s s' (1 - (1 + |s|^2)^(-1/2)) / |s|^2
+    # (1 + s s^T)^(-1/2) = 1 - s s^T (1 - (1 + |s|^2)^(-1/2)) / |s|^2
     share = (1.0 - (1.0 + shared_square).rsqrt()) / shared_square.clamp_min(1e-30)
     return Weights(diagonal, shared_deviation, share)
 
 
 def _around(values: Tensor, unclipped: Tensor) -> Tensor:
-    """Return the mean over the pixels of a square around each pixel that are not clipped."""
+    """Return the mean over the unclipped pixels in a square around each pixel."""
     return square_means(values * unclipped, _DETAIL_WINDOW) / square_means(
         unclipped.expand_as(values), _DETAIL_WINDOW
     ).clamp_min(1e-9)
 
 
 def masked_variance(picture: Tensor, unclipped: Tensor) -> Tensor:
-    """Return the variance of the pixels that are seen, of each channel: (channel, 1, 1)."""
+    """Return the variance of the unclipped pixels of each channel: (channel, 1, 1)."""
     count = unclipped.sum((-2, -1), keepdim=True).clamp_min(1.0)
     mean = (picture * unclipped).sum((-2, -1), keepdim=True) / count
     return ((picture - mean).square() * unclipped).sum((-2, -1), keepdim=True) / count
@@ -243,42 +248,40 @@ def masked_variance(picture: Tensor, unclipped: Tensor) -> Tensor:
 
 # --- censored -------------------------------------------------------------------------------------
 
-# Clipped pixels in a fit: each says that its light was at least full, and nothing more.
+# Clipped pixels as censored data of a fit: each is only known to have reached the clip level.
 #
-# The light of a clipped pixel is that of the lasers and lamps and that of the scene, which follows
-# the pixels around it. The probability that the sum is full is a normal survival function, of the
-# photons and of what the neighbours do not tell.
+# The expected light of a clipped pixel is the light of lasers and lamps, plus the scene as
+# interpolated from the pixels around it. The probability that the pixel clips is a normal survival
+# function; its variance is that of photon noise, read noise and interpolation.
 
 
-#: probability that the scene alone clips a pixel, so that no laser must explain it
+#: probability that the scene alone clips a pixel, without any laser or lamp
 _SCENE_CLIPS = 0.01
-#: of a pixel, because pixels within about three share the error of what their neighbours tell
+#: weight of a clipped pixel: the interpolation errors of pixels closer than about 3 are correlated
 _CLIPPED_WEIGHT = 1 / 9
 
 
 class Censored(NamedTuple):
-    """The clipped pixels of a frame, and how well the light of each is known from its
-    neighbours.
-    """
+    """The clipped pixels of a frame, and the standard deviation of the light of each."""
 
     seen: Tensor  #: (channel, y, x), 1 or 0
     spread: Tensor  #: (pixel,), e-, standard deviation of the charge of each clipped pixel
 
     def misfits(self, residual: Tensor) -> Tensor:
-        """Return numbers (pixel,) whose half square is minus the log likelihood, for the frame
-        less all parts, e-.
+        """Return numbers (pixel,) whose half squares are the negative log likelihood of the clipped
+        pixels; ``residual`` is the frame minus all parts, in e-.
         """
         return _root(self._over(residual))[0]
 
     def slopes(self, residual: Tensor, columns: Tensor) -> Tensor:
-        """Return how each number falls with each value (value, pixel); ``columns`` is what `lit`
-        makes of its light.
+        """Return minus the derivative (value, pixel) of each number of `misfits` with respect to
+        each fitted value; ``columns`` is `lit` of the derivatives of the light.
         """
         return _root(self._over(residual))[1] * columns / self.spread
 
     def lit(self, pictures: Tensor) -> Tensor:
-        """Return of pictures (..., channel, y, x) the light of clipped pixels beyond that of
-        their neighbours.
+        """Return the light of clipped pixels minus its interpolation from their neighbours, in
+        pictures (..., channel, y, x); 0 for the other pixels.
         """
         return (pictures - filled(pictures, self.seen)) * (1.0 - self.seen)
 
@@ -291,17 +294,17 @@ class Censored(NamedTuple):
 
 
 def _root(over: Tensor) -> tuple[Tensor, Tensor]:
-    """Return numbers whose half square is `_CLIPPED_WEIGHT` times the misfit of clipped pixels, and
-    how they fall with ``over``.
+    """Return numbers whose half squares are `_CLIPPED_WEIGHT` times the misfit of clipped pixels,
+    and minus their derivatives with respect to ``over``.
 
-    ``over`` is by how many standard deviations the light of a pixel exceeds what fills it. The
-    misfit is -log(1 - p), where p is the probability that the pixel is not full, and the scene
-    alone does not fill it.
+    ``over`` is the expected light of a pixel minus the clip level, in standard deviations. The
+    misfit is -log(1 - p), where p is the probability that neither the expected light nor the scene
+    alone clips the pixel.
     """
     below_full = (1.0 - _SCENE_CLIPS) * torch.special.ndtr(-over)
     root = (-2.0 * torch.log1p(-below_full)).sqrt()
     density = torch.exp(-0.5 * over.square()) / (2.0 * torch.pi) ** 0.5
-    # derivative of sqrt(-2 log(1 - p)) with respect to the deviations
+    # minus the derivative of sqrt(-2 log(1 - p)) with respect to `over`
     slope = (1.0 - _SCENE_CLIPS) * density / ((1.0 - below_full) * root.clamp_min(1e-6))
     return _CLIPPED_WEIGHT**0.5 * root, _CLIPPED_WEIGHT**0.5 * slope
 
@@ -309,8 +312,8 @@ def _root(over: Tensor) -> tuple[Tensor, Tensor]:
 def censored(
     electrons: Tensor, unclipped: Tensor, scene: Tensor, read_noise: float
 ) -> Censored | None:
-    """Return the clipped pixels of a frame, of which ``scene`` is what the parts do not explain;
-    None without any.
+    """Return the clipped pixels of a frame, or None if there are none; ``scene`` is the frame minus
+    the light of all parts.
     """
     if bool(unclipped.all()):
         return None
@@ -324,18 +327,18 @@ def censored(
 
 # --- joint fit ------------------------------------------------------------------------------------
 
-# The most likely values of all lasers and lamps of a frame at once, by steps of Gauss and Newton.
+# The joint maximum likelihood fit of all lasers and lamps of a frame, by Gauss-Newton steps.
 
 
 Parts = tuple[Laser | Lamp, ...]
-#: factors of the diagonal, tried in this order until a step lowers the misfit
+#: factors of the diagonal (Levenberg-Marquardt), tried in this order until a step lowers the misfit
 _DAMPINGS = (0.0, 1e-3, 1e-1, 10.0)
-_PIECE_NUMBERS = 1 << 16  #: numbers at a time whose float64 copies fit in the cache
-_LEAST_GAIN = 0.02  #: log likelihood, a smaller gain of which ends the steps
+_PIECE_NUMBERS = 1 << 16  #: size of a piece whose float64 copies fit in the cache
+_LEAST_GAIN = 0.02  #: a step that gains less log likelihood is the last one
 
 
 class Data(NamedTuple):
-    """What is fitted: a frame, and what its pixels count."""
+    """The data of a fit: a frame, its whitening filter and weights, and its clipped pixels."""
 
     electrons: Tensor  #: (channel, y, x)
     use: Filter
@@ -344,19 +347,20 @@ class Data(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Lasers and lamps, and how well they explain a frame."""
+    """Fitted lasers and lamps, with misfit, second derivatives and residual."""
 
     parts: Parts
-    misfit: float  #: half the sum of squares of the white residual and of the errors of responses
-    normal: Tensor  #: (value, value), matrix of second derivatives of the misfit
-    #: (value, number), slopes of the white residual, and of the misfits of clipped pixels after it
+    #: negative log likelihood: half the sum of squares of ``rest``, plus the prior of the values
+    misfit: float
+    normal: Tensor  #: (value, value), second derivatives of the misfit (Gauss-Newton)
+    #: (value, number), minus the derivatives of ``rest`` with respect to each value
     columns: Tensor
-    rest: Tensor  #: (number,), the white residual, and the misfits of clipped pixels after it
+    rest: Tensor  #: (number,), the white residual, then the numbers of `Censored.misfits`
 
 
 def fitted(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> Fit:
-    """Return the parts after at most ``steps`` steps, each of which lowers the misfit, with the
-    slopes at the end.
+    """Return the fit after at most ``steps`` Gauss-Newton steps, each of which lowers the
+    misfit.
     """
     parts_fitted, remainder, white_residual, misfit = _walked(data, tuple(parts), steps)
     columns = _columns(data, parts_fitted, remainder)
@@ -370,8 +374,8 @@ def misfit_of(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> tuple[Pa
 
 
 def _walked(data: Data, now: Parts, steps: int) -> tuple[Parts, Tensor, Tensor, float]:
-    """Return the parts after at most ``steps`` steps, the frame less their light, the white
-    residual and the misfit.
+    """Return the parts after at most ``steps`` steps, the frame minus their light, the numbers that
+    are squared, and the misfit.
     """
     remainder, white_residual, misfit = _misfit(data, now)
     for _ in range(steps):
@@ -389,8 +393,8 @@ def _walked(data: Data, now: Parts, steps: int) -> tuple[Parts, Tensor, Tensor, 
 def _step(
     data: Data, now: Parts, left: Tensor, white_residual: Tensor, misfit: float
 ) -> tuple[Parts, Tensor, Tensor, float] | None:
-    """Return the parts after one step, and what `_misfit` says of them; None if no step lowers
-    the misfit.
+    """Return the parts after one step, with the result of `_misfit` for them; None if no step
+    lowers the misfit.
     """
     columns = _columns(data, now, left)
     normal = _normal(now, columns)
@@ -410,7 +414,7 @@ def _step(
 
 
 def _columns(data: Data, parts: Parts, left: Tensor) -> Tensor:
-    """Return the slopes of what `_misfit` squares: (value, number)."""
+    """Return minus the derivatives (value, number) of the numbers that `_misfit` squares."""
     white = torch.cat(
         [data.weights(component.columns(data.use.__call__)).flatten(1) for component in parts]
     )
@@ -423,8 +427,8 @@ def _columns(data: Data, parts: Parts, left: Tensor) -> Tensor:
 
 
 def _normal(parts: Parts, columns: Tensor) -> Tensor:
-    """Return the matrix (value, value) of second derivatives: products of slopes, and the prior's
-    precision.
+    """Return the Gauss-Newton matrix (value, value) of second derivatives: products of the first
+    derivatives, plus the precision of the prior.
     """
     return (
         products(columns) + torch.cat([component.precision for component in parts]).double().diag()
@@ -432,11 +436,11 @@ def _normal(parts: Parts, columns: Tensor) -> Tensor:
 
 
 def products(columns: Tensor) -> Tensor:
-    """Return the products (value, value) of columns (value, number), summed in float64, a piece at
-    a time.
+    """Return the scalar products (value, value) of columns (value, number), summed in float64 piece
+    by piece.
 
-    Of a million numbers float32 loses 1e-4 of a product, and what tells strength from responses is
-    smaller than that.
+    In float32, a sum over a million numbers has a relative error of 1e-4. The difference between
+    the effects of strength and of responses is smaller than that.
     """
     total = torch.zeros(len(columns), len(columns), dtype=torch.float64, device=columns.device)
     for first in range(0, columns.shape[1], _PIECE_NUMBERS):
@@ -446,7 +450,10 @@ def products(columns: Tensor) -> Tensor:
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:
-    """Solve a normal system, whose values have any scale, in spite of values that nothing tells."""
+    """Return the solution of a system of normal equations whose values may differ much in scale.
+
+    A small ridge keeps it solvable for values that the data do not determine.
+    """
     scale = normal.diagonal().clamp_min(1e-30).rsqrt()
     scaled_matrix = scale[:, None] * normal * scale
     scaled_matrix = scaled_matrix + 1e-12 * torch.eye(len(scaled_matrix)).to(scaled_matrix)
@@ -458,7 +465,7 @@ def solved(normal: Tensor, right: Tensor) -> Tensor:
 
 
 def _misfit(data: Data, parts: Parts) -> tuple[Tensor, Tensor, float]:
-    """Return the frame less the light of the parts, the numbers that are squared, and the
+    """Return the frame minus the light of the parts, the numbers whose squares are summed, and the
     misfit.
     """
     remainder = data.electrons
@@ -475,39 +482,39 @@ def _misfit(data: Data, parts: Parts) -> tuple[Tensor, Tensor, float]:
 
 # --- intervals ------------------------------------------------------------------------------------
 
-# How well a frame tells the values of each laser: from the curvature of the fit and the scatter of
-# its residual.
+# The covariance of the values of each laser, from the curvature of the likelihood and the scatter
+# of the residual.
 
 
 NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % interval
 _BLOCK_SIDE = 8  #: pixels a side of blocks whose residuals count as independent of one another
-#: pixels, pixels and nm, standard deviations of what dirt and defocus change
+#: standard deviations of y (pixels), x (pixels) and wavelength (nm) due to dirt and defocus
 _MODEL = (0.0036, 0.0036, 0.08)
-#: the same over the root of the number of pixels seen, whose scattered light is random
+#: the same due to random scattered light, times the square root of the number of unclipped pixels
 _GRAINS = (0.23, 0.23, 5.9)
-#: standard deviation of the wavelength from the unknown shape of a line, over the width of the line
+#: standard deviation of the wavelength due to the unknown shape of a line, relative to its width
 _SHAPE = 0.03
-_AMOUNT = 0.0015  #: the same of the electrons of each channel, relative
+_AMOUNT = 0.0015  #: relative standard deviation of the electrons of each channel due to the model
 
 
 class Spread(NamedTuple):
-    """How well a frame tells the values of one laser."""
+    """The uncertainty of the fitted values of one laser."""
 
     covariance: Tensor  #: (value, value), of y, x (pixels), nm, and the electrons of each channel
-    #: (channel,) e-, standard deviation of these electrons behind a lens that is as its recipe says
+    #: (channel,) e-, standard deviation of these electrons for a lens that is as its recipe says
     ideal: Tensor
 
 
 def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
-    """Return for each laser how well its values are told.
+    """Return the uncertainty of the values of each laser.
 
-    ``unclipped`` (channel, y, x) is 0 for clipped pixels, which the fit has after all others, if at
-    all. The inverse of the second derivatives is enlarged where the slopes of blocks of the frame
-    scatter more than the model says.
+    ``unclipped`` (channel, y, x) is 0 for clipped pixels; the fit holds their numbers after those
+    of the residual, or not at all. The covariance is the inverse of the second derivatives. It is
+    enlarged where the scores of blocks of the frame scatter more than the model predicts.
     """
     value_count = len(fit.normal)
     inverse = solved(fit.normal, torch.eye(value_count).to(fit.normal))
-    # each number's part of the slope of the misfit with respect to each value
+    # score: contribution of each number to the derivative of the misfit with respect to each value
     scores_by_number = (fit.columns * fit.rest).double()
     pictures = scores_by_number[:, : unclipped.numel()].view(value_count, *unclipped.shape)
     if scores_by_number.shape[1] > unclipped.numel():
@@ -515,7 +522,7 @@ def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
             :, unclipped.numel() :
         ]  # a clipped pixel has no residual
     scores = pictures.sum(1)
-    # up to whole blocks
+    # padding to whole blocks
     rows_missing, columns_missing = (-n % _BLOCK_SIDE for n in unclipped.shape[-2:])
     blocks = (
         pad(scores, (0, columns_missing, 0, rows_missing))
@@ -525,7 +532,7 @@ def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
         .flatten(1)
     )
     prior = fit.normal - products(fit.columns)
-    # Huber's sandwich: the scatter of the blocks' scores in place of their expectation
+    # sandwich estimator (Huber): the measured scatter of the scores replaces their expectation
     sandwich = inverse @ (blocks @ blocks.T + prior) @ inverse
     deviation_growth = (
         (sandwich.diagonal() / inverse.diagonal().clamp_min(1e-300)).clamp_min(1.0).sqrt()
@@ -541,7 +548,7 @@ def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
                 _of_channels(component, matrix[own_values, own_values], pixels)
                 for matrix in (covariance, inverse)
             )
-            # after y, x and nm come the electrons of the channels
+            # index 3 onwards: the electrons of the channels, after y, x and nm
             laser_spreads.append(
                 Spread(covariance_of_laser, ideal_covariance.diagonal()[3:].sqrt())
             )
@@ -549,13 +556,14 @@ def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
 
 
 def _of_channels(laser: Laser, own: Tensor, pixels: int) -> Tensor:
-    """Return the covariance of place, wavelength and electrons of each channel, with what the model
-    neglects.
+    """Return the covariance of place, wavelength and electrons of each channel, including the
+    errors of the model (dirt, defocus, shape of the line).
 
-    ``pixels`` counts those that no channel clips.
+    ``own`` is the covariance of `Laser.values`. ``pixels`` is the number of pixels that are clipped
+    in no channel.
     """
     slopes = laser.channel_slopes().to(own)
-    # from y, x, nm, ... of `Laser.values` to y, x, nm and the electrons of each channel
+    # derivatives of y, x, nm and the electrons of each channel with respect to `Laser.values`
     jacobian = torch.zeros(3 + len(slopes), len(own)).to(own)
     jacobian[:3, :3] = torch.eye(3).to(own)
     jacobian[3:] = slopes

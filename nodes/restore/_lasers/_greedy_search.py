@@ -1,4 +1,4 @@
-"""The search: one more laser or lamp at a time, while it explains much more of the frame."""
+"""Greedy search: it adds one laser or lamp at a time, as long as each gains enough likelihood."""
 
 from __future__ import annotations
 
@@ -37,27 +37,29 @@ from neusee.nodes.restore._lasers._frame_likelihood import (
 
 # --- greedy search --------------------------------------------------------------------------------
 
-# The search: one more laser or lamp at a time, as long as it explains much more of the frame.
+# The greedy search: it adds one laser or lamp ("part") at a time, as long as each gains enough log
+# likelihood.
 
 
-_LASER_LEAD = 10.0  #: log likelihood by which a laser is ahead of a lamp at least
-_SAME_LASER = (2.0, 25.0)  #: pixels and nm, within which two lasers are one
-_FEW_CLIPPED = 4  #: clipped pixels, fewer of which need no explanation
-_CANDIDATES_TRIED = 2  #: candidates that are fitted before one of them is chosen
-#: share of the clipped pixels that no part explains, from which on one more is sought farther away
+_LASER_LEAD = 10.0  #: smallest lead in log likelihood of a laser over a lamp
+_SAME_LASER = (2.0, 25.0)  #: pixels and nm: two lasers closer than both count as one
+_FEW_CLIPPED = 4  #: fewer unexplained clipped pixels than this are ignored
+_CANDIDATES_TRIED = 2  #: number of candidates that are fitted before one of them is chosen
+#: fraction of unexplained clipped pixels above which the search extends farther from the candidates
 _UNEXPLAINED_SHARE = 0.25
-#: sum of squares of the errors of three responses, which one laser in ten exceeds by chance
+#: sum of squares of the errors of three responses: the 90 % quantile of chi2 with 3 degrees of
+#: freedom
 _ODD_RESPONSES = 6.25
-#: candidates for clipped pixels, whose surroundings are searched before any is fitted
+#: number of candidates for clipped pixels whose surroundings are searched before any is fitted
 _CLIPPED_CANDIDATES = 4
-_LEAST_GAIN_SHARE = 0.25  #: share of a gain, candidates below which are not fitted
-#: times the first width, up to which a fitted width is not compared with others
+_LEAST_GAIN_SHARE = 0.25  #: a candidate with less than this fraction of the best gain is not fitted
+#: ratio to the first width: lines that are fitted narrower are not compared with the other widths
 _WIDEST_RATIO = 1.5
 _STEPS_OF_ONE, _STEPS_OF_ALL = 5, 12  #: steps of a fit of one part, and of all parts
 
 
 class Known(NamedTuple):
-    """A frame, and what does not change during the search."""
+    """A frame, its camera and the settings: everything that stays constant during the search."""
 
     electrons: Tensor
     seen: Tensor
@@ -65,38 +67,38 @@ class Known(NamedTuple):
     lamp: LampLight
     lines: Templates
     read_noise: float
-    widths: tuple[float, ...]  #: m, of a line, that are tried
+    widths: tuple[float, ...]  #: widths of a line (full width at half maximum) that are tried, m
 
 
 class Choice(NamedTuple):
-    """A part that explains some of a frame, the log likelihood that it gains, and how far it is
-    ahead of others.
-    """
+    """A fitted laser or lamp, its gain in log likelihood, and its lead over the alternatives."""
 
     part: Laser | Lamp
     gain: float
-    margin: float  #: beyond what the other kind of light gains
-    rival: float  #: beyond what a laser at another place or wavelength gains
+    margin: float  #: gain minus the gain of the other kind of light
+    rival: float  #: gain minus the gain of a laser at another place or wavelength
 
 
 class Found(NamedTuple):
-    """What the search found, with the filter and weights of the last fit."""
+    """The result of the search, with the filter and weights of the last fit."""
 
     fit: Fit
-    choices: tuple[Choice, ...]  #: each part as it was when it was found
+    choices: tuple[Choice, ...]  #: each part as first fitted, before the joint fit
     data: Data
 
 
 def search(
     frame: Known, largest_number: int, lamps: int, smallest_gain: float, margin: float
 ) -> Found:
-    """Return the lasers and lamps of a frame: each gains at least ``smallest_gain``, a laser
-    ``margin`` of it beyond a lamp.
+    """Return the lasers and lamps of a frame.
+
+    Each gains at least ``smallest_gain`` of log likelihood. A laser exceeds the gain of a lamp by
+    at least the fraction ``margin`` of its own gain.
     """
     parts: Parts = ()
     choices: list[Choice] = []
     while True:
-        # filter and weights follow the scene that is left without the parts
+        # filter and weights are estimated from the scene: the frame minus the parts
         data = _data(frame, parts)
         fit = fitted(data, parts, _STEPS_OF_ALL) if parts else _empty(data)
         parts = fit.parts
@@ -112,15 +114,15 @@ def search(
 
 
 def _pruned(search_result: Found, smallest_gain: float) -> Found:
-    """Return what was found without parts that later parts made needless, each with its gain
-    beside the rest.
+    """Return the result without parts that later parts made superfluous; each gain becomes the gain
+    over a fit without this part.
     """
     parts, choices = search_result.fit.parts, search_result.choices
     data = search_result.data._replace(clipped=None)
     while len(parts) > 1:
         misfit = misfit_of(data, parts, 1)[1]
         parts_without_one = [parts[:n] + parts[n + 1 :] for n in range(len(parts))]
-        # the gain of a part beside the rest is the misfit that its absence costs
+        # gain of a part: how much the misfit rises without it
         costs = [
             misfit_of(data, remaining, _STEPS_OF_ONE)[1] - misfit for remaining in parts_without_one
         ]
@@ -143,7 +145,7 @@ def _pruned(search_result: Found, smallest_gain: float) -> Found:
 
 
 def _full(candidate: Laser | Lamp, parts: Parts, largest_number: int, lamps: int) -> bool:
-    """Return True if there are as many lasers, or lamps, as there may be."""
+    """Return True if the number of parts of the candidate's kind has reached its limit."""
     alike = sum(isinstance(candidate, Laser) == isinstance(other, Laser) for other in parts)
     return alike >= (largest_number if isinstance(candidate, Laser) else lamps)
 
@@ -154,8 +156,8 @@ def _light(frame: Known, parts: Parts) -> Tensor:
 
 
 def _data(frame: Known, parts: Parts) -> Data:
-    """Return the frame with the filter and the weights that the frame without the parts asks
-    for.
+    """Return the frame with a filter and weights that are estimated from the frame minus the
+    parts.
     """
     noise = noise_of(frame.electrons, frame.seen, frame.read_noise)
     scene = frame.electrons - _light(frame, parts)
@@ -177,17 +179,17 @@ def _empty(data: Data) -> Fit:
 
 
 class _Left(NamedTuple):
-    """What the parts found so far leave, in float32, which is enough to choose between
+    """The frame minus the parts found so far, in float32, which is precise enough to choose between
     candidates.
     """
 
     known: Known
     data: Data
-    before: float  #: misfit
+    before: float  #: misfit without a further part
 
 
 def _rough(frame: Known, fit: Fit, data: Data) -> _Left:
-    """Return a frame without the light of the fitted parts, and what the candidates need of it, in
+    """Return a frame minus the light of the fitted parts, with its filter, weights and camera, in
     float32.
     """
     remainder = (frame.electrons - _light(frame, fit.parts)).float()
@@ -207,7 +209,9 @@ def _rough(frame: Known, fit: Fit, data: Data) -> _Left:
 
 
 def _best(frame: Known, fit: Fit, data: Data, smallest_gain: float, margin: float) -> Choice | None:
-    """Return the laser or lamp that explains most of what is left; None if nothing does."""
+    """Return the laser or lamp that explains most of the rest of the frame; None if there is
+    none.
+    """
     remainder = _rough(frame, fit, data)
     residual = remainder.data.use(remainder.data.electrons)
     starts = _unclipped_starts(remainder, residual, frame.lines)
@@ -215,7 +219,7 @@ def _best(frame: Known, fit: Fit, data: Data, smallest_gain: float, margin: floa
     nearest_starts = [
         nearest(remainder.known.camera, remainder.data, residual, start) for start in clipped
     ]
-    # the first ones alone: each is fitted, which takes long
+    # only the best are kept, because each fit takes long
     starts += sorted(nearest_starts, reverse=True)[:_CANDIDATES_TRIED]
     grown_choices = _all_grown(remainder, sorted(starts, reverse=True))
     if clipped and _leaves_dark(frame, fit.parts, grown_choices):
@@ -224,7 +228,7 @@ def _best(frame: Known, fit: Fit, data: Data, smallest_gain: float, margin: floa
             for start in clipped[:_CANDIDATES_TRIED]
         ]
         grown_choices = _with_more(remainder, grown_choices, nearest_of_tiles)
-    # colours that do not fit ask for another wavelength
+    # improbable responses indicate a wrong wavelength
     grown_choices = _with_far_wavelengths(remainder, grown_choices, residual)
     new_choices = [choice for choice in grown_choices if not _known_already(choice.part, fit.parts)]
     best = _first_or_ahead(remainder, new_choices, smallest_gain, margin)
@@ -232,7 +236,9 @@ def _best(frame: Known, fit: Fit, data: Data, smallest_gain: float, margin: floa
 
 
 def _unclipped_starts(left: _Left, residual: Tensor, lines: Templates) -> list[Candidate]:
-    """Return the most likely lasers and the most likely lamp of a filtered residual."""
+    """Return the most likely lasers and the most likely lamp in a filtered residual, from the
+    unclipped pixels.
+    """
     use, weights, lamp = left.data.use, left.data.weights, left.known.lamp
     spot = Templates(torch.zeros(1).double(), lamp.patterns[None], lamp.colour[None])
     return [
@@ -242,12 +248,12 @@ def _unclipped_starts(left: _Left, residual: Tensor, lines: Templates) -> list[C
 
 
 def _with_far_wavelengths(left: _Left, grown: list[Choice], residual: Tensor) -> list[Choice]:
-    """Return what was grown with what grows farther away, as long as the best laser has unlikely
-    responses.
+    """Return the fitted parts, with further ones at wavelengths farther away while the best laser
+    has improbable responses.
     """
     for _ in range(_CANDIDATES_TRIED):
         best_laser = next((choice.part for choice in grown if isinstance(choice.part, Laser)), None)
-        # values[5:] are the errors of the responses, in standard deviations
+        # `values[5:]`: errors of the responses, in standard deviations
         if best_laser is None or float(best_laser.values[5:].square().sum()) < _ODD_RESPONSES:
             break
         start = nearest(left.known.camera, left.data, residual, _start(best_laser), near=FAR)
@@ -258,7 +264,9 @@ def _with_far_wavelengths(left: _Left, grown: list[Choice], residual: Tensor) ->
 def _first_or_ahead(
     left: _Left, new_choices: list[Choice], smallest_gain: float, margin: float
 ) -> Choice | None:
-    """Return the choice of the largest gain, or what `_ahead` says where there is a laser."""
+    """Return the lamp with the largest gain or, if there are lasers, the result of `_ahead`; None
+    without any choice.
+    """
     lasers = [choice for choice in new_choices if isinstance(choice.part, Laser)]
     if lasers:
         return _ahead(left, new_choices, lasers, smallest_gain, margin)
@@ -272,15 +280,15 @@ def _ahead(
     smallest_gain: float,
     margin: float,
 ) -> Choice | None:
-    """Return the best laser, or the best lamp where the laser is not ahead of it enough; None
-    for too little gain.
+    """Return the best laser, or the best lamp if the lead of the laser is too small; None if the
+    gain is too small.
     """
     if new_choices[0].gain < smallest_gain:
         return None
     best_laser = _widened(left, lasers[0])
     y, x = (round(float(coordinate)) for coordinate in best_laser.part.values[:2])
     lamps = [choice for choice in new_choices if isinstance(choice.part, Lamp)]
-    # also a lamp at the place of the laser, of its strength
+    # a lamp is also tried at the place and with the strength of the laser
     lamps += _all_grown(left, [Candidate(0.0, (y, x), 0.0, float(best_laser.part.values[3]))])
     lamps.sort(key=lambda choice: -choice.gain)
     gain_ahead = best_laser.gain - (lamps[0].gain if lamps else 0.0)
@@ -293,7 +301,7 @@ def _ahead(
 
 
 def _precise(component: Laser | Lamp, frame: Known) -> Laser | Lamp:
-    """Return a part in the precision of the frame."""
+    """Return a part, converted to the floating-point precision of the frame."""
     values = component.values.to(frame.electrons)
     if isinstance(component, Lamp):
         return replace(component, light=frame.lamp, values=values)
@@ -303,8 +311,8 @@ def _precise(component: Laser | Lamp, frame: Known) -> Laser | Lamp:
 
 
 def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
-    """Return what grows from candidates that are not far behind what others have grown to, the
-    largest gain first.
+    """Return the parts that are fitted from the candidates, the largest gain first; a candidate
+    whose gain is far below the best fit is skipped.
     """
     grown: list[Choice] = []
     for start in starts:
@@ -314,21 +322,21 @@ def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
 
 
 def _with_more(left: _Left, grown: list[Choice], starts: list[Candidate]) -> list[Choice]:
-    """Return what was grown with what grows from more candidates, the largest gain first."""
+    """Return the fitted parts together with those of further candidates, the largest gain first."""
     return sorted(
         [*grown, *_all_grown(left, sorted(starts, reverse=True))], key=lambda choice: -choice.gain
     )
 
 
 def _start(laser: Laser) -> Candidate:
-    """Return a laser as a candidate."""
+    """Return a candidate with the place, wavelength and strength of a laser."""
     y, x, nm, strength = laser.values[:4].tolist()
     return Candidate(0.0, (y, x), nm * NANOMETRE, strength)
 
 
 def _widened(left: _Left, laser: Choice) -> Choice:
-    """Return a laser with the width of its line that explains most; one of a narrow line stays
-    as it is.
+    """Return a laser with the line width of the largest gain; a laser with a narrow line is
+    returned unchanged.
     """
     best, widths = laser, left.known.widths
     assert isinstance(laser.part, Laser)
@@ -344,31 +352,33 @@ def _widened(left: _Left, laser: Choice) -> Choice:
 
 
 def _known_already(component: Laser | Lamp, parts: Parts) -> bool:
-    """Return True for a laser that is told from one of the parts only by the width of a line."""
+    """Return True for a laser that has almost the place and wavelength of one of the parts."""
     for other in parts:
         if isinstance(component, Laser) and isinstance(other, Laser):
             distances = (component.values[:3] - other.values[:3]).abs().tolist()
-            # y and x in pixels, then nm
+            # distances in y and x (pixels), then in wavelength (nm)
             if max(distances[:2]) < _SAME_LASER[0] and distances[2] < _SAME_LASER[1]:
                 return True
     return False
 
 
 def _full_well(frame: Known) -> Tensor:
-    """Return the value of the clipped pixels of each channel, 0 in a channel without any:
-    (channel, 1, 1).
+    """Return the value (channel, 1, 1) of the clipped pixels of each channel in e-; 0 for a channel
+    without clipped pixels.
     """
     return frame.electrons.where(frame.seen == 0, 0.0).amax((-2, -1), keepdim=True)
 
 
 def _dark(frame: Known, light: Tensor) -> int:
-    """Return the number of clipped pixels for which the light of the parts is too weak."""
+    """Return the number of unexplained clipped pixels: those in which the light of the parts is
+    below half the full well.
+    """
     return int(((frame.seen == 0) & (light < 0.5 * _full_well(frame))).any(0).sum())
 
 
 def _leaves_dark(frame: Known, parts: Parts, grown: list[Choice]) -> bool:
-    """Return True if many of the clipped pixels are too bright for the parts and for the one
-    that gains most.
+    """Return True if the parts and the best new part together leave many clipped pixels
+    unexplained.
     """
     strongest = [_precise(choice.part, frame).electrons() for choice in grown[:1]]
     return _dark(frame, sum(strongest, _light(frame, parts))) > _UNEXPLAINED_SHARE * int(
@@ -377,13 +387,15 @@ def _leaves_dark(frame: Known, parts: Parts, grown: list[Choice]) -> bool:
 
 
 def _clipped_starts(frame: Known, parts: Parts, use: Filter) -> list[Candidate]:
-    """Return candidates whose clipped pixels are those that no part explains; none where all are
+    """Return candidates for the clipped pixels that no part explains; none if (almost) all are
     explained.
     """
     full_light, light = _full_well(frame), _light(frame, parts)
     if _dark(frame, light) < _FEW_CLIPPED:
         return []
+    # a sensor shows at most the full well; 0: no pixel of this channel clips, so no limit is known
     picture = frame.electrons - torch.minimum(light, full_light.where(full_light > 0, torch.inf))
+    # clipped pixels are compared too: the patterns are clipped at the same level
     all_pixels = Filter(torch.ones_like(frame.seen), use.kernel)
     noise = noise_of(frame.electrons, all_pixels.seen, frame.read_noise)
     weights = weights_of(all_pixels(picture), all_pixels, noise, picture)
@@ -394,8 +406,8 @@ def _clipped_starts(frame: Known, parts: Parts, use: Filter) -> list[Candidate]:
 
 
 def _laser(frame: Known, start: Candidate, like: Tensor) -> Laser:
-    """Return a laser at a candidate's spot, wavelength and strength, with a line of the camera's
-    width, in the precision of ``like``.
+    """Return a laser with the spot, wavelength and strength of a candidate and the line width of
+    the camera, in the precision of ``like``.
     """
     values_after_spot = torch.zeros(3 + len(like)).to(like)
     values_after_spot[0], values_after_spot[1] = (
@@ -406,13 +418,13 @@ def _laser(frame: Known, start: Candidate, like: Tensor) -> Laser:
 
 
 def _elsewhere(first: Laser | Lamp, other: Laser | Lamp) -> bool:
-    """Return True if two fits ended at different places or wavelengths."""
+    """Return True if two fits ended more than 0.5 pixels or 5 nm apart."""
     distances = (first.values[:3] - other.values[:3]).abs().tolist()
     return bool(max(distances[:2]) > 0.5 or distances[2] > 5.0)
 
 
 def _grown(left: _Left, start: Candidate) -> Choice | None:
-    """Return the part that grows from a candidate, and its gain; None for no gain."""
+    """Return the part that is fitted from a candidate, and its gain; None if it gains nothing."""
     electrons, frame = left.data.electrons, left.known
     spot = torch.tensor(start.spot).to(electrons)
     component: Laser | Lamp
@@ -432,21 +444,21 @@ def _grown(left: _Left, start: Candidate) -> Choice | None:
 
 # --- beyond scatter -------------------------------------------------------------------------------
 
-# Lasers that are more than light which dirt, edges and defocus scatter out of the pattern of a
-# stronger laser.
+# Test whether a weak laser is real, or only light that dirt, edges and defocus scatter out of the
+# pattern of a stronger laser.
 
 
 _FEW_SPECKLES, _STEPS = 5, 12  #: steps of a fit without one laser, and of the last fit
 
 
 def without_scattered(search_result: Found, frame: Known, smallest_gain: float) -> Found:
-    """Return what was found without lasers that gain less than ``smallest_gain`` where scattered
-    light counts as noise.
+    """Return the result without lasers whose gain is below ``smallest_gain`` if scattered light
+    counts as noise.
 
-    A lens that is not as its recipe says leaves grains of speckle around a strong laser, and each
-    looks like a weak laser of the same colour. The frame tells how strong this speckle is likely to
-    be; its variance is added to that of the noise, beginning with the weakest laser, whose stronger
-    ones may have scattered it.
+    A lens that deviates from its recipe gives speckle around a strong laser, and each grain looks
+    like a weak laser of the same colour. The strength of the speckle is estimated from the frame,
+    and its variance is added to the variance of the noise. The lasers are tested from the weakest
+    up, each against the speckle of all stronger ones.
     """
     all_parts, choices = search_result.fit.parts, search_result.choices
     lasers = [n for n, component in enumerate(all_parts) if isinstance(component, Laser)]
@@ -474,8 +486,8 @@ def _numbered(parts: Parts, numbers: Sequence[int]) -> Parts:
 
 
 def _with_speckle(data: Data, frame: Known, parts: Parts, lasers: Parts) -> Data:
-    """Return the frame with weights for which the likeliest speckle of some lasers is noise,
-    without clipped pixels.
+    """Return the frame with weights that count the most likely speckle of ``lasers`` as noise;
+    clipped pixels are left out.
     """
     dark_frame = torch.zeros_like(frame.electrons)
     light_of_parts, light_of_lasers = (

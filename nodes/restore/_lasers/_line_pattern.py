@@ -17,15 +17,15 @@ from neusee.nodes.values import Bands, Pupil
 
 Sensor = SensorSampling
 
-#: widths of a line in m, each with the number of its parts; then the most
+#: (width in m, number of sample wavelengths) of lines below this width; then the number for others
 _LINE_SAMPLES, _MOST_LINE_SAMPLES = ((2.5e-9, 3), (6e-9, 5)), 7
-_NARROW_WIDTH = 0.1e-9  #: m, width of a line, below which slopes are those of a line so wide
-_FILTER_ERROR = 1e-8  #: of the average over a pixel, relative to the brightest pixel
+_NARROW_WIDTH = 0.1e-9  #: m, smallest width of a line in the computation of derivatives
+_FILTER_ERROR = 1e-8  #: error of the average over a pixel, relative to the brightest pixel
 
 
 class Lens(NamedTuple):
-    """What forms the pattern: focal length and pixel pitch in m, window in pixels, and how a
-    pixel sees it.
+    """Focal length and pixel pitch in m, window (y, x) in pixels, and how a pixel samples the
+    pattern.
     """
 
     focal_length: float
@@ -37,10 +37,11 @@ class Lens(NamedTuple):
 def line_pattern(
     pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor
 ) -> Tensor:
-    """Return the share of the clear pupil's light in each pixel (y, x), mean over a Gaussian line.
+    """Return the light in each pixel (y, x), averaged over a Gaussian line, as a fraction of the
+    light of the clear pupil.
 
-    The result has derivatives with respect to every tensor. Beyond half the alias-free field from
-    the spot it is 0, because a sampled pupil repeats its pattern there.
+    The result has derivatives with respect to every tensor. It is 0 beyond half the alias-free
+    field from the spot, because the pattern of a sampled pupil repeats there.
     """
     offsets, shares = _parts(fwhm)
     patterns = [
@@ -61,11 +62,11 @@ def deviation(fwhm: Tensor) -> Tensor:
 
 
 def _parts(fwhm: Tensor) -> tuple[list[float], list[float]]:
-    """Return the wavelengths that stand for a Gaussian line, in standard deviations, and their
-    shares of its light.
+    """Return the sample wavelengths of a Gaussian line, as offsets in standard deviations, and
+    their weights, which sum to 1.
 
-    The sums over them are exact for every polynomial of the wavelength up to degree 5, 9 or 13
-    (Gauss and Hermite).
+    The quadrature (Gauss-Hermite) is exact for polynomials of the wavelength up to degree 5, 9 or
+    13.
     """
     nodes, weights = hermegauss(
         next(
@@ -77,9 +78,11 @@ def _parts(fwhm: Tensor) -> tuple[list[float], list[float]]:
 
 
 def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
-    """Return the share (y, x) of the clear pupil's light in each pixel, for one wavelength in m.
+    """Return the light in each pixel (y, x) for one wavelength in m, as a fraction of the light of
+    the clear pupil.
 
-    The far field is the Fourier transform of the pupil's field, by a matrix for each axis.
+    The far field is the Fourier transform of the field in the pupil, as a matrix product for each
+    axis.
     """
     field = _field(pupil, wavelength)
     spot = direction.to(wavelength) * (lens.focal_length / lens.pixel_pitch)
@@ -96,17 +99,17 @@ def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) ->
 
 
 class _Window(NamedTuple):
-    """The places along both axes at which the light of a window is computed, and what its pixels
-    see of it.
+    """The points along both axes at which the irradiance of a window is computed, and the average
+    over its pixels.
     """
 
-    places: tuple[Tensor, Tensor]  #: pixels from the middle pixel
-    pixels: tuple[Tensor, Tensor]  #: the middles of the pixels
-    grids: tuple[FineAxis, FineAxis] | None  #: of pixels that average
+    places: tuple[Tensor, Tensor]  #: points along y and x, in pixels from the middle pixel
+    pixels: tuple[Tensor, Tensor]  #: centres of the pixels along y and x, in the same unit
+    grids: tuple[FineAxis, FineAxis] | None  #: finer grids for the average; None for point sampling
 
     @classmethod
     def of(cls, lens: Lens, field: Tensor, reach: Tensor) -> _Window:
-        # `reach` is that of `_reach`: turns of phase by one sample of the pupil and one pixel
+        # `reach` is the result of `_reach`: turns of phase per sample of the pupil and pixel
         y, x = (
             torch.arange(n, dtype=torch.float64, device=field.device) - n // 2 for n in lens.shape
         )
@@ -123,7 +126,9 @@ class _Window(NamedTuple):
         return cls((row_places, column_places), (y, x), (row_grid, column_grid))
 
     def seen(self, light: Tensor, spot: tuple[Tensor, Tensor], reach: Tensor) -> Tensor:
-        """Return the light (y, x) of each pixel; 0 where the pattern of a spot would repeat."""
+        """Return the light (y, x) of each pixel; 0 where the pattern around ``spot`` would
+        repeat.
+        """
         if self.grids is not None:
             light = averaged(light, *self.grids)
         rows_within, columns_within = (
@@ -134,13 +139,13 @@ class _Window(NamedTuple):
 
 
 def _reach(pupil: Pupil, wavelength: Tensor, lens: Lens) -> Tensor:
-    """Return the phase that one sample of the pupil and one pixel add, in turns."""
+    """Return the change of phase, in turns, per sample of the pupil and per pixel."""
     return pupil.pitch.to(wavelength) * lens.pixel_pitch / (wavelength * lens.focal_length)
 
 
 def _share(pupil: Pupil, wavelength: Tensor, reach: Tensor) -> Tensor:
-    """Return the factor from the squared sum over the pupil to the share of its light in one
-    pixel.
+    """Return the factor that converts the squared sum over the pupil to the fraction of its light
+    in one pixel.
     """
     area = pupil.aperture.double().square().sum()
     notch_share = passed_by_notches(pupil._replace(wavelengths=wavelength[None]))[0]
@@ -148,26 +153,31 @@ def _share(pupil: Pupil, wavelength: Tensor, reach: Tensor) -> Tensor:
 
 
 def _turns(samples: int, reach: Tensor, field: Tensor) -> Tensor:
-    """Return the factor (sample,) of a phasor's change when the spot moves by a pixel."""
+    """Return the factor (sample,) of a phasor in its derivative with respect to the place of the
+    spot, per pixel.
+    """
     position = torch.arange(samples, dtype=torch.float64, device=field.device) - (samples - 1) / 2
     return 2j * math.pi * (reach * position).to(field)
 
 
 class Moves(NamedTuple):
-    """A pattern and how it changes with the place of its spot, and with its wavelength: (y, x)."""
+    """A pattern (y, x), and its derivatives with respect to place, wavelength and variance of the
+    line.
+    """
 
     pattern: Tensor
-    down: Tensor  #: by pixel, as right
-    right: Tensor
-    wave: Tensor  #: by m
-    blur: Tensor  #: by m^2 of the variance of the line
+    down: Tensor  #: derivative with respect to y of the spot, per pixel
+    right: Tensor  #: derivative with respect to x of the spot, per pixel
+    wave: Tensor  #: derivative with respect to the wavelength, per m
+    blur: Tensor  #: derivative with respect to the variance of the line, per m^2
 
 
 def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor) -> Moves:
-    """Return the pattern of `line_pattern` and its slopes, for a spot in pixels; no derivative.
+    """Return the pattern of `line_pattern` and its derivatives, for a spot in pixels; no gradient
+    flows through the result.
 
-    The slopes with wavelength and variance are means over the line too, by parts of the integral
-    over a Gaussian line.
+    The derivatives with respect to wavelength and variance are means over the Gaussian line as
+    well (integration by parts).
     """
     line_width = fwhm.clamp_min(_NARROW_WIDTH)
     sigma, sums = deviation(line_width), [torch.zeros(1)] * 5
@@ -179,8 +189,8 @@ def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm:
             share * right,
             share * offset / sigma * pattern,
         )
-        # Gauss and Hermite: means of the pattern times the Hermite polynomials t and t^2 - 1 are
-        # slopes with wavelength and variance
+        # the means of the pattern times the Hermite polynomials t and t^2 - 1 are, but for a
+        # factor, its derivatives with respect to wavelength and variance
         blur = share * (offset * offset - 1.0) / (2.0 * sigma.square()) * pattern
         sums = [
             total.to(contribution) + contribution
@@ -192,7 +202,9 @@ def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm:
 def _moves(
     pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the pattern of one wavelength, and its slopes along y and x by pixel."""
+    """Return the pattern of one wavelength, and its derivatives with respect to y and x of the
+    spot, per pixel.
+    """
     field, turns_per_pixel = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     row_factor, column_factor = (_turns(n, turns_per_pixel, field) for n in field.shape)
     window, spot_place = _Window.of(lens, field, turns_per_pixel), (spot[0], spot[1])
@@ -205,7 +217,7 @@ def _moves(
     light = window.seen(
         amplitude.real.square() + amplitude.imag.square(), spot_place, turns_per_pixel
     )
-    # slope of |a|^2 = 2 Re(conj(a) a'), whose 2 is applied below
+    # derivative of |a|^2 = 2 Re(conj(a) a'); the 2 is applied below
     by_pixel = [
         window.seen(
             amplitude.real * slope.real + amplitude.imag * slope.imag, spot_place, turns_per_pixel
@@ -219,12 +231,12 @@ def _moves(
 def grid_patterns(
     pupil: Pupil, down: Tensor, right: Tensor, wavelength: Tensor, lens: Lens
 ) -> Tensor:
-    """Return the patterns (row, column, y, x) of one wavelength with spots at each of ``down`` x
-    ``right`` pixels.
+    """Return the patterns (row, column, y, x) of one wavelength for spots on a grid with the rows
+    ``down`` and the columns ``right``, in pixels.
     """
     field, turns_per_pixel = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     window = _Window.of(lens, field, turns_per_pixel)
-    # the phasors of all spots below one another: one product for all patterns
+    # the phasors of all spots are stacked, so that one product gives all patterns
     row_phasors = torch.cat(
         [_axis(window.places[0], turns_per_pixel, place, field, 0) for place in down]
     )
@@ -249,7 +261,7 @@ def grid_patterns(
 
 
 def _field(pupil: Pupil, wavelength: Tensor) -> Tensor:
-    """Return the field in the pupil, with phases reduced in float64."""
+    """Return the complex field in the pupil; its phases are reduced to one turn in float64."""
     index = index_at(wavelength, pupil)
     turns = (index * pupil.height.double() + pupil.path.double()) / wavelength
     kind = torch.promote_types(pupil.height.dtype, pupil.path.dtype)
@@ -257,7 +269,7 @@ def _field(pupil: Pupil, wavelength: Tensor) -> Tensor:
 
 
 def _axis(places: Tensor, reach: Tensor, spot: Tensor, field: Tensor, dim: int) -> Tensor:
-    """Return the phasors (place, sample) along one axis."""
+    """Return the Fourier matrix (place, sample) along one axis, for a spot at ``spot`` pixels."""
     turns = reach * (places - spot)[:, None] * centred(field.shape[dim], field.device)
     angle = -_radians(turns).to(field.real)
     return torch.polar(torch.ones_like(angle), angle)
@@ -270,13 +282,15 @@ def _within(pixels: Tensor, spot: Tensor, reach: Tensor) -> Tensor:
 
 
 def _radians(turns: Tensor) -> Tensor:
-    """Return an angle in turns as radians within half a turn; whole turns have no slope."""
+    """Return an angle in turns as radians between -pi and pi; the derivative is that of the full
+    angle.
+    """
     return (2.0 * math.pi) * (turns - turns.detach().round())
 
 
 def index_at(wavelength: Tensor, pupil: Pupil) -> Tensor:
-    """Return the index of the mask at a wavelength, by the cubic through the four nearest bands
-    or fewer.
+    """Return the refractive index of the mask at a wavelength, by cubic interpolation between the
+    four nearest bands (lower degree for fewer bands).
     """
     wavelengths, values = pupil.wavelengths.to(wavelength), pupil.index.to(wavelength)
     count = min(4, len(wavelengths))
@@ -291,7 +305,7 @@ def index_at(wavelength: Tensor, pupil: Pupil) -> Tensor:
     index = torch.zeros_like(wavelength)
     for i in range(count):
         others = [j for j in range(count) if j != i]
-        # Lagrange's polynomial
+        # Lagrange interpolation
         factors = [
             (wavelength - near_wavelengths[j]) / (near_wavelengths[i] - near_wavelengths[j])
             for j in others
@@ -301,8 +315,8 @@ def index_at(wavelength: Tensor, pupil: Pupil) -> Tensor:
 
 
 def interpolated(place: Tensor, places: Tensor, values: Tensor) -> Tensor:
-    """Return values (row,) at one place, linear between known places in rising order and beyond
-    their ends.
+    """Return values (row,) at one place, by linear interpolation between places in rising order,
+    and linear extrapolation beyond them.
     """
     if len(places) == 1:
         return values[:, 0] + 0.0 * place

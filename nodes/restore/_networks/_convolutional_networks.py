@@ -1,4 +1,4 @@
-"""Networks of convolutions alone: a standard UNet, a small NAFNet, and critics of pictures."""
+"""Purely convolutional networks: a standard UNet, a small NAFNet, and critics of pictures."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -25,7 +25,7 @@ from neusee.nodes.units import Count, DataFile, Layers
 
 # --- unet -----------------------------------------------------------------------------------------
 
-# A standard UNet, a baseline for restoring networks that use spectra and selective scans.
+# A standard UNet: a baseline for restoration networks with spectra and selective scans.
 
 
 class UNet(Flat):
@@ -98,12 +98,12 @@ unet.check(restorer_checks)
 
 # --- nafnet ---------------------------------------------------------------------------------------
 
-# A small NAFNet, a restoring network without activation functions.
+# A small NAFNet: a restoration network without activation functions.
 
 
 class NAFBlock(nn.Module):
-    """A block that multiplies pairs of channels, instead of an activation, and scales channels
-    by their means.
+    """A block that multiplies pairs of channels in place of an activation function, and scales
+    channels by a function of their means.
     """
 
     def __init__(self, width: int) -> None:
@@ -143,8 +143,8 @@ class NAFNet(Flat):
         """Build the network with ``width`` channels at full size, doubled at each of its
         ``levels``.
 
-        ``levels`` are the numbers of blocks in the encoder, ``middle`` that at the smallest size,
-        and ``inputs`` and ``outputs`` the channels of the picture before and after.
+        ``levels`` are the numbers of blocks at each level of the encoder, ``middle`` is the number
+        at the smallest size. ``inputs`` and ``outputs`` are the numbers of channels.
         """
         super().__init__()
         self.multiple = 2 ** len(levels)
@@ -221,21 +221,21 @@ nafnet.check(restorer_checks)
 # They are plain convolutions that are run uncompiled: their gradients are differentiated again, and
 # a compiled or hand-written derivative may return a wrong second derivative without an error.
 
-SMALLEST = 16  #: pixels a side, from which four halvings leave one
+SMALLEST = 16  #: smallest side in pixels: four halvings leave one pixel
 
 
 class Critic(nn.Module):
-    """A network that averages scores over all positions of a picture, halved four times: (n, 3, y,
-    x) -> (n,).
+    """A network that scores pictures: (n, 3, y, x) -> (n,). It halves the size four times, and
+    averages its scores over all positions.
 
-    The network has no norm, so each picture is scored alone.
+    The network has no norm, so each picture is scored independently.
     """
 
     gain = LEAKY
 
     def __init__(self, width: int = 64) -> None:
-        """Build a critic of ``width`` channels at half the size, doubled with each halving up to
-        eight times.
+        """Build a critic with ``width`` channels at half size, doubled at each further halving, up
+        to 8 x ``width``.
         """
         super().__init__()
         sizes = [3, width, 2 * width, 4 * width, 8 * width]
@@ -263,8 +263,8 @@ def critics(rng: torch.Generator, width: int = 64) -> tuple[Critic, Critic]:
 
 
 def skip_critic_draws(rng: torch.Generator, count: int = 1) -> None:
-    """Advance ``rng`` as `critic_slopes` does for ``count`` pictures, whose gradients another
-    process computes.
+    """Advance ``rng`` as `critic_slopes` does for ``count`` pictures; another process computes
+    their gradients.
     """
     torch.rand(count, 1, 1, 1, generator=rng, device=rng.device)
 

@@ -1,4 +1,4 @@
-"""The restoring network of the paper: selective scans of a picture and its spectrum."""
+"""The restoration network of the paper: selective scans of a picture and its spectrum."""
 
 import functools
 import math
@@ -31,18 +31,18 @@ from neusee.nodes.units import Count, DataFile, Layers
 # Trainable layers for selective scans, with the initial values of their time steps and decay rates.
 
 
-#: range of the first steps of a scan, log-uniform: a memory of ten to a thousand positions
+#: range of the initial time steps of a scan, log-uniform: a memory of 10 to 1000 positions
 STEPS = (1e-3, 0.1)
 
 
 class Scan(nn.Module):
-    """A selective scan along a sequence (n, length, channel), with step, input and output
-    weights from the sequence.
+    """A selective scan along a sequence (n, length, channel), whose time step, input and output
+    weights are computed from the sequence.
     """
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
-        """Build a scan of ``channels`` with ``states`` numbers each; ``rank`` numbers give the time
-        steps.
+        """Build a scan of ``channels`` with ``states`` state variables each; the time steps are
+        computed from ``rank`` features.
         """
         super().__init__()
         self.sizes = [rank, states, states]
@@ -88,9 +88,7 @@ class BothWays(nn.Module):
 
 
 def _first_steps(count: int, rng: torch.Generator) -> Tensor:
-    """Return random biases that softplus turns into time steps, log-uniform within the range
-    `STEPS`.
-    """
+    """Return random biases whose softplus, the time step, is log-uniform in the range `STEPS`."""
     low, high = map(math.log, STEPS)
     steps = torch.rand(count, generator=rng, device=rng.device).mul_(high - low).add_(low).exp_()
     # inverse of softplus: log(exp(step) - 1) = step + log(1 - exp(-step))
@@ -98,14 +96,14 @@ def _first_steps(count: int, rng: torch.Generator) -> Tensor:
 
 
 def _step(rate: Tensor, bias: Tensor) -> Tensor:
-    """Return the time step, softplus of the rate plus its bias, within the range that the scan
-    computes well.
+    """Return the time step softplus(rate + bias), limited to the range in which the scan is
+    precise.
     """
     return F.softplus(rate + bias).clamp(1e-5, 8.0)
 
 
 def _decay(A_log: Tensor) -> Tensor:
-    """Return the rate of decay, below 0, for its logarithm."""
+    """Return the negative decay rate -exp(A_log), limited to a finite range."""
     return -torch.exp(A_log.clamp(-12.0, 6.0))
 
 
@@ -116,13 +114,13 @@ def _decay(A_log: Tensor) -> Tensor:
 
 
 class Spatial(nn.Module):
-    """A layer that applies selective scans along the rows or columns of a picture, and gates the
-    result.
+    """A layer of selective scans along the rows or columns of a picture, whose result is multiplied
+    by a gate.
     """
 
     def __init__(self, width: int, states: int, by_columns: bool) -> None:
-        """Build a layer for ``width`` channels, twice as many inside, with ``states`` numbers each
-        in a scan.
+        """Build a layer for ``width`` channels; inside it has twice as many, with ``states`` state
+        variables each.
         """
         super().__init__()
         inner, self.by_columns = 2 * width, by_columns
@@ -154,17 +152,17 @@ def _along(scan: nn.Module, value: Tensor, by_columns: bool) -> Tensor:
 
 @functools.lru_cache(maxsize=32)
 def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the positions in the half spectrum of a (y, x) picture by rising radius, and the rank
-    of each position.
+    """Return the flat indices of the half spectrum of a (y, x) picture in order of radius, and the
+    rank of each index in this order.
 
     Radii are in cycles per pixel. Equal radii are ordered by angle, from -90 to 90 degrees.
     """
     y, x = size
-    with torch.inference_mode(False):  # the cache may serve a caller that trains
+    with torch.inference_mode(False):  # a later caller, which trains, may get the cached tensors
         # (fy / y)^2 + (fx / x)^2, times (x y)^2
         rows = torch.fft.fftfreq(y, 1 / y, dtype=torch.float64).round().long()[:, None] * x
         columns = torch.arange(x // 2 + 1)[None] * y
-        # whole numbers, so that equal radii compare equal
+        # integers, so that equal radii compare as equal
         radius = (rows * rows + columns * columns).flatten()
         angle = torch.atan2(rows.double(), columns.double()).flatten()
         # sorted by radius, and by angle where radii are equal
@@ -214,8 +212,8 @@ class Frequency(nn.Module):
 
 
 class Block(nn.Module):
-    """A block that mixes selective scans of a picture and of its spectrum, with a gated
-    feed-forward layer.
+    """A block: a weighted mean of scans of a picture and of its spectrum, then a gated feed-forward
+    layer.
     """
 
     def __init__(self, width: int, states: int, by_columns: bool) -> None:
@@ -243,8 +241,8 @@ class Block(nn.Module):
 
 # --- fft mamba ------------------------------------------------------------------------------------
 
-# The restoring network of the paper: selective scans of a picture and its spectrum, first at half
-# the size.
+# The restoration network of the paper: selective scans of a picture and its spectrum, first at half
+# size.
 
 
 class FFTMamba(PictureRestorer):
@@ -256,17 +254,17 @@ class FFTMamba(PictureRestorer):
     the modules are our choice.
     """
 
-    #: what a file of weights says beside its tensors. Earlier versions had other values, with
-    #: tensors of the same shapes, so a file that says otherwise is refused.
+    #: metadata in a file of weights. Earlier versions had other values and tensors of the same
+    #: shapes, so a file with other metadata is refused
     options: Mapping[str, Any] = {"directions": 2, "pyramid": False, "frequency": "complex"}
 
     def __init__(
         self, width: int = 64, blocks: int = 8, states: int = 16, shuffle: int = 2
     ) -> None:
-        """Build the network: ``width`` channels, ``blocks`` of scans with ``states`` numbers for
-        each channel.
+        """Build the network with ``width`` channels and ``blocks`` blocks, whose scans have
+        ``states`` state variables for each channel.
 
-        ``shuffle`` is the side of the squares of pixels that become channels.
+        Squares of ``shuffle`` x ``shuffle`` pixels become channels (pixel unshuffle).
         """
         super().__init__()
         self.shuffle, self.multiple = shuffle, 2 * shuffle

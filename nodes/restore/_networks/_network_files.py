@@ -1,4 +1,4 @@
-"""Networks in files: export to .pt2 or .onnx, checks, and the node for a network of a user."""
+"""Networks in files: export to .pt2 or .onnx, checks, and the node for a user's network."""
 
 import importlib.util
 import io
@@ -39,13 +39,13 @@ from neusee.nodes.units import Count, DataFile
 
 SUFFIXES = (".pt2", ".onnx")
 _NEEDED = ("onnx", "onnxscript")
-_LARGEST = 4096  #: pixels along a side
-_LEAST = 32
+_LARGEST = 4096  #: largest side of a picture for an exported network, pixels
+_LEAST = 32  #: smallest side, pixels
 
 
 class _Graph(nn.Module):
-    """A restoring network for pictures whose sides are multiples of its own, without the padding
-    for other sizes.
+    """A restoration network without padding, for pictures whose sides are multiples of its
+    `multiple`.
     """
 
     def __init__(self, net: Restorer) -> None:
@@ -97,7 +97,7 @@ def export_network(net: Restorer, file: Path) -> None:
     require_exportable(net, file.suffix)
     graph, multiple = _Graph(net).eval(), net.multiple
     multiples = -(-2 * _LEAST // multiple)
-    # sides that differ, so that the graph does not take them for one
+    # different sides, so that the export does not treat them as one variable
     example = torch.rand(
         1,
         3,
@@ -114,7 +114,7 @@ def export_network(net: Restorer, file: Path) -> None:
     unfinished = file.with_name(f".{os.getpid()}.{file.name}")
     try:
         with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of packages about their own future
+            warnings.simplefilter("ignore")  # deprecation warnings from inside the packages
             _write(graph, example, sides, unfinished)
         unfinished.replace(file)
     except Exception as error:
@@ -127,8 +127,8 @@ def export_network(net: Restorer, file: Path) -> None:
 
 
 def _write(graph: nn.Module, example: Tensor, sides: Any, file: Path) -> None:
-    """Write a module as a graph for pictures like ``example``, with free ``sides``, by the suffix
-    of the file.
+    """Write a module as a graph for pictures like ``example`` with variable ``sides``; the suffix
+    of the file selects the format.
     """
     program = torch.export.export(graph, (example,), dynamic_shapes=sides)
     if file.suffix == ".pt2":
@@ -147,13 +147,13 @@ def _write(graph: nn.Module, example: Tensor, sides: Any, file: Path) -> None:
 
 # --- exported network -----------------------------------------------------------------------------
 
-# A restoring network from a file of `torch.export`: what the file may hold, and the sizes that it
-# was exported for.
+# A restoration network from a file of `torch.export`: the allowed content of the file, and the
+# picture sizes that the network was exported for.
 #
-# `torch.export.load` reads pickles and calls what the graph of the file names: torch 2.6 to 2.8
-# unpickle without limits, and 2.13 does so where `weights_only` fails. So each file is checked
-# first: pickles hold tensors only, the graph calls only operators of aten and arithmetic, and
-# formulas of sizes hold no other names. Torch then reads the checked bytes.
+# `torch.export.load` reads pickles and calls the functions that the graph names: torch 2.6 to 2.8
+# unpickle without limits, and 2.13 does so if `weights_only` fails. So each file is checked first:
+# pickles contain only tensors, the graph calls only aten operators and arithmetic, and formulas of
+# sizes contain no other names. Then torch reads the checked bytes.
 
 
 EXPORTED = ".pt2"  #: suffix of a file of `torch.export`
@@ -169,13 +169,13 @@ _IN_FORMULA = re.compile(
     r"False|Eq|Ne|Le|Lt|Ge|Gt|L|size|stride|storage_offset|and|or|not|int_oo|evaluate|[suz]\d+|\d+"
 )
 _CONTAINERS = ("builtins.tuple", "builtins.list", "builtins.dict", None)
-_FLOAT = 7  #: of float32, in the graph of a file
-_TRIED = 512**2  #: pixels; a network for larger pictures alone is not tried before the run
+_FLOAT = 7  #: code of float32 in the graph of a file
+_TRIED = 512**2  #: largest number of pixels of a trial call; larger networks have none before a run
 _FIX = "export the network again, in eval() and with a picture (1, 3, y, x) as its only input"
 
 
 class Side(NamedTuple):
-    """Sizes of a side of the pictures that an exported network takes, in pixels."""
+    """The allowed lengths in pixels of one side of the pictures for an exported network."""
 
     least: int
     most: float
@@ -183,15 +183,15 @@ class Side(NamedTuple):
 
 
 class Graph(NamedTuple):
-    """What the graph of an exported network says."""
+    """The allowed picture sizes and the torch version of an exported network."""
 
     sides: tuple[Side, Side]  #: y and x
-    version: str  #: of the torch that wrote the file
+    version: str  #: version of the torch that wrote the file
 
 
 def exported_network(file: Path, multiple: int | None = None) -> OwnNetwork:
-    """Return the network of a file as a restorer; raise ParameterError for a file that is not to
-    be read.
+    """Return the network of a file as a restorer; raise ParameterError for a file that is damaged
+    or could run code.
     """
     data = _bytes(file)
     graph = _checked(file, data)
@@ -211,8 +211,8 @@ def exported_network(file: Path, multiple: int | None = None) -> OwnNetwork:
 
 
 class _Exported(OwnNetwork):
-    """A network that has no modes: `torch.export` fixes the layers as they were when the file
-    was written.
+    """A network without training and evaluation modes: `torch.export` fixes the layers in the mode
+    of the export.
     """
 
     def train(self, mode: bool = True) -> "_Exported":
@@ -220,7 +220,7 @@ class _Exported(OwnNetwork):
         return self
 
     def to(self, *args: Any, **kwargs: Any) -> "_Exported":
-        """Move the tensors to a device; the type of the numbers stays that of the file."""
+        """Move the tensors to a device; their type stays that of the file."""
         device = next((x for x in args if isinstance(x, str | torch.device)), kwargs.get("device"))
         if device is not None:
             super().to(device)
@@ -228,8 +228,8 @@ class _Exported(OwnNetwork):
 
 
 def read_sizes(file: Path, multiple: int | None, sizes: tuple[int, int] | None) -> None:
-    """Raise ParameterError for a file that is not to be read, or that was exported for other
-    sizes than ``sizes``.
+    """Raise ParameterError for a file that is damaged or could run code, or that was not exported
+    for pictures of ``sizes``.
     """
     sides = _tried(file, multiple or 1)
     if sizes is None:
@@ -252,14 +252,15 @@ def read_sizes(file: Path, multiple: int | None, sizes: tuple[int, int] | None) 
 
 @once_per_version
 def _tried(file: Path, multiple: int) -> tuple[Side, Side]:
-    """Try an exported network on a small picture with sides of a multiple, and return the sizes
-    that it takes along y and x.
+    """Call an exported network once on a small picture, and return the allowed sizes along y and x.
+
+    The sides of the small picture are multiples of ``multiple``.
     """
     net = exported_network(file)
     sides = _checked(file, _bytes(file)).sides
     multiples = [math.lcm(side.multiple, multiple) for side in sides]
     y, x = (
-        # the least multiple that is above 32, and within the sizes of the file
+        # the smallest multiple above 32 within the sizes of the file
         step * math.ceil(max(side.least, 33) / step)
         for side, step in zip(sides, multiples, strict=True)
     )
@@ -270,7 +271,7 @@ def _tried(file: Path, multiple: int) -> tuple[Side, Side]:
 
 
 def _bytes(file: Path) -> bytes:
-    """Return the bytes of a file whose content has room in memory: itself, a part that is
+    """Return the bytes of a file; memory must have room for the file, the part that is being
     checked, and the network.
     """
     archive_needs(file, 3.0, "weights")
@@ -278,8 +279,8 @@ def _bytes(file: Path) -> bytes:
 
 
 def _checked(file: Path, data: bytes) -> Graph:
-    """Return what the graph of a file says; raise ParameterError for a file that could run code,
-    or does not fit.
+    """Return sizes and version from the graph of a file; raise ParameterError for a file that could
+    run code or is not a restoration network.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -320,7 +321,7 @@ def _check_member(file: Path, name: str, data: bytes) -> None:
 
 
 def _graph(file: Path, program: Any) -> Graph:
-    """Return what the graph of a file says, after all checks of what it calls and takes."""
+    """Return sizes and version from the graph of a file, after checks of its calls and inputs."""
     _check_calls(file, program)
     module = program["graph_module"]
     if any(_trains(node) for node in module["graph"]["nodes"]):
@@ -343,14 +344,16 @@ def _check_calls(file: Path, program: Any) -> None:
 
 
 def _check_formulas(file: Path, program: Any, module: Any) -> None:
-    """Raise ParameterError for a formula of sizes with a name that none needs."""
+    """Raise ParameterError for a formula of sizes that contains a name other than those of sizes
+    and arithmetic.
+    """
     formulas = [value for key, value in _pairs(module) if key == "expr_str"]
     for text in (
         *formulas,
         *program.get("range_constraints", {}),
         *(program.get("guards_code") or ()),
     ):
-        # the input of the network, by its name
+        # `L['picture']` is the input of the network; its name is arbitrary
         without_input_name = re.sub(r"L\['\w+'\]", "L", str(text))
         other_names = [
             word
@@ -362,9 +365,7 @@ def _check_formulas(file: Path, program: Any, module: Any) -> None:
 
 
 def _trains(node: Any) -> bool:
-    """Return True for an operator that computes otherwise in training, such as dropout, and is
-    told to do so.
-    """
+    """Return True for an operator in training mode, such as dropout with ``training`` True."""
     arguments = {
         argument.get("name"): argument.get("arg", {}).get("as_bool") for argument in node["inputs"]
     }
@@ -372,15 +373,15 @@ def _trains(node: Any) -> bool:
 
 
 def _check_containers(file: Path, spec: Any) -> None:
-    """Raise ParameterError for a structure of inputs or results that is no plain container."""
+    """Raise ParameterError if inputs or results have another structure than tuple, list or dict."""
     for key, value in _pairs(spec):
         if key == "type" and value not in _CONTAINERS:
             raise _refused(file, f"takes or returns a {value}: {_FIX}")
 
 
 def _sides(file: Path, program: Any, module: Any) -> tuple[Side, Side]:
-    """Return the sizes of the pictures; raise ParameterError unless one picture gives one of the
-    same sizes.
+    """Return the allowed sizes of the pictures; raise ParameterError unless the network returns one
+    picture of the size of its input.
     """
     picture, result = _picture_and_result(file, module)
     sizes = picture["sizes"]
@@ -400,7 +401,7 @@ def _sides(file: Path, program: Any, module: Any) -> tuple[Side, Side]:
 
 
 def _picture_and_result(file: Path, module: Any) -> tuple[Any, Any]:
-    """Return type and sizes of the only input and of the only result of a graph."""
+    """Return the descriptions (type and sizes) of the only input and the only result of a graph."""
     signature, values = module["signature"], module["graph"]["tensor_values"]
     user_inputs = [
         spec["user_input"]["arg"] for spec in signature["input_specs"] if "user_input" in spec
@@ -424,18 +425,18 @@ def _picture_and_result(file: Path, module: Any) -> tuple[Any, Any]:
 
 
 def _shape(sizes: Any) -> str:
-    """Return sizes as text, with "any" for a free one."""
+    """Return sizes as text, with "any" for a variable size."""
     return " x ".join(str(size.get("as_int", "any")) for size in sizes)
 
 
 def _plain(sizes: Any) -> list[Any]:
-    """Return each size as a number, or as the formula that the file has for it."""
+    """Return each size as a number, or as its formula in the file."""
     return [size.get("as_int", size.get("as_expr", {}).get("expr_str")) for size in sizes]
 
 
 def _side(size: Any, limits: Any) -> Side:
-    """Return the sizes of a side from its formula, such as ``2*s0`` or ``Mul(Integer(2),
-    Symbol('s0', ...))``.
+    """Return the allowed lengths of a side from its formula, such as ``2*s0`` or
+    ``Mul(Integer(2), Symbol('s0', ...))``.
     """
     if "as_int" in size:
         return Side(size["as_int"], size["as_int"], 1)
@@ -453,7 +454,7 @@ def _side(size: Any, limits: Any) -> Side:
 
 
 def _pairs(value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield each key with its value, at any depth."""
+    """Yield each key of nested dicts and lists with its value."""
     pending = [value]
     while pending:
         item = pending.pop()
@@ -470,7 +471,7 @@ def _refused(file: Path, text: str) -> ParameterError:
 
 # --- network node ---------------------------------------------------------------------------------
 
-# The node that restores a picture with a network of the user: a class with weights, or a file of
+# The node that restores a picture with a user's network: a class with weights, or a file of
 # `torch.export`.
 
 
@@ -536,8 +537,8 @@ def _loaded_network(
 
 
 def _class(architecture: Architecture | type[nn.Module] | None) -> Architecture:
-    """Return the class of the network in the form that checks its parameters; raise ParameterError
-    for none.
+    """Return the class of the network as an `Architecture`, which checks its parameters; raise
+    ParameterError if there is none.
     """
     if architecture is None:
         text = (
@@ -553,7 +554,7 @@ def _class(architecture: Architecture | type[nn.Module] | None) -> Architecture:
 
 
 def _weights(weights: Path | None) -> Path:
-    """Return the file of weights; raise ParameterError for none, and for a pickle."""
+    """Return the file of weights; raise ParameterError for a missing file or a pickle."""
     if weights is None:
         text = (
             "a network needs trained weights: train them by `neusee train`, and give the"
@@ -601,8 +602,8 @@ def _(
 
 
 def _sizes(picture: Any, tile: int | None, reduce: int) -> tuple[int, int] | None:
-    """Return height and width of the pictures that the network receives, or None where they are
-    not known.
+    """Return height and width of the pictures that the network receives, or None if they are
+    unknown.
     """
     if not isinstance(picture, Tensor) or picture.ndim != 3:
         return None

@@ -1,5 +1,5 @@
-"""A restoring network of a user: how it is built and called, and a first call that shows
-mistakes and costs.
+"""A user's restoration network: building and calling it, and a trial call that shows errors, time
+and memory.
 """
 
 import functools
@@ -21,8 +21,8 @@ from neusee.nodes.precision import exact_convolutions
 from neusee.nodes.resampling import mirrored, resize
 from neusee.nodes.restore._networks._restorer import PictureRestorer
 
-_DRAWING = threading.Lock()  #: one thread at a time seeds the random numbers of the process
-_LEAST = 32  #: pixels of the smaller side of the picture on which a network is tried, at least
+_DRAWING = threading.Lock()  #: one thread at a time seeds the global random generator
+_LEAST = 32  #: smallest side in pixels of the picture of a trial call
 #: errors of Python and torch that the code of a network may raise
 _FAILURES = (
     RuntimeError,
@@ -37,33 +37,31 @@ _FAILURES = (
 
 
 class Trial(NamedTuple):
-    """What one call of a network on a small picture showed."""
+    """The measured cost of a call of a network on a small picture."""
 
-    operations: float  #: floating-point operations for each pixel
-    memory: float  #: bytes of all inner results for each pixel
+    operations: float  #: floating-point operations per pixel
+    memory: float  #: bytes of all intermediate results per pixel
 
 
 class OwnNetwork(PictureRestorer):
-    """A network of a user as a restorer: sides are padded to a multiple, and wrong results raise
-    a named error.
+    """A user's network as a restorer: pictures are padded to a multiple, and wrong results raise an
+    error that names the network.
     """
 
     def __init__(
         self, inner: nn.Module, name: str, multiple: int, options: Mapping[str, Any]
     ) -> None:
-        """Take a module of a user and its name for messages; sides of pictures become multiples of
-        ``multiple``.
+        """Wrap a user's module; messages show its ``name``, and the sides of pictures are padded to
+        multiples of ``multiple``.
         """
         super().__init__()
         self.inner, self.name, self.multiple = inner, name, multiple
-        #: what a file of weights says of the class that was trained
+        #: metadata in a file of weights about the class that was trained
         self.options = dict(options)
 
     @property
     def stored(self) -> nn.Module:
-        """Return the module of the user, whose tensors a file of weights holds under the user's
-        names.
-        """
+        """Return the user's module, so that a file of weights has the user's names of tensors."""
         return self.inner
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,7 +77,7 @@ class OwnNetwork(PictureRestorer):
         """Return the result of the user's network; raise ValueError with its name for a wrong
         result or an error.
         """
-        # torch counts the changes of a tensor in place
+        # torch increments `_version` at each change of a tensor in place
         version_before = picture._version
         with self._located(picture):
             result = self.inner(picture)
@@ -106,7 +104,7 @@ class OwnNetwork(PictureRestorer):
 
     @contextmanager
     def _located(self, picture: Tensor) -> Iterator[None]:
-        """Name the network and the line of its file in an error that its code raises."""
+        """Raise an error of the user's code as ValueError that names the network, file and line."""
         try:
             yield
         except torch.OutOfMemoryError:
@@ -136,12 +134,11 @@ def own_network(
     multiple: int | None,
     seed: int = 0,
 ) -> OwnNetwork:
-    """Return a network of a user's class with the initial weights of the class, drawn from
-    ``seed``.
+    """Return a network of a user's class, with random initial weights for ``seed``.
 
     ``multiple``: the divisor of the sides of a picture; by default the attribute ``multiple`` of
-    the class, or 1. The random numbers of the process do not change. Raises ParameterError for
-    arguments that the class refuses.
+    the class, or 1. The state of the global random generator does not change. Raises ParameterError
+    for arguments that the class refuses.
     """
     try:
         arguments = architecture.arguments(parameters)
@@ -174,13 +171,13 @@ def try_network(
     device: str = "cpu",
     sizes: tuple[int, int] | None = None,
 ) -> Trial:
-    """Call a network on a small picture, and return what the call cost; raise ParameterError for
-    what is wrong.
+    """Call a network on a small picture, and return the cost of the call; raise ParameterError for
+    an error or a wrong result.
 
-    The sides of the picture differ, and no smaller power of two than `multiple` divides them, so
-    that a network that needs certain sizes and does not say so fails here.
+    The sides of the picture differ, and are odd multiples of `multiple`. So a network that needs
+    other sizes, but does not declare them, fails here.
     """
-    # odd, so that a network that needs sides of more even factors shows it
+    # odd, so that a network that needs a multiple with more factors of 2 fails
     side_in_multiples = math.ceil(_LEAST / net.multiple) | 1
     y, x = sizes or (net.multiple * side_in_multiples, net.multiple * (side_in_multiples + 2))
     random = torch.Generator().manual_seed(1)
@@ -226,9 +223,7 @@ _DRAWS = "draw random numbers only while self.training is true, and keep no stat
 def tried(
     architecture: Architecture, parameters: dict[str, Any] | None, multiple: int | None
 ) -> Trial:
-    """Return what a call of a class costs, and remember the answer for this class and these
-    parameters.
-    """
+    """Return the cost of a call of a class; it is cached for this class and these parameters."""
     text = json.dumps(parameters, sort_keys=True, default=str)
     return _tried(architecture, text, multiple)
 
@@ -239,8 +234,8 @@ def _tried(architecture: Architecture, parameters: str, multiple: int | None) ->
 
 
 class _Counting(TorchFunctionMode):
-    """A mode of torch that counts operations, and the bytes of all results that share no memory
-    with their input.
+    """A torch function mode that counts operations, and the bytes of all results that do not share
+    memory with their input.
     """
 
     def __init__(self) -> None:
@@ -248,9 +243,7 @@ class _Counting(TorchFunctionMode):
         self.operations, self.memory = 0.0, 0.0
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run a torch function, and count its operations and the bytes of its result if these are
-        new.
-        """
+        """Run a torch function; count its operations and bytes if its result is in new memory."""
         result = func(*args, **(kwargs or {}))
         input_tensors = [x for x in args if isinstance(x, Tensor)]
         if isinstance(result, Tensor) and result.data_ptr() not in [
@@ -262,11 +255,12 @@ class _Counting(TorchFunctionMode):
 
 
 def _operations(name: str, tensors: list[Tensor], result: Tensor) -> float:
-    """Return the operations of a function of torch: two for each product of a layer, otherwise
-    one for each number.
+    """Return the operations of a torch function: two for each product of a layer, otherwise one for
+    each element of the result.
     """
     if name.startswith("conv_transpose"):
-        # tensors[1] is the weights: all products of one input number, or of one output number
+        # `tensors[1]` are the weights; `tensors[1][0]` are those of one input (transposed) or of
+        # one output channel
         return 2.0 * tensors[0].numel() * tensors[1][0].numel()
     if name.startswith(("conv", "linear")):
         return 2.0 * result.numel() * tensors[1][0].numel()

@@ -1,4 +1,4 @@
-"""The base of all restoring networks: initial weights, and a picture restored in tiles."""
+"""The base of all restoration networks: initial weights, and restoration of a picture in tiles."""
 
 import math
 from abc import ABC, abstractmethod
@@ -21,19 +21,19 @@ from neusee.nodes.units import Count
 
 # --- tiles ----------------------------------------------------------------------------------------
 
-# Restoration of a picture in tiles of the size that a network was trained on, joined without seams.
+# Restoration of a picture in tiles of the size of the training pictures, blended without seams.
 
 
-_OVERLAP = 0.25  #: least share of a tile's side that overlaps the next tile
+_OVERLAP = 0.25  #: smallest overlap of neighbouring tiles, relative to the side of a tile
 
 
 def tiled(change: Callable[[Tensor], Tensor], picture: Tensor, side: int) -> Tensor:
-    """Apply ``change`` to a picture (n, 3, y, x) tile by tile, and return the weighted mean where
-    tiles overlap.
+    """Apply ``change`` to a picture (n, 3, y, x) tile by tile, and return the weighted mean of
+    overlapping tiles.
 
-    Weights fall linearly towards an edge beyond which another tile continues, so that tiles join
-    without a step. Tiles lie inside the picture; a picture that is no larger than a tile is changed
-    as a whole.
+    The weights fall linearly towards an edge that overlaps another tile, so that there is no step
+    between tiles. Tiles lie inside the picture. A picture not larger than a tile is changed as a
+    whole.
     """
     size = (picture.shape[-2], picture.shape[-1])
     if max(size) <= side:
@@ -51,8 +51,8 @@ def tiled(change: Callable[[Tensor], Tensor], picture: Tensor, side: int) -> Ten
 
 
 def _starts(length: int, side: int) -> list[int]:
-    """Return the first pixel of each tile along an axis, for the fewest even tiles that overlap
-    by `_OVERLAP`.
+    """Return the first pixel of each tile along an axis: the smallest number of equally spaced
+    tiles that overlap by at least `_OVERLAP`.
     """
     if length <= side:
         return [0]
@@ -77,23 +77,21 @@ def _ramp(start: int, side: int, length: int, like: Tensor) -> Tensor:
 
 # --- restorer -------------------------------------------------------------------------------------
 
-# The common base of all restoring networks, with their initial weights and their application to a
+# The common base of all restoration networks, with their initial weights and their application to a
 # picture.
 
 
 Net = TypeVar("Net", bound=nn.Module)
-Tile = Annotated[Count, Field(ge=32)]  #: side of a piece, pixels
-LEAK = 0.2  #: slope of a leaky layer for negative numbers
+Tile = Annotated[Count, Field(ge=32)]  #: side of a tile, pixels
+LEAK = 0.2  #: slope of a leaky ReLU for negative inputs
 LEAKY = nn.init.calculate_gain("leaky_relu", LEAK)
 LAYERS = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
 
 
 class Restorer(nn.Module, ABC):
-    """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine
-    scale.
+    """A network that restores pictures (n, 3, y, x) of any size, at full and at half size.
 
-    ``conditions`` are what a network needs of a picture beside its pixels; most networks need
-    nothing.
+    ``conditions`` are further inputs besides the pixels of a picture; most networks have none.
     """
 
     multiple: int  #: divisor of the height and width inside the network
@@ -107,16 +105,18 @@ class Restorer(nn.Module, ABC):
 
     @abstractmethod
     def begin(self) -> None:
-        """Change the drawn weights so that the network at first returns almost the same picture."""
+        """Change the initial weights so that the network at first returns almost the same
+        picture.
+        """
 
     @property
     def stored(self) -> nn.Module:
-        """Return the module whose tensors a file of weights holds."""
+        """Return the module whose tensors are stored in a file of weights."""
         return self
 
 
 class PictureRestorer(Restorer):
-    """A restoring network that sees nothing but the picture."""
+    """A restoration network whose only input is the picture."""
 
     last: nn.Conv2d  #: layer that computes the change that is added to the picture
 
@@ -136,8 +136,8 @@ class PictureRestorer(Restorer):
 
 
 class Flat(PictureRestorer):
-    """A restoring network that works at full size only; its coarse estimate is the reduced fine
-    estimate.
+    """A restoration network that works at full size only; its coarse estimate is the fine estimate
+    at half size.
     """
 
     @abstractmethod
@@ -161,9 +161,7 @@ class ChannelNorm(nn.LayerNorm):
 
 
 class Scale(nn.Module):
-    """A trainable factor for each channel, small at the start, which scales the output of a
-    network block.
-    """
+    """A trainable factor for each channel of the output of a network block; it starts at 0.1."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -177,12 +175,13 @@ class Scale(nn.Module):
 
 
 def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
-    """Return a network with initial values: random orthogonal weights and zero biases of linear and
-    convolution layers.
+    """Return a network with initial values: random orthogonal weights and zero biases for linear
+    and convolution layers.
 
-    Norms, decays and factors have rules of their own. The weights of a network with leaky layers
-    are multiplied by its `gain`, which keeps the power from layer to layer. `Restorer.begin` makes
-    the change to a picture small, so that the network at first returns almost the same picture.
+    Norms, decays and factors have other initial values. The weights of a network with leaky layers
+    are multiplied by its `gain`, so that the power stays the same from layer to layer.
+    `Restorer.begin` makes the change of a picture small, so that the network at first returns
+    almost the same picture.
     """
     net = empty(make).to_empty(device=rng.device)
     gain = getattr(net, "gain", 1.0)
@@ -204,11 +203,11 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
 def parameter_groups(
     net: nn.Module, weights: float = 2e-4, biases: float = 4e-4
 ) -> list[dict[str, Any]]:
-    """Return the network's parameters in two groups for an optimiser; the second group has the
-    biases of layers.
+    """Return the network's parameters in two groups for an optimiser: the second group are the
+    biases of layers, with their own learning rate.
     """
     layer_biases = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
-    # by identity, because `in` would compare tensors by value
+    # by identity: `in` would compare the values of tensors
     bias_ids = set(map(id, layer_biases))
     others = [p for p in net.parameters() if id(p) not in bias_ids]
     return [{"params": others, "lr": weights}, {"params": layer_biases, "lr": biases}]
@@ -288,7 +287,7 @@ def _needed(weights: Path | None) -> Path:
 
 
 def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    """Return a check of the root mean square change by a network, which fails if this change is
+    """Return a check that shows the rms change of a picture by a network; it fails if the change is
     not finite.
     """
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())

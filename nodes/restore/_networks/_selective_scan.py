@@ -16,8 +16,8 @@ from torch.nn import functional as F
 
 from neusee.nodes import _cpp_library
 
-#: the C++ source decides a result; NEUSEE_SCAN and the threads change it within rounding, but the
-#: variable chooses one backend for all
+#: the result depends on the C++ source; NEUSEE_SCAN and the number of threads change it only within
+#: rounding, but the variable selects one backend for all
 __depends__ = (
     "_selective_scan.cpp",
     "env:NEUSEE_SCAN",
@@ -64,15 +64,15 @@ def selective_scan(
 def reference(
     u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None
 ) -> Tensor:
-    """Compute the selective scan by a loop over positions in float64, a slow reference with all
-    derivatives.
+    """Return the selective scan, computed by a loop over positions in float64: a slow reference
+    with derivatives of any order.
 
     Shapes: as `selective_scan`.
     """
     _check_shapes(u, dt, A, B, C, D)
     u, dt, A, B, C = (x.double() for x in (u, dt, A, B, C))
     states, outputs = u.new_zeros(u.shape[0], *A.shape), []
-    # unbind, because the gradient of an indexed row is as long as all rows
+    # `unbind`: the gradient of an indexed row would have the size of all rows
     for step_input, step, input_weight, output_weight in zip(
         (dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True
     ):
@@ -113,8 +113,8 @@ def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Ten
 
 
 def _common_dtype(*tensors: Tensor) -> torch.dtype:
-    """Return float64 if any tensor is, else float32; raise ValueError for numbers not in floating
-    point.
+    """Return float64 if any tensor is float64, otherwise float32; raise ValueError for a tensor
+    that is not floating-point.
     """
     for x in tensors:
         if not x.is_floating_point():
@@ -125,8 +125,8 @@ def _common_dtype(*tensors: Tensor) -> torch.dtype:
 
 
 def _runs_in_cpp(u: Tensor) -> bool:
-    """Return True on a CPU where the C++ scan can be compiled, unless the variable NEUSEE_SCAN
-    says torch.
+    """Return True if the tensor is on the CPU and the C++ scan can be compiled, unless NEUSEE_SCAN
+    is "torch".
     """
     backend_named = os.environ.get("NEUSEE_SCAN") or ""
     if backend_named not in ("", "torch", "cpp"):
@@ -135,8 +135,8 @@ def _runs_in_cpp(u: Tensor) -> bool:
 
 
 def refuse_twice() -> None:
-    """Raise RuntimeError for a second derivative, which would be silently wrong without a graph
-    of the gradient.
+    """Raise RuntimeError for a second derivative, which would be wrong without notice: the gradient
+    has no graph.
     """
     if torch.is_grad_enabled():
         raise RuntimeError(
@@ -147,16 +147,16 @@ def refuse_twice() -> None:
 
 # --- in torch operations --------------------------------------------------------------------------
 
-# The length is cut into segments that fit in a cache, and each segment into chunks that are walked
-# in parallel. A segment takes as many operations as a chunk has steps, and one more for the carry
-# of each chunk. Only the states between segments are stored; back-propagation computes all other
-# states again. Decays enter as exp(x) - 1, because the round-off of a decay near 1 would act at
-# each step. The carry between chunks is float64, because a state that hardly decays is rounded at
-# each carry.
+# The sequence is divided into segments that fit in a cache, and each segment into chunks that are
+# scanned in parallel. A segment takes one tensor operation for each step of a chunk, and one more
+# for the carry of each chunk. Only the states between segments are stored; back-propagation
+# computes all other states again. A decay is stored as exp(x) - 1, because the rounding error of a
+# decay near 1 would act at each step. The carry between chunks is float64, because a state that
+# hardly decays would be rounded at each carry.
 
-#: Numbers in the states of a segment, and in one operation: the fastest on one core at 1536 numbers
-#: a step, by 3 % over segments twice as long, by a tenth over no chunks. Smaller operations take
-#: longer to call than to compute.
+#: number of elements in the states of a segment, and in one operation: the fastest on one core for
+#: 1536 elements a step, by 3 % over segments twice as long, by a tenth over no chunks. Smaller
+#: operations take longer to call than to compute
 SEGMENT, ROW = 1 << 17, 1 << 14
 SEGMENT_CUDA, ROW_CUDA = 1 << 23, 1 << 17  #: the same two numbers on a GPU: chosen, not measured
 
@@ -175,8 +175,8 @@ class ScanPlan(NamedTuple):
 
 
 def plan_scan(length: int, width: int, cuda: bool) -> ScanPlan:
-    """Divide a sequence of ``length`` time steps with ``width`` numbers each into segments and
-    chunks.
+    """Return the division into segments and chunks of a sequence of ``length`` time steps with
+    ``width`` elements each.
     """
     row, segment_numbers = (ROW_CUDA, SEGMENT_CUDA) if cuda else (ROW, SEGMENT)
     segment = min(length, max(16, segment_numbers // width))
@@ -185,21 +185,21 @@ def plan_scan(length: int, width: int, cuda: bool) -> ScanPlan:
 
 
 class _Segment:
-    """The inputs and decays of one segment of a sequence, (step, chunk, batch, d or n), padded
-    by steps of length 0.
+    """The inputs and decays of one segment of a sequence, (step, chunk, batch, d or n), padded with
+    time steps of 0.
     """
 
     def __init__(self, division: ScanPlan, rows: slice, rate: Tensor, *lines: Tensor) -> None:
-        """Cut ``rows`` out of the sequences u, dt, B and C (``lines``) and compute their decays."""
+        """Take ``rows`` from the sequences u, dt, B and C (``lines``), and compute the decays."""
         self.division, self.rows, self.rate = division, rows, rate
         self.size = min(division.segment, lines[0].shape[1] - rows.start)
         self.u, self.dt, self.into, self.out = (self.turn(x) for x in lines)
         self.pushed = self.u * self.dt
-        # decay - 1 in each step
+        # decay of each step, minus 1
         self.lost = (self.dt[..., None] * rate).expm1_()
 
     def turn(self, x: Tensor) -> Tensor:
-        """Rearrange one segment of a sequence from (batch, length, m) to (step, chunk, batch,
+        """Return one segment of a sequence (batch, length, m), rearranged to (step, chunk, batch,
         m).
         """
         segment = F.pad(x[:, self.rows], (0, 0, 0, self.division.segment - self.size)).contiguous()
@@ -210,7 +210,7 @@ class _Segment:
         )
 
     def back(self, x: Tensor) -> Tensor:
-        """Rearrange one segment of a sequence from (step, chunk, batch, m) to (batch, rows, m)."""
+        """Return one segment (step, chunk, batch, m), rearranged to (batch, rows, m)."""
         return x.permute(2, 1, 0, 3).flatten(1, 2)[:, : self.size]
 
     def states(self, start: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,11 +221,11 @@ class _Segment:
         return h, _walk(h, list(self.lost.unbind(0)), start)
 
     def slopes(self, output_slope: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradients of all states of a scan, and of the state before the first step in
-        float64.
+        """Return the gradients with respect to all states of a scan, and with respect to the state
+        before the first step, in float64.
 
-        The gradient of a state is the sum of the gradients through its output, ``output_slope``,
-        and through the next state, or ``end`` for the last state.
+        The gradient of a state is the sum of the gradient through its output (``output_slope``) and
+        the gradient through the next state (``end`` for the last state).
         """
         state_slopes = output_slope[..., None] * self.out[..., None, :]
         first_decay, *later_decays = self.lost.unbind(0)
@@ -236,8 +236,8 @@ class _Segment:
         return state_slopes, slope_at_first + first_decay[0] * slope_at_first
 
     def gradients(self, dy: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, ...]:
-        """Return the gradients of u, dt, B, C (batch, rows, m), A and the state before the first
-        step (batch, d, n).
+        """Return the gradients with respect to u, dt, B, C (batch, rows, m), A, and the state
+        before the first step (batch, d, n).
         """
         output_slope = self.turn(dy)
         (state_values, _), (state_slopes, start_slope) = (
@@ -252,7 +252,7 @@ class _Segment:
         state_slopes[1:] *= state_values[:-1]
         state_slopes[0, 1:] *= state_values[-1, :-1]
         state_slopes[0, 0] *= start
-        # now the gradient of dt * A
+        # from here on, `state_slopes` is the gradient with respect to dt * A
         state_slopes *= torch.mul(self.dt[..., None], self.rate, out=self.lost).exp_()
         dt = (
             torch.mul(state_slopes, self.rate, out=state_values)
@@ -265,13 +265,12 @@ class _Segment:
 
 
 def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> Tensor:
-    """Turn the inputs ``h`` (step, chunk, ...) of a scan into states in place: h_i <- h_i + (1 +
-    lost_i) h_(i-1).
+    """Convert the inputs ``h`` (step, chunk, ...) of a scan to states in place, and return the last
+    state in float64: h_i <- h_i + (1 + lost_i) h_(i-1).
 
-    The state before the first step is ``start``. ``back`` walks from the last step to the first;
-    ``lost``, (chunk, ...) for each step, is in the order of the walk. Every chunk starts from 0,
-    and the state that earlier chunks carry over is added afterwards. The last state is returned in
-    float64.
+    The state before the first step is ``start``. With ``back`` the scan runs from the last step to
+    the first; ``lost``, (chunk, ...) for each step, is in the order of the scan. Each chunk starts
+    from 0, and the state carried over from earlier chunks is added afterwards.
     """
     order = slice(None, None, -1 if back else 1)
     states, growth = h.unbind(0)[order], torch.empty_like(h)
@@ -281,7 +280,7 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
         lost[1:], states, states[1:], growth_by_step, growth_by_step[1:], strict=False
     ):
         state.addcmul_(loss, state_before).add_(state_before)
-        # (1 + e)(1 + l) - 1, exact near 0
+        # (1 + e)(1 + l) - 1 = e + l + e l, precise near 0
         torch.add(loss, growth_here, out=growth_next).addcmul_(loss, growth_here)
     last_state, last_growth, chunk_starts = (
         states[-1].double(),
@@ -291,7 +290,7 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
     for chunk in range(h.shape[1])[order]:
         chunk_starts[chunk] = start
         start = (last_state[chunk] + start).addcmul_(last_growth[chunk], start)
-    # each state plus what its chunk's start has grown to: s + l s, l being growth - 1
+    # each state plus the contribution s + l s of the start s of its chunk, with l = growth - 1
     h.addcmul_(growth, chunk_starts).add_(chunk_starts)
     return start
 
@@ -349,8 +348,8 @@ class TorchScan(torch.autograd.Function):
 # --- in C++ ---------------------------------------------------------------------------------------
 
 CPP_FILE = Path(__file__).with_name("_selective_scan.cpp")
-#: digest of the source: keys of cached results depend on this file, and so on the C++ source; a
-#: test compares both
+#: digest of the C++ source. The keys of cached results depend on this file, and through the digest
+#: on the C++ source; a test compares both
 CPP_DIGEST = "ec3adefd9b3ec78c"
 TYPE_NAMES = {torch.float32: "f32", torch.float64: "f64"}
 
@@ -370,13 +369,13 @@ def compiled() -> bool:
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
-    """Return the sizes that the C++ scan takes: batch, length, d, n, groups of channels, and
-    threads.
+    """Return the size arguments of the C++ scan: batch, length, d, n, number of groups of channels,
+    number of threads.
 
-    Each group of channels sums its own gradients of B and C.
+    Each group of channels sums the gradients of B and C separately.
     """
     (batch, length, d), n, threads = u.shape, rate.shape[1], torch.get_num_threads()
-    # groups of as many channels as the C++ takes at a time
+    # the smallest group has the number of channels that the C++ code processes at a time
     most_groups = -(-d // operators().neusee_scan_channels(u.element_size()))
     return batch, length, d, n, min(most_groups, -(-threads // batch)), threads
 

@@ -1,4 +1,4 @@
-"""Networks that go on from the answer of the Wiener filter, or alternate with the filter."""
+"""Networks that improve the answer of the Wiener filter, or alternate with the filter."""
 
 from functools import partial
 from pathlib import Path
@@ -32,11 +32,11 @@ from neusee.nodes.values import Bands, Psf
 
 # --- informed -------------------------------------------------------------------------------------
 
-# A network that goes on from the answer of the Wiener filter, and sees what the filter knows.
+# A network that improves the answer of the Wiener filter; its inputs are the maps of the filter.
 
 
 class Informed(Restorer):
-    """A NAFNet that changes the answer of the Wiener filter, given the maps of
+    """A NAFNet that corrects the answer of the Wiener filter; its inputs are the maps of
     `restore.filter_facts`.
     """
 
@@ -49,11 +49,11 @@ class Informed(Restorer):
         self.body.last.weight.zero_()
 
     def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
-        """Return the restored picture at half and at full size: ``picture`` (n, 3, y, x) and what
-        the network changes.
+        """Return the restored picture at half and at full size: ``picture`` (n, 3, y, x) plus the
+        correction of the network.
 
-        ``picture`` is what the filter restores; ``conditions`` are its `FilterFacts`, and the
-        matrix (3, channel) from electrons to colours, of a single picture or of n pictures along a
+        ``picture`` is the result of the filter. ``conditions`` are its `FilterFacts` and the matrix
+        (3, channel) from electrons to colours, for a single picture, or for n pictures along the
         first axis.
         """
         value, matrix = conditions
@@ -62,11 +62,11 @@ class Informed(Restorer):
         return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
 
     def change(self, answer: Tensor, deviation: Tensor, maps: Tensor) -> Tensor:
-        """Return what the network adds to the answer of the filter (3, y, x), or to n of them, in
-        units of its scale.
+        """Return the correction of the answer of the filter ((3, y, x), or n of them), in units of
+        the scale of the answer.
 
-        It is the sum of three parts, each with a map of the network for each channel: a change,
-        multiplied by the root of the predicted error, so that what is certain hardly changes; a
+        It is the sum of three terms. Each has one output map of the network for each channel: a
+        change times the square root of the predicted error, so that certain pixels hardly change; a
         share of the answer, which draws it to the mean of the scene; and a share of the mean of its
         channels, which draws it to grey.
         """
@@ -74,7 +74,7 @@ class Informed(Restorer):
         batch = maps.to(self.body.last.weight).reshape(-1, *maps.shape[-3:])
         padded = mirrored(batch, -rows % self.multiple, -columns % self.multiple)
         network_output: Tensor = self.body.change(padded)[..., :rows, :columns].to(answer)
-        # three numbers of each channel: times the deviation, the answer and its grey
+        # three maps of each channel: factors of sqrt(deviation), of the answer, of its grey
         change_in_deviations, change_in_answer, change_in_grey = torch.tensor_split(
             network_output.reshape(*answer.shape[:-3], -1, rows, columns), 3, -3
         )
@@ -176,24 +176,24 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Ch
 
 # --- unrolled -------------------------------------------------------------------------------------
 
-# The Wiener filter unrolled: steps that alternate a learned prior and the filter, and the node that
+# The unrolled Wiener filter: steps that alternate a learned prior and the filter, and the node that
 # runs them.
 
 
 Steps = Annotated[Count, Field(le=16)]
-_MAPS_OF_PRIOR = 15  #: maps that a prior sees: five of each of three channels
-#: of what a network says, at first, and the range of its logarithm to either side
+_MAPS_OF_PRIOR = 15  #: number of input maps of a prior: five for each of three channels
+#: initial precision of a learned prior, and the half range of its logarithm
 _PRECISION, _PRECISION_REACH = 10.0, 5.0
-_GLARE_GAIN = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
+_GLARE_GAIN = 1e3  #: factor of a glare pattern of maximum 1, so that its outer rings are visible
 
 
 class Unrolled(Restorer):
-    """Steps of the Wiener filter, each with a second prior that a network finds in the picture of
-    the step before.
+    """Steps of the Wiener filter, each with a second prior that a network computes from the picture
+    of the previous step.
 
-    In step k a network says what the picture is, c, and how precisely it knows this; the step
-    returns the most likely picture under the frame, the prior of the filter, and c. A network with
-    precision 0 leaves the filter's answer.
+    In each step a network estimates the picture c and the precision of this estimate. The step
+    returns the most likely picture given the frame, the prior of the filter, and the estimate c.
+    With precision 0 the result is the answer of the filter.
     """
 
     def __init__(self, width: int = 16, steps: int = 2) -> None:
@@ -210,11 +210,11 @@ class Unrolled(Restorer):
             prior.last.weight.zero_()
 
     def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
-        """Return the restored picture at half and at full size: ``picture`` (1, 3, y, x) and what
-        the network changes.
+        """Return the restored picture at half and at full size: ``picture`` (1, 3, y, x) plus the
+        correction of the steps.
 
-        ``picture`` is what the filter restores; ``conditions`` are the `WienerProblem` whose answer
-        it is, and the matrix (3, channel) from electrons to colours.
+        ``picture`` is the result of the filter. ``conditions`` are its `WienerProblem` and the
+        matrix (3, channel) from electrons to colours.
         """
         value, matrix = conditions
         change = self.change(unpacked(value), value.answer, value.seen) * value.scale
@@ -222,8 +222,8 @@ class Unrolled(Restorer):
         return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
 
     def change(self, problem: Blurred, answer: Tensor, blurred: Tensor) -> Tensor:
-        """Return what the steps add to the filter's answer (3, y, x), given this answer and its
-        blur by the camera.
+        """Return the sum of the corrections of all steps to the filter's answer (3, y, x);
+        ``blurred`` is the answer after the blur of the camera.
         """
         change = blurred_change = torch.zeros_like(answer)
         for prior in self.priors:
@@ -235,27 +235,27 @@ class Unrolled(Restorer):
 def _prior_of(
     prior: nn.Module, problem: Blurred, x: Tensor, blurred: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the change of the picture of the step before that a network wants, and its
-    precision (channel, y, x).
+    """Return the estimated change (channel, y, x) of the picture of the previous step, and the
+    precision (channel, y, x) of this estimate.
     """
     rows, columns = problem.picture.shape[-2:]
     weight = next(prior.parameters())
     maps = mirrored(_maps(problem, x, blurred).to(weight)[None], -rows % 8, -columns % 8)
     change, precision_logarithm = prior.change(maps)[0, :, :rows, :columns].to(x).split(3)  # type: ignore[operator]
     return change, _PRECISION * torch.exp(
-        # one precision for a channel, within exp(-5) to exp(5) of the first
+        # one precision for each channel: the initial one times exp(-5) to exp(5)
         _PRECISION_REACH * torch.tanh(precision_logarithm.mean((-2, -1), keepdim=True))
     ).expand_as(change)
 
 
 def _maps(problem: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
-    """Return what a prior sees (15, y, x): picture, residual over its noise, certainty, seen
-    pixels, and glare.
+    """Return the input maps (15, y, x) of a prior: picture, residual over its noise, certainty,
+    unclipped pixels, and glare.
     """
     unclipped = problem.weight > 0
     inverse_deviation = (
         torch.where(unclipped, problem.weight, 1.0).sqrt() * unclipped
-    )  # the slope of sqrt is infinite at 0
+    )  # `where` before `sqrt`, whose derivative is infinite at 0
     residual = inverse_deviation * (problem.picture - blurred)
     glare = sum(problem.glare, torch.zeros_like(residual))
     brightest = glare.detach().amax().clamp_min(1e-30)
