@@ -773,7 +773,7 @@ MUTANTS = (
         within("nodes/laser", "beam.py"),
         ("_AGREE = 0.02\n", "_AGREE = 0.05\n"),
         ("_AGREE = 0.02\n", "_AGREE = 0.01\n"),
-        ("_SERIES_ARGUMENT = 1e-4 ", "_SERIES_ARGUMENT = 1e-1 "),
+        ("_SERIES_ARGUMENT = 1e-4\n", "_SERIES_ARGUMENT = 1e-1\n"),
         ("duration * rate >= 1:", "duration * rate > 1:"),
         ("m_squared < 1:", "m_squared <= 1:"),
         ("implied < 1 - _STATEMENTS_AGREE", "implied < 1"),
