@@ -296,7 +296,8 @@ def _(result: Tensor, *inputs: Any, dwell: float, **params: Any) -> list[Check]:
     low, high = float(result.min()), float(result.max())
     return [
         Check(
-            f"after {dwell:.3g} s the hottest pixel is {low:.3g} to {high:.3g} times as hot",
+            f"after {dwell:.3g} s the hottest pixel is {low:.3g} to {high:.3g} times as hot as"
+            " behind the plain lens",
             high < 1.01,
         )
     ]

@@ -324,7 +324,7 @@ def filled(name: str, content: bytes, date: str, seconds: float) -> bytes:
 
 
 def write_again(answer: Answer, seconds: float) -> Path:
-    """Write the folder of results of an answer with the present date and the seconds of the
+    """Write the results folder of a stored answer again, with today's date and the run time of the
     command; return its path.
 
     Raises `OSError` if the folder cannot be written; no part of it is left then.

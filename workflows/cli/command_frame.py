@@ -111,8 +111,8 @@ def search_for_garbage() -> None:
 def load(
     words: list[str] | None, *command: str, before: int = 0, exact: bool = False
 ) -> tuple[Recipe, list[str]]:
-    """Return the recipe that the arguments ``words`` name and change, and the command line that
-    runs this recipe.
+    """Return the recipe that the arguments ``words`` name, with the changes that they ask for, and
+    the command line that runs it again.
     """
     name, changes, first_number = split(words, before)
 
@@ -366,15 +366,16 @@ class ProgressLines:
     def _time_left(self, line: str) -> str:
         """Return the time that is left, as the end of a line with a count.
 
-        Other lines, and a first count, have an empty text.
+        The text is empty for a line without a count, and for a first count above 1: there is no
+        rate yet.
         """
         present_time, previous_time = self._clock(), self._time_of_last_line
         self._time_of_last_line = present_time
         if not (count := _COUNT_AT_END.search(line) or _COUNT.match(line)):
             return ""
         task, done_count, total = count["what"], int(count["done"]), int(count["all"])
-        # a stopped study may begin with any count
-        # the rate is taken from the first count of a kind of line
+        # the rate is taken from the first count of a kind of line, which is above 1 where a stopped
+        # study goes on; a count that does not rise begins a new series
         if task not in self._began or done_count <= self._last[task]:
             # a count of 1 began at the line before it
             self._began[task] = (

@@ -1,5 +1,5 @@
-"""The folder of a run as it is read for a comparison, with one located error for a folder that
-cannot be compared.
+"""The results folder of a run, read for a comparison. A folder that cannot be compared gives one
+error that names the file.
 """
 
 from __future__ import annotations

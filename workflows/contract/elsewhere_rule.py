@@ -249,8 +249,8 @@ class Trial:
         self._settle_others([name for name in differing_names if name not in self.findings])
 
     def ends(self, name: str) -> bool:
-        """Return True if a call ends its process also in unchanged surroundings, so that it is not
-        made here.
+        """Return True if the call of a node ended a child process whose environment was unchanged;
+        such a call is not made in this process.
         """
         return name not in self._outcomes_here and name in self._pickled
 

@@ -472,7 +472,9 @@ class _SharedResults:
 
 
 def _is_moved(step: str) -> bool:
-    """Return True for the first steps that depend on the laser strength, and for their copies."""
+    """Return True if a step is one of the first that depend on the laser strength, or a copy of
+    one.
+    """
     return step.partition("[")[0].removeprefix(TOLD) in _MOVED
 
 
@@ -503,7 +505,7 @@ _WAVELENGTH, _DIRECTION = f"lasers.{BEAM}.wavelength", f"direction[{BEAM}]"
 
 @dataclass(frozen=True)
 class PointCommands:
-    """The common parts of the commands of all points of an evaluation."""
+    """What the commands of all points of an evaluation have in common."""
 
     named: NamedRecipe  #: the recipe; commands are run in its folder
     bench: EvaluationPoints

@@ -194,8 +194,9 @@ def _read(table: Path) -> Iterator[TableRow | str]:
 
 
 def _table_row(table: Path, line: int, row: Mapping[str, str], time: str) -> TableRow:
-    """Return a line of a table; raise ValueError for a file that is not there, and for a value
-    that is no number.
+    """Return one row of the table of frames.
+
+    Raises ValueError if the file of the row is missing, or if a value is not a number.
     """
     file = table.parent / row.get("file", "")
     if not file.is_file():

@@ -52,7 +52,7 @@ class SensorFrames(NamedTuple):
 
 
 def sensor_target(name: str, folder: Path) -> Path:
-    """Return the file of a sensor group in a folder.
+    """Return the path of the recipe group ``sensor/NAME.yaml`` that a calibration writes.
 
     Raises: ValueError for a name that is no word, and for a file that no calibration wrote.
     """

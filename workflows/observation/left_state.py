@@ -172,8 +172,8 @@ def watch_state(own: OwnCode) -> _Told:
 
 
 def is_of_library(left: Taint, own: OwnCode) -> bool:
-    """Return True for a change outside of the user's modules behind the step, where code of any
-    module may read it.
+    """Return True if the change is in memory outside of the modules of the user's node, where
+    code of any module may read it.
     """
     return left.kind == "memory" and not any(
         left.what.startswith(f"{module}.") for module in own.modules
@@ -264,7 +264,9 @@ def _is_unread(own: OwnCode, module: str, name: str) -> bool:
 
 
 def _is_lazy(module: str, name: str) -> bool:
-    """Return True if functions set a name of a module, to a value that depends on no argument."""
+    """Return True if functions of a module assign a name of the module, and the assigned value
+    depends on none of their arguments.
+    """
     path = module_path(module)
     if path is None:
         return False

@@ -64,8 +64,8 @@ _COLOUR_LIMIT = 8.0  #: dB, end of the colour scale of the maps
 
 @drawn
 def winning_region(result: ProtectionResult) -> Any:
-    """Draw the gain of the mask over the best stop with filter, by scene light and protection;
-    hatched where the mask wins.
+    """Draw how much better the mask is than the best round stop with a grey filter, against scene
+    light and protection; hatched where the mask is better.
     """
     figure, axes = canvas(11.6, 4.1, 1, len(DRAWN), sharey=True)
     levels = sorted({result.own, *LEVELS})

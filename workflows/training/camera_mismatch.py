@@ -196,7 +196,7 @@ def _inputs(recipe: Recipe, mismatch: Mapping[str, Difference]) -> Inputs | None
 
 
 def _probes(inputs: Inputs) -> dict[str, float]:
-    """Return a test value for each law that differs from the value of the recipe."""
+    """Return for each uncertain input a test value other than its value in the recipe."""
     assert inputs.recipe.uncertain is not None
     recipe_values = {
         path: difference.own for path, difference in inputs.recipe.uncertain.mismatch.items()

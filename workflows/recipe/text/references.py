@@ -419,7 +419,7 @@ def broken(value: Value) -> bool:
 
 
 def _pasted(data: Any) -> str:
-    """Return a value as YAML writes it in a text."""
+    """Return a value as the text that stands for it in YAML."""
     return str(data).lower() if isinstance(data, bool) else "null" if data is None else str(data)
 
 
