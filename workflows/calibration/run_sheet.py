@@ -9,7 +9,6 @@ from typing import Any
 
 from neusee.nodes.calibrate import Budget, EmvaSheet, emva_sheet, sheet_budgets
 from neusee.workflows.calibration import emva_figures
-from neusee.workflows.calibration import emva_figures as emva_pdf
 from neusee.workflows.calibration.emva_sheet import (
     OPERATING_POINT,
     EmvaFrames,
@@ -148,7 +147,7 @@ def _report(
         files={
             "emva1288.json": as_json(document),
             "budget.json": as_json(budget_document(budgets, stated(recipe))),
-            "emva1288.pdf": emva_pdf.pdf(sheet, title, pdf_lines, budgets),
+            "emva1288.pdf": emva_figures.pdf(sheet, title, pdf_lines, budgets),
         },
         banner=document["fails"],
     )

@@ -22,7 +22,6 @@ from neusee.workflows.store.metadata import is_kept
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from neusee.workflows.store.derived_files import DerivedFiles
     from neusee.workflows.store.result_store import Store
 
 _PAGE = 50  #: results that `ls` shows

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.comparison import differences
-from neusee.workflows.comparison import differences as picture_differences
 from neusee.workflows.comparison.differences import (
     FileDifference,
     NumberDifference,
@@ -310,9 +309,9 @@ def compare(left: RunRecord, right: RunRecord) -> RunComparison:
         differences.code(left, right),
         differences.environment(left, right),
         differences.steps(left, right),
-        picture_differences.figures(left.folder, right.folder),
-        picture_differences.data_files(left.folder, right.folder),
-        picture_differences.only_one_has(left.folder, right.folder),
+        differences.figures(left.folder, right.folder),
+        differences.data_files(left.folder, right.folder),
+        differences.only_one_has(left.folder, right.folder),
         began,
     )
 
