@@ -46,7 +46,8 @@ def many():
     return {"x": torch.rand(1_000_003, generator=torch.Generator().manual_seed(1))}
 
 '''
-#: the body of a node of each kind, and what is said of it
+#: the body of a node of each kind, and what is said of it; no seed of ours is that of this process,
+#: so the words of the set are many and the result holds several of them
 KINDS = {
     "folder": ("x * len(os.getcwd())", "in another working folder the result differs by "),
     "file": (
@@ -58,7 +59,7 @@ KINDS = {
         "in the locale C it raises UnicodeDecodeError: ",
     ),
     "hashed": (
-        "x * float([*{str(i) for i in range(40)}][0])",
+        "x * float(''.join({str(i) for i in range(40)})[:9])",
         "with another hash seed (PYTHONHASHSEED) the result ",
     ),
     "counted": (
