@@ -447,11 +447,11 @@ class Node:
     @functools.cached_property
     def path(self) -> str:
         """Return the name of the node in a recipe, such as ``sensor.digitize``."""
-        public_names = [
-            name
-            for name in self.fn.__module__.removeprefix("neusee.nodes.").split(".")
-            if not name.startswith("_")
-        ]
+        module = self.fn.__module__.removeprefix("neusee.nodes.")
+        public_names = [name for name in module.split(".") if not name.startswith("_")]
+        if module != self.fn.__module__:
+            # a room of a family, such as ``restore.networks``, is no part of the name
+            public_names = public_names[:1]
         return ".".join([*public_names, self.fn.__name__])
 
     def _checked_bands(self, bands: Mapping[str, int]) -> Mapping[str, int]:

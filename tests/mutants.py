@@ -224,7 +224,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "nodes/restore/_inverse/_wiener.py",
+        "nodes/restore/inverse/_wiener.py",
         "GREY = 0.95",
         "GREY = 0.30",
         within(
@@ -305,7 +305,7 @@ MUTANTS = (
         within("nodes", "bounds.py::test_what_is_not_added_is_no_brighter_than_stated[spot-30]"),
     ),
     Mutant(
-        "nodes/optics/_transform/_scaled_transform.py",
+        "nodes/optics/transform/_scaled_transform.py",
         "cosine[:, 0] /= 2",
         "cosine[:, 0] /= 1",
         within(
@@ -314,7 +314,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "nodes/optics/_transform/_pupil_field.py",
+        "nodes/optics/transform/_pupil_field.py",
         "_FLOAT32_TURNS = 2.0",
         "_FLOAT32_TURNS = 2e9",
         within(
@@ -322,7 +322,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "nodes/optics/_transform/_pupil_field.py",
+        "nodes/optics/transform/_pupil_field.py",
         "torch.add(self.tilt_u[columns], turns, alpha=self.view.turns_height, out=turns)",
         "torch.add(self.tilt_u[columns], (self.screens.height[rows, columns] *"
         " self.view.turns_height), out=turns)",
@@ -331,7 +331,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "nodes/optics/_transform/_field.h",
+        "nodes/optics/transform/_field.h",
         "        turns.part[i] = t - ((t + Kind<double>::round) - Kind<double>::round);",
         "        turns.part[i] = __builtin_convertvector(__builtin_convertvector(t, Eight),"
         " Turns);",
@@ -579,7 +579,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "nodes/restore/_inverse/_conjugate_gradients.py",
+        "nodes/restore/inverse/_conjugate_gradients.py",
         "step[:, 0] *= 2.0",
         "step[:, 0] *= 1.0",
         within(
@@ -588,7 +588,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "nodes/restore/_inverse/_masked_blur.py",
+        "nodes/restore/inverse/_masked_blur.py",
         "count[-1] = 1.0",
         "count[-1] = 2.0",
         within("nodes/losses", "wiener_loss.py::test_it_agrees_with_its_reference"),

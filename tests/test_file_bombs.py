@@ -119,7 +119,7 @@ from neusee.nodes.calibrate._measurement_files import parsed_descriptor as descr
 from neusee.nodes.doe._height_map_files import map_header
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.network_weights import fits
-from neusee.nodes.restore._networks._network_files import exported_network
+from neusee.nodes.restore.networks._network_files import exported_network
 from neusee.nodes.scene._hyperspectral import size_and_type, wrong_values
 from neusee.nodes.scene._exr import picture_size
 from neusee.nodes.scene._photograph import read_header

@@ -67,6 +67,20 @@ ACROSS = {
     ): "the study of calibration judges the posterior that this room computes",
 }
 
+#: Rooms inside a family of nodes, which serve that family alone.
+FAMILY_ROOMS = frozenset(
+    ".".join(path.parent.relative_to(ROOT / "nodes").parts)
+    for path in ROOT.glob("nodes/*/*/__init__.py")
+)
+ACROSS_FAMILIES = {
+    ("losses", "restore.inverse"): "a mask is judged by the filter that restores its frames",
+    (
+        "metrics",
+        "restore.inverse",
+    ): "the PSF of a channel is that of a grey scene, as in the filter",
+    ("restore", "optics.transform"): "lengths of FFTs, and axes that are centred",
+}
+
 #: Files of each kind of study: they share `run_study`, and import nothing of another kind.
 STUDIES = {
     "accuracy": ("accuracy_study", "accuracy_page", "recipe_knobs", "work_precision"),
@@ -353,6 +367,17 @@ def private(files):
                 yield f"{file}:{each.line}: {each.full}"
 
 
+def family_rooms(files):
+    """Imports of a room inside a family of nodes, or of its files, from outside of that family."""
+    for file, tree in files.items():
+        for each in imports(tree):
+            family, _, inner = each.full.removeprefix("neusee.nodes.").partition(".")
+            room = f"{family}.{inner.partition('.')[0]}"
+            is_outside = not file.startswith(f"nodes/{family}/")
+            if each.full.startswith("neusee.nodes.") and room in FAMILY_ROOMS and is_outside:
+                yield f"{file}:{each.line}: {each.full}"
+
+
 def dynamic(files, allowed=DYNAMIC):
     """Calls that import a module by a name, but for those that are allowed."""
     for file, tree in files.items():
@@ -474,7 +499,9 @@ def offers(files):
                 yield f"{file}: offers {module}.{name}, which is not there"
 
 
-FILE_RULES = (direction, pure, siblings, exits, terminal, samplers, private, dynamic, formulas)
+FILE_RULES = (
+    direction, pure, siblings, exits, terminal, samplers, private, family_rooms, dynamic, formulas,
+)  # fmt: skip
 HOUSE_RULES = (classes, names, places, offers, cycles)
 
 # --- the tests ------------------------------------------------------------------------------------
@@ -531,6 +558,20 @@ def test_no_two_families_of_nodes_need_each_other():
                 needs[family].add(needed)
     assert needs, "the families are found"
     assert not list(circles(needs))
+
+
+def node_files():
+    """The files of nodes: syntax trees by path."""
+    return {path.relative_to(ROOT).as_posix(): parsed(path) for path in NODES}
+
+
+def test_a_room_of_a_family_serves_that_family_alone():
+    assert FAMILY_ROOMS, "the rooms are found"
+    crossings = set()
+    for line in family_rooms(node_files()):
+        family = line.split("/")[1]
+        crossings |= {(family, room) for room in FAMILY_ROOMS if f"neusee.nodes.{room}." in line}
+    assert crossings == set(ACROSS_FAMILIES)
 
 
 def test_heavy_imports_wait_until_they_are_needed():
@@ -637,6 +678,15 @@ OFFENCES = [
     (private, "training/run_training.py", "import neusee.nodes._node"),
     (private, "engine/runner.py", "from neusee.nodes.doe import _refractive_index"),
     (private, "engine/runner.py", "from neusee.workflows.store.lease import _name"),
+    (family_rooms, "restoration/frame_recipes.py", "from neusee.nodes.restore import inverse"),
+    (family_rooms, "engine/runner.py", "import neusee.nodes.optics.transform"),
+    (
+        family_rooms,
+        "training/run_training.py",
+        "def _():\n    from neusee.nodes.restore.networks import tiled",
+    ),
+    (family_rooms, "safety/run_safety.py", "import neusee.nodes.restore.lasers._find_lasers"),
+    (family_rooms, "nodes/scene/_exr.py", "from neusee.nodes.restore.networks import tiled"),
     (dynamic, "engine/runner.py", "importlib.import_module('neusee.workflows.cli.app')"),
     (dynamic, "keys/cache_key.py", "__import__('neusee.workflows.cli')"),
     (formulas, "report/figures/optics.py", "area = np.pi * radius**2"),

@@ -13,8 +13,8 @@ from neusee.nodes import node
 from neusee.nodes.metrics import bsr
 from neusee.nodes.optics._lens import cut_off
 from neusee.nodes.precision import single
-from neusee.nodes.restore._inverse._masked_blur import effective_psf, grey_shares, variance
-from neusee.nodes.restore._inverse._wiener_prior import fall
+from neusee.nodes.restore.inverse._masked_blur import effective_psf, grey_shares, variance
+from neusee.nodes.restore.inverse._wiener_prior import fall
 from neusee.nodes.values import Bands, Psf
 
 # --- mask losses ----------------------------------------------------------------------------------

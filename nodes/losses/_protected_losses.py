@@ -14,7 +14,7 @@ from neusee.nodes import node
 from neusee.nodes.losses._mask_losses import HighestFrequency
 from neusee.nodes.optics._lens import averaged_side, cut_off, round_lens, stop_width
 from neusee.nodes.precision import single
-from neusee.nodes.restore._inverse._masked_blur import effective_psf, grey_shares, times
+from neusee.nodes.restore.inverse._masked_blur import effective_psf, grey_shares, times
 from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
 

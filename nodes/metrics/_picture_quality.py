@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.precision import exact_convolutions, single
-from neusee.nodes.restore._inverse._masked_blur import grey_shares
+from neusee.nodes.restore.inverse._masked_blur import grey_shares
 from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from neusee.nodes import Check, node
-from neusee.nodes.optics._transform._fft_transforms import fft_length
+from neusee.nodes.optics.transform._fft_transforms import fft_length
 from neusee.nodes.precision import one_by_one
 from neusee.nodes.values import Psf
 

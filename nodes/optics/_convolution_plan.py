@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._transform._fft_transforms import fft_length
+from neusee.nodes.optics.transform._fft_transforms import fft_length
 from neusee.nodes.precision import one_by_one
 
 # --- psf energy -----------------------------------------------------------------------------------

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.optics._psf_definition import Geometry
-from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
-from neusee.nodes.optics._transform._pupil_field import View
-from neusee.nodes.optics._transform._sample_axis import Axis, centred
-from neusee.nodes.optics._transform._scaled_transform import Method
+from neusee.nodes.optics.transform._intensity import Sampling, intensity_of
+from neusee.nodes.optics.transform._pupil_field import View
+from neusee.nodes.optics.transform._sample_axis import Axis, centred
+from neusee.nodes.optics.transform._scaled_transform import Method
 from neusee.nodes.precision import one_by_one, plain
 from neusee.nodes.values import Pupil
 

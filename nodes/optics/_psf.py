@@ -22,8 +22,8 @@ from neusee.nodes.optics._pixel_average import (
     view_on_grid,
 )
 from neusee.nodes.optics._psf_definition import Geometry, SensorSampling, by_definition
-from neusee.nodes.optics._transform._intensity import KEPT_FIELD_BYTES, Sampling, intensity_of
-from neusee.nodes.optics._transform._scaled_transform import Method
+from neusee.nodes.optics.transform._intensity import KEPT_FIELD_BYTES, Sampling, intensity_of
+from neusee.nodes.optics.transform._scaled_transform import Method
 from neusee.nodes.precision import refuse_half, refuse_not_finite, transformed
 from neusee.nodes.units import Angle, FocalLength, PixelPitch, Shape
 from neusee.nodes.values import Psf, Pupil

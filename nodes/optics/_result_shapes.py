@@ -14,8 +14,8 @@ from neusee.nodes.optics._pixel_average import FINE_SAMPLES, fine_axes
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import pupil
 from neusee.nodes.optics._pupil_grid import clear_diameter
-from neusee.nodes.optics._transform._fused import expected_seconds
-from neusee.nodes.optics._transform._sample_axis import Axis
+from neusee.nodes.optics.transform._fused import expected_seconds
+from neusee.nodes.optics.transform._sample_axis import Axis
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
 from neusee.nodes.values import Bands, Channels, FewBands, LowRankCube, Psf, Pupil, Stop, Wavefront
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes.precision import single
-from neusee.nodes.restore._inverse._masked_blur import effective_psf
+from neusee.nodes.restore.inverse._masked_blur import effective_psf
 from neusee.nodes.scene._picture_changes import luminance
 from neusee.nodes.sensor._digitization import Bits, is_clipped
 from neusee.nodes.sensor._exposure import channel_weights

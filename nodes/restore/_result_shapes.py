@@ -18,13 +18,16 @@ from neusee.nodes.restore._electrons_and_colour import (
     electrons,
     white_level,
 )
-from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST, MODES, SHARE
-from neusee.nodes.restore._inverse._glare import nearby_glare
-from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
-from neusee.nodes.restore._inverse._masked_blur import bordered, halvings, torus
-from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
-from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
-from neusee.nodes.restore._inverse._wiener import (
+from neusee.nodes.restore._measured_psf import measured_psf
+from neusee.nodes.restore._point_frames import points_in
+from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field
+from neusee.nodes.restore.inverse._conjugate_gradients import LOWEST, MODES, SHARE
+from neusee.nodes.restore.inverse._glare import nearby_glare
+from neusee.nodes.restore.inverse._hidden_pixels import MOST, STEPS
+from neusee.nodes.restore.inverse._masked_blur import bordered, halvings, torus
+from neusee.nodes.restore.inverse._posterior_spread import wiener_spread
+from neusee.nodes.restore.inverse._richardson_lucy import richardson_lucy
+from neusee.nodes.restore.inverse._wiener import (
     MAPS,
     MAPS_OF_CHANNEL,
     PRECISE,
@@ -32,15 +35,12 @@ from neusee.nodes.restore._inverse._wiener import (
     wiener,
     wiener_problem,
 )
-from neusee.nodes.restore._lasers._find_lasers import find_lasers, found_glare, found_nearby
-from neusee.nodes.restore._measured_psf import measured_psf
-from neusee.nodes.restore._networks._convolutional_networks import nafnet, unet
-from neusee.nodes.restore._networks._fft_mamba import fft_mamba
-from neusee.nodes.restore._networks._network_files import network
-from neusee.nodes.restore._networks._own_network import tried
-from neusee.nodes.restore._networks._wiener_networks import informed, unrolled
-from neusee.nodes.restore._point_frames import points_in
-from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field
+from neusee.nodes.restore.lasers._find_lasers import find_lasers, found_glare, found_nearby
+from neusee.nodes.restore.networks._convolutional_networks import nafnet, unet
+from neusee.nodes.restore.networks._fft_mamba import fft_mamba
+from neusee.nodes.restore.networks._network_files import network
+from neusee.nodes.restore.networks._own_network import tried
+from neusee.nodes.restore.networks._wiener_networks import informed, unrolled
 from neusee.nodes.shape_rules import (
     at_least_single,
     blank,

@@ -12,11 +12,12 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.precision import single
-from neusee.nodes.restore._inverse._glare import Glare, with_light_around, with_smooth
-from neusee.nodes.restore._inverse._hidden_pixels import most_likely
-from neusee.nodes.restore._inverse._masked_blur import edge
-from neusee.nodes.restore._inverse._posterior_spread import Draws, frame_deviation
-from neusee.nodes.restore._inverse._wiener import (
+from neusee.nodes.restore._point_frames import hats
+from neusee.nodes.restore.inverse._glare import Glare, with_light_around, with_smooth
+from neusee.nodes.restore.inverse._hidden_pixels import most_likely
+from neusee.nodes.restore.inverse._masked_blur import edge
+from neusee.nodes.restore.inverse._posterior_spread import Draws, frame_deviation
+from neusee.nodes.restore.inverse._wiener import (
     PRECISE,
     Doubt,
     LaserLight,
@@ -26,7 +27,6 @@ from neusee.nodes.restore._inverse._wiener import (
     known_and_light,
     posed,
 )
-from neusee.nodes.restore._point_frames import hats
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, MeasuredPsf, Psf
 

@@ -23,9 +23,9 @@ import torch
 from scipy import stats
 
 from neusee.nodes import metrics, restore
-from neusee.nodes.restore._inverse import _conjugate_gradients, _hidden_pixels, _wiener
-from neusee.nodes.restore._inverse import _conjugate_gradients as _lowest_frequencies
-from neusee.nodes.restore._inverse import _masked_blur as _fft_grid
+from neusee.nodes.restore.inverse import _conjugate_gradients, _hidden_pixels, _wiener
+from neusee.nodes.restore.inverse import _conjugate_gradients as _lowest_frequencies
+from neusee.nodes.restore.inverse import _masked_blur as _fft_grid
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store

@@ -35,7 +35,7 @@ from bench_filter import (
 from scipy.linalg import cho_factor, cho_solve
 
 from neusee.nodes import metrics, restore
-from neusee.nodes.restore._inverse import _wiener
+from neusee.nodes.restore.inverse import _wiener
 from neusee.workflows.store.result_store import Store
 
 WAYS = ("before", "shipped", "float32", "converged")

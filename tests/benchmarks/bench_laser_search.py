@@ -33,7 +33,7 @@ from scipy.stats import beta
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
-from neusee.nodes.restore._lasers import _find_lasers  # noqa: E402
+from neusee.nodes.restore.lasers import _find_lasers  # noqa: E402
 from tests.benchmarks import bench_restored_frames as wrong_camera  # noqa: E402
 from tests.benchmarks.bench_restored_intervals import recipe_daylight  # noqa: E402
 from tests.nodes.restore.lasers import own_camera as own  # noqa: E402

@@ -5,7 +5,7 @@ with drawn dirt.
     python tests/benchmarks/bench_lost_light.py results.jsonl --seeds 5000 70 --side 128
     python tests/benchmarks/bench_lost_light.py results.jsonl --report
 
-The constants of `nodes/restore/_lasers/_find_lasers.py` were learnt from these frames. A lens is
+The constants of `nodes/restore/lasers/_find_lasers.py` were learnt from these frames. A lens is
 clean in one case of four; in the others it has dust, scratches, grease and dents, each in 3 to 100
 % of the amount in `recipes/flare/dirty_windshield.yaml` (log-uniform), and the defocus of
 `recipes/mismatch/usual.yaml`. Scene, noise and converter are those of
@@ -31,19 +31,19 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from neusee.nodes import flare, optics  # noqa: E402
-from neusee.nodes.restore._inverse._wiener import View  # noqa: E402
-from neusee.nodes.restore._lasers import _find_lasers as law  # noqa: E402
-from neusee.nodes.restore._lasers._components import (  # noqa: E402
+from neusee.nodes.restore.inverse._wiener import View  # noqa: E402
+from neusee.nodes.restore.lasers import _find_lasers as law  # noqa: E402
+from neusee.nodes.restore.lasers._components import (  # noqa: E402
     Camera,
     Laser,
     lamp_light,
 )
-from neusee.nodes.restore._lasers._frame_likelihood import (  # noqa: E402
+from neusee.nodes.restore.lasers._frame_likelihood import (  # noqa: E402
     fitted,
     spreads,
 )
-from neusee.nodes.restore._lasers._greedy_search import Known, _data  # noqa: E402
-from neusee.nodes.restore._lasers._line_pattern import Lens, line_pattern  # noqa: E402
+from neusee.nodes.restore.lasers._greedy_search import Known, _data  # noqa: E402
+from neusee.nodes.restore.lasers._line_pattern import Lens, line_pattern  # noqa: E402
 from tests.benchmarks import bench_restored_frames as masks  # noqa: E402
 from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
 from tests.nodes.restore.lasers.as_inputs import inputs, pupil_of  # noqa: E402

@@ -18,8 +18,8 @@ from pathlib import Path
 import torch
 
 from neusee.nodes import metrics, restore
-from neusee.nodes.restore._inverse import _conjugate_gradients
-from neusee.nodes.restore._inverse import _masked_blur as _fft_grid
+from neusee.nodes.restore.inverse import _conjugate_gradients
+from neusee.nodes.restore.inverse import _masked_blur as _fft_grid
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -116,7 +116,7 @@ def _picture(seen, told):
 
 def _alone(seen, told, nearby):
     """The filter whose noise variance has that of the patterns, and no covariance."""
-    from neusee.nodes.restore._inverse import _glare
+    from neusee.nodes.restore.inverse import _glare
 
     whole = _glare._estimated
 

@@ -25,10 +25,10 @@ import torch
 from safetensors.torch import load_file
 from scipy.stats import t as student
 
-from neusee.nodes.restore._inverse import _wiener as filters
-from neusee.nodes.restore._inverse._hidden_pixels import most_likely
-from neusee.nodes.restore._inverse._masked_blur import effective_psf, grey_white
-from neusee.nodes.restore._inverse._posterior_spread import frame_deviation
+from neusee.nodes.restore.inverse import _wiener as filters
+from neusee.nodes.restore.inverse._hidden_pixels import most_likely
+from neusee.nodes.restore.inverse._masked_blur import effective_psf, grey_white
+from neusee.nodes.restore.inverse._posterior_spread import frame_deviation
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.report.figures.camera_pictures import half_width
 from tests.benchmarks import bench_restored_frames as frames

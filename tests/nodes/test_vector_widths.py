@@ -16,13 +16,13 @@ import pytest
 import torch
 
 from neusee.nodes import _cpp_library
-from neusee.nodes.optics._transform import _fused
-from neusee.nodes.optics._transform._fft_transforms import work_by_axis
-from neusee.nodes.optics._transform._fused import fused_axis
-from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
-from neusee.nodes.optics._transform._pupil_field import View
-from neusee.nodes.optics._transform._sample_axis import Axis, centred, last_type
-from neusee.nodes.restore._networks import _selective_scan
+from neusee.nodes.optics.transform import _fused
+from neusee.nodes.optics.transform._fft_transforms import work_by_axis
+from neusee.nodes.optics.transform._fused import fused_axis
+from neusee.nodes.optics.transform._intensity import Sampling, intensity_of
+from neusee.nodes.optics.transform._pupil_field import View
+from neusee.nodes.optics.transform._sample_axis import Axis, centred, last_type
+from neusee.nodes.restore.networks import _selective_scan
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")]
 

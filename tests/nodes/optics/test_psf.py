@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.optics import psf
 from neusee.nodes.optics._psf import _Camera, _focus
-from neusee.nodes.optics._transform import _intensity, _pupil_field, _sample_axis
+from neusee.nodes.optics.transform import _intensity, _pupil_field, _sample_axis
 from neusee.nodes.values import Pupil
 
 DIAMETER, FOCAL, PIXEL, GREEN = 2160 * 3.74e-6, 0.11, 2.9e-6, 550e-9

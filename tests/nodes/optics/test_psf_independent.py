@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from neusee.nodes import doe, optics, spectra
-from neusee.nodes.optics._transform import _intensity
+from neusee.nodes.optics.transform import _intensity
 
 sys.path.insert(0, str(Path(__file__).parent))
 from independent_psf import round_stop, window

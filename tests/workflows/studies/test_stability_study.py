@@ -10,7 +10,7 @@ import torch
 
 from neusee.nodes import node
 from neusee.nodes.optics import _psf, psf
-from neusee.nodes.optics._transform import _intensity, _pupil_field
+from neusee.nodes.optics.transform import _intensity, _pupil_field
 from neusee.nodes.values import Pupil
 from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Step

@@ -11,7 +11,7 @@ import torch
 
 from neusee.nodes import _cpp_library, doe
 from neusee.nodes.optics import _psf, _psf_definition, psf, pupil, stop
-from neusee.nodes.optics._transform import _fused, _intensity, _pupil_field, _sample_axis
+from neusee.nodes.optics.transform import _fused, _intensity, _pupil_field, _sample_axis
 from neusee.nodes.spectra import bands
 from neusee.nodes.values import Psf, Pupil
 

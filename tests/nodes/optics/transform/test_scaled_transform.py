@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics._transform import _fft_transforms, _sample_axis, _scaled_transform
+from neusee.nodes.optics.transform import _fft_transforms, _sample_axis, _scaled_transform
 
 METHODS = ["direct", "folded", "bluestein", "kaiser_bessel", "auto"]
 CPU = torch.device("cpu")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener_spread
-from neusee.nodes.restore._inverse import _masked_blur, _wiener_prior
+from neusee.nodes.restore.inverse import _masked_blur, _wiener_prior
 from neusee.nodes.values import Bands, Psf
 
 SIDE, TORUS, WIDE = 64, 100, 256

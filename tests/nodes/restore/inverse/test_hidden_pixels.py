@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from neusee.nodes.restore._inverse import (
+from neusee.nodes.restore.inverse import (
     _conjugate_gradients,
     _hidden_pixels,
     _masked_blur,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neusee.nodes import doe, optics, restore, spectra
-from neusee.nodes.restore._inverse import _glare as _nearby_glare
+from neusee.nodes.restore.inverse import _glare as _nearby_glare
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
 STOP = optics.stop(samples=48, pitch=168.3e-6, diameter=48 * 168.3e-6)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore._inverse import _hidden_pixels, _masked_blur
+from neusee.nodes.restore.inverse import _hidden_pixels, _masked_blur
 
 GREY = 0.6
 SIZE, TORUS = (5, 4), (8, 6)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener, wiener_by_field, wiener_spread
-from neusee.nodes.restore._inverse import _glare, _wiener_prior
+from neusee.nodes.restore.inverse import _glare, _wiener_prior
 from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 SIDE, READ, WELL = 96, 5.0, 25000.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore._inverse import _wiener_prior
+from neusee.nodes.restore.inverse import _wiener_prior
 
 WHITE = np.array([0.9, 1.0, 0.5])
 FULL = 25_000.0

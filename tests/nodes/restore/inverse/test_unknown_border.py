@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener, wiener_spread
-from neusee.nodes.restore._inverse import _wiener, _wiener_prior
+from neusee.nodes.restore.inverse import _wiener, _wiener_prior
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)

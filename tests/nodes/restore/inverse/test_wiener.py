@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
-from neusee.nodes.restore._inverse import _glare, _masked_blur, _wiener
+from neusee.nodes.restore.inverse import _glare, _masked_blur, _wiener
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, leaves, reflectances, responses
 from neusee.nodes.values import Bands, Psf

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from neusee.nodes import restore
-from neusee.nodes.restore._lasers import _candidates, _line_pattern
+from neusee.nodes.restore.lasers import _candidates, _line_pattern
 from neusee.nodes.values import Bands, Psf, Pupil
 from tests.nodes.restore.lasers import own_camera as own
 

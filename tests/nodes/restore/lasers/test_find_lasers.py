@@ -8,7 +8,7 @@ import torch
 from scipy.stats import norm
 
 from neusee.nodes import restore
-from neusee.nodes.restore._lasers import _frame_likelihood, _line_pattern
+from neusee.nodes.restore.lasers import _frame_likelihood, _line_pattern
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, inputs, pupil_of, tensor
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore._lasers import _frame_likelihood
+from neusee.nodes.restore.lasers import _frame_likelihood
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from neusee.nodes import optics
-from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._lasers import _components, _line_pattern
+from neusee.nodes.restore.inverse import _wiener
+from neusee.nodes.restore.lasers import _components, _line_pattern
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, pupil_of, tensor
 

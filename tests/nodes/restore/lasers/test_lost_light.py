@@ -12,8 +12,8 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._lasers import (
+from neusee.nodes.restore.inverse import _wiener
+from neusee.nodes.restore.lasers import (
     _components,
     _find_lasers,
     _frame_likelihood,

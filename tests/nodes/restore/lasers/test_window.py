@@ -5,7 +5,7 @@ for odd sides too.
 import pytest
 import torch
 
-from neusee.nodes.restore._lasers._candidates import _COMPARED_SIDE, _window
+from neusee.nodes.restore.lasers._candidates import _COMPARED_SIDE, _window
 
 
 @pytest.mark.parametrize("sides", [(640, 500), (641, 257), (90, 300)])

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from neusee.nodes.losses import gradient_penalty
 from neusee.nodes.restore import critic_slopes, critics, parameter_groups
-from neusee.nodes.restore._networks import _convolutional_networks
+from neusee.nodes.restore.networks import _convolutional_networks
 
 
 def seeded(seed=0):

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from neusee.nodes import ParameterError
 from neusee.nodes.network_weights import OPTIONS, file_metadata
 from neusee.nodes.restore import FFTMamba, fft_mamba, start_network
-from neusee.nodes.restore._networks import _fft_mamba
+from neusee.nodes.restore.networks import _fft_mamba
 
 CPU = torch.device("cpu")
 

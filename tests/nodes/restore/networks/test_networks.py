@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from neusee.nodes import ParameterError, restore
 from neusee.nodes.resampling import resize
 from neusee.nodes.restore import FFTMamba, NAFNet, UNet, parameter_groups, start_network
-from neusee.nodes.restore._networks import _convolutional_networks
+from neusee.nodes.restore.networks import _convolutional_networks
 
 SMALL = {"width": 4, "blocks": 2, "states": 3}
 MAKE = {

@@ -138,6 +138,6 @@ def test_layers_of_a_file_that_builds_others_are_not_the_networks_of_a_family():
     found = network_classes(sys.modules[__name__])
     assert set(found) == {"Net"}
     assert (
-        set(whole_networks(sys.modules["neusee.nodes.restore._networks._convolutional_networks"]))
+        set(whole_networks(sys.modules["neusee.nodes.restore.networks._convolutional_networks"]))
         == set()
     )

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from neusee.nodes import _cpp_library
-from neusee.nodes.restore._networks import _selective_scan
+from neusee.nodes.restore.networks import _selective_scan
 
 ROOT = Path(__file__).parents[4]
 RATES = [1e-6, 1e-3, 0.1, 1.0, 50.0, 200.0, "mix"]
@@ -315,7 +315,7 @@ def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
 def test_two_processes_that_compile_at_once_both_succeed(tmp_path):
     code = (
-        "from neusee.nodes.restore._networks import _selective_scan;"
+        "from neusee.nodes.restore.networks import _selective_scan;"
         " print(_selective_scan.operators().neusee_scan_steps())"
     )
     env = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT / ".src")}

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from neusee.nodes import restore
 from neusee.nodes.resampling import resize
 from neusee.nodes.restore import NAFNet, start_network
-from neusee.nodes.restore._networks import _restorer
+from neusee.nodes.restore.networks import _restorer
 
 
 def seeded():

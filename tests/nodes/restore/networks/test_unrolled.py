@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from neusee.nodes import ParameterError
 from neusee.nodes.restore import Unrolled, start_network, unrolled, wiener, wiener_problem
-from neusee.nodes.restore._networks import _wiener_networks
+from neusee.nodes.restore.networks import _wiener_networks
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)

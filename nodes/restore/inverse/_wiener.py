@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.precision import refuse_not_finite, single
-from neusee.nodes.restore._inverse._glare import (
+from neusee.nodes.restore.inverse._glare import (
     Glare,
     Light,
     average,
@@ -22,8 +22,8 @@ from neusee.nodes.restore._inverse._glare import (
     visible,
     with_light_around,
 )
-from neusee.nodes.restore._inverse._hidden_pixels import most_likely
-from neusee.nodes.restore._inverse._masked_blur import (
+from neusee.nodes.restore.inverse._hidden_pixels import most_likely
+from neusee.nodes.restore.inverse._masked_blur import (
     Blurred,
     Size,
     bordered,
@@ -34,7 +34,7 @@ from neusee.nodes.restore._inverse._masked_blur import (
     variance,
     wrapped,
 )
-from neusee.nodes.restore._inverse._wiener_prior import (
+from neusee.nodes.restore.inverse._wiener_prior import (
     SceneDoubt,
     about_mean,
     expected_variance,

@@ -21,8 +21,8 @@ from neusee.nodes.file_headers import archive_needs, safetensors_need
 from neusee.nodes.input_files import bytes_of, once_per_version
 from neusee.nodes.network_weights import fits
 from neusee.nodes.own_modules import Architecture, NetworkClass
-from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network, tried, try_network
-from neusee.nodes.restore._networks._restorer import (
+from neusee.nodes.restore.networks._own_network import OwnNetwork, own_network, tried, try_network
+from neusee.nodes.restore.networks._restorer import (
     Flat,
     Restorer,
     Tile,

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from neusee.nodes import node
 from neusee.nodes.precision import single
-from neusee.nodes.restore._networks._restorer import (
+from neusee.nodes.restore.networks._restorer import (
     LEAK,
     LEAKY,
     ChannelNorm,

@@ -11,14 +11,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from neusee.nodes.precision import transformed
-from neusee.nodes.restore._inverse._conjugate_gradients import (
+from neusee.nodes.restore.inverse._conjugate_gradients import (
     LOWEST,
     Preconditioner,
     descend,
     inner,
     pieces,
 )
-from neusee.nodes.restore._inverse._masked_blur import (
+from neusee.nodes.restore.inverse._masked_blur import (
     Blurred,
     Size,
     halvings,

@@ -5,8 +5,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._transform._fft_transforms import bluestein, fft_length, kaiser_bessel
-from neusee.nodes.optics._transform._sample_axis import (
+from neusee.nodes.optics.transform._fft_transforms import bluestein, fft_length, kaiser_bessel
+from neusee.nodes.optics.transform._sample_axis import (
     Axis,
     Sink,
     Source,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._transform._sample_axis import (
+from neusee.nodes.optics.transform._sample_axis import (
     Axis,
     Sink,
     Source,

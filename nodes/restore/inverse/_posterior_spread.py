@@ -14,8 +14,8 @@ from torch.nn.functional import avg_pool2d
 
 from neusee.nodes import Check, node
 from neusee.nodes.precision import single
-from neusee.nodes.restore._inverse._hidden_pixels import Inverses, most_likely
-from neusee.nodes.restore._inverse._masked_blur import (
+from neusee.nodes.restore.inverse._hidden_pixels import Inverses, most_likely
+from neusee.nodes.restore.inverse._masked_blur import (
     Blurred,
     blurred,
     effective_psf,
@@ -23,7 +23,7 @@ from neusee.nodes.restore._inverse._masked_blur import (
     mixed,
     wrapped,
 )
-from neusee.nodes.restore._inverse._wiener import (
+from neusee.nodes.restore.inverse._wiener import (
     Border,
     Doubt,
     LaserLight,
@@ -33,7 +33,7 @@ from neusee.nodes.restore._inverse._wiener import (
     known_and_light,
     posed,
 )
-from neusee.nodes.restore._inverse._wiener_prior import drawn_blotches, fitted_law
+from neusee.nodes.restore.inverse._wiener_prior import drawn_blotches, fitted_law
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.optics import psf as focus
-from neusee.nodes.optics._transform._fft_transforms import fft_length
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera
-from neusee.nodes.restore._lasers._frame_likelihood import Data, Filter, Weights
-from neusee.nodes.restore._lasers._line_pattern import Lens, grid_patterns, index_at, response_at
+from neusee.nodes.optics.transform._fft_transforms import fft_length
+from neusee.nodes.restore.lasers._components import NANOMETRE, Camera
+from neusee.nodes.restore.lasers._frame_likelihood import Data, Filter, Weights
+from neusee.nodes.restore.lasers._line_pattern import Lens, grid_patterns, index_at, response_at
 from neusee.nodes.values import Bands, Pupil
 
 # --- candidates -----------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from neusee.nodes.restore._inverse._masked_blur import (
+from neusee.nodes.restore.inverse._masked_blur import (
     Blurred,
     Size,
     inverse_colour,

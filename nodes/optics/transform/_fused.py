@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import _cpp_library
-from neusee.nodes.optics._transform._fft_transforms import (
+from neusee.nodes.optics.transform._fft_transforms import (
     DOUBLE,
     SINGLE,
     Kernel,
@@ -20,8 +20,8 @@ from neusee.nodes.optics._transform._fft_transforms import (
     next_odd,
     work_by_axis,
 )
-from neusee.nodes.optics._transform._pupil_field import Screens, View
-from neusee.nodes.optics._transform._sample_axis import (
+from neusee.nodes.optics.transform._pupil_field import Screens, View
+from neusee.nodes.optics.transform._sample_axis import (
     Axis,
     Workspace,
     centred,

@@ -12,9 +12,9 @@ from neusee.nodes import Check, node
 from neusee.nodes.network_weights import loaded, same_layout
 from neusee.nodes.precision import exact_convolutions, single
 from neusee.nodes.resampling import mirrored, resize
-from neusee.nodes.restore._inverse._hidden_pixels import PULLED_STEPS, most_likely, pulled
-from neusee.nodes.restore._inverse._masked_blur import Blurred
-from neusee.nodes.restore._inverse._wiener import (
+from neusee.nodes.restore.inverse._hidden_pixels import PULLED_STEPS, most_likely, pulled
+from neusee.nodes.restore.inverse._masked_blur import Blurred
+from neusee.nodes.restore.inverse._wiener import (
     MAPS,
     Doubt,
     LaserLight,
@@ -25,8 +25,8 @@ from neusee.nodes.restore._inverse._wiener import (
     pose,
     unpacked,
 )
-from neusee.nodes.restore._networks._convolutional_networks import NAFNet
-from neusee.nodes.restore._networks._restorer import Restorer
+from neusee.nodes.restore.networks._convolutional_networks import NAFNet
+from neusee.nodes.restore.networks._restorer import Restorer
 from neusee.nodes.units import Count, DataFile, Electrons, Layers
 from neusee.nodes.values import Bands, Psf
 

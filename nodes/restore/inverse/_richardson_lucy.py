@@ -11,8 +11,8 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.precision import single
-from neusee.nodes.restore._inverse._masked_blur import edge, effective_psf, torus, wrapped
-from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
+from neusee.nodes.restore.inverse._masked_blur import edge, effective_psf, torus, wrapped
+from neusee.nodes.restore.inverse._wiener import refuse_other_pictures
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf

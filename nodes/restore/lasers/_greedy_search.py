@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.restore._inverse._glare import speckle, visible
-from neusee.nodes.restore._inverse._wiener_prior import picture_noise
-from neusee.nodes.restore._lasers._candidates import (
+from neusee.nodes.restore.inverse._glare import speckle, visible
+from neusee.nodes.restore.inverse._wiener_prior import picture_noise
+from neusee.nodes.restore.lasers._candidates import (
     FAR,
     Candidate,
     Templates,
@@ -20,8 +20,8 @@ from neusee.nodes.restore._lasers._candidates import (
     nearest,
     nearest_of_many,
 )
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, LampLight, Laser
-from neusee.nodes.restore._lasers._frame_likelihood import (
+from neusee.nodes.restore.lasers._components import NANOMETRE, Camera, Lamp, LampLight, Laser
+from neusee.nodes.restore.lasers._frame_likelihood import (
     Data,
     Filter,
     Fit,

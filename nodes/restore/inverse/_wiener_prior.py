@@ -9,10 +9,10 @@ import torch
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d
 
-from neusee.nodes.restore._inverse._conjugate_gradients import pieces
-from neusee.nodes.restore._inverse._glare import Light, average
-from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, variance
-from neusee.nodes.restore._inverse._masked_blur import variance as variance_of
+from neusee.nodes.restore.inverse._conjugate_gradients import pieces
+from neusee.nodes.restore.inverse._glare import Light, average
+from neusee.nodes.restore.inverse._masked_blur import Blurred, Size, variance
+from neusee.nodes.restore.inverse._masked_blur import variance as variance_of
 
 # --- picture scale --------------------------------------------------------------------------------
 

@@ -11,13 +11,13 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.precision import refuse_not_finite, single
-from neusee.nodes.restore._inverse._glare import Patterns
-from neusee.nodes.restore._inverse._wiener import View, refuse_other_pictures
-from neusee.nodes.restore._lasers._candidates import line_templates
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser, lamp_light
-from neusee.nodes.restore._lasers._frame_likelihood import NORMAL, spreads
-from neusee.nodes.restore._lasers._greedy_search import Found, Known, search, without_scattered
-from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor, line_pattern
+from neusee.nodes.restore.inverse._glare import Patterns
+from neusee.nodes.restore.inverse._wiener import View, refuse_other_pictures
+from neusee.nodes.restore.lasers._candidates import line_templates
+from neusee.nodes.restore.lasers._components import NANOMETRE, Camera, Laser, lamp_light
+from neusee.nodes.restore.lasers._frame_likelihood import NORMAL, spreads
+from neusee.nodes.restore.lasers._greedy_search import Found, Known, search, without_scattered
+from neusee.nodes.restore.lasers._line_pattern import Lens, Sensor, line_pattern
 from neusee.nodes.units import Electrons, FocalLength, PixelPitch, PositiveLength, Ratio
 from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 

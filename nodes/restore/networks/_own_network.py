@@ -19,7 +19,7 @@ from neusee.nodes import ParameterError
 from neusee.nodes.own_modules import Architecture
 from neusee.nodes.precision import exact_convolutions
 from neusee.nodes.resampling import mirrored, resize
-from neusee.nodes.restore._networks._restorer import PictureRestorer
+from neusee.nodes.restore.networks._restorer import PictureRestorer
 
 _DRAWING = threading.Lock()  #: one thread at a time seeds the global random generator
 _LEAST = 32  #: smallest side in pixels of the picture of a trial call

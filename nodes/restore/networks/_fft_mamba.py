@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from neusee.nodes import node
 from neusee.nodes.precision import single
 from neusee.nodes.resampling import resize
-from neusee.nodes.restore._networks._restorer import (
+from neusee.nodes.restore.networks._restorer import (
     ChannelNorm,
     PictureRestorer,
     Scale,
@@ -23,7 +23,7 @@ from neusee.nodes.restore._networks._restorer import (
     restored,
     restorer_checks,
 )
-from neusee.nodes.restore._networks._selective_scan import selective_scan
+from neusee.nodes.restore.networks._selective_scan import selective_scan
 from neusee.nodes.units import Count, DataFile, Layers
 
 # --- scan layer -----------------------------------------------------------------------------------

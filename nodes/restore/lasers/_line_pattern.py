@@ -12,7 +12,7 @@ from torch import Tensor
 from neusee.nodes.optics._lens import passed_by_notches
 from neusee.nodes.optics._pixel_average import FineAxis, averaged, fine_axis
 from neusee.nodes.optics._psf_definition import SensorSampling
-from neusee.nodes.optics._transform._sample_axis import centred
+from neusee.nodes.optics.transform._sample_axis import centred
 from neusee.nodes.values import Bands, Pupil
 
 Sensor = SensorSampling

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._transform._sample_axis import Axis, Source, Workspace, centred
+from neusee.nodes.optics.transform._sample_axis import Axis, Source, Workspace, centred
 from neusee.nodes.precision import refuse_not_finite
 
 _MOST_TURNS = 1e9  #: largest phase in turns, which float64 represents to 2e-7 turns

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
-from neusee.nodes.optics._transform._fft_transforms import fft_length
-from neusee.nodes.restore._lasers._components import NANOMETRE, Lamp, Laser
+from neusee.nodes.optics.transform._fft_transforms import fft_length
+from neusee.nodes.restore.lasers._components import NANOMETRE, Lamp, Laser
 
 # --- whitening ------------------------------------------------------------------------------------
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from neusee.nodes.optics import psf as focus
-from neusee.nodes.optics._transform._fft_transforms import fft_length
-from neusee.nodes.restore._inverse._masked_blur import grey_shares
-from neusee.nodes.restore._inverse._wiener import View
-from neusee.nodes.restore._lasers._line_pattern import (
+from neusee.nodes.optics.transform._fft_transforms import fft_length
+from neusee.nodes.restore.inverse._masked_blur import grey_shares
+from neusee.nodes.restore.inverse._wiener import View
+from neusee.nodes.restore.lasers._line_pattern import (
     Lens,
     deviation,
     line_moves,

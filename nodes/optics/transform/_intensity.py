@@ -10,10 +10,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._transform._fused import FusedPupil, available, operators
-from neusee.nodes.optics._transform._pupil_field import Field, Screens, View, refuse_too_many_turns
-from neusee.nodes.optics._transform._sample_axis import Workspace, borrowed, patch_view
-from neusee.nodes.optics._transform._scaled_transform import Method, propagate
+from neusee.nodes.optics.transform._fused import FusedPupil, available, operators
+from neusee.nodes.optics.transform._pupil_field import Field, Screens, View, refuse_too_many_turns
+from neusee.nodes.optics.transform._sample_axis import Workspace, borrowed, patch_view
+from neusee.nodes.optics.transform._scaled_transform import Method, propagate
 from neusee.nodes.precision import one_by_one, transformed
 
 _NO_SECOND_DERIVATIVE = (
