@@ -20,7 +20,7 @@ MEMORY = "more than the"  #: in each sentence about memory
 OTHER = "is not a regular file but"
 
 SCENE, FRAMES, SENSOR = "scene.{}(file=path)", "calibrate.frames(files=(path,))", "read_frame(path)"
-CUBE = "list(wrong(cube, path))"
+CUBE = "scene.hyperspectral.hooks.preflight(file=path, start=4e-7, stop=7e-7)"
 HEIGHT = "map_header(path)"
 #: name of the bomb: its maker, the name of its file, what reads it, and what the sentence says
 BOMBS = {
@@ -80,7 +80,7 @@ BOMBS = {
     "recipe of a hole": (bombs.hole, "a.yaml", "load(path)", "more than the limit of 4000000"),
     "posterior of aliases": (bombs.aliases, "a.yaml", "read_posterior(path)", "unknown key a0"),
     "posterior of a hole": (bombs.hole, "posterior.json", "read_posterior(path)", "more than the limit of 4000000"),
-    "descriptor of a hole": (bombs.hole, "a.txt", "descriptor(path)", "more than the limit of 67.1 MB"),
+    "descriptor of a hole": (bombs.hole, "a.txt", "descriptor_release((path,))", "more than the limit of 67.1 MB"),
     "record of a run": (bombs.hole, "provenance.json", "record(path)", "more than the limit of 67108864"),
     # --- what is no file
     "pipe as a photograph": (bombs.pipe, "a.png", SCENE.format("photograph"), OTHER),
@@ -114,16 +114,14 @@ import h5py
 
 from neusee.nodes import calibrate, scene
 from neusee.nodes.file_headers import hdf5_needs
-from neusee.nodes.calibrate import frame_header
-from neusee.nodes.calibrate._measurement_files import parsed_descriptor as descriptor
+from neusee.nodes.calibrate import descriptor_release, frame_header
 from neusee.nodes.doe._height_map_files import map_header
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.network_weights import fits
-from neusee.nodes.restore.networks._network_files import exported_network
-from neusee.nodes.scene._hyperspectral import size_and_type, wrong_values
+from neusee.nodes.restore.networks import exported_network
 from neusee.nodes.scene._exr import picture_size
 from neusee.nodes.scene._photograph import read_header
-from neusee.nodes.scene._photograph import list_photographs
+from neusee.nodes.scene import list_photographs
 from neusee.nodes.sensor._frame_file import read_frame
 from neusee.nodes.spectra._plausible_spectra import _spectra_of_file as reflectances
 from neusee.nodes.spectra._lift import _checkpoint_tensors as lift_weights
@@ -147,14 +145,6 @@ class Said(Exception):
 
 def said(value):
     raise Said(str(value))
-
-
-def wrong(name, path):
-    size_and_type(path, None)
-    yield wrong_values(path, None)
-
-
-cube = None
 
 
 def weights(path):

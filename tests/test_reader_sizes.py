@@ -53,8 +53,8 @@ STORE = (
 OPENS = "it opens the file for others, without waiting for a pipe"
 DIGEST = "a digest, in pieces of a few kilobytes, opened without waiting"
 NO_SIZE = {
-    "nodes/_cpp_library.py:_library": SOURCE,
-    "nodes/_cpp_library.py:_processor": SYSTEM,
+    "nodes/cpp_library.py:_library": SOURCE,
+    "nodes/cpp_library.py:_processor": SYSTEM,
     "nodes/calibrate/_frame_files.py:_header_of_fits": HEADER,
     "nodes/calibrate/_frame_files.py:fits_header": HEADER,
     "nodes/calibrate/_frame_files.py:fits_image": HEADER,

@@ -4,7 +4,7 @@ flat light.
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.calibrate._camera_likelihood import camera, expected_levels
-from neusee.nodes.calibrate._emva_quantities import Quantity
+from neusee.nodes.calibrate._emva_quantities import Quantity, saturation_point
 from neusee.nodes.calibrate._emva_sheet import (
     EmvaSheet,
     LeastSquares,
@@ -18,7 +18,14 @@ from neusee.nodes.calibrate._frame_files import (
     frame_header,
     frame_means,
 )
-from neusee.nodes.calibrate._frame_pairs import CLEAN_PAIRS, FrameTest, Hidden, Stack, open_errors
+from neusee.nodes.calibrate._frame_pairs import (
+    CLEAN_PAIRS,
+    FrameTest,
+    Hidden,
+    Stack,
+    chance_of_no_fault,
+    open_errors,
+)
 from neusee.nodes.calibrate._inspection import coarse, inspect_frames
 from neusee.nodes.calibrate._light_levels import (
     SaturationSignal,
@@ -46,6 +53,7 @@ from neusee.nodes.calibrate._nonuniformity import (
     defects,
     profiles,
     spatial_series,
+    spatial_variances,
     spectrogram,
     without_trend,
 )
@@ -63,16 +71,25 @@ from neusee.nodes.calibrate._priors import (
 )
 from neusee.nodes.calibrate._scatter import (
     SCATTER_NAMES,
+    PointCamera,
     Rings,
     ScatterCoordinates,
     guess_scatter,
     point_source,
+    reduce_rings,
     stray_light,
     stray_prior,
 )
-from neusee.nodes.calibrate._sensor_likelihood import Likelihood, Sufficient, density, sufficient
+from neusee.nodes.calibrate._sensor_likelihood import (
+    Likelihood,
+    Sufficient,
+    density,
+    log_cell,
+    sufficient,
+)
 from neusee.nodes.calibrate._sheet_budget import (
     MODEL,
+    SOURCES,
     STATISTICS,
     camera_sources,
     sheet_budgets,
@@ -87,6 +104,7 @@ from neusee.nodes.calibrate._uncertainty_budget import (
     Contribution,
     Laboratory,
     Traceability,
+    coverage_factor,
     laboratory_contributions,
 )
 
@@ -99,6 +117,7 @@ __all__ = [
     "NOT_INVOLVED",
     "NOT_STATED",
     "SCATTER_NAMES",
+    "SOURCES",
     "STATISTICS",
     "Budget",
     "CameraCoordinates",
@@ -113,6 +132,7 @@ __all__ = [
     "LeastSquares",
     "Likelihood",
     "Nonuniformity",
+    "PointCamera",
     "Prior",
     "Profiles",
     "Quantity",
@@ -128,7 +148,9 @@ __all__ = [
     "camera",
     "camera_prior",
     "camera_sources",
+    "chance_of_no_fault",
     "coarse",
+    "coverage_factor",
     "defects",
     "density",
     "descriptor",
@@ -151,16 +173,20 @@ __all__ = [
     "laboratory_contributions",
     "least_squares",
     "levels",
+    "log_cell",
     "open_errors",
     "point_source",
     "prior",
     "profiles",
     "reduce",
+    "reduce_rings",
     "refuse_descriptor",
+    "saturation_point",
     "saturation_signal",
     "sheet_budgets",
     "source_freedom",
     "spatial_series",
+    "spatial_variances",
     "spectrogram",
     "stray_light",
     "stray_prior",

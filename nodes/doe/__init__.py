@@ -15,6 +15,7 @@ from neusee.nodes.doe._height_map_files import read_height_map, size_metadata
 from neusee.nodes.doe._parametrisations import (
     PARAMETRISATIONS,
     Drawn,
+    HeightNet,
     LearntStop,
     Modes,
     Pixels,
@@ -39,6 +40,7 @@ __all__ = [
     "PARAMETRISATIONS",
     "Drawn",
     "Glass",
+    "HeightNet",
     "LearntStop",
     "Material",
     "Modes",

@@ -41,6 +41,7 @@ from neusee.nodes.laser._damage_distances import (
     heated_diameter,
     heated_in_spot,
     sensor_gain,
+    spot_heat,
     spot_in_pixels,
     widest_heated_diameter,
 )
@@ -70,7 +71,13 @@ from neusee.nodes.laser._damage_parts import (
     state_of,
     worst_state,
 )
-from neusee.nodes.laser._damage_spot import SpotDamage, damage, damaged_pixels, heated_spot
+from neusee.nodes.laser._damage_spot import (
+    SpotDamage,
+    damage,
+    damaged_pixels,
+    heated_spot,
+    steady_heat,
+)
 from neusee.nodes.laser._damage_table import FittedThreshold, Shots, fit_shots, read_damage_laws
 from neusee.nodes.laser._dazzle import (
     Dazzle,
@@ -227,10 +234,12 @@ __all__ = [
     "silicon_absorption",
     "size_exponent",
     "spot_factor",
+    "spot_heat",
     "spot_in_pixels",
     "spot_peak",
     "spot_reach",
     "state_of",
+    "steady_heat",
     "stopped_share",
     "summit_gain",
     "threshold_luminance",

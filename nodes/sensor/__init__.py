@@ -1,7 +1,14 @@
 """Sensor: conversion of photons to electrons, and of electrons to digital numbers."""
 
 from neusee.nodes.sensor import _expected_ranges, _result_shapes  # noqa: F401  attach ranges and shape rules
-from neusee.nodes.sensor._digitization import Bits, crop, digitize, electrons_to_clip, full_well
+from neusee.nodes.sensor._digitization import (
+    Bits,
+    clipping_number,
+    crop,
+    digitize,
+    electrons_to_clip,
+    full_well,
+)
 from neusee.nodes.sensor._exposure import add_photons, expose, level
 from neusee.nodes.sensor._frame_file import FRAME_SUFFIXES, frame
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
@@ -21,6 +28,7 @@ __all__ = [
     "Bits",
     "Limits",
     "add_photons",
+    "clipping_number",
     "crop",
     "dark_current",
     "digitize",

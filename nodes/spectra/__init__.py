@@ -12,8 +12,10 @@ from neusee.nodes.spectra._bands import (
     mean_wavelength,
 )
 from neusee.nodes.spectra._channel_responses import camera_curves, responses, rows
+from neusee.nodes.spectra._cie_tables import Table, light, observer, paints, to_srgb
 from neusee.nodes.spectra._illuminant import illuminant, illuminate, light_curve
 from neusee.nodes.spectra._lift import (
+    MSTPlusPlus,
     lift_lmmse,
     lift_lmmse_mixture,
     lift_mallett,
@@ -29,6 +31,8 @@ from neusee.nodes.spectra._plausible_spectra import metamers, reflectances
 from neusee.nodes.spectra._synthetic_pictures import grain, leaves, render
 
 __all__ = [
+    "MSTPlusPlus",
+    "Table",
     "bands",
     "camera_curves",
     "compress",
@@ -45,15 +49,19 @@ __all__ = [
     "lift_matrix",
     "lift_mst_plus_plus",
     "lift_pictures",
+    "light",
     "light_curve",
     "line",
     "line_table",
     "mean_wavelength",
     "metamers",
     "need_mst_plus_plus_bands",
+    "observer",
+    "paints",
     "reflectances",
     "render",
     "responses",
     "rows",
     "start_mst_plus_plus",
+    "to_srgb",
 ]

@@ -30,7 +30,7 @@ import numpyro
 import torch
 from numpyro.infer import MCMC, NUTS
 
-from neusee.nodes.calibrate._sensor_likelihood import log_cell
+from neusee.nodes.calibrate import log_cell
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.log_posterior import SensorPosterior, search_mode
 from neusee.workflows.calibration.posterior_checks import importance_samples

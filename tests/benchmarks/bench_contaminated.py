@@ -40,8 +40,8 @@ from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import (
     Check,
-    _of_data,
     count_failures,
+    data_checks,
     importance_samples,
 )
 from neusee.workflows.calibration.run_calibration import (
@@ -221,7 +221,7 @@ def sampled(recipe, store):
         law.samples[chosen][None, :, None], np.zeros((1, 8000, 1)), 0.3, 1.0, 8000, True
     )
     search = Check("the search found the mode", "", "settled", "pass" if mode.settled else "fail")
-    found = [*frame_checks(tests), search, *_of_data(problem, mode, identifiability, law)]
+    found = [*frame_checks(tests), search, *data_checks(problem, mode, identifiability, law)]
     return CalibrationResult(
         problem, mode, identifiability, widened(problem, chains, tests, 2), found, (), tests
     )

@@ -28,7 +28,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
 from neusee.nodes.optics import _few_bands
-from neusee.nodes.optics import _few_bands as _band_thumbnail
 from neusee.workflows.engine.runner import run
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.run_study import cold
@@ -70,8 +69,8 @@ def line(seed, memo, size):
 def main(count, start, file, small):
     known, size = {}, () if small else random_recipes.LARGE
     if small:
-        _band_thumbnail.CELLS_ACROSS = _few_bands.CELLS_ACROSS = 20
-        _band_thumbnail._PART_CELLS, _band_thumbnail._TILE_CELLS = 40, 8
+        _few_bands.CELLS_ACROSS = 20
+        _few_bands._PART_CELLS, _few_bands._TILE_CELLS = 40, 8
     if file and Path(file).exists():
         known = {
             each["seed"]: each for each in map(json.loads, Path(file).read_text().splitlines())

@@ -23,13 +23,18 @@ import torch
 from scipy import stats
 
 from neusee.nodes import metrics, restore
-from neusee.nodes.restore.inverse import _conjugate_gradients, _hidden_pixels, _wiener
-from neusee.nodes.restore.inverse import _conjugate_gradients as _lowest_frequencies
-from neusee.nodes.restore.inverse import _masked_blur as _fft_grid
+from neusee.nodes.restore.inverse import (
+    _conjugate_gradients,
+    _hidden_pixels,
+    _masked_blur,
+    _wiener,
+    descend,
+    most_likely,
+)
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.run_training import _photographs
+from neusee.workflows.training.run_training import training_photographs
 from neusee.workflows.training.training_pictures import PictureSource, TrainingStream
 
 MASKS, SCENES, STRENGTHS = (
@@ -49,8 +54,8 @@ NAMES = [
     "laser_photons[mask,green]",
 ]
 BEFORE = {
-    (_fft_grid, "DENSE"): 40,
-    (_lowest_frequencies, "MODES"): 1000,
+    (_masked_blur, "DENSE"): 40,
+    (_conjugate_gradients, "MODES"): 1000,
     (_conjugate_gradients, "LOWEST"): 256,
     (_hidden_pixels, "ENOUGH"): 1e-5,
 }
@@ -90,18 +95,18 @@ def numbers(those):
 def before(problem, coarser=True):
     """The answer with the numbers as before, for the grid as shipped."""
     with numbers(BEFORE):
-        return _hidden_pixels.most_likely(problem, enough=_hidden_pixels.ENOUGH)
+        return most_likely(problem, enough=_hidden_pixels.ENOUGH)
 
 
 def shipped(problem, coarser=True):
     """The answer as shipped."""
-    return _hidden_pixels.most_likely(problem)
+    return most_likely(problem)
 
 
 def converged(problem, coarser=True):
     """The answer after many steps, with a preconditioner on every grid."""
     with numbers({(_conjugate_gradients, "LOWEST"): 512}):
-        return _conjugate_gradients.descend(problem, before(problem), CONVERGED, 0.0)
+        return descend(problem, before(problem), CONVERGED, 0.0)
 
 
 def filtered(seen, solve):
@@ -186,7 +191,7 @@ def pictures(count=3):
     filter, filter alone.
     """
     recipe = load("train_demonstration", ["train.laser_free=0"], Path())
-    photographs = _photographs(recipe, recipe.training, True)
+    photographs = training_photographs(recipe, recipe.training, True)
     stream = TrainingStream(recipe, recipe.training, PictureSource(photographs, Store()), recipe)
     spent = []
 

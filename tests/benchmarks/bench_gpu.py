@@ -25,7 +25,7 @@ warnings.simplefilter("ignore")
 
 from neusee.nodes import doe as masks  # noqa: E402
 from neusee.nodes import optics, spectra  # noqa: E402
-from neusee.nodes.restore.networks._selective_scan import reference, selective_scan  # noqa: E402
+from neusee.nodes.restore.networks import reference, selective_scan  # noqa: E402
 from neusee.workflows import Store, load  # noqa: E402
 from neusee.workflows.engine.runner import run  # noqa: E402
 

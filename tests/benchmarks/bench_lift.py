@@ -25,12 +25,12 @@ from neusee.nodes.spectra import (
     leaves,
     lift_lmmse,
     lift_mallett,
+    lift_matrix,
     lift_mst_plus_plus,
     metamers,
     reflectances,
     render,
 )
-from neusee.nodes.spectra._lift import lift_matrix
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 PICTURES, SIZE, LEAST = 32, (64, 64), 1e-2

@@ -31,19 +31,20 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from neusee.nodes import flare, optics  # noqa: E402
-from neusee.nodes.restore.inverse._wiener import View  # noqa: E402
-from neusee.nodes.restore.lasers import _find_lasers as law  # noqa: E402
-from neusee.nodes.restore.lasers._components import (  # noqa: E402
+from neusee.nodes.restore.inverse import View  # noqa: E402
+from neusee.nodes.restore.lasers import (  # noqa: E402
     Camera,
+    Known,
     Laser,
-    lamp_light,
-)
-from neusee.nodes.restore.lasers._frame_likelihood import (  # noqa: E402
+    Lens,
+    at_the_aperture,
+    data_of,
     fitted,
+    lamp_light,
+    line_pattern,
     spreads,
 )
-from neusee.nodes.restore.lasers._greedy_search import Known, _data  # noqa: E402
-from neusee.nodes.restore.lasers._line_pattern import Lens, line_pattern  # noqa: E402
+from neusee.nodes.restore.lasers import _find_lasers as law  # noqa: E402
 from tests.benchmarks import bench_restored_frames as masks  # noqa: E402
 from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
 from tests.nodes.restore.lasers.as_inputs import inputs, pupil_of  # noqa: E402
@@ -118,7 +119,7 @@ def fit_of(frame, mask, laser, lens):
         ),
     )
     for _ in range(2):
-        fit = fitted(_data(known, parts), parts, 12)
+        fit = fitted(data_of(known, parts), parts, 12)
         parts = fit.parts
     return parts[0], spreads(fit, known.seen)[0]
 
@@ -146,7 +147,7 @@ def channels(all_rows):
             continue
         each = (torch.tensor(r[name], dtype=torch.float64) for name in ("found", "spread", "ideal"))
         seen = (1.0 - torch.tensor(r["clipped"]))[:, None, None].expand(-1, r["side"], r["side"])
-        middle, ends = (x.numpy() for x in law.at_the_aperture(*each, seen))
+        middle, ends = (x.numpy() for x in at_the_aperture(*each, seen))
         for c, truth in enumerate(r["truth"]):
             found.append(
                 {

@@ -18,8 +18,7 @@ from pathlib import Path
 import torch
 
 from neusee.nodes import metrics, restore
-from neusee.nodes.restore.inverse import _conjugate_gradients
-from neusee.nodes.restore.inverse import _masked_blur as _fft_grid
+from neusee.nodes.restore.inverse import Light, _conjugate_gradients, _glare, _masked_blur
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -116,13 +115,11 @@ def _picture(seen, told):
 
 def _alone(seen, told, nearby):
     """The filter whose noise variance has that of the patterns, and no covariance."""
-    from neusee.nodes.restore.inverse import _glare
-
     whole = _glare._estimated
 
     def independent(electrons, weights, glare, doubt):
         light = whole(electrons, weights, glare, doubt)
-        return _glare.Light(light.sum, _glare._total(light), [])
+        return Light(light.sum, _glare._total(light), [])
 
     _glare._estimated = independent
     try:
@@ -139,7 +136,7 @@ def _psnr(seen, found):
 
 def main(side):
     store = Store()
-    _conjugate_gradients.LOWEST, _fft_grid.DENSE = 64, 20
+    _conjugate_gradients.LOWEST, _masked_blur.DENSE = 64, 20
     print(
         "| mask, strength | filter |",
         " | ".join(ERRORS),

@@ -48,7 +48,7 @@ from prysm.conf import config
 
 from neusee.nodes.optics import psf
 from neusee.nodes.optics._psf import _Camera, _focus
-from neusee.nodes.optics.transform._scaled_transform import Grids, transform
+from neusee.nodes.optics.transform import Grids, transform
 from neusee.nodes.values import Pupil
 
 WAVELENGTH, FOCAL, PIXEL, DIAMETER, INDEX = 550e-9, 0.11, 2.9e-6, 2160 * 3.74e-6, 0.46

@@ -40,8 +40,11 @@ from PIL import Image
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
-from neusee.nodes.calibrate import CLEAN_PAIRS, STATISTICS  # noqa: E402
-from neusee.nodes.calibrate._sheet_budget import SOURCES  # noqa: E402
+from neusee.nodes.calibrate import (  # noqa: E402
+    CLEAN_PAIRS,
+    SOURCES,
+    STATISTICS,
+)
 from neusee.workflows.calibration import emcee_sampler  # noqa: E402
 from neusee.workflows.calibration.run_calibration import (  # noqa: E402
     CalibrationOptions,

@@ -22,7 +22,7 @@ import torch
 
 warnings.simplefilter("ignore")
 
-from neusee.nodes.restore.networks._selective_scan import reference, selective_scan  # noqa: E402
+from neusee.nodes.restore.networks import reference, selective_scan  # noqa: E402
 
 D, N, LENGTHS = 96, 16, (4096, 65_536)
 LOOP = 4096  #: steps beyond which the loop is not worth waiting for

@@ -25,10 +25,16 @@ import torch
 from safetensors.torch import load_file
 from scipy.stats import t as student
 
-from neusee.nodes.restore.inverse import _wiener as filters
-from neusee.nodes.restore.inverse._hidden_pixels import most_likely
-from neusee.nodes.restore.inverse._masked_blur import effective_psf, grey_white
-from neusee.nodes.restore.inverse._posterior_spread import frame_deviation
+from neusee.nodes.restore.inverse import (
+    LaserLight,
+    Settings,
+    effective_psf,
+    frame_deviation,
+    grey_white,
+    known_and_light,
+    most_likely,
+    posed,
+)
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.report.figures.camera_pictures import half_width
 from tests.benchmarks import bench_restored_frames as frames
@@ -84,17 +90,17 @@ def restored(found, optics, scatter, interval):
     """
     bands = Bands(*(optics[f"bands.{name}"] for name in Bands._fields))
     psf = Psf(optics["psf[mask].intensity"], optics["psf[mask].clear_peak"])
-    light = filters.LaserLight(
+    light = LaserLight(
         glare=[found[name] for name in FOUND[: len(RANKS)]],
         nearby=[found[name] for name in FOUND[len(RANKS) :]],
     )
     camera = (found["illuminant"], found["responses"], bands)
-    fine, known, glare = filters.known_and_light(
+    fine, known, glare = known_and_light(
         psf, camera[1], found["signal[mask]"], found["clipped[mask]"].bool(), light
     )
     kernels = effective_psf(psf, *camera, fine.dtype).to(fine)
-    settings = filters.Settings(1.0, own.READ, None, 0.3, scatter)
-    scaled = filters.posed(fine, known, kernels, glare, settings, grey_white(*camera))
+    settings = Settings(1.0, own.READ, None, 0.3, scatter)
+    scaled = posed(fine, known, kernels, glare, settings, grey_white(*camera))
     matrix = found["matrix"].double()
     picture = torch.tensordot(
         matrix, scaled.pixels(most_likely(scaled.problem)) + scaled.mean, 1

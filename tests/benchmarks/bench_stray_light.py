@@ -20,7 +20,7 @@ import torch
 from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.importance_sampling import draw_samples
 from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
-from neusee.workflows.calibration.posterior_checks import _SMOOTH, _SURPRISE, slow_waves
+from neusee.workflows.calibration.posterior_checks import LARGEST_SURPRISE, SLOW_P_VALUE, slow_waves
 from neusee.workflows.calibration.posterior_mixture import normalised
 from tests.workflows.calibration.simulated_lenses import (
     PRIOR,
@@ -85,8 +85,8 @@ def main(count=200, file="stray_light_coverage.jsonl", prior="wide", first=0):
     below = np.array([[row["below"][name] for name in SHAPE] for row in rows])
     held = ((below >= 0.05) & (below <= 0.95)).mean(0)
     sizes = np.array([row["effective"] for row in rows])
-    misfits = sum(slow_waves(np.array(row["residuals"]))[1] < _SMOOTH for row in rows)
-    surprises = sum(np.abs(row["middle"]).max() > _SURPRISE for row in rows)
+    misfits = sum(slow_waves(np.array(row["residuals"]))[1] < SLOW_P_VALUE for row in rows)
+    surprises = sum(np.abs(row["middle"]).max() > LARGEST_SURPRISE for row in rows)
     print(
         "| cameras | refused | b0 | l | s | misfit told | prior said to be wrong | effective size:"
         " least, median | s |"

@@ -39,8 +39,7 @@ def one_level(level, repeats):
         scipy_call,
     )
 
-    from neusee.nodes.optics.transform._sample_axis import Axis
-    from neusee.nodes.optics.transform._scaled_transform import cheapest
+    from neusee.nodes.optics.transform import Axis, cheapest
 
     torch.set_num_threads(1)
     for samples, window in SIZES:

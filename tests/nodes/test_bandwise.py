@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes.optics.transform._sample_axis import Axis
-from neusee.nodes.optics.transform._scaled_transform import cheapest
+from neusee.nodes.optics.transform import Axis, cheapest
 from neusee.nodes.values import BAND_FIELDS, Psf, Pupil
 from tests.nodes.test_contract import NODES
 

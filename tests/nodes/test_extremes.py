@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neusee.nodes import doe, flare, losses, metrics, optics, restore, sensor, spectra
-from neusee.nodes.optics.transform._scaled_transform import Grids, transform
+from neusee.nodes.optics.transform import Grids, transform
 from neusee.nodes.precision import refuse_half, refuse_not_finite, single
 from neusee.nodes.values import Bands, Psf, Pupil
 

@@ -21,12 +21,9 @@ from neusee.nodes import constants
 from neusee.nodes.losses import charbonnier
 from neusee.nodes.metrics import quality
 from neusee.nodes.resampling import enlarge, resize
-from neusee.nodes.scene import Photographs
-from neusee.nodes.scene._exr import _PREFIX_EXPONENTS, spectral_channels
-from neusee.nodes.scene._picture_changes import framed_scene
+from neusee.nodes.scene import Photographs, framed_scene, spectral_channels
 from neusee.nodes.sensor import crop
-from neusee.nodes.spectra import bands, illuminant, lift_mallett, render
-from neusee.nodes.spectra._cie_tables import light, paints
+from neusee.nodes.spectra import bands, illuminant, lift_mallett, light, paints, render
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)
@@ -183,8 +180,9 @@ def test_a_picture_is_lifted_at_once_and_with_a_gradient_where_colour_science_li
 
 
 def test_names_of_spectral_channels_are_read_as_by_colour_science():
+    prefixes = ("", "da", *"pnumcdhkMGTPEZY")
     numbers = {"m": ("5,5", "550", "1e-3"), "Hz": ("545,07", "5e2", "3")}
-    for prefix, unit in itertools.product(_PREFIX_EXPONENTS, numbers):
+    for prefix, unit in itertools.product(prefixes, numbers):
         for number in numbers[unit]:
             [(found, name)] = spectral_channels([f"T.{number}{prefix}{unit}"]).items()
             assert name == f"T.{number}{prefix}{unit}"

@@ -15,14 +15,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from neusee.nodes import _cpp_library
-from neusee.nodes.optics.transform import _fused
-from neusee.nodes.optics.transform._fft_transforms import work_by_axis
-from neusee.nodes.optics.transform._fused import fused_axis
-from neusee.nodes.optics.transform._intensity import Sampling, intensity_of
-from neusee.nodes.optics.transform._pupil_field import View
-from neusee.nodes.optics.transform._sample_axis import Axis, centred, last_type
-from neusee.nodes.restore.networks import _selective_scan
+from neusee.nodes import cpp_library
+from neusee.nodes.optics.transform import (
+    Axis,
+    Sampling,
+    View,
+    _fused,
+    centred,
+    fused_axis,
+    intensity_of,
+    last_type,
+    work_by_axis,
+)
+from neusee.nodes.restore.networks import _selective_scan, selective_scan
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")]
 
@@ -223,7 +228,7 @@ def scan_by_loop(u, dt, A, B, C):
 def test_the_scan_and_its_gradient_are_the_loop(compiled, level, dtype):
     compiled(level)
     for d in (1, 3, 4, 7, 16, 17, 40):
-        ours = scan_results(d, 3, dtype, _selective_scan.selective_scan)
+        ours = scan_results(d, 3, dtype, selective_scan)
         truth = scan_results(d, 3, torch.float64, scan_by_loop)
         rounding = 4e-6 if dtype == torch.float32 else 1e-13
         for found, expected in zip(ours, truth, strict=True):
@@ -236,7 +241,7 @@ def test_the_scan_has_the_same_bits_at_every_width_with_fma(compiled):
         compiled(level)
         both.append(
             [
-                scan_results(d, 3, t, _selective_scan.selective_scan)
+                scan_results(d, 3, t, selective_scan)
                 for d in (5, 16, 45, 100)
                 for t in (torch.float32, torch.float64)
             ]
@@ -273,11 +278,11 @@ def driver(tmp_path_factory):
         if not program.exists():
             flags = [
                 flag
-                for flag in _cpp_library.FLAGS
+                for flag in cpp_library.FLAGS
                 if not flag.startswith(("-march", "-fopenmp", "-shared"))
             ]
             include = f"-I{_fused.SOURCES[0].parent.resolve()}"
-            command = [*compiler, *flags, _cpp_library.UNFUSED, include, DRIVER, "-o", program]
+            command = [*compiler, *flags, cpp_library.UNFUSED, include, DRIVER, "-o", program]
             subprocess.run(command, check=True)
         return [*runner, program]
 

@@ -25,7 +25,7 @@ import torch
 from neusee.workflows import Store, load
 from neusee.workflows.training.process_mesh import Mesh, joined
 from neusee.workflows.training.resumable_loop import TrainingSession
-from neusee.workflows.training.run_training import _photographs, train
+from neusee.workflows.training.run_training import train, training_photographs
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import PictureSource, Shared, TrainingStream
 
@@ -41,7 +41,9 @@ def step(job: dict[str, Any], mesh: Mesh) -> None:
     samples = TrainingStream(
         recipe,
         how,
-        PictureSource(_photographs(recipe, how, True), Store(Path(job["store"])), mesh=mesh),
+        PictureSource(
+            training_photographs(recipe, how, True), Store(Path(job["store"])), mesh=mesh
+        ),
         None,
     )
     losses, _ = learner.iterate(samples, 1, 0)
@@ -58,7 +60,10 @@ def pooled(job: dict[str, Any], mesh: Mesh) -> None:
     recipe = load("train_small", job["words"])
     how, store = recipe.training, Store(Path(job["store"]))
     samples = TrainingStream(
-        recipe, how, PictureSource(_photographs(recipe, how, True), store, mesh=mesh), recipe
+        recipe,
+        how,
+        PictureSource(training_photographs(recipe, how, True), store, mesh=mesh),
+        recipe,
     )
     usual, drawn = samples._drawn, []
     samples._drawn = lambda *place: drawn.append(place) or usual(*place)  # type: ignore[method-assign, func-returns-value]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -76,8 +77,6 @@ def serve() -> None:
 
 def work(job: dict[str, Any]) -> None:
     """Run the program as a new process would, and end this process."""
-    from neusee.__main__ import main
-
     for number, place in enumerate((os.devnull, job["out"], job["err"])):
         opened = os.open(place, os.O_RDWR | os.O_CREAT, 0o600)
         os.dup2(opened, number)
@@ -87,7 +86,7 @@ def work(job: dict[str, Any]) -> None:
     os.environ.update(job["env"])
     os.chdir(job["cwd"])
     sys.argv = ["neusee", *job["words"]]
-    main()
+    runpy.run_module("neusee", run_name="__main__")
     sys.exit()
 
 

@@ -274,9 +274,9 @@ _TAIL, _SD, _MEAN, _BELOW = 0.5, 0.05, 0.1, 2.0
 _WEIGHTED = 0.1  #: least effective sample size of weighted draws, as a share of their number
 #: number of slowest cosine components over the rings, and the p-value below which chance does not
 #: explain them
-_SLOW_MIXING, _SMOOTH = 8, 5e-3
+_SLOW_MIXING, SLOW_P_VALUE = 8, 5e-3
 #: largest distance of a mean from the middle of its prior, in standard deviations of the prior
-_SURPRISE = 3.5
+LARGEST_SURPRISE = 3.5
 _LUCK = 4.0  #: standard errors by which the widths of two samples may differ by chance
 
 
@@ -374,7 +374,7 @@ def checks(
     return [
         *_of_chains(chains),
         *_of_peak(problem, mode, identifiability, chains, law),
-        *_of_data(problem, mode, identifiability, law),
+        *data_checks(problem, mode, identifiability, law),
     ]
 
 
@@ -492,7 +492,7 @@ def _of_agreement(chains: Chains, law: ImportanceSamples, columns: list[int]) ->
     return Check("importance sampling agrees with the chains", text, bar, _mark(agrees, failure))
 
 
-def _of_data(
+def data_checks(
     problem: SensorPosterior,
     mode: LaplaceFit,
     identifiability: Identifiability,
@@ -543,8 +543,8 @@ def _of_rings(problem: SensorPosterior, law: ImportanceSamples, guide: Guide) ->
     yield Check(
         "the rings deviate from the model without a trend",
         f"slow waves of the deviations over the radius: {strength:.1f}, p = {p:.2g}",
-        f"a p-value above {_SMOOTH}; else one surface does not describe this lens",
-        _mark(p >= _SMOOTH, "warn"),
+        f"a p-value above {SLOW_P_VALUE}; else one surface does not describe this lens",
+        _mark(p >= SLOW_P_VALUE, "warn"),
     )
     prior_distance = law.weights @ problem.whitened(guide.samples)
     worst_column = int(np.abs(prior_distance).argmax())
@@ -552,8 +552,8 @@ def _of_rings(problem: SensorPosterior, law: ImportanceSamples, guide: Guide) ->
         f"{problem.names[worst_column].replace('_', ' ')} {prior_distance[worst_column]:+.1f}"
         " sd of its prior from the middle"
     )
-    surprised = abs(float(prior_distance[worst_column])) > _SURPRISE
-    bar = f"each mean within {_SURPRISE} sd; else prior and picture contradict each other"
+    surprised = abs(float(prior_distance[worst_column])) > LARGEST_SURPRISE
+    bar = f"each mean within {LARGEST_SURPRISE} sd; else prior and picture contradict each other"
     yield Check("the priors agree with the picture", text, bar, _mark(not surprised, "warn"))
 
 

@@ -329,7 +329,7 @@ def measured_size(
 
 _FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
-_MOST_RESULTS = (
+MOST_RESULTS = (
     100  #: number of earlier results of a step or a node that are searched for results of its size
 )
 #: peak (bytes) below which the measured memory of the process is mostly noise
@@ -569,10 +569,10 @@ class Costs:
 
 
 def _append(rows: list[Row], row: Row) -> None:
-    """Append a row, and keep at most twice `_MOST_RESULTS` of the newest rows."""
+    """Append a row, and keep at most twice `MOST_RESULTS` of the newest rows."""
     rows.append(row)
-    if len(rows) > 2 * _MOST_RESULTS:
-        del rows[:_MOST_RESULTS]
+    if len(rows) > 2 * MOST_RESULTS:
+        del rows[:MOST_RESULTS]
 
 
 def _loading(cost: Estimate, loads: Loading) -> Estimate:

@@ -146,7 +146,7 @@ def caches() -> tuple[str, ...]:
     stated_folders = [
         os.environ[name] for name in ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR") if os.environ.get(name)
     ]
-    # the first is `folder` of neusee.nodes._cpp_library
+    # the first is `folder` of neusee.nodes.cpp_library
     return _real(
         [
             cache_folder / "neusee" / "build",

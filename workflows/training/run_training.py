@@ -130,7 +130,7 @@ class BegunTraining:
         new one.
         """
         photograph_split = held_out.split(
-            recipe, settings, _photographs(recipe, settings, pictures)
+            recipe, settings, training_photographs(recipe, settings, pictures)
         )
         warm_start = WarmStart.of(recipe, settings)
         code = Code(store.code_memo)
@@ -166,7 +166,7 @@ def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> Non
             )
 
 
-def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photographs:
+def training_photographs(recipe: Recipe, settings: Training, needed: bool) -> Photographs:
     """Return the photographs of a training: those of its folder, or the single file of the scene
     step.
 

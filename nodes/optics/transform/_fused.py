@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes import _cpp_library
+from neusee.nodes import cpp_library
 from neusee.nodes.optics.transform._fft_transforms import (
     DOUBLE,
     SINGLE,
@@ -285,15 +285,15 @@ def operators() -> ctypes.CDLL:
     """Return the C++ library, compiled if needed; raise `NoCompilerError` if it cannot be
     compiled.
     """
-    return _cpp_library.load(*SOURCES, rounding=_cpp_library.UNFUSED)
+    return cpp_library.load(*SOURCES, rounding=cpp_library.UNFUSED)
 
 
 def available(device: torch.device) -> bool:
     """Return True if the C++ code can run on this device; on a CPU without a compiler, warn once
     and return False.
     """
-    return device.type == "cpu" and _cpp_library.compiled(
-        "PSF", *SOURCES, rounding=_cpp_library.UNFUSED
+    return device.type == "cpu" and cpp_library.compiled(
+        "PSF", *SOURCES, rounding=cpp_library.UNFUSED
     )
 
 

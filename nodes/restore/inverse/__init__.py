@@ -39,6 +39,7 @@ from neusee.nodes.restore.inverse._wiener import (
     wiener_problem,
 )
 from neusee.nodes.restore.inverse._wiener_prior import (
+    BLOTCH_PIXELS,
     Told,
     about_mean,
     drawn_blotches,
@@ -50,6 +51,7 @@ from neusee.nodes.restore.inverse._wiener_prior import (
 )
 
 __all__ = [
+    "BLOTCH_PIXELS",
     "MAPS_OF_CHANNEL",
     "RADII",
     "Blurred",

@@ -128,7 +128,7 @@ _VARIANCE_ERROR = 0.1  #: relative error of a variance that is estimated from on
 _GRID_POINTS = 241  #: number of grid points in the shared logarithm
 _GRID_DEVIATIONS = 4.0  #: half width of this grid, in standard deviations of the prior
 _BLOTCHES = 0.3  #: standard deviation of a blotch, relative to that of scattered light in a pixel
-_BLOTCH_PIXELS = 16  #: distance between neighbouring blotches in pixels
+BLOTCH_PIXELS = 16  #: distance between neighbouring blotches in pixels
 
 
 class Told(NamedTuple):
@@ -235,8 +235,8 @@ def _hats(size: int) -> Tensor:
     of a pixel sum to 1.
     """
     # triangle functions: 1 at the centre of a blotch, 0 at the centres of its neighbours
-    position = torch.arange(size) / _BLOTCH_PIXELS
-    hats = (1.0 - (position - torch.arange(size // _BLOTCH_PIXELS + 2)[:, None]).abs()).clamp_min(
+    position = torch.arange(size) / BLOTCH_PIXELS
+    hats = (1.0 - (position - torch.arange(size // BLOTCH_PIXELS + 2)[:, None]).abs()).clamp_min(
         0.0
     )
     return hats / hats.square().sum(0).sqrt()

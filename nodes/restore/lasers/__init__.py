@@ -21,7 +21,13 @@ from neusee.nodes.restore.lasers._frame_likelihood import (
     misfit_of,
     spreads,
 )
-from neusee.nodes.restore.lasers._greedy_search import Choice, Found, Known, without_scattered
+from neusee.nodes.restore.lasers._greedy_search import (
+    Choice,
+    Found,
+    Known,
+    data_of,
+    without_scattered,
+)
 from neusee.nodes.restore.lasers._line_pattern import (
     Lens,
     grid_patterns,
@@ -41,6 +47,7 @@ __all__ = [
     "Lens",
     "at_the_aperture",
     "censored",
+    "data_of",
     "filled",
     "filter_of",
     "find_lasers",

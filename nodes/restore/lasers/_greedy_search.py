@@ -99,7 +99,7 @@ def search(
     choices: list[Choice] = []
     while True:
         # filter and weights are estimated from the scene: the frame minus the parts
-        data = _data(frame, parts)
+        data = data_of(frame, parts)
         fit = fitted(data, parts, _STEPS_OF_ALL) if parts else _empty(data)
         parts = fit.parts
         best = _best(frame, fit, data, smallest_gain, margin)
@@ -155,7 +155,7 @@ def _light(frame: Known, parts: Parts) -> Tensor:
     return sum((component.electrons() for component in parts), torch.zeros_like(frame.electrons))
 
 
-def _data(frame: Known, parts: Parts) -> Data:
+def data_of(frame: Known, parts: Parts) -> Data:
     """Return the frame with a filter and weights that are estimated from the frame minus the
     parts.
     """

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from neusee.nodes import _cpp_library
+from neusee.nodes import cpp_library
 
 #: the result depends on the C++ source; NEUSEE_SCAN and the number of threads change it only within
 #: rounding, but the variable selects one backend for all
@@ -358,14 +358,14 @@ def operators() -> ctypes.CDLL:
     """Return the library of the C++ scan, compiled if needed; raise `NoCompilerError` if it
     cannot be compiled.
     """
-    return _cpp_library.load(CPP_FILE)  # without FMA the scan would take 1.2 to 1.5 times as long
+    return cpp_library.load(CPP_FILE)  # without FMA the scan would take 1.2 to 1.5 times as long
 
 
 def compiled() -> bool:
     """Return True if the C++ scan is available, compiled if needed; otherwise warn once and
     return False.
     """
-    return _cpp_library.compiled("scan", CPP_FILE)
+    return cpp_library.compiled("scan", CPP_FILE)
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:

@@ -16,14 +16,14 @@ from neusee.nodes.calibrate import (
     general_model,
     profiles,
     reduce,
+    saturation_point,
     spatial_series,
+    spatial_variances,
     spectrogram,
     table,
     without_trend,
 )
 from neusee.nodes.calibrate import levels as joined
-from neusee.nodes.calibrate._emva_quantities import saturation_point
-from neusee.nodes.calibrate._nonuniformity import spatial_variances
 from neusee.nodes.values import Levels
 
 DATA = Path(

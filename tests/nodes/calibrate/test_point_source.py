@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neusee.nodes import ParameterError, calibrate
-from neusee.nodes.calibrate._scatter import PointCamera, reduce_rings
+from neusee.nodes.calibrate import PointCamera, reduce_rings
 
 CAMERA = {"gain": 0.5, "offset": 100.0, "full_well": 20000.0, "read_noise": 5.0, "bits": 14}
 

@@ -13,12 +13,12 @@ from neusee.nodes.calibrate import (
     Contribution,
     Laboratory,
     camera_sources,
+    coverage_factor,
     emva_sheet,
     laboratory_contributions,
     sheet_budgets,
     variance_shares,
 )
-from neusee.nodes.calibrate._uncertainty_budget import coverage_factor
 from neusee.nodes.values import Levels
 
 K, ETA, NOISE, OFFSET, PIXELS = 0.25, 0.5, 12.0, 60.0, 4096

@@ -10,13 +10,8 @@ from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, doe, optics
-from neusee.nodes.doe._parametrisations import (
-    PARAMETRISATIONS,
-    HeightNet,
-    network_height,
-    new_network,
-    pupil_coordinates,
-)
+from neusee.nodes.doe import PARAMETRISATIONS, HeightNet
+from neusee.nodes.doe._parametrisations import network_height, new_network, pupil_coordinates
 from neusee.nodes.resampling import enlarge
 
 STOP = optics.stop(samples=64, pitch=5e-6, diameter=320e-6)

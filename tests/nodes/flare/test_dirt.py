@@ -20,8 +20,7 @@ from neusee.nodes.flare._dirt import (
     _scratches,
     stamp,
 )
-from neusee.nodes.optics._pupil import phase_screen, zernike_surface
-from neusee.nodes.optics._pupil_grid import grid_of, inside_stop, pupil_grid
+from neusee.nodes.optics import grid_of, inside_stop, phase_screen, pupil_grid, zernike_surface
 
 STOP = optics.stop(samples=128, pitch=10e-6, diameter=1.28e-3)
 FILTHY = {"dust": 30.0, "scratches": 10.0, "grease": 0.2, "smudges": 0.5, "dents": 0.4}

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.integrate import dblquad, quad
 
-from neusee.nodes.flare._stray_light import light_within, lobe, on_pixels, scattered_share
+from neusee.nodes.flare import light_within, lobe, on_pixels, scattered_share
 
 CASES = [
     (1e-2, -1.5),

@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, TensorStats, doe, flare, optics
-from neusee.nodes.flare._stray_light import lobe, on_pixels
+from neusee.nodes.flare import lobe, on_pixels
 from neusee.nodes.values import Psf, Pupil
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "diameter": 8e-3}

@@ -17,8 +17,8 @@ from neusee.nodes.laser import (
     airy_diameter,
     damage,
     damaged_pixels,
+    steady_heat,
 )
-from neusee.nodes.laser._damage_spot import steady_heat
 from neusee.nodes.values import Bands, LaserLight
 
 PITCH, SHAPE = 2.9e-6, (64, 80)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.laser import beam, density_in_spot, heated_in_spot
-from neusee.nodes.laser._damage_distances import spot_heat
+from neusee.nodes.laser import beam, density_in_spot, heated_in_spot, spot_heat
 
 AIRY = 16 / (3 * math.pi)  # integral of (2 J1(v) / v)^2 over v
 

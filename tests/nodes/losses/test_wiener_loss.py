@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neusee.nodes.losses import wiener
-from neusee.nodes.restore.inverse._wiener_prior import fall
+from neusee.nodes.restore.inverse import fall
 from neusee.nodes.values import Bands, Psf
 
 

@@ -9,8 +9,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.metrics import least_lsr, limits, lsr, most_contrast, most_unsuppressed, mtf
-from neusee.nodes.metrics._suppression import passed_frequency_shares
+from neusee.nodes.metrics import (
+    least_lsr,
+    limits,
+    lsr,
+    most_contrast,
+    most_unsuppressed,
+    mtf,
+    passed_frequency_shares,
+)
 from neusee.nodes.values import Psf
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError, optics
-from neusee.nodes.optics import _lens, _pixel_average, psf
+from neusee.nodes.optics import _pixel_average, cut_off, psf, round_lens
 from neusee.nodes.values import Pupil
 from tests.nodes.optics import own_pixel_average as own
 from tests.nodes.optics.random_pixel_cameras import compared, drawn, energy
@@ -303,9 +303,9 @@ def test_the_lens_band_of_a_psf_does_not_depend_on_its_sampling(number, pixel):
     found = psf(pupil, **camera)
     area = float(pupil.aperture.sum()) * float(pupil.pitch) ** 2
     expected = math.sqrt(4 * area / math.pi) * pixel / (532e-9 * FOCAL)
-    assert float(_lens.cut_off(found)) == pytest.approx(expected, rel=1e-9)
+    assert float(cut_off(found)) == pytest.approx(expected, rel=1e-9)
     assert found.averaged.tolist() == [1.0]
-    lens = _lens.round_lens(found.cut_off, found.averaged)
+    lens = round_lens(found.cut_off, found.averaged)
     assert float(found.clear_peak) == pytest.approx(
         float(lens.peak) * math.pi / 4 * expected**2, rel=3e-3
     )

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.optics import psf
 from neusee.nodes.optics._psf import _Camera, _focus
-from neusee.nodes.optics.transform import _intensity, _pupil_field, _sample_axis
+from neusee.nodes.optics.transform import Axis, PupilIntensity, Sampling, View, _intensity
 from neusee.nodes.values import Pupil
 
 DIAMETER, FOCAL, PIXEL, GREEN = 2160 * 3.74e-6, 0.11, 2.9e-6, 550e-9
@@ -253,13 +253,13 @@ def test_gradients_are_those_of_finite_differences(method, kept, monkeypatch):
     if method == "fused" and shutil.which("g++") is None:
         pytest.skip("no g++")
     monkeypatch.setattr(_intensity, "KEPT_FIELD_BYTES", 1 << 30 if kept else 0)
-    axes = _sample_axis.Axis(5, 3, 0.03), _sample_axis.Axis(4, 6, 0.02)
+    axes = Axis(5, 3, 0.03), Axis(4, 6, 0.02)
     envelope = torch.linspace(0.5, 1, 3).double(), torch.linspace(1, 0.3, 6).double()
-    views = (_pupil_field.View(0, *axes, 1.3, 0.7, (0.1, -0.2), 0.3, envelope), _pupil_field.View(0, *axes, 1.3, 0.7, (0.0, 0.1), 0.2),
-             _pupil_field.View(1, *axes, 0.9, 0.5, (0.1, -0.2), 0.3))  # fmt: skip
-    sampling = _intensity.Sampling(views, torch.float64, method)
+    views = (View(0, *axes, 1.3, 0.7, (0.1, -0.2), 0.3, envelope), View(0, *axes, 1.3, 0.7, (0.0, 0.1), 0.2),
+             View(1, *axes, 0.9, 0.5, (0.1, -0.2), 0.3))  # fmt: skip
+    sampling = Sampling(views, torch.float64, method)
     parts = [torch.rand(5, 4, dtype=torch.float64, requires_grad=True) for _ in range(3)]
-    assert torch.autograd.gradcheck(lambda *p: _intensity.PupilIntensity.apply(*p, sampling), parts)
+    assert torch.autograd.gradcheck(lambda *p: PupilIntensity.apply(*p, sampling), parts)
 
 
 @pytest.mark.parametrize("params", CASES[:4])

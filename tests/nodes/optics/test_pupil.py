@@ -10,7 +10,18 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import doe, optics
-from neusee.nodes.optics import _pupil, _pupil_grid
+from neusee.nodes.optics import (
+    PupilGrid,
+    inside_stop,
+    noll,
+    phase_screen,
+    phase_steps,
+    polar_coordinates,
+    pupil_axes,
+    pupil_grid,
+    zernike_sum,
+    zernike_surface,
+)
 from neusee.nodes.values import Bands, Dirt
 
 LENS = {"pitch": 10e-6, "diameter": 2e-3}
@@ -50,7 +61,7 @@ def on_axis(p):
 
 @pytest.mark.parametrize("samples", [1, 2, 15, 64, 2160])
 def test_stop_is_round_centred_and_inscribed(samples):
-    open_ = _pupil_grid.inside_stop(_pupil_grid.pupil_grid(samples, 3.74e-6, 11e-3, "inscribed"))
+    open_ = inside_stop(pupil_grid(samples, 3.74e-6, 11e-3, "inscribed"))
     assert bool(open_.any())
     assert torch.equal(open_, open_.flip(0))
     assert torch.equal(open_, open_.T)
@@ -68,7 +79,7 @@ def test_stop_is_round_centred_and_inscribed(samples):
 )
 def test_every_user_of_the_stop_sees_the_same_one(samples, pitch, diameter, aperture):
     try:
-        grid = _pupil_grid.pupil_grid(samples, pitch, diameter, aperture)
+        grid = pupil_grid(samples, pitch, diameter, aperture)
     except ValueError:
         assert diameter < math.sqrt(2) * pitch or (
             aperture == "held" and diameter > samples * pitch
@@ -79,8 +90,8 @@ def test_every_user_of_the_stop_sees_the_same_one(samples, pitch, diameter, aper
     at = optics.stop(samples=samples, pitch=pitch, diameter=diameter, aperture=aperture)
     p = optics.pupil(torch.zeros(samples, samples), doe.material(line), line, at)
     assert float(p.pitch) == grid.pitch
-    assert torch.equal(p.aperture > 0, _pupil_grid.inside_stop(grid))
-    assert bool(_pupil_grid.inside_stop(grid).any())
+    assert torch.equal(p.aperture > 0, inside_stop(grid))
+    assert bool(inside_stop(grid).any())
 
 
 def test_clear_pupil_is_clear():
@@ -110,7 +121,7 @@ def test_small_aberrations_follow_marechal(index):
 
 def test_tilt_is_a_slope_of_four_rms_across():
     p = pupil(aberrations={3: 100e-9})
-    v = _pupil_grid.pupil_axes(_pupil_grid.pupil_grid(200, **LENS))[0].expand(200, 200)
+    v = pupil_axes(pupil_grid(200, **LENS))[0].expand(200, 200)
     open_ = p.aperture > 0
     assert_close(p.path.double()[open_], (200e-9 * v)[open_], rtol=1e-6, atol=1e-14)
     assert not p.path[~open_].any()
@@ -132,10 +143,10 @@ def test_noll_counts_as_noll_does():
         (4, 2),
         (4, -2),
     ]
-    assert [_pupil.noll(j) for j in range(1, 14)] == table
-    assert _pupil.noll(22) == (6, 0)
+    assert [noll(j) for j in range(1, 14)] == table
+    assert noll(22) == (6, 0)
     with pytest.raises(ValueError, match="begin at 1"):
-        _pupil.noll(0)
+        noll(0)
 
 
 def test_zernikes_are_orthonormal():
@@ -145,7 +156,7 @@ def test_zernikes_are_orthonormal():
     azimuth = torch.arange(40, dtype=torch.float64)[None, :] * (2 * math.pi / 40)
     every = torch.stack(
         [
-            _pupil.zernike_sum({j: 1.0}, radius * azimuth.sin(), radius * azimuth.cos())
+            zernike_sum({j: 1.0}, radius * azimuth.sin(), radius * azimuth.cos())
             for j in range(1, 46)
         ]
     )
@@ -154,8 +165,8 @@ def test_zernikes_are_orthonormal():
 
 
 def test_zernikes_are_those_of_the_textbook():
-    radius, azimuth = _pupil_grid.polar_coordinates(_pupil_grid.PupilGrid(31, 1.0, 31.0))
-    v, u = _pupil_grid.pupil_axes(_pupil_grid.PupilGrid(31, 1.0, 31.0))
+    radius, azimuth = polar_coordinates(PupilGrid(31, 1.0, 31.0))
+    v, u = pupil_axes(PupilGrid(31, 1.0, 31.0))
     wanted = {
         4: math.sqrt(3) * (2 * radius**2 - 1),
         5: math.sqrt(6) * radius**2 * torch.sin(2 * azimuth),
@@ -164,13 +175,13 @@ def test_zernikes_are_those_of_the_textbook():
         14: math.sqrt(10) * radius**4 * torch.cos(4 * azimuth),
     }
     for index, formula in wanted.items():
-        assert_close(_pupil.zernike_sum({index: 1.0}, v, u), formula, rtol=0, atol=1e-12)
+        assert_close(zernike_sum({index: 1.0}, v, u), formula, rtol=0, atol=1e-12)
 
 
 def test_coefficients_add_up_in_root_sum_of_squares():
     parts = {4: 30e-9, 6: -40e-9, 11: 120e-9}
-    grid = _pupil_grid.pupil_grid(400, 10e-6, 4e-3)
-    total = _pupil.zernike_surface(parts, grid)[_pupil_grid.inside_stop(grid)]
+    grid = pupil_grid(400, 10e-6, 4e-3)
+    total = zernike_surface(parts, grid)[inside_stop(grid)]
     assert float(total.std()) == pytest.approx(130e-9, rel=0.01)
 
 
@@ -239,8 +250,8 @@ def test_check_warns_of_phase_that_the_samples_cannot_follow(waves, ok):
     p = pupil(height=doe.axicon(stop(200), waves=waves), wavelengths=(550,))
     _, step = check(p)
     assert step.ok is ok
-    median, _ = _pupil.phase_steps(p)
-    radius, azimuth = _pupil_grid.polar_coordinates(_pupil_grid.pupil_grid(200, **LENS))
+    median, _ = phase_steps(p)
+    radius, azimuth = polar_coordinates(pupil_grid(200, **LENS))
     slopes = torch.cat([azimuth.cos().abs()[radius <= 1], azimuth.sin().abs()[radius <= 1]])
     assert median == pytest.approx(waves / 100 * float(slopes.median()), rel=0.03)
 
@@ -254,22 +265,19 @@ def test_wrapped_elements_are_not_called_aliased():
 
 def test_a_large_pupil_is_made_and_checked_by_parts_as_a_whole():
     """More rows than one stripe has, and more than are looked at one by one."""
-    grid = _pupil_grid.pupil_grid(1100, 10e-6, 11e-3)
-    height = _pupil.phase_screen(grid, 0.02, torch.Generator().manual_seed(0)).float() * 2e-6
+    grid = pupil_grid(1100, 10e-6, 11e-3)
+    height = phase_screen(grid, 0.02, torch.Generator().manual_seed(0)).float() * 2e-6
     p = pupil(height=height, wavelengths=(550,), diameter=11e-3, defocus=2.0, aberrations={5: 1e-7})
-    v, u = _pupil_grid.pupil_axes(grid)
-    path = _pupil.zernike_surface({5: 1e-7}, grid) + 2.0 * 550e-9 * (
+    v, u = pupil_axes(grid)
+    path = zernike_surface({5: 1e-7}, grid) + 2.0 * 550e-9 * (
         v.square() + u.square()
-    ) * _pupil_grid.inside_stop(grid)
+    ) * inside_stop(grid)
     assert_close(p.path, path.float(), rtol=1e-6, atol=1e-15)
-    assert torch.equal(p.aperture > 0, _pupil_grid.inside_stop(grid))
+    assert torch.equal(p.aperture > 0, inside_stop(grid))
     turns = (p.index[0] * p.height.double() + p.path.double()) / p.wavelengths[0]
-    pairs = [
-        (turns.diff(dim=d).abs(), _pupil_grid.inside_stop(grid).unfold(d, 2, 1).all(-1))
-        for d in (0, 1)
-    ]
+    pairs = [(turns.diff(dim=d).abs(), inside_stop(grid).unfold(d, 2, 1).all(-1)) for d in (0, 1)]
     steps = torch.cat([step[both] for step, both in pairs])
-    median, share = _pupil.phase_steps(p)
+    median, share = phase_steps(p)
     assert median == pytest.approx(float(steps.median()), rel=5e-3)
     assert share == pytest.approx(float((steps > 0.5).double().mean()), abs=2e-3)
 
@@ -277,13 +285,13 @@ def test_a_large_pupil_is_made_and_checked_by_parts_as_a_whole():
 def test_one_sample_is_a_pupil():
     p = pupil(height=torch.zeros(1, 1), wavelengths=(550,))
     assert float(p.amplitude) == 1
-    assert _pupil.phase_steps(p) == (0.0, 0.0)
+    assert phase_steps(p) == (0.0, 0.0)
 
 
 def test_screen_is_standard_noise_with_the_asked_correlation():
-    grid = _pupil_grid.pupil_grid(61, 1.0, 61.0)
+    grid = pupil_grid(61, 1.0, 61.0)
     draws = torch.stack(
-        [_pupil.phase_screen(grid, 0.15, torch.Generator().manual_seed(k)) for k in range(400)]
+        [phase_screen(grid, 0.15, torch.Generator().manual_seed(k)) for k in range(400)]
     )
     assert float(draws.mean()) == pytest.approx(0, abs=0.03)
     assert float(draws.square().mean()) == pytest.approx(1, abs=0.03)
@@ -318,7 +326,7 @@ def test_phase_steps_on_a_thick_plate_are_exact():
     """10 mm are 8600 turns, of which float32 holds the steps to 5e-4 turn alone."""
     grid = stop(64, pitch=30e-6)
     height = doe.half_rings(grid, waves=(3.0,)) + 10e-3
-    median, share = _pupil.phase_steps(
+    median, share = phase_steps(
         p := optics.pupil(height, doe.material(bands(532)), bands(532), grid)
     )
     turns = p.index * height.double() / p.wavelengths

@@ -9,7 +9,7 @@ import torch
 from scipy.integrate import quad
 
 from neusee.nodes import ParameterError, optics
-from neusee.nodes.optics._pupil_grid import (
+from neusee.nodes.optics import (
     clear_area,
     clear_diameter,
     gaussian_integral,

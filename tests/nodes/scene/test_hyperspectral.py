@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError
-from neusee.nodes.scene import hyperspectral, write_spectral
-from neusee.nodes.scene._exr import read_spectral, spectral_channels
+from neusee.nodes.scene import hyperspectral, read_spectral, spectral_channels, write_spectral
 from neusee.nodes.spectra import bands
 
 NM = 1e-9

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from neusee.nodes import ParameterError, input_files
-from neusee.nodes.scene import _picture_changes, exr, photograph
+from neusee.nodes.scene import _picture_changes, exr, framed_scene, photograph
 
 SIZES = [
     ((101, 67), (8, 8)), ((101, 67), (30, 50)), ((67, 101), (67, 100)), ((50, 60), (75, 75)), ((50, 60), (50, 60)),
@@ -35,7 +35,7 @@ def test_bands_of_rows_give_the_light_of_the_whole_picture(monkeypatch, size, sh
     assert result.dtype == torch.float32
     torch.testing.assert_close(
         result.double(),
-        _picture_changes.framed_scene(light(codes).double(), shape),
+        framed_scene(light(codes).double(), shape),
         rtol=0,
         atol=2e-7,
     )

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from neusee.nodes import ParameterError
-from neusee.nodes.scene import _photograph, _picture_changes, photograph
+from neusee.nodes.scene import _photograph, _picture_changes, framed_scene, photograph
 
 
 def saved(folder, array, name="a.png", **how):
@@ -174,7 +174,7 @@ def test_a_foreign_profile_is_named(tmp_path):
 @given(*(st.integers(1, 70) for _ in range(4)))
 def test_frame_has_the_shape_and_no_overshoot(y, x, to_y, to_x):
     scene = torch.rand(3, y, x, generator=torch.Generator().manual_seed(y * x))
-    result = _picture_changes.framed_scene(scene, (to_y, to_x))
+    result = framed_scene(scene, (to_y, to_x))
     assert result.shape == (3, to_y, to_x)
     assert float(result.min()) >= float(scene.min()) - 1e-6
     assert float(result.max()) <= float(scene.max()) + 1e-6
@@ -185,8 +185,8 @@ def test_frame_has_the_shape_and_no_overshoot(y, x, to_y, to_x):
 
 def test_frame_without_scaling_cuts_the_centre():
     scene = torch.arange(3 * 6 * 4.0).reshape(3, 6, 4)
-    assert torch.equal(_picture_changes.framed_scene(scene, (2, 4)), scene[:, 2:4, :])
-    assert _picture_changes.framed_scene(scene, None) is scene
+    assert torch.equal(framed_scene(scene, (2, 4)), scene[:, 2:4, :])
+    assert framed_scene(scene, None) is scene
 
 
 def test_frame_averages_in_linear_light(tmp_path):

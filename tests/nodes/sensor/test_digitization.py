@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes import ErrorBound, TensorStats
-from neusee.nodes.sensor import crop, digitize, electrons_to_clip, full_well
-from neusee.nodes.sensor._digitization import clipping_number
+from neusee.nodes.sensor import clipping_number, crop, digitize, electrons_to_clip, full_well
 from neusee.nodes.units import read_quantity
 
 

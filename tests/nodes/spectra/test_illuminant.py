@@ -7,8 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError
-from neusee.nodes.spectra import bands, illuminant, illuminate, line, responses
-from neusee.nodes.spectra._cie_tables import Table, light, observer, to_srgb
+from neusee.nodes.spectra import (
+    Table,
+    bands,
+    illuminant,
+    illuminate,
+    light,
+    line,
+    observer,
+    responses,
+    to_srgb,
+)
 from neusee.nodes.values import Bands
 
 NM = 1e-9

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.scene import hyperspectral
-from neusee.nodes.spectra import bands, lift_lmmse, lift_mallett
-from neusee.nodes.spectra._cie_tables import to_srgb
+from neusee.nodes.spectra import bands, lift_lmmse, lift_mallett, to_srgb
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)

@@ -15,10 +15,11 @@ from neusee.nodes.spectra import (
     illuminate,
     lift_lmmse,
     lift_mallett,
+    lift_matrix,
+    paints,
     responses,
     rows,
 )
-from neusee.nodes.spectra._lift import _estimator
 from neusee.nodes.values import Bands, LowRankCube
 
 NM = 1e-9
@@ -275,7 +276,8 @@ def test_rows_are_photons_of_each_channel_and_wells():
 def test_the_matrix_of_a_lift_is_the_basis_of_its_cube():
     colours = 0.5 + 0.01 * rand(3, 20, 21)
     found = compress(lift_lmmse(colours, SCENE))
-    matrix = _estimator(SCENE)
+    measured = torch.cat([paint.at(SCENE.centres) for paint in paints()])
+    matrix = lift_matrix(measured, SCENE.centres)
     inside = found.basis @ (found.basis.T @ matrix)
     torch.testing.assert_close(inside, matrix, rtol=0, atol=1e-4)
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from neusee.nodes import ParameterError
-from neusee.nodes.spectra import bands, lift_mst_plus_plus
-from neusee.nodes.spectra._lift import MSTPlusPlus
+from neusee.nodes.spectra import MSTPlusPlus, bands, lift_mst_plus_plus
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)

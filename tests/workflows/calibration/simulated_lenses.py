@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import j1
 
 from neusee.nodes import calibrate
-from neusee.nodes.calibrate._scatter import PointCamera, reduce_rings
+from neusee.nodes.calibrate import PointCamera, reduce_rings
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.recipe.loading import load
 

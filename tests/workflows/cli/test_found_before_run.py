@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from neusee.nodes.spectra import _bands, _channel_responses
 from neusee.workflows.cli import app
 from neusee.workflows.recipe import step_checks
 
@@ -206,14 +207,12 @@ def test_inside_the_range_that_needs_no_table_every_wavelength_is_seen(camera):
     """The range stands as two numbers in the program; the table of colour-science is asked here."""
     import colour
 
-    from neusee.nodes.spectra._channel_responses import _SEEN_RANGE
-
     table = (
         colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
         if camera == "CIE 1931"
         else colour.MSDS_CAMERA_SENSITIVITIES[f"{camera} (NPL)"]
     )
-    low, high = _SEEN_RANGE[camera]
+    low, high = _channel_responses._SEEN_RANGE[camera]
     inside = (table.wavelengths >= low - 5) & (table.wavelengths <= high + 5)
     assert (table.values.max(1) / table.values.max())[inside].min() > 1e-3
 
@@ -671,7 +670,6 @@ def test_a_file_of_ones_own_recipe_is_no_mistake_with_a_scene_that_has_no_file(n
 
 def test_the_guide_states_each_limit_as_the_program_has_it():
     from neusee.nodes import input_files
-    from neusee.nodes.spectra import _bands
     from neusee.workflows.recipe import steps
     from neusee.workflows.recipe.text import references, yaml_values
     from neusee.workflows.recipe.text.recipe_files import packaged

@@ -408,7 +408,7 @@ def test_a_height_network_and_a_lift_refuse_weights_that_are_not_finite(tmp_path
     from safetensors.torch import save_file
 
     from neusee.nodes import ParameterError, doe, spectra
-    from neusee.nodes.doe._parametrisations import HeightNet
+    from neusee.nodes.doe import HeightNet
 
     nets = {
         "height": HeightNet(4),

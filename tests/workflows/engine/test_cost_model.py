@@ -8,7 +8,7 @@ import torch
 
 from neusee.nodes import doe, node, optics, registered_nodes, shape_rules
 from neusee.workflows.engine.cost_model import (
-    _MOST_RESULTS,
+    MOST_RESULTS,
     Costs,
     Law,
     Loading,
@@ -313,7 +313,7 @@ def test_costs_follow_the_journal_and_read_each_line_once(tmp_path, monkeypatch)
 def test_only_the_newest_runs_of_a_step_are_kept():
     costs = Costs([row("a", float(n), of=SMALL) for n in range(1000)])
     assert {len(rows) for rows in (*costs._nodes.values(), *costs._steps.values())} <= set(
-        range(_MOST_RESULTS, 2 * _MOST_RESULTS + 1)
+        range(MOST_RESULTS, 2 * MOST_RESULTS + 1)
     )
     newest = Costs([row("a", float(n), of=SMALL) for n in range(900, 1000)], {"a": SMALL})
     assert costs.with_sizes({"a": SMALL}).of(step("a"), ["cpu"]) == newest.of(step("a"), ["cpu"])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import neusee.nodes.optics
-from neusee.nodes import _cpp_library
+from neusee.nodes import cpp_library
 from neusee.workflows.observation import covered_paths
 
 
@@ -64,7 +64,7 @@ def test_the_compiled_code_of_the_program_is_a_cache(monkeypatch, tmp_path):
         monkeypatch.setenv("XDG_CACHE_HOME", home) if home else monkeypatch.delenv(
             "XDG_CACHE_HOME", raising=False
         )
-        assert os.path.realpath(_cpp_library.folder()) in covered_paths.caches()
+        assert os.path.realpath(cpp_library.folder()) in covered_paths.caches()
 
 
 def test_libraries_are_searched_where_the_loader_was_told_to(monkeypatch, tmp_path):

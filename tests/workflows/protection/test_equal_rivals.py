@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neusee.nodes import metrics
-from neusee.nodes.optics._lens import round_lens
+from neusee.nodes.optics import round_lens
 from neusee.workflows import load
 from neusee.workflows.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
 from neusee.workflows.protection.protection_camera import (

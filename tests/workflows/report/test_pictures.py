@@ -199,14 +199,12 @@ NAMES = [f.name for f in contents.FIGURES] + ["graph"]
 @pytest.fixture(scope="module")
 def figure_of(drawings):
     """The figure of a drawing itself, laid out; several tests look at one."""
-    import matplotlib
-
-    from neusee.workflows.report.figures.style import _RC
+    from neusee.workflows.report.figures.style import styled
 
     @functools.cache
     def figure_of(name):
         draw, arguments = drawings[name]
-        with matplotlib.rc_context(dict(_RC)):
+        with styled():
             figure = draw.__wrapped__(**arguments)
             figure.canvas.draw()
         return figure

@@ -12,8 +12,7 @@ from safetensors.torch import save_file
 
 import neusee
 from neusee.nodes.restore import NAFNet, start_network
-from neusee.nodes.scene import grey
-from neusee.nodes.scene._exr import exr_parts
+from neusee.nodes.scene import exr_parts, grey
 from neusee.workflows import Store, load
 
 #: quantum efficiency in percent by wavelength in nm, as a data sheet draws it

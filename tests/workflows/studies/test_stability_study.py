@@ -10,7 +10,7 @@ import torch
 
 from neusee.nodes import node
 from neusee.nodes.optics import _psf, psf
-from neusee.nodes.optics.transform import _intensity, _pupil_field
+from neusee.nodes.optics.transform import PupilIntensity, _intensity, _pupil_field
 from neusee.nodes.values import Pupil
 from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Step
@@ -377,7 +377,7 @@ def test_a_fault_planted_in_the_light_fails_on_a_plate(fault, monkeypatch):
     if fault == "phase":
         monkeypatch.setattr(_pupil_field.Field, "__init__", single)
     elif fault == "backward":
-        backward = _intensity.PupilIntensity.backward
+        backward = PupilIntensity.backward
 
         def wrong(ctx, *slopes):
             with monkeypatch.context() as patch:
@@ -385,7 +385,7 @@ def test_a_fault_planted_in_the_light_fails_on_a_plate(fault, monkeypatch):
                 return backward(ctx, *slopes)
 
         monkeypatch.setattr(_intensity, "KEPT_FIELD_BYTES", 0)
-        monkeypatch.setattr(_intensity.PupilIntensity, "backward", staticmethod(wrong))
+        monkeypatch.setattr(PupilIntensity, "backward", staticmethod(wrong))
     else:
         points = _psf._intensity_at_points
 

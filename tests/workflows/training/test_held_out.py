@@ -13,7 +13,7 @@ from PIL import Image
 from safetensors.torch import load_file
 from scipy import stats
 
-from neusee.nodes.scene import Photographs
+from neusee.nodes.scene import Photographs, crop_photograph
 from neusee.nodes.scene import _photograph as _photograph_folder
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.training.held_out import COLUMNS, Validation, interval, split
@@ -94,7 +94,7 @@ def test_few_photographs_are_refused_where_they_stand_unless_none_is_held_out(tm
 
 def test_a_photograph_that_cannot_be_decoded_is_held_out_and_not_restored(folder, monkeypatch):
     bad = parts_of(folder).held_out[0]
-    usual = _photograph_folder.crop_photograph
+    usual = crop_photograph
 
     def damaged(path, *rest):
         if path == bad:

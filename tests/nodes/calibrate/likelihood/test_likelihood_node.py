@@ -10,8 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.calibrate import Sufficient, density, expose, levels, reduce, sufficient
-from neusee.nodes.calibrate._sensor_likelihood import log_cell
+from neusee.nodes.calibrate import Sufficient, density, expose, levels, log_cell, reduce, sufficient
 
 PAPER = {
     "gain": 0.37,

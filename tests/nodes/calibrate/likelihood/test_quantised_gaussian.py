@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from neusee.nodes.calibrate._sensor_likelihood import log_cell
+from neusee.nodes.calibrate import log_cell
 from neusee.nodes.sensor import digitize, full_well
 
 KINDS = ["nearest", "truncation", "dithered_floor"]

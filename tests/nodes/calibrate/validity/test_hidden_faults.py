@@ -13,8 +13,14 @@ import torch
 from scipy.integrate import quad
 from scipy.stats import cauchy, norm
 
-from neusee.nodes.calibrate import CLEAN_PAIRS, Hidden, Stack, inspect_frames, open_errors
-from neusee.nodes.calibrate._frame_pairs import chance_of_no_fault
+from neusee.nodes.calibrate import (
+    CLEAN_PAIRS,
+    Hidden,
+    Stack,
+    chance_of_no_fault,
+    inspect_frames,
+    open_errors,
+)
 
 DATA = Path(
     os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[4] / "../shared/data/emva1288")

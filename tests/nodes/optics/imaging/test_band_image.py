@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
-from neusee.nodes.optics.transform._fft_transforms import fft_length
+from neusee.nodes.optics.transform import fft_length
 from neusee.nodes.values import Psf
 
 

@@ -4,8 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics import image
-from neusee.nodes.optics._band_image import light_in_field
+from neusee.nodes.optics import image, light_in_field
 from neusee.nodes.values import Psf
 
 

@@ -9,9 +9,9 @@ import shutil
 import pytest
 import torch
 
-from neusee.nodes import _cpp_library, doe
+from neusee.nodes import cpp_library, doe
 from neusee.nodes.optics import _psf, _psf_definition, psf, pupil, stop
-from neusee.nodes.optics.transform import _fused, _intensity, _pupil_field, _sample_axis
+from neusee.nodes.optics.transform import Axis, Sampling, View, _fused, fused_axis, intensity_of
 from neusee.nodes.spectra import bands
 from neusee.nodes.values import Psf, Pupil
 
@@ -117,12 +117,10 @@ def test_a_phase_of_many_turns_is_exact(turns):
     """One sample sends |U|^2 = 1; two samples interfere as their phases do, whole turns apart or
     not.
     """
-    axis = _sample_axis.Axis(1, 1, 0.1), _sample_axis.Axis(2, 1, 0.1)
+    axis = Axis(1, 1, 0.1), Axis(2, 1, 0.1)
     height = torch.tensor([[0.0, turns + 0.3]], dtype=torch.float64)
-    sampling = _intensity.Sampling(
-        (_pupil_field.View(0, *axis, 1.0, 0.0, (0.0, 0.0), 1.0),), torch.float32, "fused"
-    )
-    found = float(_intensity.intensity_of(torch.ones(1, 2), height, torch.zeros(1, 2), sampling))
+    sampling = Sampling((View(0, *axis, 1.0, 0.0, (0.0, 0.0), 1.0),), torch.float32, "fused")
+    found = float(intensity_of(torch.ones(1, 2), height, torch.zeros(1, 2), sampling))
     assert found == pytest.approx(4 * math.cos(0.3 * math.pi) ** 2, abs=1e-5)
 
 
@@ -152,9 +150,7 @@ def test_every_factor_of_the_fft_is_used_by_the_cases():
         for n, k in zip(samples, shape, strict=True):
             alpha = 8e-3 / max(samples) * 2.9e-6 / (450e-9 * 0.11)
             used |= set(
-                _fused.fused_axis(
-                    _sample_axis.Axis(n, k, alpha), torch.float32, torch.float32, torch.float32
-                )
+                fused_axis(Axis(n, k, alpha), torch.float32, torch.float32, torch.float32)
                 .held[0]
                 .tolist()
             )
@@ -164,7 +160,7 @@ def test_every_factor_of_the_fft_is_used_by_the_cases():
 def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CXX", str(tmp_path / "no-such-compiler"))
-    _cpp_library._say_once.cache_clear()
+    cpp_library._say_once.cache_clear()
     light = rough(64, 64)
     with pytest.warns(
         UserWarning, match=r"C\+\+ of the PSF is not compiled and torch computes the PSF"
@@ -175,7 +171,7 @@ def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_
     assert len(said) == 1
     expected = _psf._focus(light, camera((64, 64)), torch.float64, "direct").intensity
     assert all(float((x - expected).abs().max()) <= 2e-6 * float(expected.max()) for x in found)
-    with pytest.raises(_cpp_library.NoCompilerError, match="could not be run"):
+    with pytest.raises(cpp_library.NoCompilerError, match="could not be run"):
         _psf._focus(light, camera((64, 64)), torch.float32, "fused")
 
 

@@ -6,7 +6,19 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics.transform import _fft_transforms, _sample_axis, _scaled_transform
+from neusee.nodes.optics.transform import (
+    Axis,
+    Banded,
+    Grids,
+    _sample_axis,
+    borrowed,
+    centred,
+    cheapest,
+    fft_length,
+    radians,
+    transform,
+    unit_phasor,
+)
 
 METHODS = ["direct", "folded", "bluestein", "kaiser_bessel", "auto"]
 CPU = torch.device("cpu")
@@ -56,12 +68,8 @@ def test_every_method_is_the_double_sum(method, n, k, a, c_in, c_out, sign):
     field = noise(*n)
     truth = exact(field, k, a, c_in, c_out, sign)
     scale = float(field.abs().square().sum().sqrt()) * math.sqrt(n[0] * n[1]) ** 0.5
-    double = _scaled_transform.transform(
-        field, k, _scaled_transform.Grids(a, c_in, c_out, sign), method
-    )
-    single = _scaled_transform.transform(
-        field.to(torch.complex64), k, _scaled_transform.Grids(a, c_in, c_out, sign), method
-    )
+    double = transform(field, k, Grids(a, c_in, c_out, sign), method)
+    single = transform(field.to(torch.complex64), k, Grids(a, c_in, c_out, sign), method)
     assert double.shape == single.shape == k
     assert float((double - truth).abs().max()) < 2e-12 * scale
     assert float((single - truth).abs().max()) < 3e-6 * scale
@@ -77,19 +85,15 @@ def test_primes_ones_and_rectangles(method, n, k):
         dict(alpha=(1 / 150, 1 / 97), centre_in=(3.25, -2.0), centre_out=(0.5, 40.0)),
     )
     truth = exact(field, k, **where)
-    assert float(
-        (_scaled_transform.transform(field, k, _scaled_transform.Grids(**where), method) - truth)
-        .abs()
-        .max()
-    ) < 1e-12 * float(truth.abs().max() + 1)
+    assert float((transform(field, k, Grids(**where), method) - truth).abs().max()) < 1e-12 * float(
+        truth.abs().max() + 1
+    )
 
 
 @pytest.mark.parametrize("method", METHODS[:4])
 def test_a_window_wider_than_one_period_repeats(method):
     field = noise(16, 16)
-    out = _scaled_transform.transform(
-        field, (40, 40), _scaled_transform.Grids((1 / 20, 1 / 20), (7.5, 7.5), (0.0, 0.0)), method
-    )
+    out = transform(field, (40, 40), Grids((1 / 20, 1 / 20), (7.5, 7.5), (0.0, 0.0)), method)
     phase = torch.exp(
         1j * math.pi * torch.ones(1, dtype=torch.float64)
     )  # half-sample origin: one period turns the sign
@@ -99,12 +103,12 @@ def test_a_window_wider_than_one_period_repeats(method):
 @pytest.mark.parametrize("method", METHODS[:4])
 def test_the_adjoint_axis_is_the_conjugate_transpose(method):
     field, other = noise(23, 40), noise(31, 19, seed=1)
-    there = _scaled_transform.Grids((0.011, 0.013), (11, 19.5), (15, 9))
-    forward = _scaled_transform.transform(field, (31, 19), there, method)
-    back = _scaled_transform.transform(
+    there = Grids((0.011, 0.013), (11, 19.5), (15, 9))
+    forward = transform(field, (31, 19), there, method)
+    back = transform(
         other,
         (23, 40),
-        _scaled_transform.Grids(there.alpha, there.centre_out, there.centre_in, 1),
+        Grids(there.alpha, there.centre_out, there.centre_in, 1),
         method,
     )
     torch.testing.assert_close(
@@ -119,12 +123,12 @@ def test_phases_stay_exact_far_out():
     """A float32 chirp of 570 turns is off by 4e-5 rad; reduced in float64 and then cast, by
     4e-7.
     """
-    turns = _sample_axis.centred(2161, CPU).square() * (3.74e-6 * 2.9e-6 / (400e-9 * 0.11) / 2)
+    turns = centred(2161, CPU).square() * (3.74e-6 * 2.9e-6 / (400e-9 * 0.11) / 2)
     truth = torch.exp(2j * math.pi * turns)
-    assert float((_sample_axis.unit_phasor(turns, torch.float32) - truth).abs().max()) < 4e-7
+    assert float((unit_phasor(turns, torch.float32) - truth).abs().max()) < 4e-7
     angle = turns.float() * (2 * math.pi)
     assert float((torch.complex(angle.cos(), angle.sin()) - truth).abs().max()) > 1e-5
-    assert float(_sample_axis.radians(turns).abs().max()) <= math.pi
+    assert float(radians(turns).abs().max()) <= math.pi
 
 
 def test_zero_stays_zero_and_huge_and_tiny_scale():
@@ -132,17 +136,15 @@ def test_zero_stays_zero_and_huge_and_tiny_scale():
     for method in METHODS:
         for scale in (0.0, 1e-25, 1e25):
             field = (scale * noise(20, 20)).to(torch.complex64)
-            out = _scaled_transform.transform(
-                field, (20, 20), _scaled_transform.Grids(**where), method
-            )
+            out = transform(field, (20, 20), Grids(**where), method)
             truth = exact(field, (20, 20), **where)
             assert float((out - truth).abs().max()) <= 1e-5 * scale * 20
 
 
 def test_smooth_numbers():
-    assert [_fft_transforms.fft_length(n) for n in (1, 7, 11, 4207, 2160)] == [1, 8, 12, 4320, 2160]
-    assert _fft_transforms.fft_length(15, even=True) == 16
-    assert _fft_transforms.fft_length(75, even=True) % 2 == 0
+    assert [fft_length(n) for n in (1, 7, 11, 4207, 2160)] == [1, 8, 12, 4320, 2160]
+    assert fft_length(15, even=True) == 16
+    assert fft_length(75, even=True) % 2 == 0
 
 
 @given(
@@ -156,11 +158,7 @@ def test_banded_is_the_dense_matrix(rows, columns, step, origin):
     def weigh(i, j):
         return (16 - (j - origin - step * i).square()).clamp(min=0) * torch.cos(i + 2 * j)
 
-    band = (
-        _fft_transforms.Banded(rows, columns, origin, step, 4.0, 16)
-        .fill(weigh)
-        .to(torch.float64, CPU)
-    )
+    band = Banded(rows, columns, origin, step, 4.0, 16).fill(weigh).to(torch.float64, CPU)
     dense = weigh(torch.arange(band.n_rows).double()[:, None], torch.arange(columns).double())
     x = torch.randn(columns, 6, dtype=torch.float64)
     padded = torch.nn.functional.pad(x, (0, 0, band.margin, band.margin))
@@ -176,16 +174,16 @@ def test_banded_is_the_dense_matrix(rows, columns, step, origin):
 
 def test_large_windows_go_by_grids_and_small_ones_by_matrices():
     def chosen(n, k):
-        axis = _sample_axis.Axis(n, k, 1 / 5578)
-        return _scaled_transform.cheapest(axis, axis, CPU)
+        axis = Axis(n, k, 1 / 5578)
+        return cheapest(axis, axis, CPU)
 
     assert chosen(2160, 2048) == chosen(2048, 2160) == "kaiser_bessel"
     assert chosen(2160, 16) in ("direct", "folded")
     assert chosen(8, 8) in ("direct", "bluestein")
     assert (
-        _scaled_transform.cheapest(
-            _sample_axis.Axis(2160, 2048, 1e-4),
-            _sample_axis.Axis(2160, 2048, 1e-4),
+        cheapest(
+            Axis(2160, 2048, 1e-4),
+            Axis(2160, 2048, 1e-4),
             torch.device("cuda"),
         )
         == "folded"
@@ -201,9 +199,7 @@ def test_threads_never_share_a_workspace():
 
     def work():
         for _ in range(10):
-            out = _scaled_transform.transform(
-                field, (48, 48), _scaled_transform.Grids(**where), "kaiser_bessel"
-            )
+            out = transform(field, (48, 48), Grids(**where), "kaiser_bessel")
             wrong.append(float((out - truth).abs().max()) > 1e-9)
 
     threads = [threading.Thread(target=work) for _ in range(4)]
@@ -217,14 +213,14 @@ def test_threads_never_share_a_workspace():
 
 def test_workspaces_are_kept_but_not_collected():
 
-    with _sample_axis.borrowed(torch.float32, CPU) as first:
+    with borrowed(torch.float32, CPU) as first:
         memory = first.take("x", 100).data_ptr()
         with (
-            _sample_axis.borrowed(torch.float32, CPU) as second,
-            _sample_axis.borrowed(torch.float32, CPU) as third,
+            borrowed(torch.float32, CPU) as second,
+            borrowed(torch.float32, CPU) as third,
         ):
             assert len({first, second, third}) == 3
-    with _sample_axis.borrowed(torch.float32, CPU) as again:
+    with borrowed(torch.float32, CPU) as again:
         assert again is first
         assert again.take("x", 50).data_ptr() == memory
     assert len(_sample_axis._idle) <= 2

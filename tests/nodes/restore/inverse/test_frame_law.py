@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener_spread
-from neusee.nodes.restore.inverse import _masked_blur, _wiener_prior
+from neusee.nodes.restore.inverse import Blurred, fitted_law
 from neusee.nodes.values import Bands, Psf
 
 SIDE, TORUS, WIDE = 64, 100, 256
@@ -61,7 +61,7 @@ def problem_of(slope, rng, noise=1e-3, told=1e-3, glare=False):
     picture[10:14, 30:50] = 40.0
     given = [torch.from_numpy(x[None].copy()) for x in (picture, weight)]
     transfer = torch.fft.rfft2(torch.from_numpy(centred(kernel, TORUS)))[None]
-    return _masked_blur.Blurred(
+    return Blurred(
         *given, transfer, torch.ones(TORUS, TORUS // 2 + 1), (TORUS, TORUS), 0.0
     ), strength
 
@@ -77,10 +77,7 @@ def test_the_law_of_a_frame_is_that_of_its_scene_behind_a_mask(slope, glare, wit
         problem, strength = problem_of(
             slope, np.random.default_rng([seed, int(10 * slope)]), glare=glare
         )
-        ratio = (
-            _wiener_prior.fitted_law(problem).power.numpy()
-            / law(TORUS, slope, strength)[:, : TORUS // 2 + 1]
-        )
+        ratio = fitted_law(problem).power.numpy() / law(TORUS, slope, strength)[:, : TORUS // 2 + 1]
         at = frequency(TORUS)[:, : TORUS // 2 + 1]
         found.append([np.log(ratio[(at > low) & (at < 2 * low)]).mean() for low in (0.05, 0.1)])
     assert np.abs(np.median(found, 0)).max() < np.log(within), np.exp(found)
@@ -89,9 +86,7 @@ def test_the_law_of_a_frame_is_that_of_its_scene_behind_a_mask(slope, glare, wit
 def test_noise_beyond_what_the_filter_assumes_is_found_and_the_right_one_is_kept():
     factors = [
         [
-            _wiener_prior.fitted_law(
-                problem_of(3.0, np.random.default_rng(s), noise=0.1, told=0.1 / f)[0]
-            ).noise
+            fitted_law(problem_of(3.0, np.random.default_rng(s), noise=0.1, told=0.1 / f)[0]).noise
             for s in range(4)
         ]
         for f in (1.0, 8.0)

@@ -9,10 +9,18 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from neusee.nodes.restore.inverse import (
+    Blurred,
+    Lowest,
     _conjugate_gradients,
     _hidden_pixels,
     _masked_blur,
-    _wiener_prior,
+    descend,
+    fall,
+    halved,
+    halvings,
+    most_likely,
+    torus,
+    variance,
 )
 
 
@@ -25,7 +33,7 @@ def problem(picture, size, channels=1, grey=0.0, seed=0, hidden=0.0):
     transfer = torch.fft.rfft2(kernel / kernel.sum((-2, -1), keepdim=True))
     seen = torch.randn(channels, *picture, generator=rng, dtype=torch.float64)
     weight = 25.0 * (torch.rand(seen.shape, generator=rng) >= hidden).double()
-    return _masked_blur.Blurred(seen, weight, transfer, _wiener_prior.fall(size), size, grey)
+    return Blurred(seen, weight, transfer, fall(size), size, grey)
 
 
 def space(seen, spectrum):
@@ -60,12 +68,10 @@ def by_matrix(seen, glare=()):
 def test_equals_the_full_matrix(channels, grey, hidden):
     seen = problem((6, 5), (10, 9), channels, grey, hidden=hidden)
     expected = by_matrix(seen)
-    torch.testing.assert_close(
-        space(seen, _hidden_pixels.most_likely(seen)), expected, rtol=0, atol=1e-9
-    )
+    torch.testing.assert_close(space(seen, most_likely(seen)), expected, rtol=0, atol=1e-9)
     start = torch.zeros_like(seen.transfer)
     torch.testing.assert_close(
-        space(seen, _conjugate_gradients.descend(seen, start, 300, 0.0)),
+        space(seen, descend(seen, start, 300, 0.0)),
         expected,
         rtol=0,
         atol=1e-5,
@@ -81,12 +87,10 @@ def test_glare_of_unknown_strength_equals_the_full_matrix():
         seen, picture=seen.picture + 70 * patterns[0] - 30 * patterns[1], glare=patterns
     )
     expected = by_matrix(seen, patterns)
-    torch.testing.assert_close(
-        space(seen, _hidden_pixels.most_likely(marred)), expected, rtol=0, atol=1e-4
-    )
+    torch.testing.assert_close(space(seen, most_likely(marred)), expected, rtol=0, atol=1e-4)
     start = torch.zeros_like(seen.transfer)
     torch.testing.assert_close(
-        space(seen, _conjugate_gradients.descend(marred, start, 300, 0.0)),
+        space(seen, descend(marred, start, 300, 0.0)),
         expected,
         rtol=0,
         atol=1e-4,
@@ -99,9 +103,7 @@ def test_without_edges_it_is_the_wiener_filter(size):
     signal, noise = seen.power, 1.0 / 25.0
     gain = seen.transfer.conj() * signal / (seen.transfer.abs().square() * signal + noise)
     expected = torch.fft.irfft2(gain * torch.fft.rfft2(seen.picture), s=size)
-    torch.testing.assert_close(
-        space(seen, _hidden_pixels.most_likely(seen)), expected, rtol=0, atol=1e-6
-    )
+    torch.testing.assert_close(space(seen, most_likely(seen)), expected, rtol=0, atol=1e-6)
 
 
 def periodic_filter(seen, weight):
@@ -129,7 +131,7 @@ def test_a_picture_without_noise_is_inverted_to_rounding(weight, channels):
         grey=0.9,
     )
     expected = periodic_filter(seen, weight)
-    answer = space(seen, _hidden_pixels.most_likely(seen))
+    answer = space(seen, most_likely(seen))
     assert float((answer - expected).abs().max() / expected.abs().max()) < 1e-8
 
 
@@ -139,7 +141,7 @@ def test_a_gradient_is_right_to_rounding_times_the_ratio_of_scene_to_noise(weigh
     picture, gradients = model.picture.requires_grad_(), []
     seen = replace(model, weight=torch.full_like(picture, weight))
     towards = torch.rand(12, 10, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    for answer in (space(seen, _hidden_pixels.most_likely(seen)), periodic_filter(seen, weight)):
+    for answer in (space(seen, most_likely(seen)), periodic_filter(seen, weight)):
         gradients.append(torch.autograd.grad((answer * towards).sum(), picture)[0])
     ratio = weight * float((model.transfer.abs().square() * model.power).max())
     error = float((gradients[0] - gradients[1]).abs().max() / gradients[1].abs().max())
@@ -157,7 +159,7 @@ def test_even_glare_over_a_picture_without_noise_takes_its_share_of_the_mean(bou
     scene = float(model.power[0, 0]) / count
     expected = periodic_filter(seen, weight)
     expected = expected - expected.mean() + seen.picture.mean() * scene / (scene + noise + glare)
-    answer = space(seen, _hidden_pixels.most_likely(seen))
+    answer = space(seen, most_likely(seen))
     assert float((answer - expected).abs().max() / expected.abs().max()) < 1e-8
 
 
@@ -174,9 +176,7 @@ def test_on_average_no_other_balance_does_better():
         noise = 0.2 * torch.randn(1, 24, 24, dtype=torch.float64, generator=rng)
         picture = model.blur(truth) + noise
         for k, factor in enumerate((1 / 9, 1.0, 9.0)):
-            found = _hidden_pixels.most_likely(
-                replace(model, picture=picture, weight=factor * model.weight)
-            )
+            found = most_likely(replace(model, picture=picture, weight=factor * model.weight))
             errors[k] += (space(model, found - truth)[:, :24, :24]).square().mean()
     assert errors[1] < 0.98 * errors[0]
     assert errors[1] < 0.98 * errors[2]
@@ -184,7 +184,7 @@ def test_on_average_no_other_balance_does_better():
 
 def test_few_steps_from_a_coarse_start_are_near_the_exact_answer(monkeypatch):
     """Where plain conjugate gradients, from nothing, are still far off."""
-    size = _masked_blur.torus((60, 60), (20, 20))
+    size = torus((60, 60), (20, 20))
     y, x = (torch.minimum(torch.arange(n), n - torch.arange(n)) for n in size)
     ring = ((torch.hypot(y[:, None].double(), x[None].double()) - 16).abs() < 1).double()
     model = replace(problem((60, 60), size), transfer=torch.fft.rfft2(ring / ring.sum())[None])
@@ -199,11 +199,11 @@ def test_few_steps_from_a_coarse_start_are_near_the_exact_answer(monkeypatch):
     def error(spectrum):
         return float(space(model, spectrum - truth)[:, :60, :60].square().mean().sqrt())
 
-    found = _hidden_pixels.most_likely(model)
+    found = most_likely(model)
     monkeypatch.setattr(_conjugate_gradients, "LOWEST", 0)
-    plain = _conjugate_gradients.descend(model, torch.zeros_like(truth), 20, 0.0)
+    plain = descend(model, torch.zeros_like(truth), 20, 0.0)
     monkeypatch.setattr(_masked_blur, "DENSE", 60)
-    exact = _hidden_pixels.most_likely(model)
+    exact = most_likely(model)
     assert error(found) < 1.1 * error(exact)
     assert error(plain) > 1.5 * error(exact)
 
@@ -221,7 +221,7 @@ def answered(request):
     """A problem with glare of unknown strength, and its answer."""
     seen = problem(
         (90, 70),
-        _masked_blur.torus((90, 70), (9, 9)),
+        torus((90, 70), (9, 9)),
         request.param,
         0.9 if request.param > 1 else 0.0,
         hidden=0.2,
@@ -230,7 +230,7 @@ def answered(request):
         seen.picture.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5)
     )
     seen = replace(seen, weight=40 * seen.weight, glare=(pattern,))
-    return seen, _hidden_pixels.most_likely(seen, 400, 1e-14)
+    return seen, most_likely(seen, 400, 1e-14)
 
 
 @pytest.mark.parametrize("single", [False, True])
@@ -242,7 +242,7 @@ def test_it_ends_near_the_answer_as_the_residual_says(answered, single):
     count = float((seen.weight > 0).sum())
     steepest = float(space(seen, seen.slope(0 * answer)).abs().max())
     assert float(space(seen, seen.slope(answer)).abs().max()) < 1e-7 * steepest
-    rough = _masked_blur.Blurred(
+    rough = Blurred(
         seen.picture.float(),
         seen.weight.float(),
         seen.transfer.to(torch.complex64),
@@ -252,7 +252,7 @@ def test_it_ends_near_the_answer_as_the_residual_says(answered, single):
         (seen.glare[0].float(),),
     )
     for enough in (1e-1, 1e-3, 1e-5):
-        found = _hidden_pixels.most_likely(rough if single else seen, 100, enough).to(answer)
+        found = most_likely(rough if single else seen, 100, enough).to(answer)
         assert far(seen, found, answer) / count < 40 * enough
 
 
@@ -264,7 +264,7 @@ def test_the_lowest_frequencies_are_inverted_exactly(monkeypatch, rows):
     seen = replace(seen, glare=(pattern,))
     monkeypatch.setattr(_conjugate_gradients, "SHARE", 0.5)
     monkeypatch.setattr(_conjugate_gradients, "_INVERSE_ROWS", rows)
-    lowest = _conjugate_gradients.Lowest(seen, torch.ones_like(seen.transfer.real))
+    lowest = Lowest(seen, torch.ones_like(seen.transfer.real))
     assert len(lowest.fy) == (15 * 13 + 1) // 2
     slope, found = seen.slope(torch.zeros_like(seen.transfer)), torch.zeros_like(seen.transfer)
     rise = float(lowest.add(slope, found))
@@ -274,9 +274,9 @@ def test_the_lowest_frequencies_are_inverted_exactly(monkeypatch, rows):
 
 @pytest.mark.parametrize("ratio", [1e-12, 1e12])
 def test_finite_where_some_weights_are_beyond_all_others(ratio):
-    seen = problem((50, 45), _masked_blur.torus((50, 45), (9, 9)), 2, 0.95, hidden=0.2)
+    seen = problem((50, 45), torus((50, 45), (9, 9)), 2, 0.95, hidden=0.2)
     seen.weight[:, 20:30, 20:30] *= ratio
-    assert torch.isfinite(_hidden_pixels.most_likely(seen)).all()
+    assert torch.isfinite(most_likely(seen)).all()
 
 
 def through_the_matrix(seen):
@@ -288,7 +288,7 @@ def through_the_matrix(seen):
 
 def slopes(leaves, probe, solve):
     picture, weight, transfer, power, pattern = (leaf.clone().requires_grad_() for leaf in leaves)
-    model = _masked_blur.Blurred(
+    model = Blurred(
         picture, weight, torch.view_as_complex(transfer), power, probe.shape[-2:], 0.5, (pattern,)
     )
     (space(model, solve(model)) * probe).sum().backward()
@@ -296,7 +296,7 @@ def slopes(leaves, probe, solve):
 
 
 def test_gradients_through_the_iteration_are_those_of_the_exact_answer(monkeypatch):
-    size, rng = _masked_blur.torus((46, 11), (8, 8)), torch.Generator().manual_seed(4)
+    size, rng = torus((46, 11), (8, 8)), torch.Generator().manual_seed(4)
     seen = problem((46, 11), size, 2, 0.5)
     weight = seen.weight * (0.5 + torch.rand(seen.weight.shape, generator=rng, dtype=torch.float64))
     pattern, probe = (
@@ -304,13 +304,9 @@ def test_gradients_through_the_iteration_are_those_of_the_exact_answer(monkeypat
     )
     leaves = [seen.picture, weight, torch.view_as_real(seen.transfer), seen.power, pattern]
     exact = slopes(leaves, probe, through_the_matrix)
-    found = slopes(
-        leaves, probe, lambda model: _hidden_pixels.most_likely(model, steps=200, enough=1e-14)
-    )
+    found = slopes(leaves, probe, lambda model: most_likely(model, steps=200, enough=1e-14))
     monkeypatch.setattr(_masked_blur, "DENSE", 46)
-    for mine, dense, right in zip(
-        found, slopes(leaves, probe, _hidden_pixels.most_likely), exact, strict=True
-    ):
+    for mine, dense, right in zip(found, slopes(leaves, probe, most_likely), exact, strict=True):
         assert float((mine - right).norm()) < 1e-3 * float(right.norm())
         assert float((dense - right).norm()) < 1e-6 * float(right.norm())
 
@@ -341,13 +337,13 @@ def test_the_gradient_of_a_picture_that_is_solved_exactly_needs_no_matrix_but_th
     """Work is counted, not timed: one decomposition forward; one solve by its factor, and no
     matrix, backward.
     """
-    picture, size = (20, 16), _masked_blur.torus((20, 16), (6, 6))
+    picture, size = (20, 16), torus((20, 16), (6, 6))
     seen = problem(picture, size, 2, 0.5, hidden=0.2)
     leaf = seen.picture.clone().requires_grad_()
     model = replace(seen, picture=leaf, transfer=seen.transfer.clone().requires_grad_())
     side = 2 * 20 * 16
     with Work(side) as forward:
-        found = space(model, _hidden_pixels.most_likely(model)).square().sum()
+        found = space(model, most_likely(model)).square().sum()
     with Work(side) as backward:
         found.backward()
     assert (forward.decompositions, backward.decompositions) == (1, 0)
@@ -361,7 +357,7 @@ def test_gradcheck_of_a_picture_that_is_solved_exactly():
 
     def restored(picture, through):
         model = replace(seen, picture=picture, transfer=torch.view_as_complex(through))
-        return space(seen, _hidden_pixels.most_likely(model))
+        return space(seen, most_likely(model))
 
     leaves = [
         leaf.clone().requires_grad_() for leaf in (seen.picture, torch.view_as_real(seen.transfer))
@@ -371,23 +367,23 @@ def test_gradcheck_of_a_picture_that_is_solved_exactly():
 
 @pytest.mark.parametrize("picture", [(41, 80), (81, 7), (200, 123)])
 def test_halving_keeps_the_light_and_the_prior(picture):
-    size = _masked_blur.torus(picture, (5, 9))
+    size = torus(picture, (5, 9))
     seen = problem(picture, size, hidden=0.1)
-    half = _hidden_pixels.halved(replace(seen, picture=torch.ones_like(seen.picture)))
+    half = halved(replace(seen, picture=torch.ones_like(seen.picture)))
     assert half.torus == (size[0] // 2, size[1] // 2)
     assert half.picture.shape[-2:] == (-(-picture[0] // 2), -(-picture[1] // 2))
     torch.testing.assert_close(
         half.picture[half.weight > 0], torch.ones_like(half.picture)[half.weight > 0]
     )
     torch.testing.assert_close(half.transfer[..., 0, 0].real, seen.transfer[..., 0, 0].real)
-    assert 0.8 < float(_masked_blur.variance(half.power, half.torus)) <= 1.0
+    assert 0.8 < float(variance(half.power, half.torus)) <= 1.0
     assert float(half.weight.sum()) <= float(seen.weight.sum())
 
 
 @pytest.mark.parametrize("picture", [(1, 1), (1, 300), (39, 40), (640, 640), (2048, 1)])
 def test_the_grid_has_room_and_can_be_halved(picture):
-    y, x = _masked_blur.torus(picture, (7, 30))
-    times = 2 ** _masked_blur.halvings(picture)
+    y, x = torus(picture, (7, 30))
+    times = 2 ** halvings(picture)
     assert (y % times, x % times) == (0, 0)
     assert y >= picture[0] + 14
     assert x >= picture[1] + 60

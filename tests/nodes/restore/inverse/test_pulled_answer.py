@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore.inverse import _hidden_pixels, _masked_blur
+from neusee.nodes.restore.inverse import Blurred, pulled
 
 GREY = 0.6
 SIZE, TORUS = (5, 4), (8, 6)
@@ -30,7 +30,7 @@ def problem(glare=True):
     power = torch.as_tensor((fy[:, None] ** 2 + fx**2 + 0.01) ** -1.2)
     patterns = tuple(random(2, *SIZE, seed=k) for k in (7, 8)) if glare else ()
     picture = random(2, *SIZE, seed=9)
-    return _masked_blur.Blurred(
+    return Blurred(
         picture,
         weight,
         torch.fft.rfft2(kernel),
@@ -103,7 +103,7 @@ def reference(seen, towards, precision):
 @pytest.mark.parametrize("glare", [False, True])
 def test_the_change_is_the_posterior_mean_under_both_priors_less_that_under_one(glare):
     seen = problem(glare)
-    found = _hidden_pixels.pulled(seen, TOWARDS, PRECISION, STEPS)
+    found = pulled(seen, TOWARDS, PRECISION, STEPS)
     for one, expected in zip(found, reference(seen, TOWARDS, PRECISION), strict=True):
         assert np.abs(one.numpy() - expected).max() < 5e-6 * np.abs(expected).max()
 
@@ -111,28 +111,20 @@ def test_the_change_is_the_posterior_mean_under_both_priors_less_that_under_one(
 def test_a_certain_picture_is_taken_a_worthless_one_is_not_and_none_changes_no_bit():
     seen = problem()
     assert torch.allclose(
-        _hidden_pixels.pulled(seen, TOWARDS, torch.full_like(TOWARDS, 1e9), STEPS)[0],
+        pulled(seen, TOWARDS, torch.full_like(TOWARDS, 1e9), STEPS)[0],
         TOWARDS,
         rtol=0,
         atol=1e-5,
     )
-    assert (
-        float(
-            _hidden_pixels.pulled(seen, TOWARDS, torch.full_like(TOWARDS, 1e-9), STEPS)[0]
-            .abs()
-            .max()
-        )
-        < 1e-7
-    )
+    assert float(pulled(seen, TOWARDS, torch.full_like(TOWARDS, 1e-9), STEPS)[0].abs().max()) < 1e-7
     assert not any(
-        float(part.abs().max())
-        for part in _hidden_pixels.pulled(seen, torch.zeros_like(TOWARDS), PRECISION)
+        float(part.abs().max()) for part in pulled(seen, torch.zeros_like(TOWARDS), PRECISION)
     )
 
 
 def test_a_frame_without_a_seen_pixel_leaves_the_two_priors():
     seen = replace(problem(glare=False), weight=torch.zeros(2, *SIZE, dtype=torch.float64))
-    found = _hidden_pixels.pulled(seen, TOWARDS, PRECISION, STEPS)[0]
+    found = pulled(seen, TOWARDS, PRECISION, STEPS)[0]
     expected = reference(seen, TOWARDS, PRECISION)[0]
     assert np.abs(found.numpy() - expected).max() < 5e-6 * np.abs(expected).max()
     assert np.abs(expected).max() > 0.1
@@ -143,11 +135,9 @@ def test_in_float32_the_change_is_that_of_float64():
     parts = {name: getattr(seen, name).float() for name in ("picture", "weight", "power")}
     glare = tuple(pattern.float() for pattern in seen.glare)
     single = replace(seen, **parts, transfer=seen.transfer.to(torch.complex64), glare=glare)
-    found = _hidden_pixels.pulled(single, TOWARDS.float(), PRECISION.float())[0]
+    found = pulled(single, TOWARDS.float(), PRECISION.float())[0]
     assert found.dtype == torch.float32
-    assert torch.allclose(
-        found.double(), _hidden_pixels.pulled(seen, TOWARDS, PRECISION)[0], rtol=0, atol=2e-5
-    )
+    assert torch.allclose(found.double(), pulled(seen, TOWARDS, PRECISION)[0], rtol=0, atol=2e-5)
 
 
 def moved(seen, logarithm, bright, through, towards, precision):
@@ -156,7 +146,7 @@ def moved(seen, logarithm, bright, through, towards, precision):
     """
     weight, glare = seen.weight * logarithm.exp(), tuple(p * bright for p in seen.glare)
     other = replace(seen, weight=weight, glare=glare, transfer=seen.transfer * through)
-    return _hidden_pixels.pulled(other, towards, precision, STEPS)
+    return pulled(other, towards, precision, STEPS)
 
 
 def start():
@@ -212,7 +202,7 @@ def test_all_derivatives_pass_gradcheck():
 def test_there_is_no_second_derivative():
     towards = TOWARDS.clone().requires_grad_()
     (slope,) = torch.autograd.grad(
-        _hidden_pixels.pulled(problem(), towards, PRECISION)[0].square().sum(),
+        pulled(problem(), towards, PRECISION)[0].square().sum(),
         towards,
         create_graph=True,
     )

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes import restore
-from neusee.nodes.restore.inverse._masked_blur import edge, torus
+from neusee.nodes.restore.inverse import edge, torus
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener, wiener_by_field, wiener_spread
-from neusee.nodes.restore.inverse import _glare, _wiener_prior
+from neusee.nodes.restore.inverse import RADII, _glare, shared_level, visible, with_smooth
 from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 SIDE, READ, WELL = 96, 5.0, 25000.0
@@ -53,8 +53,7 @@ def frame(strength, shares, seed):
     away = np.hypot(y - 40, x - 55)
     told = strength * np.cos(2.0 * away) ** 2 / (1 + away) ** 3
     wide = sum(
-        share * blurred(told, radius / 1.7)
-        for share, radius in zip(shares, _glare.RADII, strict=True)
+        share * blurred(told, radius / 1.7) for share, radius in zip(shares, RADII, strict=True)
     )
     light = COLOUR * np.abs(np.sqrt(told) + np.sqrt(wide) * speckle(rng)) ** 2
     true = scene(rng)
@@ -85,10 +84,8 @@ def test_speckle_tells_how_much_is_scattered(planted):
         _, seen, told = frame(1e7, planted, seed)
         seen, told = torch.from_numpy(seen), torch.from_numpy(told)
         known = (seen < WELL).double()
-        glare = _glare.visible([told], [None], known)
-        found.append(
-            _glare._likeliest(seen, known, _glare.with_smooth(glare), partial(noise, seen))
-        )
+        glare = visible([told], [None], known)
+        found.append(_glare._likeliest(seen, known, with_smooth(glare), partial(noise, seen)))
     strength, narrow, _, wide = np.exp(np.log(np.array(found)).mean(0))
     assert 0.7 < strength < 1.4
     assert planted[2] / 2.5 < wide < 2 * planted[2]
@@ -130,11 +127,11 @@ def test_a_channel_that_glare_covers_takes_the_level_of_others():
     white = torch.tensor([0.9, 1.0, 0.6], dtype=torch.float64)[:, None, None]
     level = white * torch.tensor([100.0, 100.0, 7.0], dtype=torch.float64)[:, None, None]
     trust = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)[:, None, None]
-    torch.testing.assert_close(_wiener_prior.shared_level(level, trust, white), 100.0 * white)
+    torch.testing.assert_close(shared_level(level, trust, white), 100.0 * white)
     torch.testing.assert_close(
-        _wiener_prior.shared_level(100.0 * white, torch.zeros_like(trust), white), 100.0 * white
+        shared_level(100.0 * white, torch.zeros_like(trust), white), 100.0 * white
     )
-    own = _wiener_prior.shared_level(level, torch.ones_like(trust), white)
+    own = shared_level(level, torch.ones_like(trust), white)
     assert 7.0 < float(own[2] / white[2]) < 9.0
 
 

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore.inverse import _wiener_prior
+from neusee.nodes.restore.inverse import (
+    BLOTCH_PIXELS,
+    Told,
+    drawn_blotches,
+    level_and_variance,
+)
 
 WHITE = np.array([0.9, 1.0, 0.5])
 FULL = 25_000.0
@@ -17,7 +22,7 @@ def column(values):
 
 
 def told(value, errors):
-    return _wiener_prior.Told(column(value), column(errors))
+    return Told(column(value), column(errors))
 
 
 def worlds(count, seed):
@@ -41,9 +46,7 @@ def worlds(count, seed):
 def test_the_deviation_of_the_mean_is_that_of_its_errors():
     squares = []
     for (mean, seen, errors), (_, varied, wrong) in worlds(300, 1):
-        level, _ = _wiener_prior.level_and_variance(
-            told(seen, errors), told(varied, wrong), column(WHITE), FULL
-        )
+        level, _ = level_and_variance(told(seen, errors), told(varied, wrong), column(WHITE), FULL)
         squares.append(
             ((level.value[:, 0, 0].numpy() - mean) / level.deviation[:, 0, 0].numpy()) ** 2
         )
@@ -53,9 +56,7 @@ def test_the_deviation_of_the_mean_is_that_of_its_errors():
 def test_the_mean_is_better_than_what_the_picture_tells_and_than_the_prior():
     found, direct, prior = [], [], []
     for (mean, seen, errors), (_, varied, wrong) in worlds(300, 2):
-        level, _ = _wiener_prior.level_and_variance(
-            told(seen, errors), told(varied, wrong), column(WHITE), FULL
-        )
+        level, _ = level_and_variance(told(seen, errors), told(varied, wrong), column(WHITE), FULL)
         for values, x in (
             (found, level.value[:, 0, 0].numpy()),
             (direct, seen),
@@ -69,7 +70,7 @@ def test_the_mean_is_better_than_what_the_picture_tells_and_than_the_prior():
 def test_the_variance_is_right_on_average_by_a_factor():
     ratios = []
     for (_, seen, errors), (variance, varied, wrong) in worlds(300, 3):
-        _, squares = _wiener_prior.level_and_variance(
+        _, squares = level_and_variance(
             told(seen, errors), told(varied, wrong), column(WHITE), FULL
         )
         ratios.append(np.log(squares.value[:, 0, 0].numpy() / variance).mean())
@@ -80,7 +81,7 @@ def test_the_variance_is_right_on_average_by_a_factor():
 def test_what_is_told_exactly_is_kept():
     mean, variance = np.array([3000.0, 100.0, 9000.0]), np.array([4e6, 5e6, 1.5e6])
     nothing = np.zeros((1, 3))
-    level, squares = _wiener_prior.level_and_variance(
+    level, squares = level_and_variance(
         told(mean, nothing), told(variance, nothing), column(WHITE), FULL
     )
     np.testing.assert_allclose(level.value[:, 0, 0], mean, rtol=0.01)
@@ -92,13 +93,10 @@ def test_what_is_told_exactly_is_kept():
 def test_blotches_have_the_deviation_that_is_given_and_are_wide(size):
     deviation = torch.linspace(1.0, 3.0, size[0] * size[1], dtype=torch.float64).reshape(1, *size)
     draws = torch.stack(
-        [
-            _wiener_prior.drawn_blotches(deviation, torch.Generator().manual_seed(seed))[0]
-            for seed in range(600)
-        ]
+        [drawn_blotches(deviation, torch.Generator().manual_seed(seed))[0] for seed in range(600)]
     )
     torch.testing.assert_close(draws.square().mean(0).sqrt(), deviation[0], rtol=0.15, atol=0.0)
-    far = 3 * _wiener_prior._BLOTCH_PIXELS
+    far = 3 * BLOTCH_PIXELS
     row = draws[:, 0] / deviation[0, 0]
     assert float((row[:, 0] * row[:, 2]).mean()) > 0.8
     if size[1] > far:

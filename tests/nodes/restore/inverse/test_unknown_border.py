@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener, wiener_spread
-from neusee.nodes.restore.inverse import _wiener, _wiener_prior
+from neusee.nodes.restore.inverse import (
+    Settings,
+    about_mean,
+    expected_variance,
+    fall,
+    posed,
+    visible,
+)
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)
@@ -108,13 +115,11 @@ def frame(seed):
     return picture + rng.standard_normal(picture.shape) * np.sqrt(picture + READ**2)
 
 
-def posed(electrons, border):
+def problem_of(electrons, border):
     kernel = torch.tensor(ring())[None]
     known = torch.ones(1, SIDE, SIDE, dtype=torch.float64)
-    settings = _wiener.Settings(1.0, READ, border=border)
-    return _wiener.posed(
-        torch.tensor(electrons)[None], known, kernel, _wiener.visible([], [], known), settings
-    )
+    settings = Settings(1.0, READ, border=border)
+    return posed(torch.tensor(electrons)[None], known, kernel, visible([], [], known), settings)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -122,7 +127,7 @@ def test_a_wider_border_comes_nearer_to_a_scene_that_does_not_repeat(seed):
     electrons = frame(seed)
     gaps = []
     for border in (1.01, 2.0, 4.0):
-        exact = dense(posed(electrons, border))
+        exact = dense(problem_of(electrons, border))
         found = restored(electrons, ring(), border=border)
         gaps.append(np.sqrt(np.mean((found - exact) ** 2)) / exact.std())
     assert gaps[1] < 0.5 * gaps[0]
@@ -150,13 +155,9 @@ def test_a_scene_whose_ends_differ_is_restored_better(seed):
 def test_the_variance_about_the_mean_is_that_of_the_covariance(picture, torus):
     rng = np.random.default_rng(1)
     kernel = rng.uniform(0, 1, torus)
-    power = _wiener_prior.fall(torus)
+    power = fall(torus)
     transfer = torch.fft.rfft2(torch.tensor(kernel))[None]
-    found = float(
-        _wiener_prior.expected_variance(
-            transfer, _wiener_prior.about_mean(power, picture, torus), torus
-        )
-    )
+    found = float(expected_variance(transfer, about_mean(power, picture, torus), torus))
     whole = (
         np.abs(np.fft.fft2(kernel)) ** 2
         * np.fft.fft2(torch.fft.irfft2(power, s=torus).numpy()).real
@@ -197,5 +198,5 @@ def test_the_deviation_of_drawn_scenes_is_that_of_the_wider_border():
         .mean()
         for border in (1.0, 2.0)
     ]
-    assert float(found[1]) == pytest.approx(dense_variance(posed(electrons, 2.0)), rel=0.15)
+    assert float(found[1]) == pytest.approx(dense_variance(problem_of(electrons, 2.0)), rel=0.15)
     assert float(found[0]) < 0.8 * float(found[1])

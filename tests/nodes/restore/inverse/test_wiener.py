@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
-from neusee.nodes.restore.inverse import _glare, _masked_blur, _wiener
+from neusee.nodes.restore.inverse import _masked_blur, _wiener, effective_psf, strengths
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, leaves, reflectances, responses
 from neusee.nodes.values import Bands, Psf
@@ -125,11 +125,11 @@ def test_each_channel_has_its_own_psf():
     )
     psf = Psf(torch.stack([disc(1).intensity[0], disc(3).intensity[0]]), torch.ones(2))
     seen_by = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
-    found = _masked_blur.effective_psf(psf, torch.tensor([3.0, 1.0]), seen_by, line)
+    found = effective_psf(psf, torch.tensor([3.0, 1.0]), seen_by, line)
     torch.testing.assert_close(found[:2], psf.intensity)
     torch.testing.assert_close(found[2], (1200 * psf.intensity[0] + 700 * psf.intensity[1]) / 1900)
     with pytest.raises(ValueError, match="one `bands` step"):
-        _masked_blur.effective_psf(psf, torch.ones(3), seen_by, line)
+        effective_psf(psf, torch.ones(3), seen_by, line)
 
 
 def photographs(count, size=16):
@@ -278,7 +278,7 @@ def test_the_first_guess_of_the_glare_is_least_squares_beside_a_constant():
     rng = torch.Generator().manual_seed(0)
     electrons, one, two = torch.rand(3, 2, 150, 20, generator=rng)
     known = (torch.rand(2, 150, 20, generator=rng) > 0.2).float()
-    fit_one, fit_two = _glare.strengths(electrons, known, [one, two])
+    fit_one, fit_two = strengths(electrons, known, [one, two])
     found = fit_one * one + fit_two * two
     seen = known.double()
     centred = [

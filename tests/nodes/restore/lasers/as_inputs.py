@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from neusee.nodes import restore
-from neusee.nodes.restore.lasers import _candidates, _line_pattern
+from neusee.nodes.restore.lasers import Lens, line_templates
 from neusee.nodes.values import Bands, Psf, Pupil
 from tests.nodes.restore.lasers import own_camera as own
 
@@ -56,6 +56,6 @@ def kept_templates(mask, side):
     """The patterns on the axis of a mask, which are the same for every frame of a size."""
     with torch.no_grad():
         responses = tensor(own.band_response())
-        return _candidates.line_templates(
-            pupil_of(mask), responses, BANDS, _line_pattern.Lens(own.FOCAL, own.PITCH, (side, side))
+        return line_templates(
+            pupil_of(mask), responses, BANDS, Lens(own.FOCAL, own.PITCH, (side, side))
         )

@@ -8,7 +8,16 @@ import torch
 from scipy.stats import norm
 
 from neusee.nodes import restore
-from neusee.nodes.restore.lasers import _frame_likelihood, _line_pattern
+from neusee.nodes.restore.lasers import (
+    Lens,
+    censored,
+    filled,
+    filter_of,
+    grid_patterns,
+    index_at,
+    line_moves,
+    line_pattern,
+)
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, inputs, pupil_of, tensor
 
@@ -27,8 +36,8 @@ def number(x):
 @pytest.mark.parametrize("mask", ["plain", "half_ring", "cubic"])
 def test_the_pattern_of_a_line_is_that_of_direct_sums(mask):
     expected = own.pattern(mask, 533e-9, (3.3, -8.2), (48, 40))
-    lens = _line_pattern.Lens(own.FOCAL, own.PITCH, (48, 40))
-    found = _line_pattern.line_pattern(
+    lens = Lens(own.FOCAL, own.PITCH, (48, 40))
+    found = line_pattern(
         pupil_of(mask, torch.float64),
         number([3.3, -8.2]) * PIXEL,
         number(533e-9),
@@ -41,21 +50,21 @@ def test_the_pattern_of_a_line_is_that_of_direct_sums(mask):
 def test_the_index_between_bands_is_that_of_the_glass_and_other_numbers_of_bands_have_one():
     pupil = pupil_of("plain")
     for nm in (401.0, 533.0, 699.0):
-        assert float(_line_pattern.index_at(number(nm * 1e-9), pupil)) == pytest.approx(
+        assert float(index_at(number(nm * 1e-9), pupil)) == pytest.approx(
             own.silica(nm * 1e-9), abs=3e-8
         )
     for count in (1, 2, 3):
         few = pupil._replace(index=pupil.index[:count], wavelengths=pupil.wavelengths[:count])
         for n in range(count):
-            assert float(_line_pattern.index_at(few.wavelengths[n], few)) == pytest.approx(
+            assert float(index_at(few.wavelengths[n], few)) == pytest.approx(
                 float(few.index[n]), abs=1e-12
             )
 
 
 def test_a_pixel_between_two_points_of_it_sees_their_mean():
     """The mean over a pixel by SciPy's direct sums at 9 x 9 places in that pixel."""
-    lens = _line_pattern.Lens(own.FOCAL, own.PITCH, (9, 9), "integrated")
-    found = _line_pattern.line_pattern(
+    lens = Lens(own.FOCAL, own.PITCH, (9, 9), "integrated")
+    found = line_pattern(
         pupil_of("plain", torch.float64), number([0.0, 0.0]), number(550e-9), lens, number(0.0)
     ).numpy()
     at = (np.arange(9) + 0.5) / 9 - 0.5
@@ -84,8 +93,8 @@ def test_the_slopes_of_a_line_are_differences_of_direct_sums(fwhm):
         (name,) = move
         return (line(**{name: step}) - line(**{name: -step})) / (2 * step)
 
-    lens = _line_pattern.Lens(own.FOCAL, own.PITCH, (24, 20))
-    moves = _line_pattern.line_moves(
+    lens = Lens(own.FOCAL, own.PITCH, (24, 20))
+    moves = line_moves(
         pupil_of("half_ring", torch.float64),
         number([3.3, -8.2]),
         number(533e-9),
@@ -104,8 +113,8 @@ def test_the_slopes_of_a_line_are_differences_of_direct_sums(fwhm):
 
 
 def test_patterns_at_several_places_are_those_of_direct_sums():
-    lens = _line_pattern.Lens(own.FOCAL, own.PITCH, (24, 30))
-    found = _line_pattern.grid_patterns(
+    lens = Lens(own.FOCAL, own.PITCH, (24, 30))
+    found = grid_patterns(
         pupil_of("cubic", torch.float64), number([1.0, -2.3]), number([0.4]), number(533e-9), lens
     )
     for n, y in enumerate((1.0, -2.3)):
@@ -121,8 +130,8 @@ def test_a_clipped_pixel_counts_as_at_least_full():
     seen = torch.ones_like(electrons)
     seen[0, 8, 8] = 0
     electrons[0, 8, 8] = 20000.0
-    clipped = _frame_likelihood.censored(electrons, seen, electrons, read_noise=5.0)
-    assert _frame_likelihood.censored(electrons, torch.ones_like(seen), electrons, 5.0) is None
+    clipped = censored(electrons, seen, electrons, read_noise=5.0)
+    assert censored(electrons, torch.ones_like(seen), electrons, 5.0) is None
     # the scene around is even, so nothing but photons and read noise is not known
     sigma = np.sqrt(20000 + 25)
     spot = torch.zeros_like(electrons)
@@ -213,9 +222,9 @@ def test_what_is_filled_comes_from_what_is_seen_and_a_smooth_picture_is_removed(
     slope = (3 * y + x)[None].double().repeat(3, 1, 1) + 100
     seen = torch.ones_like(slope)
     seen[:, 10:18, 12:19] = 0
-    again = _frame_likelihood.filled(torch.where(seen > 0, slope, torch.nan).nan_to_num(1e9), seen)
+    again = filled(torch.where(seen > 0, slope, torch.nan).nan_to_num(1e9), seen)
     assert float((again - slope).abs().max()) < 12
-    use = _frame_likelihood.filter_of(
+    use = filter_of(
         slope + torch.randn(slope.shape, generator=torch.Generator().manual_seed(0)),
         0 * slope + 1,
         seen,

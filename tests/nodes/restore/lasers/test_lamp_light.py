@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from neusee.nodes import optics
-from neusee.nodes.restore.inverse import _wiener
-from neusee.nodes.restore.lasers import _components, _line_pattern
+from neusee.nodes.restore.inverse import View
+from neusee.nodes.restore.lasers import Lamp, Lens, lamp_light
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, pupil_of, tensor
 
@@ -22,11 +22,11 @@ def lamp_at(spot, mask, veil=0.0, sensor="point"):
     """
     psf = optics.psf(pupil_of(mask), shape=(WINDOW, WINDOW), sensor=sensor, **LENS)
     psf = psf._replace(intensity=psf.intensity + veil * tensor(gaussian((0.0, 0.0), WINDOW)))
-    lens = _line_pattern.Lens(own.FOCAL, own.PITCH, (SIDE, SIDE), sensor)
+    lens = Lens(own.FOCAL, own.PITCH, (SIDE, SIDE), sensor)
     told = tensor(own.daylight(own.BANDS)), tensor(own.band_response()), BANDS
-    light = _components.lamp_light(_wiener.View(psf, *told), pupil_of(mask), lens, torch.float64)
+    light = lamp_light(View(psf, *told), pupil_of(mask), lens, torch.float64)
     values = torch.tensor([*spot, 1, 1, 1, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
-    return _components.Lamp(light, (SIDE, SIDE), values)
+    return Lamp(light, (SIDE, SIDE), values)
 
 
 def summed(spot, mask):

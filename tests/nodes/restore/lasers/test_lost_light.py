@@ -12,13 +12,22 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from neusee.nodes.restore.inverse import _wiener
+from neusee.nodes.restore.inverse import View
 from neusee.nodes.restore.lasers import (
-    _components,
-    _find_lasers,
-    _frame_likelihood,
-    _greedy_search,
-    _line_pattern,
+    NORMAL,
+    Camera,
+    Choice,
+    Found,
+    Known,
+    Laser,
+    Lens,
+    at_the_aperture,
+    data_of,
+    fitted,
+    lamp_light,
+    misfit_of,
+    spreads,
+    without_scattered,
 )
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import found_in, inputs
@@ -53,18 +62,12 @@ def dirty_lenses(monkeypatch):
 def fit_of(frame, mask, lasers):
     """What a fit from these lasers finds, as the search would return it."""
     electrons, clipped, psf, known_pupil, light, responses, bands = inputs(frame, mask)
-    lens = _line_pattern.Lens(own.FOCAL, own.PITCH, (SIDE, SIDE))
-    camera = _components.Camera(
-        known_pupil, responses, bands, lens, torch.tensor(1e-9, dtype=torch.float64)
-    )
-    lamp = _components.lamp_light(
-        _wiener.View(psf, light, responses, bands), known_pupil, lens, torch.float64
-    )
-    known = _greedy_search.Known(
-        electrons.double(), (~clipped).double(), camera, lamp, None, own.READ, (1e-9,)
-    )
+    lens = Lens(own.FOCAL, own.PITCH, (SIDE, SIDE))
+    camera = Camera(known_pupil, responses, bands, lens, torch.tensor(1e-9, dtype=torch.float64))
+    lamp = lamp_light(View(psf, light, responses, bands), known_pupil, lens, torch.float64)
+    known = Known(electrons.double(), (~clipped).double(), camera, lamp, None, own.READ, (1e-9,))
     parts = tuple(
-        _components.Laser(
+        Laser(
             camera,
             torch.tensor(
                 [
@@ -78,36 +81,31 @@ def fit_of(frame, mask, lasers):
         for x in lasers
     )
     for _ in range(2):
-        data = _greedy_search._data(known, parts)
-        fit = _frame_likelihood.fitted(data, parts, 12)
+        data = data_of(known, parts)
+        fit = fitted(data, parts, 12)
         parts = fit.parts
     open_data = data._replace(clipped=None)
-    now = _frame_likelihood.misfit_of(open_data, parts, 1)[1]
+    now = misfit_of(open_data, parts, 1)[1]
     rests = [parts[:n] + parts[n + 1 :] for n in range(len(parts))] if len(parts) > 1 else [()]
-    gains = [
-        _frame_likelihood.misfit_of(open_data, rest, 5 if rest else 0)[1] - now for rest in rests
-    ]
-    choices = tuple(
-        _greedy_search.Choice(part, gain, gain, gain)
-        for part, gain in zip(parts, gains, strict=True)
-    )
-    return _greedy_search.Found(fit, choices, data), known
+    gains = [misfit_of(open_data, rest, 5 if rest else 0)[1] - now for rest in rests]
+    choices = tuple(Choice(part, gain, gain, gain) for part, gain in zip(parts, gains, strict=True))
+    return Found(fit, choices, data), known
 
 
 def strength_of(found, known):
     """The interval of the electrons that follow the pattern of the first laser, and what is said
     of all of them.
     """
-    told = _frame_likelihood.spreads(found.fit, known.seen)[0]
+    told = spreads(found.fit, known.seen)[0]
     straight, spread = found.fit.parts[0].channels(), told.covariance.diagonal()[3:].sqrt()
     ends = torch.stack(
         [
-            straight - _frame_likelihood.NORMAL * spread,
-            straight + _frame_likelihood.NORMAL * spread,
+            straight - NORMAL * spread,
+            straight + NORMAL * spread,
         ],
         -1,
     )
-    return ends.numpy(), _find_lasers.at_the_aperture(straight, spread, told.ideal, known.seen)
+    return ends.numpy(), at_the_aperture(straight, spread, told.ideal, known.seen)
 
 
 def holds(ends, truth):
@@ -155,7 +153,7 @@ def test_the_interval_is_that_of_draws_from_the_stated_law():
         lost = 2.10 * size**0.74 * np.exp(2.15 / 8 + width * rng.normal(size=dirty.shape))
         draws = straight * np.exp(np.where(dirty, lost, 0)) + growth * rng.normal(size=dirty.shape)
         given = (torch.tensor([x], dtype=torch.float64) for x in (straight, growth, ideal))
-        middle, ends = _find_lasers.at_the_aperture(*given, seen)
+        middle, ends = at_the_aperture(*given, seen)
         expected = np.quantile(draws, [0.5, 0.05, 0.95])
         assert np.abs(
             np.array([float(middle), *ends[0].tolist()]) - expected
@@ -167,7 +165,7 @@ def test_a_channel_that_does_not_see_the_laser_has_a_finite_interval():
         torch.tensor(x, dtype=torch.float64)
         for x in ([-3.0, 0.0, 5.0], [10.0, 0.0, 9.0], [10.0, 0.0, 1.0])
     ]
-    middle, ends = _find_lasers.at_the_aperture(
+    middle, ends = at_the_aperture(
         *given, torch.tensor([1.0, 0.0, 0.0])[:, None, None].expand(3, 300, 300)
     )
     assert middle.isfinite().all()
@@ -187,11 +185,11 @@ def test_speckle_of_a_strong_laser_is_no_laser_and_a_second_laser_is():
     speck = own.Laser((2.3, -12.8), 533e-9, 10.0)
     found, known = fit_of(frame, "half_ring", [laser, speck])
     assert found.choices[1].gain > LEAST
-    assert len(_greedy_search.without_scattered(found, known, LEAST).fit.parts) == 1
+    assert len(without_scattered(found, known, LEAST).fit.parts) == 1
     found, known = fit_of(
         own.Frame(*own.digitized(scene + strong + weak, rng)), "half_ring", [laser, other]
     )
-    assert _greedy_search.without_scattered(found, known, LEAST) is found
+    assert without_scattered(found, known, LEAST) is found
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from neusee.nodes.losses import gradient_penalty
 from neusee.nodes.restore import critic_slopes, critics, parameter_groups
-from neusee.nodes.restore.networks import _convolutional_networks
+from neusee.nodes.restore.networks import Critic
 
 
 def seeded(seed=0):
@@ -24,11 +24,7 @@ def test_has_as_many_parameters_as_its_parts():
     sizes = [3, 64, 128, 256, 512]
     parts = sum(16 * a * b + b for a, b in pairwise(sizes)) + 9 * 512 + 1
     with torch.device("meta"):
-        assert (
-            sum(p.numel() for p in _convolutional_networks.Critic().parameters())
-            == parts
-            == 2_761_153
-        )
+        assert sum(p.numel() for p in Critic().parameters()) == parts == 2_761_153
 
 
 def test_two_scales_start_differently_and_orthogonal():
@@ -41,8 +37,8 @@ def test_two_scales_start_differently_and_orthogonal():
 
 
 def test_holds_nothing_that_sees_the_batch_or_breaks_a_second_derivative():
-    kinds = {type(m) for m in _convolutional_networks.Critic(2).modules()}
-    assert kinds == {_convolutional_networks.Critic, nn.Sequential, nn.Conv2d, nn.LeakyReLU}
+    kinds = {type(m) for m in Critic(2).modules()}
+    assert kinds == {Critic, nn.Sequential, nn.Conv2d, nn.LeakyReLU}
 
 
 @pytest.mark.parametrize("size", [(16, 16), (17, 40), (64, 33)])
@@ -56,7 +52,7 @@ def test_one_score_a_picture_of_any_size(size):
 
 def test_what_is_too_small_is_refused():
     with pytest.raises(ValueError, match="give 16 pixels a side"):
-        _convolutional_networks.Critic(2)(torch.rand(1, 3, 15, 64))
+        Critic(2)(torch.rand(1, 3, 15, 64))
 
 
 def test_slopes_are_those_of_each_picture_on_the_line_between():
@@ -120,6 +116,6 @@ def test_finite_for_any_light(size):
 
 
 def test_learns_with_the_rates_of_the_generator():
-    critic = _convolutional_networks.Critic(2)
+    critic = Critic(2)
     weights, biases = parameter_groups(critic)
     assert (len(weights["params"]), len(biases["params"])) == (5, 5)

@@ -13,7 +13,15 @@ from torch.testing import assert_close
 from neusee.nodes import ParameterError
 from neusee.nodes.network_weights import OPTIONS, file_metadata
 from neusee.nodes.restore import FFTMamba, fft_mamba, start_network
-from neusee.nodes.restore.networks import _fft_mamba
+from neusee.nodes.restore.networks import (
+    Block,
+    BothWays,
+    Frequency,
+    Scan,
+    Spatial,
+    _fft_mamba,
+    radial_order,
+)
 
 CPU = torch.device("cpu")
 
@@ -86,7 +94,7 @@ def test_the_usual_network_has_938_thousand_parameters_in_eight_blocks():
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 6), (8, 8), (7, 5), (6, 9), (18, 26)])
 def test_the_order_is_a_permutation_and_the_places_undo_it(size):
-    order, place = _fft_mamba.radial_order(size, CPU)
+    order, place = radial_order(size, CPU)
     every = torch.arange(size[0] * (size[1] // 2 + 1))
     assert torch.equal(order.sort().values, every)
     assert torch.equal(order[place], every)
@@ -96,7 +104,7 @@ def test_the_order_is_a_permutation_and_the_places_undo_it(size):
 @pytest.mark.parametrize("size", [(8, 8), (7, 5), (6, 9), (4, 12)])
 def test_frequencies_rise_and_those_of_one_radius_turn(size):
     y, x = size
-    order, _ = _fft_mamba.radial_order(size, CPU)
+    order, _ = radial_order(size, CPU)
     known = []
     for row, column in itertools.product(range(y), range(x // 2 + 1)):
         up, right = Fraction(row - y if 2 * row >= y else row, y), Fraction(column, x)
@@ -107,10 +115,10 @@ def test_frequencies_rise_and_those_of_one_radius_turn(size):
 
 
 def test_the_order_made_where_nobody_learns_serves_those_who_learn():
-    _fft_mamba.radial_order.cache_clear()
+    radial_order.cache_clear()
     with torch.inference_mode():
-        _fft_mamba.radial_order((6, 10), CPU)
-    net = start_network(lambda: _fft_mamba.Frequency(4, 2), seeded())
+        radial_order((6, 10), CPU)
+    net = start_network(lambda: Frequency(4, 2), seeded())
     net(drawn(1, 4, 6, 10)).square().sum().backward()
     assert bool(net.strength.grad)
 
@@ -119,7 +127,7 @@ def test_the_order_made_where_nobody_learns_serves_those_who_learn():
 
 
 def test_steps_at_the_start_remember_ten_to_a_thousand_places():
-    scan = begun(lambda: _fft_mamba.Scan(400, 16, 4))
+    scan = begun(lambda: Scan(400, 16, 4))
     steps = softplus(scan.dt_bias.double())
     assert 1e-3 * (1 - 1e-4) <= float(steps.min()) < 1.5e-3
     assert 0.098 < float(steps.max()) <= 0.1 * (1 + 1e-4)
@@ -129,7 +137,7 @@ def test_steps_at_the_start_remember_ten_to_a_thousand_places():
 
 
 def test_a_scan_remembers_and_does_not_foresee():
-    scan, before = begun(lambda: _fft_mamba.Scan(6, 4, 2)), drawn(1, 40, 6)
+    scan, before = begun(lambda: Scan(6, 4, 2)), drawn(1, 40, 6)
     after = before.clone()
     after[:, 12] += 1
     change = (scan(after) - scan(before)).abs().amax((0, 2))
@@ -138,7 +146,7 @@ def test_a_scan_remembers_and_does_not_foresee():
 
 
 def test_a_scan_is_its_recurrence():
-    scan, u = begun(lambda: _fft_mamba.Scan(3, 2, 2)), drawn(2, 9, 3)
+    scan, u = begun(lambda: Scan(3, 2, 2)), drawn(2, 9, 3)
     read = u.double() @ scan.read.weight.double().T
     rate, into, out = read.split([2, 2, 2], -1)
     step = softplus(rate @ scan.rate.weight.double().T + scan.dt_bias.double())
@@ -154,7 +162,7 @@ def test_a_scan_is_its_recurrence():
 
 
 def test_decays_and_steps_stay_within_bounds_whatever_is_learnt():
-    scan, u = start_network(lambda: _fft_mamba.Scan(6, 4, 2), seeded()), 100 * drawn(1, 40, 6)
+    scan, u = start_network(lambda: Scan(6, 4, 2), seeded()), 100 * drawn(1, 40, 6)
     with torch.no_grad():
         scan.A_log.copy_(torch.linspace(-200, 200, scan.A_log.numel()).view_as(scan.A_log))
         scan.dt_bias.copy_(torch.linspace(-300, 300, scan.dt_bias.numel()))
@@ -169,7 +177,7 @@ def test_decays_and_steps_stay_within_bounds_whatever_is_learnt():
 
 
 def test_both_ways_turned_round_are_the_other_ways():
-    both, u = begun(lambda: _fft_mamba.BothWays(4, 3, 1)), drawn(2, 17, 4)
+    both, u = begun(lambda: BothWays(4, 3, 1)), drawn(2, 17, 4)
     turned = both(u.flip(1))
     both.there, both.back = both.back, both.there
     assert_close(both(u).flip(1), turned, rtol=0, atol=1e-6)
@@ -178,7 +186,7 @@ def test_both_ways_turned_round_are_the_other_ways():
 
 
 def test_columns_of_a_picture_are_rows_of_the_picture_laid_on_its_side():
-    rows, columns = (begun(lambda by=by: _fft_mamba.Spatial(4, 3, by)) for by in (False, True))
+    rows, columns = (begun(lambda by=by: Spatial(4, 3, by)) for by in (False, True))
     state = rows.state_dict()
     columns.load_state_dict(state | {"mix.weight": state["mix.weight"].mT})
     x = drawn(1, 4, 6, 9)
@@ -188,7 +196,7 @@ def test_columns_of_a_picture_are_rows_of_the_picture_laid_on_its_side():
 
 def test_a_scan_by_rows_goes_along_rows():
     """Without the way back and the filter, a pixel changes what comes after it, row by row."""
-    part = begun(lambda: _fft_mamba.Spatial(4, 3, False))
+    part = begun(lambda: Spatial(4, 3, False))
     part.scan.back = torch.nn.Identity()
     part.mix = torch.nn.Identity()
     before = drawn(1, 4, 5, 6)
@@ -204,14 +212,14 @@ def test_a_scan_by_rows_goes_along_rows():
 
 @pytest.mark.parametrize("size", [(8, 8), (7, 5), (1, 6), (9, 1)])
 def test_a_gate_that_is_constant_multiplies_the_picture(size):
-    part, x = begun(lambda: _fft_mamba.Frequency(4, 3)), drawn(2, 4, *size)
+    part, x = begun(lambda: Frequency(4, 3)), drawn(2, 4, *size)
     part.leave.weight.zero_()
     part.leave.bias[:4] = 3.0
     assert_close(part(x), 1.3 * x, rtol=1e-5, atol=1e-6)
 
 
 def test_the_gate_of_a_frequency_is_drawn_from_the_lower_ones():
-    part = begun(lambda: _fft_mamba.Frequency(4, 3))
+    part = begun(lambda: Frequency(4, 3))
     part.scan.back = torch.nn.Identity()
     drawn_gates = []
     part.leave.register_forward_hook(lambda *call: drawn_gates.append(call[-1]))
@@ -222,7 +230,7 @@ def test_the_gate_of_a_frequency_is_drawn_from_the_lower_ones():
     part(before)
     part(before + wave)
     change = (drawn_gates[1] - drawn_gates[0]).abs().amax((0, 2))
-    place = int(_fft_mamba.radial_order((12, 16), CPU)[1][3 * 9 + 4])
+    place = int(radial_order((12, 16), CPU)[1][3 * 9 + 4])
     assert float(change[:place].max()) < 3e-6  # rounding
     assert float(change[place]) > 0.1
     assert float(change[place:].median()) > 1e-5
@@ -230,8 +238,8 @@ def test_the_gate_of_a_frequency_is_drawn_from_the_lower_ones():
 
 @pytest.mark.parametrize("size", [(8, 6), (7, 9)])
 def test_a_gate_acts_on_the_frequency_that_it_was_drawn_for(size):
-    part, x = begun(lambda: _fft_mamba.Frequency(4, 3)), drawn(1, 4, *size)
-    order, _ = _fft_mamba.radial_order(size, CPU)
+    part, x = begun(lambda: Frequency(4, 3)), drawn(1, 4, *size)
+    order, _ = radial_order(size, CPU)
     columns = order % (size[1] // 2 + 1)
     # whose mirror image is not here
     for rank in torch.nonzero((columns > 0) & (2 * columns < size[1]))[:, 0].tolist():
@@ -244,7 +252,7 @@ def test_a_gate_acts_on_the_frequency_that_it_was_drawn_for(size):
 
 
 def test_the_spectrum_is_in_single_precision_under_autocast():
-    part, x = begun(lambda: _fft_mamba.Frequency(4, 3)), drawn(1, 4, 6, 10)
+    part, x = begun(lambda: Frequency(4, 3)), drawn(1, 4, 6, 10)
     with torch.autocast("cpu", torch.bfloat16):
         result = part(x)
     assert result.dtype == torch.float32
@@ -254,7 +262,7 @@ def test_the_spectrum_is_in_single_precision_under_autocast():
 
 def test_a_small_spectrum_has_a_bounded_slope():
     """Amplitude and phase would have slopes of 1 / amplitude."""
-    part = begun(lambda: _fft_mamba.Frequency(4, 3))
+    part = begun(lambda: Frequency(4, 3))
     for size in (1.0, 1e-6, 0.0):
         x = (size * drawn(1, 4, 8, 8)).requires_grad_()
         part(x).sum().backward()
@@ -265,7 +273,7 @@ def test_a_small_spectrum_has_a_bounded_slope():
 
 
 def test_a_block_weighs_both_and_adds_little_at_the_start():
-    block, x = begun(lambda: _fft_mamba.Block(4, 3, False)), drawn(1, 4, 6, 6)
+    block, x = begun(lambda: Block(4, 3, False)), drawn(1, 4, 6, 6)
     assert float((block(x) - x).abs().max()) < 1
     block.second_scale.factor.zero_()
     for bias, part in ((60.0, block.spatial), (-60.0, block.frequency)):

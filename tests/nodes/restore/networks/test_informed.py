@@ -18,7 +18,7 @@ from neusee.nodes.restore import (
     wiener,
     wiener_problem,
 )
-from neusee.nodes.restore.inverse._wiener import MAPS_OF_CHANNEL
+from neusee.nodes.restore.inverse import MAPS_OF_CHANNEL
 from tests.nodes.restore.networks.test_unrolled import frame, random
 
 READ = {"read_noise": 10.0}

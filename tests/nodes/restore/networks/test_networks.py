@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from neusee.nodes import ParameterError, restore
 from neusee.nodes.resampling import resize
 from neusee.nodes.restore import FFTMamba, NAFNet, UNet, parameter_groups, start_network
-from neusee.nodes.restore.networks import _convolutional_networks
+from neusee.nodes.restore.networks import NAFBlock
 
 SMALL = {"width": 4, "blocks": 2, "states": 3}
 MAKE = {
@@ -223,9 +223,7 @@ def test_detail_passes_beside_what_is_small(name):
 
 def test_a_block_of_nafnet_multiplies_channels_and_weighs_them_by_their_mean():
     block, x = (
-        start_network(lambda: _convolutional_networks.NAFBlock(3), seeded())
-        .requires_grad_(False)
-        .double(),
+        start_network(lambda: NAFBlock(3), seeded()).requires_grad_(False).double(),
         drawn(2, 3, 5, 4).double(),
     )
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes import _cpp_library
-from neusee.nodes.restore.networks import _selective_scan
+from neusee.nodes import cpp_library
+from neusee.nodes.restore.networks import ScanPlan, _selective_scan, reference, selective_scan
 
 ROOT = Path(__file__).parents[4]
 RATES = [1e-6, 1e-3, 0.1, 1.0, 50.0, 200.0, "mix"]
@@ -40,7 +40,7 @@ def scan_by(*values, backend):
     """The scan by one of the two backends, as the environment selects it."""
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("NEUSEE_SCAN", backend)
-        return _selective_scan.selective_scan(*values)
+        return selective_scan(*values)
 
 
 def draw(length, d=4, n=4, *, batch=1, rate=None, kind=torch.float64, seed=0, even=False):
@@ -111,7 +111,7 @@ def test_a_state_that_hardly_decays_is_not_rounded_away_in_wide_lines(monkeypatc
     precision.
     """
     values, truth = long_line(1e-6, torch.float32, True, 2, 2, seed)
-    monkeypatch.setattr(_selective_scan, "plan_scan", lambda *_: _selective_scan.ScanPlan(*steps))
+    monkeypatch.setattr(_selective_scan, "plan_scan", lambda *_: ScanPlan(*steps))
     assert worst(scan_by(*values, backend="torch"), truth) < 4e-7
 
 
@@ -130,9 +130,9 @@ def test_any_size_and_its_gradients(length, d, n, batch, backend):
     seen = torch.randn(
         batch, length, d, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
     )
-    assert worst(scan_by(*values, backend=backend), _selective_scan.reference(*values)) < 1e-13
+    assert worst(scan_by(*values, backend=backend), reference(*values)) < 1e-13
     found = gradients(lambda *x: scan_by(*x, backend=backend), values, seen)
-    for one, truth in zip(found, gradients(_selective_scan.reference, values, seen), strict=True):
+    for one, truth in zip(found, gradients(reference, values, seen), strict=True):
         assert worst(one, truth) < 1e-12 or (length == 1 and not truth.any())
 
 
@@ -141,7 +141,7 @@ def test_any_size_and_its_gradients(length, d, n, batch, backend):
 def test_gradients_in_single_precision(rate):
     values = draw(1500, 3, 2, rate=rate, kind=torch.float32)
     seen = torch.randn(1, 1500, 3, generator=torch.Generator().manual_seed(1))
-    truth = gradients(_selective_scan.reference, [x.double() for x in values], seen.double())
+    truth = gradients(reference, [x.double() for x in values], seen.double())
     for backend in ("torch", "cpp"):
         found = gradients(lambda *x, b=backend: scan_by(*x, backend=b), values, seen)
         assert max(map(worst, found, truth)) < 5e-6, backend
@@ -150,9 +150,9 @@ def test_gradients_in_single_precision(rate):
 @pytest.mark.parametrize("steps", [(1, 1), (5, 1), (3, 4), (1, 7), (40, 1), (6, 7)])
 def test_any_cut_of_the_length_gives_the_same(monkeypatch, steps):
     values, seen = draw(40, 3, 2), torch.randn(1, 40, 3, dtype=torch.float64)
-    monkeypatch.setattr(_selective_scan, "plan_scan", lambda *_: _selective_scan.ScanPlan(*steps))
+    monkeypatch.setattr(_selective_scan, "plan_scan", lambda *_: ScanPlan(*steps))
     found = gradients(lambda *x: scan_by(*x, backend="torch"), values, seen)
-    for one, truth in zip(found, gradients(_selective_scan.reference, values, seen), strict=True):
+    for one, truth in zip(found, gradients(reference, values, seen), strict=True):
         assert worst(one, truth) < 1e-12
 
 
@@ -240,13 +240,13 @@ def test_strided_inputs_and_the_direct_path(backend):
     turned = [x.transpose(1, 2).contiguous().transpose(1, 2) for x in (u, dt, B, C)]
     y = scan_by(turned[0], turned[1], A.T.contiguous().T, turned[2], turned[3], D, backend=backend)
     assert worst(y, loop(u, dt, A, B, C) + D * u) < 1e-13
-    assert worst(y, _selective_scan.reference(u, dt, A, B, C, D)) < 1e-13
+    assert worst(y, reference(u, dt, A, B, C, D)) < 1e-13
 
 
 def test_the_backward_of_the_reference_is_linear_in_length():
     nodes, todo = (
         set(),
-        [_selective_scan.reference(*(x.requires_grad_() for x in draw(64, 2, 2))).grad_fn],
+        [reference(*(x.requires_grad_() for x in draw(64, 2, 2))).grad_fn],
     )
     while todo:
         one = todo.pop()
@@ -266,17 +266,17 @@ def test_shapes_that_do_not_fit_are_named(name):
     )
     values[name] = values[name][..., :1]
     with pytest.raises(ValueError, match=rf"^(B|{name}) is \("):
-        _selective_scan.selective_scan(**values)
+        selective_scan(**values)
 
 
 def test_what_cannot_be_scanned_is_refused():
     values = draw(6, 3, 2)
     with pytest.raises(ValueError, match="nothing to scan"):
-        _selective_scan.selective_scan(*(x[:, :0] if x.ndim == 3 else x for x in values))
+        selective_scan(*(x[:, :0] if x.ndim == 3 else x for x in values))
     with pytest.raises(ValueError, match="real numbers in floating point"):
-        _selective_scan.selective_scan(*(x.to(torch.complex64) for x in values))
+        selective_scan(*(x.to(torch.complex64) for x in values))
     with pytest.raises(ValueError, match=r"u must be \(batch, length, d\)"):
-        _selective_scan.selective_scan(values[0][0], *values[1:])
+        selective_scan(values[0][0], *values[1:])
     with pytest.raises(ValueError, match="NEUSEE_SCAN is 'fast': write torch or cpp"):
         scan_by(*values, backend="fast")
 
@@ -285,25 +285,25 @@ def test_the_environment_chooses(monkeypatch):
     values, called = draw(6, 3, 2), []
     monkeypatch.setattr(_selective_scan, "compiled", lambda: called.append(1))
     monkeypatch.setenv("NEUSEE_SCAN", "torch")
-    _selective_scan.selective_scan(*values)
+    selective_scan(*values)
     assert not called
     monkeypatch.setenv("NEUSEE_SCAN", "cpp")
-    _selective_scan.selective_scan(*values)
+    selective_scan(*values)
     assert called
     monkeypatch.setenv("NEUSEE_SCAN", "fortran")
     with pytest.raises(ValueError, match="NEUSEE_SCAN is 'fortran'"):
-        _selective_scan.selective_scan(*values)
+        selective_scan(*values)
 
 
 def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CXX", str(tmp_path / "no-such-compiler"))
-    _cpp_library._say_once.cache_clear()
+    cpp_library._say_once.cache_clear()
     values = draw(20, 3, 2)
     with pytest.warns(
         UserWarning, match="C\\+\\+ of the scan is not compiled and torch computes the scan"
     ) as said:
-        found = [_selective_scan.selective_scan(*values), scan_by(*values, backend="cpp")]
+        found = [selective_scan(*values), scan_by(*values, backend="cpp")]
     assert len(said) == 1
     assert "\n" not in str(said[0].message)
     truth = scan_by(*values, backend="torch")

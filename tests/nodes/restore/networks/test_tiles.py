@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from neusee.nodes import restore
 from neusee.nodes.resampling import resize
 from neusee.nodes.restore import NAFNet, start_network
-from neusee.nodes.restore.networks import _restorer
+from neusee.nodes.restore.networks import tiled
 
 
 def seeded():
@@ -33,13 +33,13 @@ def test_what_looks_at_single_pixels_does_not_notice_tiles(y, x, side):
         seen.append(part.shape[-2:])
         return part.square() + 1
 
-    assert_close(_restorer.tiled(change, picture, side), picture.square() + 1, rtol=1e-12, atol=0)
+    assert_close(tiled(change, picture, side), picture.square() + 1, rtol=1e-12, atol=0)
     assert {tuple(size) for size in seen} == {(min(y, side), min(x, side))}
 
 
 def test_as_few_tiles_as_overlap_by_a_quarter():
     seen = []
-    _restorer.tiled(lambda part: seen.append(part) or part, torch.zeros(1, 3, 640, 128), 128)
+    tiled(lambda part: seen.append(part) or part, torch.zeros(1, 3, 640, 128), 128)
     assert len(seen) == 7  # 640 = 128 + 6 x 85.3; of 5 or 6 some would share less than 32 rows
 
 
@@ -47,9 +47,7 @@ def test_no_seam_where_a_tile_does_not_know_its_edge():
     """A blur that takes what lies beyond a tile for dark is 0 there, and counts for nothing."""
     picture = torch.ones(1, 1, 200, 200, dtype=torch.float64)
     kernel = torch.full((1, 1, 5, 5), 1 / 25, dtype=torch.float64)
-    found = _restorer.tiled(lambda part: F.conv2d(part, kernel, padding=2), picture, 64)[
-        0, 0, 4:-4, 4:-4
-    ]
+    found = tiled(lambda part: F.conv2d(part, kernel, padding=2), picture, 64)[0, 0, 4:-4, 4:-4]
     whole = F.conv2d(picture, kernel, padding=2)[0, 0, 4:-4, 4:-4]
     assert float(whole.min()) == pytest.approx(1)
     assert float((found - whole).abs().max()) < 0.04  # beside 0.4 at the edge of a tile
