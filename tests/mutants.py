@@ -4,11 +4,11 @@ contains one of them.
 
 Each mutant is one fault in one file: a constant, a sign, a limit that is off by one, a correction
 that is dropped, a comparison that is turned round. Every mutant gets a temporary copy of the tree
-of its own, and there the tests that are named beside the mutant must fail. Before, the same tests
-must pass on a copy without any fault. Two lines are printed for each mutant: what became of it, and
-which test failed and how, for a test may fail for another reason. The exit status is 1 where a
-mutant survives, where its tests cannot be run, or where its old text does not stand exactly once in
-its file.
+of its own, and there the tests that are named beside the mutant must fail: of a file those that run
+by default, or else its slow ones. Before, the same tests must pass on a copy without any fault. Two
+lines are printed for each mutant: what became of it, and which test failed and how, for a test may
+fail for another reason. The exit status is 1 where a mutant survives, where its tests cannot be
+run, or where its old text does not stand exactly once in its file.
 """
 
 import os
@@ -24,7 +24,8 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 _LINKED = ("nodes", "workflows", "recipes")  #: folders of the package, which .src/neusee links to
 _SKIPPED = shutil.ignore_patterns("__pycache__", ".hypothesis")
-_RESULTS = {0: "SURVIVED", 1: "killed"}  #: by the exit status of pytest
+PASSED = (0, 5)  #: exit statuses of pytest: all tests pass, or the files have none of this kind
+_RESULTS = {0: "SURVIVED", 1: "killed", 5: "SURVIVED"}  #: by the exit status of pytest
 
 
 class Mutant(NamedTuple):
@@ -2714,10 +2715,29 @@ def tested(tree: Path, tests: Sequence[str]) -> subprocess.CompletedProcess[str]
     files = [test for test in tests if "::" not in test]
     named = [test for test in tests if "::" in test]
     done = run_pytest(tree, files) if files else None
-    if named and (done is None or not done.returncode):
+    if named and (done is None or done.returncode in PASSED):
         done = run_pytest(tree, ["-m", "not long", *named])
     assert done is not None
     return done
+
+
+def tested_slowly(tree: Path, tests: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run the slow tests of the named files in a copy of the tree until one fails; one that fails
+    there must pass where there is no fault.
+    """
+    files = [test for test in tests if "::" not in test]
+    done = run_pytest(tree, ["-m", "slow and not long", *files])
+    if done.returncode == 1:
+        failed = failures(done)[-1].split()[1]
+        with tempfile.TemporaryDirectory() as folder:
+            unharmed = run_pytest(copied(Path(folder) / "tree"), ["-m", "slow", failed])
+        assert unharmed.returncode == 0, f"{failed} fails without any fault"
+    return done
+
+
+def failures(done: subprocess.CompletedProcess[str]) -> list[str]:
+    """Return the lines of pytest that name a test that failed."""
+    return [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
 
 
 def run_pytest(tree: Path, words: Sequence[str]) -> subprocess.CompletedProcess[str]:
@@ -2744,11 +2764,12 @@ def became(mutant: Mutant) -> tuple[str, str]:
         file.write_text(
             file.read_text(encoding="utf-8").replace(mutant.old, mutant.new), encoding="utf-8"
         )
-        done = tested(tree, mutant.tests.split())
-    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    return _RESULTS.get(done.returncode, f"NOT RUN (pytest ended with {done.returncode})"), "".join(
-        failed[-1:]
-    )
+        tests = mutant.tests.split()
+        done = tested(tree, tests)
+        if done.returncode in PASSED and any("::" not in test for test in tests):
+            done = tested_slowly(tree, tests)
+    result = _RESULTS.get(done.returncode, f"NOT RUN (pytest ended with {done.returncode})")
+    return result, "".join(failures(done)[-1:])
 
 
 def sound(mutants: Sequence[Mutant]) -> bool:
@@ -2758,9 +2779,9 @@ def sound(mutants: Sequence[Mutant]) -> bool:
     tests = list(dict.fromkeys(test for mutant in mutants for test in mutant.tests.split()))
     with tempfile.TemporaryDirectory() as folder:
         done = tested(copied(Path(folder) / "tree"), tests)
-    if done.returncode:
+    if done.returncode not in PASSED:
         print(done.stdout, done.stderr, sep="\n")
-    return not done.returncode
+    return done.returncode in PASSED
 
 
 def main(words: Sequence[str]) -> int:

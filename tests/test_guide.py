@@ -83,6 +83,7 @@ def parsed(words: list[str]) -> tuple[str, dict]:
     return " ".join(path), context.params
 
 
+@pytest.mark.slow
 def test_every_command_line_parses_and_its_recipe_loads(folder, monkeypatch):
     monkeypatch.chdir(folder)
     wrong = []

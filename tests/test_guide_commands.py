@@ -195,6 +195,7 @@ def timed(found):
 COMMANDS = sorted(cases(run_here), key=lambda case: case.values[0] != LABORATORY)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", timed(COMMANDS))
 def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
     if words.split()[0] in ("new", "init", "check"):

@@ -189,6 +189,7 @@ def test_names_of_spectral_channels_are_read_as_by_colour_science():
             assert found == pytest.approx(match_groups_to_nm(number, prefix, unit) * NM, rel=1e-14)
 
 
+@pytest.mark.slow
 def test_names_are_read_without_the_import_of_colour_science():
     code = "from neusee.nodes.scene._exr import spectral_channels as s; s(['T.550,0nm'])"
     done = subprocess.run(

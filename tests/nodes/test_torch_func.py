@@ -54,6 +54,7 @@ def test_the_line_names_the_tensor_and_gives_a_reason_where_something_does_not_p
         assert bool(line["why"]) == any(line[each] != "yes" for each in TRANSFORMS), path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transform", TRANSFORMS)
 def test_what_the_table_says_is_so(transform, every_case):
     wrong = []

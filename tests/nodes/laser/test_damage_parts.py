@@ -60,6 +60,7 @@ def judged(light, device="CMOS", exposure=1.0, own=()):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["CMOS", "CCD", "InGaAs"])
 def test_no_laser_is_without_its_rows_and_none_is_safe_by_what_is_not_judged(device):
     """Pulses outside 1 to 100 ns were once judged by their mean alone, and said nothing else."""
@@ -86,6 +87,7 @@ def test_no_laser_is_without_its_rows_and_none_is_safe_by_what_is_not_judged(dev
     )
 
 
+@pytest.mark.slow
 def test_more_energy_and_more_power_never_read_as_safer():
     draw = np.random.default_rng(8)
     order = {"below": 0, "within": 1, "not judged": 1, "above": 2}

@@ -145,6 +145,7 @@ def test_the_peaks_of_many_beams_at_once_are_upper_bounds_and_close():
     assert ratio[waves < 8].max() < 1.006
 
 
+@pytest.mark.slow
 def test_the_largest_peak_within_a_range_of_defocus_misses_none():
     rng = np.random.default_rng(4)
     for fill, waves in zip(rng.uniform(0, 2, 12), rng.uniform(0, 80, 12), strict=True):

@@ -41,6 +41,7 @@ def summed_heat(fill, waves, samples=1024, pad=16.0):
     return max(found) / AIRY
 
 
+@pytest.mark.slow
 def test_an_even_beam_in_focus_has_the_heat_of_the_airy_spot():
     assert heat_of(0.0, 0.0) == pytest.approx(1, rel=1e-5)
 
@@ -60,6 +61,7 @@ def test_far_out_of_focus_the_heat_is_that_of_straight_rays(fill):
     assert rays * 0.9999 < heat_of(fill, 500.0) * AIRY < rays * 1.003
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fill", "waves"),
     [(0.0, 0.3), (0.0, 1.0), (0.0, 1.35), (0.2, 1.0), (0.5, 2.5), (1.0, 0.0), (1.4, 0.01), (3.0, 4.2), (0.0, 6.0)],
@@ -68,6 +70,7 @@ def test_the_heat_is_that_of_the_sampled_spot(fill, waves):
     assert heat_of(fill, waves) == pytest.approx(summed_heat(fill, waves), rel=0.012)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fill", "waves"), [(0.0, 9.0), (0.0, 12.0), (2.0, 9.0)])
 def test_beyond_the_table_the_heat_is_an_upper_bound_that_is_near(fill, waves):
     found = summed_heat(fill, waves, samples=4096)

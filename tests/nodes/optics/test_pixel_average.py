@@ -139,6 +139,7 @@ def test_the_filter_averages_every_fringe_of_the_band(pixels, bandwidth, errors)
             assert float((found - expected).abs().max()) < most
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("pixel", ["point", "zoh"])
 def test_gradients_are_those_of_the_definition(pixel):

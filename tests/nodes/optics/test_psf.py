@@ -246,6 +246,7 @@ def test_any_shape_and_any_height_is_finite_and_right(rows, columns, y, x, scale
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["direct", "folded", "bluestein", "kaiser_bessel", "fused"])
 @pytest.mark.parametrize("kept", [True, False])
 def test_gradients_are_those_of_finite_differences(method, kept, monkeypatch):

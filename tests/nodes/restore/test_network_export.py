@@ -62,6 +62,7 @@ def onnx():
     return onnxruntime
 
 
+@pytest.mark.slow
 def test_a_graph_of_torch_gives_the_picture_of_the_module_and_of_its_weights(tmp_path):
     net, file, weights = (
         started(lambda: UNet(4)),

@@ -37,6 +37,7 @@ def fit(points):
     return best, cov.diagonal().sqrt()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distribution", ["gaussian", "poisson"])
 @pytest.mark.parametrize(
     ("gain", "unit", "rounding"),

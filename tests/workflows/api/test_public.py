@@ -137,6 +137,7 @@ def test_importing_it_loads_neither_torch_nor_pydantic():
     assert done.stdout == "[]\n"
 
 
+@pytest.mark.slow
 def test_the_example_of_the_docstring_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lines = [line[4:] for line in (neusee.__doc__ or "").splitlines() if line.startswith("    ")]

@@ -93,6 +93,7 @@ def test_sweep_takes_changes_as_values_and_as_words():
     assert {row["doe"] for row in values.rows} == {"axicon", "vortex"}
 
 
+@pytest.mark.slow
 def test_evaluate_takes_pipelines_as_a_text():
     told = []
     folder = neusee.evaluate(

@@ -114,6 +114,7 @@ def curves(folder, name):
     return len(rows)
 
 
+@pytest.mark.slow
 def test_a_descriptor_gives_page_tables_and_document(neusee, archive, tmp_path):
     light = "traceability.photons={relative_uncertainty: 0.03, instrument: photodiode}"
     code, out, _ = neusee(str(archive), light, "--state", "temperature=25 °C")
@@ -216,6 +217,7 @@ def drifting(tmp_path_factory):
     return text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stated", "option", "kept", "said"),
     [
@@ -259,6 +261,7 @@ def test_the_release_is_that_of_the_descriptor_unless_the_user_says_another(
     assert command.endswith(f" --release {option}" if option else "set.txt")
 
 
+@pytest.mark.slow
 def test_relative_light_and_tables_without_frames(neusee, tmp_path):
     code, out, _ = neusee("calibrate_camera", "--relative")
     found = json.loads((results(out, tmp_path) / "emva1288.json").read_text())["quantities"]

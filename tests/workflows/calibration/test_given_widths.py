@@ -116,6 +116,7 @@ def of_mode(problem):
     return {name: float(x) for name, x in problem.parameters(mode.theta).items()}, mode
 
 
+@pytest.mark.slow
 def test_a_well_before_the_read_noise_is_refused_in_a_sentence_and_described_without_its_saturated_levels(
     tmp_path,
 ):
@@ -168,6 +169,7 @@ def test_a_well_at_the_edge_of_what_a_number_allows_is_a_mode(tmp_path):
     assert problem.log_posterior(mode.theta[None] - 1e-4 * np.eye(6)[[at]]) == -np.inf
 
 
+@pytest.mark.slow
 def test_hot_pixels_do_not_end_the_search(tmp_path):
     """A coarse dark level had a variance of 0 between its ends, and the search ended with `SVD
     did not converge`.

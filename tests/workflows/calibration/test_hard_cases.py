@@ -146,6 +146,7 @@ def test_frames_too_coarse_for_the_read_noise_are_counted_number_by_number(fitte
     assert told.kinds["read_noise"] != "estimate"
 
 
+@pytest.mark.slow
 def test_a_coarse_read_noise_lies_within_its_interval(fitted):
     problem, truth, mode, _ = fitted(*QUIET)
     found = problem.parameters(walk_draws(problem, mode, 1).samples)
@@ -154,6 +155,7 @@ def test_a_coarse_read_noise_lies_within_its_interval(fitted):
         assert low < truth[name] < high, name
 
 
+@pytest.mark.slow
 def test_a_read_noise_below_the_numbers_is_an_upper_limit(fitted):
     """Of a dark current that leaves an electron in a pixel of twenty, numbers tell even so:
     electrons are counted.

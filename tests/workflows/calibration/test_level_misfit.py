@@ -123,6 +123,7 @@ def test_the_level_that_deviates_is_named_with_what_to_do(folder, change, says):
     assert PREDICTED in wrong(found)
 
 
+@pytest.mark.slow
 def test_no_laboratory_has_such_a_lamp(folder):
     found, _, _ = looked_at(folder, lamp=0.2)
     assert LAMP in wrong(found)

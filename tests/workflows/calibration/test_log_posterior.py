@@ -202,6 +202,7 @@ def marks(drawn, **changes):
     return {check.name: check.mark for check in found}
 
 
+@pytest.mark.slow
 def test_good_draws_pass_and_each_fault_is_found(drawn):
     good = marks(drawn)
     assert set(good.values()) <= {"pass", "warn"}

@@ -75,6 +75,7 @@ def failed(result):
     return [f"{check.name}: {check.found}" for check in result.checks if check.mark == "fail"]
 
 
+@pytest.mark.slow
 def test_a_well_below_the_converter_moves_no_gain(tmp_path):
     """Neighbours of saturated levels correlate; a correction by them moved this gain by 10 % and
     4 deviations.
@@ -90,6 +91,7 @@ def test_a_well_below_the_converter_moves_no_gain(tmp_path):
     assert abs(row.apart) < 2
 
 
+@pytest.mark.slow
 def test_a_posterior_that_is_moved_away_from_its_levels_is_refused(tmp_path, monkeypatch):
     """As by a correction: every draw of the gain 10 % too large."""
 

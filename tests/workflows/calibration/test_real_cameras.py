@@ -63,6 +63,7 @@ def real(name):
     return of(emva(name), *(f"table.{key}={column}" for key, column in NAMES.items()))
 
 
+@pytest.mark.slow
 def test_the_packaged_camera_comes_back_from_its_table(store):
     rows = stated(load("calibrate_camera"), store)
     for name, truth in cameras.TRUTH.items():
@@ -109,6 +110,7 @@ def test_the_peak_explains_its_levels_in_either_unit(store, unit):
     assert not identify(problem, mode).refused
 
 
+@pytest.mark.slow
 def test_fewer_models_where_fewer_terms_are_free(store):
     recipe = load("calibrate_camera", ["steps.prior.with.twist=null"])
     rows = {row.name: row for row in compare_models(recipe, store)}
@@ -120,6 +122,7 @@ def test_fewer_models_where_fewer_terms_are_free(store):
     assert row.stated == row.models[0]
 
 
+@pytest.mark.slow
 def test_stated_is_the_middle_of_the_two_richest_and_half_their_distance(store):
     rows = compare_models(load("calibrate_camera"), store)
     (gain,) = (row for row in rows if row.name == "gain")

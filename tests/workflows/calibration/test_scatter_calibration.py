@@ -101,6 +101,7 @@ def test_coordinates_are_one_to_one_and_their_density_is_that_of_the_prior():
     assert float(coordinates.log_prior(back)) == pytest.approx(float(flat + stretch), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_lobe_within_the_saturated_pixels_gives_limits_and_no_value():
     narrow = {**TRUTH, "b0": 15.0 * 20**2.2, "l": 0.004 / 20, "s": -2.2}
     problem, mode = fitted(

@@ -107,6 +107,7 @@ FORGERIES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", FORGERIES)
 def test_changed_draws_are_drawn_anew_and_written_anew(tmp_path, sampled, how):
     path = tmp_path / "draws.h5"

@@ -153,6 +153,7 @@ CAMERAS = [  #: dark current, drift, scatter, seed
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("current", "drift", "scatter", "seed"), CAMERAS)
 def test_weights_of_a_camera_with_hardly_any_dark_current_are_reliable(
     tmp_path, current, drift, scatter, seed

@@ -115,6 +115,7 @@ def shorten(command, monkeypatch):
         monkeypatch.setattr(leave_out_study, "measure_scenes", lambda *_: [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "fault"), CASES)
 def test_a_cache_that_fails_costs_one_warning(command, fault, call, tmp_path, monkeypatch):
     shorten(command, monkeypatch)

@@ -155,6 +155,7 @@ def test_an_input_file_whose_device_fails_is_named(run, tmp_path, calls, after):
     assert not list((tmp_path / "runs").glob("[!.l]*"))
 
 
+@pytest.mark.slow
 def test_results_whose_device_fails_end_with_a_sentence_and_lose_nothing(run, first, tmp_path):
     shutil.rmtree(tmp_path / "cache")
     done = run(tmp_path / "runs", "write", 3, errno.ENOSPC)

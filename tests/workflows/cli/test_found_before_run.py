@@ -551,6 +551,7 @@ LIMITS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("recipe", "said"), LIMITS.values(), ids=LIMITS)
 def test_a_recipe_that_grows_beyond_a_limit_is_refused_with_the_limit(
     neusee, tmp_path, recipe, said

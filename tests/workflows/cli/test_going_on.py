@@ -156,6 +156,7 @@ def test_a_folder_that_is_a_file_is_refused_before_anything_runs(command, neusee
     assert not (here / "cache").exists() or not list((here / "cache").glob("??/*.json"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "file", ["metrics.csv", "provenance.json", "report.html", "figures/graph.png"]
 )
@@ -247,6 +248,7 @@ def test_a_missing_extra_is_named(neusee, monkeypatch):
 # one JSON object
 
 
+@pytest.mark.slow
 def test_every_long_command_prints_one_json_object(neusee, here, monkeypatch):
     from neusee.workflows.studies import leave_out_study
 
@@ -399,6 +401,7 @@ def test_a_printed_command_goes_through_a_real_shell(neusee, here):
         assert found.stdout.splitlines() == ["run", "night one.yaml", "sensor.read_noise=20 e-"]
 
 
+@pytest.mark.slow
 def test_one_list_is_printed_once(neusee, here):
     wrong = "\n".join(
         f"  s{i}: {{node: sensor.qqqqqqqq, from: {{electrons: scene}}}}" for i in range(300)

@@ -155,6 +155,7 @@ def commands_of(name):
     return ("run",) if name.startswith("deep brackets") else ("validate", "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_recipe_of_a_stranger_does_no_harm(name, told, tmp_path):
     text, make, runs = HOSTILE[name]

@@ -214,6 +214,7 @@ def here(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_step_keeps_the_finished_steps(here, forked):
     stopped(forked(here, "-c", LISTENING, "run", "pressing.yaml"))
     again = forked(here, "-c", LISTENING, "run", "pressing.yaml")
@@ -240,6 +241,7 @@ def test_ctrl_c_reaches_no_worker_of_a_command(here, words, forked):
     stopped(done)
 
 
+@pytest.mark.slow
 def test_a_program_that_ignores_the_signal_goes_on(here, forked):
     """A script that runs the program in the background lets the shell decide."""
     ignoring = (

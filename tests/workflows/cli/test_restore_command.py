@@ -122,6 +122,7 @@ def test_a_camera_may_be_a_sensor_file_and_a_laser_may_be_told(neusee, tmp_path)
     assert "restored_spread" in steps
 
 
+@pytest.mark.slow
 def test_the_scene_and_the_laser_of_the_camera_are_not_used(neusee, tmp_path):
     (tmp_path / "mine.yaml").write_text(
         "# Mine.\ndefaults: [camera: neusee, scene: china, illuminant: daylight, lift: lmmse,"

@@ -77,6 +77,7 @@ LOCALES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOCALES)
 def test_json_is_all_that_stdout_has(called, name):
     out, err = called("run", "r.yaml", "--json", **LOCALES[name])
@@ -118,6 +119,7 @@ def printed(*, by: float = 2.0) -> Tensor:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "imports", ["", "import decimal"], ids=["changes nothing", "may change something"]
 )

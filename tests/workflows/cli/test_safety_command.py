@@ -41,6 +41,7 @@ def neusee(capfd, tmp_path, monkeypatch, cache):
     return call
 
 
+@pytest.mark.slow
 def test_the_terminal_has_limits_distances_eye_and_sources(neusee, tmp_path):
     code, out, err = neusee("safety", "safety_pointer", *QUICK)
     assert (code, err) == (0, "")
@@ -104,6 +105,7 @@ def test_without_thresholds_the_estimate_says_that_damage_is_not_known():
     assert {row.state for verdict in found.damage for row in verdict.rows} == {"not judged"}
 
 
+@pytest.mark.slow
 def test_a_pulse_of_a_microsecond_reads_as_far_beyond_and_not_as_nowhere(
     neusee, tmp_path, monkeypatch
 ):

@@ -77,6 +77,7 @@ def test_a_planted_fault_breaks_its_rule_and_no_other(made, rule):
     assert SAID.get(rule, "") in found[rule].text
 
 
+@pytest.mark.slow
 def test_the_command_checks_nodes_and_networks_and_leaves_their_layers_out(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.chdir(tmp_path)

@@ -206,6 +206,7 @@ def test_a_node_without_a_reference_or_an_example_is_told_how_to_attach_one(made
     assert "gradient" not in found
 
 
+@pytest.mark.slow
 def test_the_command_says_each_rule_and_ends_with_three_where_one_is_broken(
     tmp_path, monkeypatch, made
 ):

@@ -68,6 +68,7 @@ def programs():
     server.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TAKES)
 def test_an_own_node_stays_within_1_3_of_the_limit(name, programs, tmp_path):
     (tmp_path / f"hoard_{name}.py").write_text(NODE.format(take=TAKES[name]))

@@ -282,6 +282,7 @@ def camera_and_height(store, output, exact=False):
 
 
 # of torch
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")
 @pytest.mark.parametrize("output", ["lsr[mask]", "raw[mask]", "restored"])
 def test_torch_func_follows_the_camera_backwards_and_forwards(output, store):

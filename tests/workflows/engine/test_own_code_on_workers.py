@@ -90,6 +90,7 @@ def on_a_worker(job, *modules):
     return done.stdout.strip() or done.stderr
 
 
+@pytest.mark.slow
 def test_a_worker_lacks_modules_that_the_caller_imported(lab, tmp_path):
     import neusee.nodes.metrics  # noqa: F401  imports modules of optics that optics itself does not
 
@@ -99,6 +100,7 @@ def test_a_worker_lacks_modules_that_the_caller_imported(lab, tmp_path):
     assert on_a_worker(job) == "one.one"
 
 
+@pytest.mark.slow
 def test_a_worker_that_served_other_recipes_has_modules_that_the_caller_lacks(lab, tmp_path):
     (tmp_path / "mine.yaml").write_text(
         RECIPE.format(nodes=f"other: {lab}.two", family="other", name="two")
@@ -108,6 +110,7 @@ def test_a_worker_that_served_other_recipes_has_modules_that_the_caller_lacks(la
     assert on_a_worker(job, f"{lab}.one", "neusee.nodes.metrics") == "other.two"
 
 
+@pytest.mark.slow
 def test_a_changed_helper_is_refused(lab, tmp_path):
     (tmp_path / "mine.yaml").write_text(RECIPE.format(nodes=f"{lab}.two", family="two", name="two"))
     job = job_of(load("mine.yaml", (), tmp_path), tmp_path)

@@ -121,6 +121,7 @@ def test_many_arms_are_counted(store):
         neusee.run(recipe, store=store, outputs=["spot"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outputs", [None, ["raw[mask]"]])
 def test_metrics_are_the_numbers_that_the_program_prints(outputs, store, tmp_path):
     recipe = load("first_light", SMALL)

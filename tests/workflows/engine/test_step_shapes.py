@@ -78,6 +78,7 @@ def compare(recipe, outputs, store):
         assert measured_size(step.node, inputs, step.params, value) == list(sizes[name][:4]), name
 
 
+@pytest.mark.slow
 def test_the_shapes_of_the_first_recipe_are_those_of_its_run(tmp_path):
     recipe = load("first_light", SIZES["small"])
     compare(recipe, ("raw[mask]", "lsr[mask]", "bsr[mask]", "truth", "peak[mask]"), Store(tmp_path))

@@ -254,6 +254,7 @@ def run_node(place, parts, lab):
     return result.keys["it"]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("kind", UNSEEN)
 def test_what_a_key_does_not_cover_is_refused_or_not_stored(kind, place, tmp_path_factory):

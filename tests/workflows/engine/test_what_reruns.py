@@ -206,6 +206,7 @@ TRUTHS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", TRUTHS)
 def test_what_may_have_changed_runs_again_and_nothing_else(lab, change):
     make, value, ran = TRUTHS[change]
@@ -267,6 +268,7 @@ def test_processes_agree_on_keys_and_share_results(lab, others):
         assert lab.last["keys"] == keys
 
 
+@pytest.mark.slow
 def test_equal_tensors_of_two_processes_make_equal_keys(lab, others, tmp_path):
     """Each process saves its own weights and makes its own keys, in a folder and a store of its
     own.

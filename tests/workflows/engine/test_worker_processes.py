@@ -144,6 +144,7 @@ def test_no_worker_is_left_when_the_caller_stops_early():
         os.kill(pid, 0)
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_process_that_is_killed():
     code = (
         "import os, time\nfrom neusee.workflows.engine.worker_processes import shared\n"

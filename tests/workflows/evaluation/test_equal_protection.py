@@ -50,6 +50,7 @@ def values(pipeline, store, *names):
     return run(pipeline.recipe(NONE), store, names).values
 
 
+@pytest.mark.slow
 def test_every_pipeline_gets_the_filter_that_brings_its_peak_to_the_level(store):
     plain, mask = protected(store, 5e-4)
     assert plain.name == "plain lens + filter 0.0005, wiener"
@@ -70,6 +71,7 @@ def test_every_pipeline_gets_the_filter_that_brings_its_peak_to_the_level(store)
     )
 
 
+@pytest.mark.slow
 def test_no_picture_is_scored_at_the_dark_exposure_of_its_filter(store):
     """Behind a grey filter of 1 % the developed picture has the light of the scene, and its
     noise has grown.

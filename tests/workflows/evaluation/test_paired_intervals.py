@@ -43,6 +43,7 @@ def share_held(intervals, truth):
     return float(np.mean([x.low <= truth <= x.high for x in intervals]))
 
 
+@pytest.mark.slow
 def test_the_interval_over_photographs_covers_and_the_one_over_pictures_fails_as_its_closed_form_says(
     quick,
 ):

@@ -77,6 +77,7 @@ def assert_same(pipeline, found, run):
 
 
 #: of a photograph that is larger than a scene, and of a smaller one
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "law", "place"), [("five_half_rings+none", [], 0), ("flat+wiener", LAW, 1)]
 )
@@ -96,6 +97,7 @@ def test_the_command_of_a_point_gives_its_numbers(store, folder, name, law, plac
     assert len(set(commands)) == 4
 
 
+@pytest.mark.slow
 def test_the_command_behind_a_filter_of_equal_protection_has_its_filter_and_its_exposure(
     store, folder
 ):

@@ -80,6 +80,7 @@ def by_hand(tmp_path, scene, pipeline, strength, more=()):
     return run(recipe, Store(tmp_path / "by_hand"), line.outputs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "strength"), [("five_half_rings+none", 1e4), ("flat+wiener", 1e5), ("flat+none", 0.0)]
 )
@@ -105,6 +106,7 @@ def test_a_point_is_a_run_with_its_values_to_the_last_bit(tmp_path, store, name,
     assert found["l1 small"] == float(small.l1)
 
 
+@pytest.mark.slow
 def test_what_a_recipe_has_laws_for_is_drawn_for_each_scene(tmp_path, store):
     """The paper's sampling: a run with the drawn values, the same for all masks and strengths of
     a scene.
@@ -163,6 +165,7 @@ def test_what_several_points_share_is_computed_once(store, monkeypatch):
     assert called.count("spot[mask,beam]") == called.count("raw[mask]") == 4
 
 
+@pytest.mark.slow
 def test_a_key_hangs_on_all_that_decides_a_point(store, photographs):
     keys = set()
     for more, small, number, case, strength in (
@@ -319,6 +322,7 @@ def test_an_argument_that_cannot_be_ends_with_one_line(tmp_path, monkeypatch, op
 # --- the whole ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(
     tmp_path, store, photographs, monkeypatch
 ):

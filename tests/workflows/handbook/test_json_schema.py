@@ -64,6 +64,7 @@ def errors(of_toys):
     ]
 
 
+@pytest.mark.slow
 def test_the_schema_is_a_schema(of_toys):
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     jsonschema.Draft202012Validator.check_schema(of_toys)

@@ -58,6 +58,7 @@ def test_a_module_without_a_file_is_an_error(digest_with, line):
         digest_with({"engine.runner": f"{line}\n"})
 
 
+@pytest.mark.slow
 def test_every_module_of_the_program_has_a_digest():
     """None imports, at its top, what the digest cannot find."""
     wrong = {}

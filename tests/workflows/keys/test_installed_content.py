@@ -72,6 +72,7 @@ def parts(folder, *modules):
     return json.loads(told(folder, ASK, *modules or ("thing",)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("record", ["sha256=abc,6", ",", None])
 def test_other_files_under_the_same_version_are_other_code(tmp_path, record):
     install(tmp_path, record=record)
@@ -142,6 +143,7 @@ def test_a_package_that_changes_after_its_import_is_told(tmp_path):
     assert told(tmp_path, EDITED.format(change=change)) == "thing"
 
 
+@pytest.mark.slow
 def test_the_key_of_an_own_node_has_the_files_of_an_installed_helper(tmp_path):
     folders = [tmp_path / name for name in ("one", "again", "other")]
     for folder, number in zip(folders, (2.0, 2.0, 3.0), strict=True):

@@ -88,6 +88,7 @@ def package(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_objects_whose_methods_all_fail_count_by_their_class(package):
     imports = "from hostile import Answering, Hostile, Number, Unplaced\n"
     held = "".join(f"held_{n} = {text}\n" for n, text in enumerate(OBJECTS))
@@ -101,6 +102,7 @@ def test_objects_whose_methods_all_fail_count_by_their_class(package):
     assert told(package, seed="2") == [first]
 
 
+@pytest.mark.slow
 def test_a_key_of_quantities_and_units_is_the_same_in_each_process(tmp_path):
     pytest.importorskip("astropy")
     folders = [tmp_path / str(number) for number in range(len(QUANTITIES))]
@@ -112,6 +114,7 @@ def test_a_key_of_quantities_and_units_is_the_same_in_each_process(tmp_path):
     assert {kind: keys for kind, keys in found.items() if keys[0] != keys[1]} == {}
 
 
+@pytest.mark.slow
 def test_an_array_of_objects_counts_by_what_it_holds(tmp_path):
     folders = []
 
@@ -135,6 +138,7 @@ def test_an_array_of_objects_counts_by_what_it_holds(tmp_path):
     assert hidden != masked
 
 
+@pytest.mark.slow
 def test_own_objects_whose_parts_cannot_be_read_are_refused_with_place_and_fix(tmp_path):
     before = (
         "class Part(dict):\n    def items(self):\n        raise OSError('not now')\n\n\nheld = {}"

@@ -175,6 +175,7 @@ READERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.__name__)
 def test_a_file_that_is_read_is_found(reader, data, taints, layer):
     found = taints(lambda: reader(data))

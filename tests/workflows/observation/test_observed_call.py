@@ -250,6 +250,7 @@ def test_a_process_that_was_forked_has_a_watcher_of_its_own(tmp_path, taints, wa
     assert server() == first
 
 
+@pytest.mark.slow
 def test_the_watcher_ends_with_its_process_and_with_what_a_step_left_behind(tmp_path, watched):
     """A process that a step started goes on after both, and its calls are answered until it
     ends.

@@ -131,6 +131,7 @@ def test_heft_lies_between_the_optimum_and_half_as_much_again(seed):
 # --- the referee ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(max_examples=1000, deadline=None)
 @given(st.integers(0, 2**40))
 def test_no_schedule_breaks_a_rule(seed):

@@ -59,6 +59,7 @@ def no_graph(monkeypatch):
     monkeypatch.setattr(step_checks, "_graphs", {})
 
 
+@pytest.mark.slow
 def test_a_check_after_others_says_what_a_check_alone_says(monkeypatch):
     words = [drawn(seed) for seed in range(40)]
     after = [told(each) for each in words]

@@ -86,6 +86,7 @@ def test_two_packages_with_one_family_are_named(install, write, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_check_takes_the_module_of_a_family_that_is_called_as_its_package(install, write):
     install("labpack", "labpack", GOOD)
     write(

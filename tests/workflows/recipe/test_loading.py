@@ -122,6 +122,7 @@ def test_the_config_is_a_recipe_that_says_the_same(read, tmp_path, toy):
     assert "# argument 1" in first.config.to_yaml()
 
 
+@pytest.mark.slow
 def test_every_packaged_recipe_says_itself_again(tmp_path):
     """Steps that share their parameters by an alias once lost them."""
     for name in (titled.name for titled in recipes()):

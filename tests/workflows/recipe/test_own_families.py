@@ -258,6 +258,7 @@ def test_no_code_refuses_before_anything_is_run(mine, tmp_path, monkeypatch):
     assert "bloom_e" not in sys.modules
 
 
+@pytest.mark.slow
 def test_nodes_and_schema_list_those_of_a_recipe(mine, tmp_path, monkeypatch):
     mine("bloom_f")
     monkeypatch.chdir(tmp_path)

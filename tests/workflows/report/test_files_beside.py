@@ -157,6 +157,7 @@ def test_what_is_large_or_no_data_is_not_sent(tmp_path, forks, monkeypatch):
     assert not drawer._process.is_alive()
 
 
+@pytest.mark.slow
 def test_the_process_that_draws_ends_with_a_run_that_is_killed(tmp_path, forks):
     code = (
         "from neusee.workflows.report.files_beside import DrawingProcess\n"
@@ -205,6 +206,7 @@ def test_two_threads_take_turns_with_the_process_that_draws(tmp_path, forks):
     ]
 
 
+@pytest.mark.slow
 def test_a_thread_that_waits_is_the_next(tmp_path, forks):
     drawer, order, entered = DrawingProcess(), [], []
     drawer._next = NotedDoor(drawer._next, lambda: entered.append(len(order)))

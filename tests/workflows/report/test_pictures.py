@@ -212,6 +212,7 @@ def figure_of(drawings):
     return figure_of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_every_figure_is_a_picture_and_the_same_one_each_time(drawings, name):
     draw, arguments = drawings[name]
@@ -223,6 +224,7 @@ def test_every_figure_is_a_picture_and_the_same_one_each_time(drawings, name):
     assert draw(**arguments) == first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_texts_are_large_enough_and_none_lies_on_another(figure_of, name):
     from matplotlib.text import Text

@@ -130,6 +130,7 @@ def test_what_a_cheaper_step_says_and_took_is_said_again_from_the_cache(recipe, 
         ], name
 
 
+@pytest.mark.slow
 def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     result = run(recipe, store)
     before = spent(result)

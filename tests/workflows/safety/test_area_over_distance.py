@@ -86,6 +86,7 @@ def area(safety, option=PLAIN, ranked=None, at=(0.8, 6.0, 90.0, 4e3), **drawn):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("option", "diameter"), [(PLAIN, DIAMETER), (STOP, 6e-3)])
 @pytest.mark.parametrize(("focus", "metres", "scatter", "lens"), [("infinity", math.inf, None, 0.0),
                                                                   ("7 m", 7.0, 0.02, 0.8)])  # fmt: skip

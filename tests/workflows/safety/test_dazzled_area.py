@@ -112,6 +112,7 @@ def test_the_zone_of_dazzle_behind_a_mask_ends_at_its_root_with_the_interval_of_
     assert dazzle(said, "plain lens")["zones"][0]["far"]["value"] < zone["far"]["value"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [183, 99])
 def test_an_area_beyond_the_window_has_a_safe_limit_and_is_said_with_the_way_out(window, store):
     """The ring of the axicon lies at 33 pixels: the larger window holds it, the smaller one the

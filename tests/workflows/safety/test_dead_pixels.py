@@ -69,6 +69,7 @@ def expected_point(found, joules):
     }
 
 
+@pytest.mark.slow
 def test_points_are_white_where_the_light_exceeds_the_limit_at_the_distance_of_the_recipe(found):
     estimated = found({"point": 1.0})
     plain, mask = estimated.dead
@@ -81,6 +82,7 @@ def test_points_are_white_where_the_light_exceeds_the_limit_at_the_distance_of_t
     assert set(np.unique(np.round(plain.frame, 3))) == {0.4, 0.999}
 
 
+@pytest.mark.slow
 def test_lines_crosses_and_lost_frames_are_drawn_and_a_ccd_has_white_columns(found):
     quick = "safety.dazzle=null"
     row = found({"line": 1e3}, quick).dead[0].frame
@@ -97,6 +99,7 @@ def test_lines_crosses_and_lost_frames_are_drawn_and_a_ccd_has_white_columns(fou
     np.testing.assert_array_equal(lost.frame, row)
 
 
+@pytest.mark.slow
 def test_without_damage_here_the_largest_distance_of_damage_is_drawn_and_without_any_none(found):
     far = found({"point": 10.0}, "safety.dazzle=null", "lasers.reflection.distance=50 km")
     plain = next(
@@ -112,6 +115,7 @@ def test_without_damage_here_the_largest_distance_of_damage_is_drawn_and_without
     assert found({"point": 1e9}).dead == ()
 
 
+@pytest.mark.slow
 def test_the_words_say_how_much_the_mask_enlarges_the_dazzled_area(found):
     estimated = found({"point": 1.0}, "lasers.reflection.pulse_energy=2 nJ")
     plain, mask = (each for each in estimated.dazzled if "filter" not in each.option)

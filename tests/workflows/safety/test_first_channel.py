@@ -59,6 +59,7 @@ def counted(folder, store, changes):
     ), plain.pixels.value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("camera", "nanometres", "power"),
     [("CIE 1931", 638, "0.02 mW"), ("Nikon 5100", 680, "1 mW"), ("own.csv", 690, "0.02 mW"),
@@ -77,6 +78,7 @@ def test_a_run_and_an_estimate_count_the_same_saturated_pixels(
     assert estimated == pytest.approx(run, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bits", [8, 12])
 def test_the_end_of_the_converter_counts_in_both(tmp_path, store, bits):
     """A converter of 8 bits that ends at a half, and one of 12 bits that ends at a tenth of the
@@ -121,6 +123,7 @@ def test_the_saturation_irradiance_is_that_of_the_best_channel_of_an_absolute_ta
     assert found[0] == pytest.approx(filled(nanometres, WELL - OFFSET), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_what_is_drawn_stays_drawn(tmp_path):
     """The table of absolute efficiencies does not change with that of the sensor; relative
     responses do.
@@ -147,6 +150,7 @@ def test_what_is_drawn_stays_drawn(tmp_path):
     np.testing.assert_allclose(limits, limits[0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_laser_that_no_channel_sees_is_not_judged_and_not_called_safe(tmp_path):
     found = estimate(load("first_light", words(tmp_path, "Nikon 5100", 740), tmp_path))
     assert not found.dazzled

@@ -216,6 +216,7 @@ SMALL = Case(
 )
 
 
+@pytest.mark.slow
 def test_a_small_camera_behind_an_axicon(tmp_path):
     check(SMALL, tmp_path)
 
@@ -226,6 +227,7 @@ def tilted(waves: float) -> own.Mask:
     return own.Mask(lambda v, u: waves * wave * (1 + u) + 0 * v, waves)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("waves", "is_computed"), [(12.0, True), (40.0, False)])
 def test_a_peak_outside_the_window_of_its_spot_counts(waves, is_computed, tmp_path):
     """In a window of 16 wavelengths times f-number to each side a spot at 24 is found, one at 80

@@ -52,6 +52,7 @@ def same_ends(recipe, changes, distances, store):
                 assert one == pytest.approx(other, rel=0.01), (row, metres)
 
 
+@pytest.mark.slow
 def test_the_intervals_of_a_camera_do_not_move_with_the_distance_of_the_recipe(store):
     """At 3 m they once were "nowhere", and 45 m in place of 522 m behind the mask."""
     same_ends("first_light", [*CAMERA, "optics.bands=5"], (3.0,), store)
@@ -108,6 +109,7 @@ def level_by_hand(metres, scatter, share=0.1):
     return faintest, 5e-3 * 0.9 * -np.expm1(-2 * fill), pitch**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scatter", [0.005, 0.0])
 def test_the_ends_are_those_of_a_direct_sum_over_the_pupil_and_every_pixel(scatter, store):
     setting = "null" if scatter == 0 else f"{{share: {scatter}}}"
@@ -135,6 +137,7 @@ def test_the_ends_are_those_of_a_direct_sum_over_the_pupil_and_every_pixel(scatt
         assert found[0][0] > 1  # without a veil a narrow beam leaves most pixels dark
 
 
+@pytest.mark.slow
 def test_the_veil_is_named_with_its_value_and_can_be_turned_off(store):
     few = [*LENS, "safety.protection={}", "safety.distances=[10 m, 1 km]"]
     said = document(estimate(load("safety_pointer", few), store))
@@ -154,6 +157,7 @@ def test_the_veil_is_named_with_its_value_and_can_be_turned_off(store):
     )
 
 
+@pytest.mark.slow
 def test_hot_spots_and_turbulence_raise_the_exposure_by_their_factors(store):
     few = [*LENS, "safety.protection.mask=null", "safety.dazzle=null"]
     even, spotted, moved = (
@@ -171,6 +175,7 @@ def test_hot_spots_and_turbulence_raise_the_exposure_by_their_factors(store):
     assert factor > 1.2
 
 
+@pytest.mark.slow
 def test_a_lens_that_focuses_on_the_laser_has_the_peak_of_the_focused_lens(store):
     few = [
         *LENS,

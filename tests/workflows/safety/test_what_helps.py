@@ -91,6 +91,7 @@ def random_case(rng, **more):
     return laser, lens, sensor, settings
 
 
+@pytest.mark.slow
 def test_each_answer_put_back_gives_the_limit_over_random_cameras():
     rng = np.random.default_rng(21)
     solved = 0
@@ -107,6 +108,7 @@ def test_each_answer_put_back_gives_the_limit_over_random_cameras():
     pytest.fail(f"only {solved} are solved")
 
 
+@pytest.mark.slow
 def test_the_density_and_the_stop_against_damage_are_those_of_the_closed_form():
     rng = np.random.default_rng(22)
     stops = 0
@@ -135,6 +137,7 @@ def test_the_density_and_the_stop_against_damage_are_those_of_the_closed_form():
     assert stops > 4
 
 
+@pytest.mark.slow
 def test_the_exposure_and_the_density_against_saturation_leave_the_counted_pixels():
     """Filled pixels counted one by one behind the density that is said: within what the closed
     form states.
@@ -294,6 +297,7 @@ def test_the_safe_density_is_that_of_the_weakest_twentieth_of_the_devices():
     assert stop.safe < stop.value.value
 
 
+@pytest.mark.slow
 def test_an_uncertain_power_widens_every_answer():
     rng = np.random.default_rng(4)
     powers = np.exp(rng.normal(0, 0.5, 1000))

@@ -397,6 +397,7 @@ def test_the_ends_of_the_show_have_the_interval_of_their_laws():
     )
 
 
+@pytest.mark.slow
 def test_a_filter_and_a_stop_move_the_limits_as_they_must():
     here = SITUATIONS["safety_laboratory"]
     said = document(
@@ -420,6 +421,7 @@ def test_a_filter_and_a_stop_move_the_limits_as_they_must():
     assert stopped == pytest.approx(here.sensor(here.distance, 1e-3), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_mask_divides_the_peak_by_its_ratio():
     recipe = load(
         "safety_pointer", ["safety.draws=100", "optics.samples=512", "safety.dazzle=null"]

@@ -50,7 +50,11 @@ def sheet_of(tmp_path_factory):
     return functools.cache(lambda name: made_sheet(name, Store(tmp_path_factory.mktemp("store"))))
 
 
-@pytest.fixture(params=SHEETS)
+@pytest.fixture(
+    params=[
+        pytest.param(name, marks=[] if name == "pointer" else [pytest.mark.slow]) for name in SHEETS
+    ]
+)
 def sheet(request, sheet_of):
     """The estimate, the text of its worksheet, and its lines: value and numbers by symbol."""
     return sheet_of(request.param)
@@ -164,6 +168,7 @@ def test_the_sheet_says_what_it_is_and_loads_nothing(sheet):
     assert set(UNITS) == {"irradiance", "fluence"}
 
 
+@pytest.mark.slow
 def test_the_rule_of_the_eye_stands_on_page_terminal_and_document(sheet):
     from neusee.workflows.safety.run_safety import document
     from neusee.workflows.safety.safety_page import report

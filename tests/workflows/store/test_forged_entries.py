@@ -176,6 +176,7 @@ def test_the_maintenance_of_a_cache_runs_nothing_either(tmp_path, monkeypatch, l
         assert done.exit_code == 0, (command, done.output)
 
 
+@pytest.mark.slow
 def test_a_check_of_all_results_needs_no_type_of_theirs(tmp_path):
     """In a process that has not imported the node; which imports the type, and nothing else
     does.

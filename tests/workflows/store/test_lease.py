@@ -265,6 +265,7 @@ def test_a_heartbeat_that_ended_early_starts_again(tmp_path, monkeypatch):
         assert lease_module._thread.is_alive()
 
 
+@pytest.mark.slow
 def test_heartbeats_are_seen_while_a_lease_is_held_and_end_after_it(tmp_path, monkeypatch):
     monkeypatch.setattr(lease_module, "BEAT", 0.01)
     while any(t.name == "neusee-leases" for t in threading.enumerate()):

@@ -252,6 +252,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["json", "safetensors"])
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damage_is_seen_and_mended(ward, suffix, damage):
@@ -522,6 +523,7 @@ def test_a_wrong_clock_does_no_harm(ward, name):
     assert ward.run(level=1.0, first=clock(name)) == ([], Counter())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CLOCKS)
 def test_processes_whose_clocks_differ_get_on_with_each_other(ward, name):
     """Who is ten years ahead holds nobody for dead, and sweeps away nothing that is being

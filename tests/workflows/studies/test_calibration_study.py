@@ -344,6 +344,7 @@ def test_a_study_has_a_page_and_goes_on(tmp_path, monkeypatch, quick):
     assert json.loads((second / "provenance.json").read_text())["verdicts"] == doc["verdicts"]
 
 
+@pytest.mark.slow
 def test_a_study_that_was_stopped_goes_on_with_the_same(tmp_path, monkeypatch):
     whole = [s.rank for s in simulated(tmp_path / "whole", 6, SEEN, pixels=32)[1]]
     real, done = SensorSimulator._simulate, []

@@ -115,6 +115,7 @@ def by_input(doc, quantity, kind):
     return {given["name"]: row["value"] for given, row in rows}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "points"), [*((law, "sobol") for law in BRUTE), (EMPIRICAL, "draws")]
 )
@@ -241,6 +242,7 @@ def test_a_covariance_that_none_can_have_is_refused_at_its_line(own, tmp_path):
         load("wrong.yaml")
 
 
+@pytest.mark.slow
 def test_a_changed_file_of_samples_is_another_study(own, tmp_path):
     words = ["values.x=empirical(samples.csv, unit e-)"]
     before = own(words, most=64, error=1.0)

@@ -267,6 +267,7 @@ def test_the_camera_holds_what_it_states(windshield):
     assert "http" not in page.replace("http://www.w3.org", "")
 
 
+@pytest.mark.slow
 def test_what_is_nothing_is_left_away_and_changes_nothing(study):
     clean = [f"dirt.{kind}=0" for kind in ("dust", "scratches", "smudges")]
     overrides = (

@@ -68,6 +68,7 @@ def test_indices_are_those_of_the_closed_form(name, count, error):
         assert [row.value for row in rows] == pytest.approx(exact, abs=error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count"), [("ishigami", 64), ("ishigami", 128), ("g", 64), ("g", 128)]
 )

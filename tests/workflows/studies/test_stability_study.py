@@ -164,6 +164,7 @@ def _without_restoration(recipe):
     return replace(recipe, steps=steps)
 
 
+@pytest.mark.slow
 def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch):
     recipe, store, told = (
         _without_restoration(load("laser_free", [])),

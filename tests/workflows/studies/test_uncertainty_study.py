@@ -161,6 +161,7 @@ def test_a_draw_is_a_run_with_its_values_to_the_last_bit(store):
     assert found["saturated[mask].pixels"][0] > 0
 
 
+@pytest.mark.slow
 def test_draws_at_once_are_those_one_after_another(store, tmp_path):
     inputs = Inputs.of(
         small(
@@ -185,6 +186,7 @@ def test_a_key_hangs_on_all_that_decides_a_draw(tmp_path):
     assert len(keys) == 4
 
 
+@pytest.mark.slow
 def test_pictures_have_the_mean_and_deviation_of_all_draws(store):
     inputs = Inputs.of(small("raw", *LAWS))
     values = inputs.independent(5, 1).values
@@ -396,6 +398,7 @@ def test_a_run_with_a_posterior_says_where_the_recipe_lies(tmp_path, store):
     assert "gain: 2.63 DN/e-" in (done.folder / "recipe.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):
     real = OutputDraws.numbers
 
@@ -419,6 +422,7 @@ def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):
 # --- what decides when to stop --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_only_what_is_named_decides_when_to_stop(store, tmp_path):
     recipe = small("peak, saturated", "lasers.green.strength=lognormal(1e3, 3)")
     whole = study_recipe("uncertainty", recipe, store, tmp_path / "a", most=96, error=0.01)
@@ -518,6 +522,7 @@ def test_a_study_that_cannot_be_ends_with_2_before_it_runs(words, told):
     assert told in done.output
 
 
+@pytest.mark.slow
 def test_a_negligible_part_outside_is_cut_off_and_told(store, tmp_path):
     """Of normal(10 e-, 3.1 e-) 6e-4 are below 0: no draw is negative, and the page says what was
     cut off.
@@ -586,6 +591,7 @@ def test_a_joint_normal_law_is_refused_or_cut_off():
         inputs(5)
 
 
+@pytest.mark.slow
 def test_values_that_exclude_each_other_are_left_out_and_told(tmp_path):
     """One value of 64 is enough to refuse before the run; later ones are left out, whole blocks
     of a Sobol sequence.

@@ -123,6 +123,7 @@ def swept(count, tmp_path, counted):
     return planned, Counter(counted)
 
 
+@pytest.mark.slow
 def test_a_further_point_repeats_nothing_that_cannot_differ(tmp_path, counted):
     swept(2, tmp_path, counted)  # what a process does once, whichever test comes first
     few, many = swept(4, tmp_path, counted), swept(8, tmp_path, counted)
@@ -137,6 +138,7 @@ def test_a_further_point_repeats_nothing_that_cannot_differ(tmp_path, counted):
     assert further["form_of"] <= 3
 
 
+@pytest.mark.slow
 def test_the_calls_of_a_point_do_not_grow_with_the_points_before_it(tmp_path):
     (tmp_path / "chain.yaml").write_text(CHAIN, encoding="utf-8")
     (tmp_path / "chained.py").write_text(NODES, encoding="utf-8")

@@ -68,6 +68,7 @@ def test_what_is_not_known_before_the_run_promises_nothing(recipe):
     assert expected_excess(replace(recipe, exact=True), recipe.outputs) == 0.0
 
 
+@pytest.mark.slow
 def test_a_run_whose_converter_clips_begins_once_and_is_within_its_tolerance(
     recipe, tmp_path, monkeypatch
 ):
@@ -107,6 +108,7 @@ def test_a_second_attempt_never_keeps_a_cube_that_was_too_coarse(recipe, over):
     )
 
 
+@pytest.mark.slow
 def test_a_run_whose_cube_was_too_coarse_needs_no_third_attempt(tmp_path):
     """Points on black: the residual of the cube was 1.7 times too large, and was the same in the
     second attempt.
@@ -116,6 +118,7 @@ def test_a_run_whose_cube_was_too_coarse_needs_no_third_attempt(tmp_path):
     assert not found.recipe.exact
 
 
+@pytest.mark.slow
 def test_the_plan_foresees_most_failures_of_random_cameras():
     """Of the seeds from 1000 to 1039, these began again when nothing was foreseen."""
     failed = [

@@ -42,6 +42,7 @@ def compared(recipe, folder):
     return result, rows
 
 
+@pytest.mark.slow
 def test_stray_light_that_a_psf_lacks_is_in_the_stated_error_of_the_photons(tmp_path):
     """The level of the scene was off by what the PSF lacked, and the bound of the photons
     counted rounding alone.
@@ -62,6 +63,7 @@ def test_without_estimates_no_stray_light_is_left_out(tmp_path):
     assert {result.proof.kind_of(name) for name in result.values} <= {"proved", "exact"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 9])
 def test_a_random_recipe_states_errors_that_hold(seed, tmp_path):
     _, rows = compared(random_recipes.draw_any(seed), tmp_path)

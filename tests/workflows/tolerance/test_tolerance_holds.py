@@ -55,6 +55,7 @@ def holds(recipe, result, full):
         assert float(result[f"bsr[{arm}]"].max()) <= 1.0 + 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [13, 20])
 def test_a_random_recipe_is_within_its_tolerance(seed, tmp_path):
     holds(*compared(seed, tmp_path))

@@ -76,6 +76,7 @@ def test_a_little_is_not_nothing():
     assert asked(recipe("lasers.green.strength=1e-30")) == asked(recipe())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes", [("lasers.green.strength=0",), CLEAN, ("ghosts.count=0",)], ids=str
 )

@@ -209,6 +209,7 @@ def test_the_height_error_is_drawn_for_the_camera_alone(photograph, store):
 # --- pools and trainings --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_pool_of_another_law_is_another_pool(tmp_path, photograph):
     def counts(*laws, seed=7):
         words = [

@@ -303,6 +303,7 @@ KINDS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_changed_input_begins_anew_and_is_named(lab, kind, monkeypatch):
     words, change, said = KINDS[kind]
@@ -348,6 +349,7 @@ def test_equal_files_are_the_same_training_wherever_they_are_and_whatever_they_a
     assert lab.begin(words) == (first, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "word", ["outputs=[truth]", "train.show=7", "train.keep=9", "train.tensorboard=false"]
 )

@@ -218,6 +218,7 @@ def test_the_best_state_is_kept_and_a_stopped_training_finds_the_same(tmp_path, 
     assert same[0] == same[1]
 
 
+@pytest.mark.slow
 def test_a_training_that_gets_worse_stops_early_and_keeps_its_best(tmp_path, folder, monkeypatch):
     scores = iter([20.0, 19.0, 20.0, 25.0])
 

@@ -141,6 +141,7 @@ def test_a_pair_is_that_of_its_number_and_renders_as_the_steps_do(tmp_path):
     assert 0 <= float(cube.min()) <= float(cube.max()) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["linear", "random"])
 def test_a_few_iterations_lower_the_error(tmp_path, start):
     recipe = load(
@@ -255,6 +256,7 @@ def test_the_rate_rises_and_falls_as_a_cosine():
     assert how.rate_at(999) == pytest.approx(1e-6, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_command_learns_a_lift_and_knows_no_stages(tmp_path, capsys, monkeypatch):
     from neusee.workflows.cli.app import main
 

@@ -40,6 +40,7 @@ def small(name, *changes):
     )
 
 
+@pytest.mark.slow
 @every_network
 def test_a_recipe_names_its_network_and_the_picture_goes_through_it(name, tmp_path):
     store = Store(tmp_path / "store")

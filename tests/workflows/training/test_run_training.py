@@ -299,6 +299,7 @@ def test_a_network_is_learnt_behind_the_recipes_own_restorer(tmp_path, photograp
     assert float(moved.abs().max()) > 1e-10  # a step of 2e-4 in a logit; rounding: 1e-13
 
 
+@pytest.mark.slow
 def test_a_network_is_learnt_behind_an_element_that_stays(tmp_path, photographs):
     words = [*STILL, "doe=half_ring", "train.learn=null", f"train.photographs={photographs}"]
     recipe = load("train_small", words)
@@ -309,6 +310,7 @@ def test_a_network_is_learnt_behind_an_element_that_stays(tmp_path, photographs)
         trained(recipe, tmp_path, [1])
 
 
+@pytest.mark.slow
 def test_it_runs_as_printed_too(tmp_path, photographs):
     strength = 'lasers.drawn.strength="uniform(0, 2e6)"'
     recipe = load(
@@ -410,6 +412,7 @@ def test_a_training_that_goes_on_has_no_crate_until_it_ends(tmp_path, tiny):
     assert (set(seen), list(faults(folder))) == ({False}, [])
 
 
+@pytest.mark.slow
 def test_a_state_that_is_none_is_not_gone_on_from(tmp_path, photographs):
     tiny = load(
         "train_small", [*TINY, "train.stages.1.iterations=1", f"train.photographs={photographs}"]
@@ -458,6 +461,7 @@ def test_options_of_one_network_are_refused_of_another():
         load("train_small", ["train.network.kind=unet", "train.network.shuffle=4"])
 
 
+@pytest.mark.slow
 def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, photographs):
     own = [*TINY, "train.network.kind=fft_mamba", "train.network.shuffle=4"]
     recipe = load(
@@ -480,6 +484,7 @@ def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, 
     load("first_light", [*run, "restore.shuffle=4"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("doe", "said"), [("flat", "which has no trainable parameters"), ("axicon", "")]
 )
@@ -531,6 +536,7 @@ def command(tmp_path, monkeypatch, capfd):
     return call
 
 
+@pytest.mark.slow
 def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, photographs):
     words = [
         "train_small",
@@ -580,6 +586,7 @@ def _element_of(words, folder):
     )["height"]
 
 
+@pytest.mark.slow
 def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, photographs):
     changes = [c for c in TINY if not c.startswith("doe.")]
     words = [
@@ -602,6 +609,7 @@ def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, ph
     assert (Path(out.strip()) / "network.safetensors").is_file()
 
 
+@pytest.mark.slow
 def test_a_mask_is_not_designed_over_one_that_learns(tmp_path, photographs):
     tiny = load(
         "train_small", [*TINY, "train.stages.1.iterations=1", f"train.photographs={photographs}"]

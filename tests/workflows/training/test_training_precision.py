@@ -100,6 +100,7 @@ class Trial:
         return float(sum(each))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["mask", "net"])
 def test_the_loss_in_float64_has_no_step_of_single_precision(tmp_path, part):
     trial = Trial(tmp_path, "train.precision=float64", "train.clip=null", "train.stages.1.batch=1")

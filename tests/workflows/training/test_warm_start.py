@@ -42,6 +42,7 @@ def weights(tmp_path):
     return file
 
 
+@pytest.mark.slow
 def test_the_network_begins_with_the_given_weights_and_stays_there_at_no_rate(tmp_path, weights):
     lines, slow = [], ["train.rates.weights=1e-30", "train.rates.biases=1e-30"]
     found = trained([f"train.start={weights}", *slow], tmp_path, lines)

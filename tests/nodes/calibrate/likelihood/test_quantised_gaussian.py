@@ -56,6 +56,7 @@ def by_quadrature(k, mean, sd, well, kind, top):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("well", [1e9, 12.3, 11.45, 11.0, 10.7, 10.2])
 @pytest.mark.parametrize(

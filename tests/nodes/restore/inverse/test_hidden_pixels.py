@@ -233,6 +233,7 @@ def answered(request):
     return seen, most_likely(seen, 400, 1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("single", [False, True])
 def test_it_ends_near_the_answer_as_the_residual_says(answered, single):
     """The residual tells a tenth to a thirtieth of the square distance; it tells the slowest

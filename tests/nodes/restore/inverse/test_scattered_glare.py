@@ -77,6 +77,7 @@ def noise(seen, mean):
     return torch.maximum(seen, mean) + READ**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planted", [(0.3, 0.0, 0.02), (0.05, 0.0, 0.05), (0.05, 0.0, 0.01)])
 def test_speckle_tells_how_much_is_scattered(planted):
     found = []
@@ -92,6 +93,7 @@ def test_speckle_tells_how_much_is_scattered(planted):
     assert planted[0] / 3 < narrow < 3 * planted[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strength", [1e6, 1e8])
 def test_a_picture_is_restored_better_when_light_is_scattered_and_as_well_when_not(strength):
     errors = []
@@ -107,6 +109,7 @@ def test_a_picture_is_restored_better_when_light_is_scattered_and_as_well_when_n
     assert errors[1, 0] < errors[1, 1] + 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strength", [1e7, 1e9])
 def test_the_interval_knows_of_scattered_light(strength):
     shares = []

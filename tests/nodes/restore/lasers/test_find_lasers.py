@@ -72,6 +72,7 @@ def test_a_pixel_between_two_points_of_it_sees_their_mean():
     assert np.abs(found - expected).max() < 6e-3 * expected.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fwhm", [1e-9, 5e-9])
 def test_the_slopes_of_a_line_are_differences_of_direct_sums(fwhm):
     """Differences of a line summed by the rule of the trapezium over ten deviations, over the
@@ -255,6 +256,7 @@ def grey(wavelength):
     return (0.25 + 0.75 * np.exp(-0.5 * ((np.asarray(wavelength) - 550e-9) / 90e-9) ** 2))[None]
 
 
+@pytest.mark.slow
 def test_one_channel_tells_a_wavelength_by_the_scale_of_the_pattern_and_the_laser_is_removed(
     monkeypatch,
 ):

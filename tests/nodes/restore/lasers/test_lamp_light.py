@@ -44,6 +44,7 @@ def gaussian(spot, side):
     return np.exp(-(y[:, None] ** 2 + x**2) / 8.0).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mask", ["plain", "half_ring", "cubic"])
 @pytest.mark.parametrize("spot", [CORNER, CENTRE])
 def test_a_lamp_between_pixels_lights_the_frame_beyond_the_window_of_the_psf(mask, spot):
@@ -54,6 +55,7 @@ def test_a_lamp_between_pixels_lights_the_frame_beyond_the_window_of_the_psf(mas
     assert np.abs(found - expected).max() < 1e-5 * brightest
 
 
+@pytest.mark.slow
 def test_a_pixel_that_is_integrated_sees_the_mean_over_its_area():
     """Four points of Gauss and Legendre along each axis of a pixel."""
     found = lamp_at(CENTRE, "plain", sensor="integrated").electrons().numpy()
@@ -84,6 +86,7 @@ def test_the_slopes_of_a_lamp_are_differences_of_direct_sums():
         assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [33, 34])
 def test_a_lamp_that_clips_behind_a_mask_is_no_laser(seed):
     """With the light of a lamp cut at the window of the PSF, both had a laser with a place and a

@@ -112,6 +112,7 @@ def holds(ends, truth):
     return (ends[:, 0] < truth) & (truth < ends[:, 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mask", "strength"), [("plain", 1e4), ("half_ring", 1e3), ("cubic", 1e5)])
 def test_the_strength_behind_dirt_and_defocus_is_that_at_the_aperture(mask, strength):
     laser = own.Laser((4.3, -7.8), 533e-9, strength)
@@ -125,6 +126,7 @@ def test_the_strength_behind_dirt_and_defocus_is_that_at_the_aperture(mask, stre
     assert abs(float(middle[1]) - truth[1]) < 0.8 * abs(straight[1].mean() - truth[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mask", ["plain", "half_ring", "cubic"])
 def test_behind_a_clean_lens_the_interval_is_hardly_wider(mask):
     laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
@@ -174,6 +176,7 @@ def test_a_channel_that_does_not_see_the_laser_has_a_finite_interval():
     assert ends[2, 0] < middle[2] < ends[2, 1]
 
 
+@pytest.mark.slow
 def test_speckle_of_a_strong_laser_is_no_laser_and_a_second_laser_is():
     laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
     other = own.Laser((-9.6, 11.2), 610e-9, 1e2)

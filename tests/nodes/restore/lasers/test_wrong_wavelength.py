@@ -28,6 +28,7 @@ def test_a_strong_blue_laser_is_found_where_it_is(mask, seed):
     assert float(found.wavelength[0]) == pytest.approx(laser.wavelength, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_frame_with_few_pixels_that_are_not_clipped_tells_less_of_place_and_wavelength():
     """At 1e6 nine tenths of the pixels are clipped; errors behind dirt were four times those at
     1e3 there.

@@ -97,6 +97,7 @@ def gradients(scan, values, seen):
     return torch.autograd.grad((scan(*leaves) * seen).sum(), leaves)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("even", [False, True])
 @pytest.mark.parametrize("rate", RATES)
 def test_a_long_line_is_that_of_the_loop(rate, even, backend):
@@ -104,6 +105,7 @@ def test_a_long_line_is_that_of_the_loop(rate, even, backend):
     assert worst(scan_by(*values, backend=backend), truth) < (8e-7 if backend == "torch" else 3e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("steps", [(16, 1), (10, 9)])
 def test_a_state_that_hardly_decays_is_not_rounded_away_in_wide_lines(monkeypatch, steps, seed):
@@ -136,6 +138,7 @@ def test_any_size_and_its_gradients(length, d, n, batch, backend):
         assert worst(one, truth) < 1e-12 or (length == 1 and not truth.any())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cpp")
 @pytest.mark.parametrize("rate", [1e-6, 1e-2, 50.0, "mix", None])
 def test_gradients_in_single_precision(rate):

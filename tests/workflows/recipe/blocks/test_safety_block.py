@@ -91,6 +91,7 @@ def test_null_is_no_estimate_and_a_run_needs_no_block():
     assert load("laser_free").safety is None
 
 
+@pytest.mark.slow
 def test_the_questions_are_added_to_a_camera():
     from neusee.workflows.safety.safety_estimate import prepare
 

@@ -85,6 +85,7 @@ def test_what_is_drawn_from_a_positive_law_is_positive_and_rises(first, factor, 
     assert (np.diff(drawn) > 0).all()
 
 
+@pytest.mark.slow
 @given(st.text(max_size=30))
 def test_no_text_breaks_the_reader(text):
     """Hypothesis also tries constants of the modules that are loaded, and some of these are

@@ -141,6 +141,7 @@ def test_an_old_parameter_in_place_of_the_new_one_is_one_mistake(old):
     assert [message for _, _, message in found] == [instead(old)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("node", ON_A_GRID)
 @pytest.mark.parametrize("new", [False, True], ids=["old", "with the new input"])
 def test_a_step_with_its_own_pupil_grid_is_one_mistake(node, new):

@@ -82,6 +82,7 @@ def test_two_duplicates_are_two_problems():
     assert refused("a: 1\na: 2\nb: 1\nb: 2\n").count("given twice") == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -108,6 +108,7 @@ def test_a_direction_moves_the_peak_and_not_the_picture_and_a_wavelength_both(re
     )
 
 
+@pytest.mark.slow
 def test_the_filter_holds_the_worst_peak_of_the_laws(recipe, store):
     terms = Terms(recipe, how(direction_spread=f"{HALF} rad"), store)
     height = neusee.run(recipe, store=store, outputs=["height"])["height"]

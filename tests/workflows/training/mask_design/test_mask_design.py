@@ -74,6 +74,7 @@ def read(folder):
     return json.loads((folder / "mask.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pixelwise", "zernike", "rings", "unet"])
 def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
     given = how(kind=kind, iterations=15)
@@ -89,6 +90,7 @@ def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
     assert {"loss", "lsr", "bsr", "contrast"} <= set(rows[0])
 
 
+@pytest.mark.slow
 def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path, monkeypatch):
     given, draw = {}, optics.suppression
     monkeypatch.setattr(
@@ -129,6 +131,7 @@ def test_the_losses_of_several_starts_have_a_legend():
     assert design_run.history_figure.__wrapped__(rows[:4]).legends == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "values"), [("pixelwise", {}), ("unet", {"starts": 2}),
                                               ("five_half_rings", {"population": 8})])  # fmt: skip
 def test_an_interrupted_design_goes_on_bit_for_bit(kind, values, recipe, store, tmp_path):
