@@ -305,9 +305,9 @@ _registered: dict[tuple[str, str], Node] = {}
 class ParameterError(ValueError):
     """Raised by the ``preflight`` of a node for an invalid parameter, before any step runs.
 
-    Args: the name of the parameter, and one sentence with the value and the fix. The name
-            ``direction.angle`` means the parameter ``angle`` of the step that computes the input
-            ``direction``.
+    Its arguments are the name of the parameter, and one sentence with the value and the fix. The
+    name ``direction.angle`` means the parameter ``angle`` of the step that computes the input
+    ``direction``.
     """
 
     def __init__(self, parameter: str, message: str) -> None:

@@ -86,8 +86,9 @@ def as_paths(hint: Any, value: Any) -> Any:
     """Convert a text to a path, or a text or list to a tuple of paths; return other values
     unchanged.
 
-    Args: hint: the annotation of a parameter that `is_file`; a text that the annotation names stays
-            a text.
+    Args:
+        hint: the annotation of a parameter that `is_file`; a text that the annotation names stays a
+            text
     """
     if isinstance(value, str) and value in texts_of(hint):
         return value

@@ -967,7 +967,7 @@ MUTANTS = (
             "damage_parts.py::test_the_bracket_of_an_own_law_holds_nine_of_ten_devices_with_what_is_unknown_of_their_median",
         ),
         ("math.hypot(*log_deviations)", "sum(log_deviations)"),
-        ("_NORMAL_QUANTILE = 1.6448536269514722", "_NORMAL_QUANTILE = 1.2815515655446004"),
+        ("math.exp(NORMAL_QUANTILE *", "math.exp(1.2815515655446004 *"),
     ),
     *faults(
         "nodes/laser/_damage_parts.py",
@@ -1036,7 +1036,7 @@ MUTANTS = (
             "nodes/laser",
             "damage_laws.py::test_the_probability_is_the_share_of_devices_and_its_ends_move_with_the_median",
         ),
-        ("_NORMAL_QUANTILE = 1.6448536269514722", "_NORMAL_QUANTILE = 1.959963984540054"),
+        ("NORMAL_QUANTILE = 1.6448536269514722", "NORMAL_QUANTILE = 1.959963984540054"),
         (
             "_QUANTILE * math.log(law.median_factor) / math.log(law.factor)",
             "_QUANTILE * math.log(law.median_factor)",

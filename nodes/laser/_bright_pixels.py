@@ -414,7 +414,7 @@ def _over_squares(places: Tensor, fill: float, waves: float, spread: float) -> T
     near_spot = places.amax(1) <= 2
     # the nearest pixels need more points, because the spot may be far smaller than a pixel
     for pixels_of_group, node_limit in (
-        (near_spot, 4 * _MOST_PIXEL_POINTS * 4),
+        (near_spot, 16 * _MOST_PIXEL_POINTS),
         (~near_spot, _MOST_PIXEL_POINTS),
     ):
         points, weights = (

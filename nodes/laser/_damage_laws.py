@@ -33,7 +33,7 @@ KINDS: tuple[Kind, ...] = ("point", "line", "cross", "destruction", "frame")
 DIFFUSIVITY = 9e-5
 LEVEL = 0.9  #: probability of every interval of this module
 #: quantile of the standard normal distribution at 0.95, for a two-sided interval of `LEVEL`
-_NORMAL_QUANTILE = 1.6448536269514722
+NORMAL_QUANTILE = 1.6448536269514722
 
 
 class DamageLaw(NamedTuple):
@@ -177,7 +177,7 @@ def damage_at(
         return Damage(ratio, None, None, None)
     # distance of the exposure above the median threshold, in standard deviations of ln threshold
     deviations = math.log(ratio) / math.log(law.factor) if ratio > 0 else -math.inf
-    median_shift = _NORMAL_QUANTILE * math.log(law.median_factor) / math.log(law.factor)
+    median_shift = NORMAL_QUANTILE * math.log(law.median_factor) / math.log(law.factor)
     return Damage(
         ratio,
         _normal_distribution(deviations),

@@ -19,6 +19,7 @@ from torch import Tensor
 from neusee.nodes.laser._damage_laws import (
     ABSORPTION_SOURCE,
     CONTINUOUS_FROM,
+    NORMAL_QUANTILE,
     PUBLISHED_DAMAGE,
     PULSE_END,
     SHORTEST,
@@ -44,7 +45,6 @@ PARTS: tuple[Part, ...] = ("pulse", "mean", "accumulation", "incubation")
 MEASURED = 532e-9  #: m, wavelength of the published experiments
 #: exponents S of the incubation law F_N = F_1 N^(S - 1): least, middle, largest; an assumption
 INCUBATION = (0.8, 0.9, 1.0)
-_NORMAL_QUANTILE = 1.6448536269514722  #: quantile of the standard normal distribution at 0.95
 _MILLISECOND = 1e-3  #: s, shortest dwell of the published continuous law
 _OWN_LAW = "own law"
 _SUPERPOSED = (
@@ -408,7 +408,7 @@ def _own_bracket(law: DamageLaw) -> Bracket:
     ]
     # the two spreads are independent: their logarithms add in quadrature
     bracket_factor = (
-        math.exp(_NORMAL_QUANTILE * math.hypot(*log_deviations)) if log_deviations else 1.0
+        math.exp(NORMAL_QUANTILE * math.hypot(*log_deviations)) if log_deviations else 1.0
     )
     return Bracket(median / bracket_factor, median, median * bracket_factor)
 

@@ -360,10 +360,11 @@ class Command:
         """Store the answer of a command that ended well, unless one of its dependencies is in
         doubt.
 
-        Args: text: of the terminal, with `stored_answer.PAGE` for the path of the page. recipe:
-                that of the command.
-        results: what the command has written, or what it has taken from a store. A command that
-        writes nothing makes no cache either.
+        Args:
+            text: of the terminal, with `stored_answer.PAGE` for the path of the page
+            recipe: that of the command
+            results: what the command has written, or what it has taken from a store. A command that
+                writes nothing makes no cache either.
         """
         self._opened.end()
         with suppress(OSError, ValueError, KeyError, TypeError):

@@ -96,8 +96,7 @@ def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
     """Return a recipe for the sheet of the measurement that an EMVA 1288 descriptor file describes.
 
     Raises: ValueError for a descriptor or an image that is missing or cannot be read, `RecipeError`
-            with all mistakes
-    of ``changes``.
+            with all mistakes of ``changes``.
     """
     refuse_descriptor(file)
     name = "".join(c if c.isalnum() else "_" for c in file.parent.absolute().name or file.stem)

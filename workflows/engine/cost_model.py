@@ -426,8 +426,10 @@ class Costs:
         """Predict the costs of steps that run one after another; the cost of loading a library is
         added to the first step that loads it.
 
-        Args: steps: a key, the step, and the measured costs of the same result or None. Returns:
-                the costs by key.
+        Args:
+            steps: a key, the step, and the measured costs of the same result or None
+
+        Returns: the costs by key.
         """
         estimates, loaded_libraries = dict[str, Estimate](), set[str]()
         for key, step, exact in steps:

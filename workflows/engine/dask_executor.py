@@ -450,10 +450,10 @@ class Dask:
         """Send a chain of jobs to the assigned worker, or to another worker if the assigned
         worker is gone.
         """
-        worker_address = work[0].lane
+        assigned_worker = work[0].lane
         assignment = (
-            {"workers": [worker_address], "allow_other_workers": True}
-            if worker_address in self.link.newest
+            {"workers": [assigned_worker], "allow_other_workers": True}
+            if assigned_worker in self.link.newest
             else {}
         )
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
@@ -462,8 +462,7 @@ class Dask:
             tuple(work),
             self.where,
             self.threads,
-            _SHARE
-            * min((worker_address.memory for worker_address in self._lanes.values()), default=0.0),
+            _SHARE * min((lane.memory for lane in self._lanes.values()), default=0.0),
             signature("worker", "", b""),
             # a new name for each attempt: dask returns the old result for an equal name
             key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",

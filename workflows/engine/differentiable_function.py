@@ -60,12 +60,14 @@ def as_function(
     no restoration. A node that does not pass raises RunError with its place and the transform;
     ``recipes/guide/torch_func.md`` lists every node.
 
-    Args: free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result
-            the caller
-    provides. Steps that do not depend on ``free`` are computed once, here, or read from the store.
-    Noise is the same at every call, because its stream depends on the seed and the step. Random
-    steps in ``redraw`` are computed at every call, which may have another seed. ``caller`` replaces
-    `call` for all steps computed at a call.
+    Noise is the same at every call, because its stream depends on the seed and the step.
+
+    Args:
+        free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result
+            the caller provides. Steps that do not depend on ``free`` are computed once, here, or
+            read from the store.
+        redraw: random steps that are computed at every call, which may have another seed
+        caller: replaces `call` for all steps that are computed at a call
     """
     names = recipe.outputs if outputs is None else tuple(outputs)
     replaced_steps, tuned_params = _read(recipe, free)

@@ -79,10 +79,11 @@ def lanes_of(
     """Return one `Lane` for each device; devices with a common memory divide the bytes that a
     schedule may use.
 
-    Args: memory: the limit of the memory of each GPU, and for the CPU of the memory of this process
-            with what the
-    program itself holds; if None, most of a GPU, or most of the memory that is free now. nodes: the
-    paths of the nodes that will run, whose libraries the program holds as well.
+    Args:
+        memory: the limit of the memory of each GPU, and for the CPU of the memory of this process
+            with what the program itself holds; if None, most of a GPU, or most of the memory that
+            is free now
+        nodes: the paths of the nodes that will run, whose libraries the program holds as well
     """
     pools = [pool_of(device) for device in devices]
     lanes = {}

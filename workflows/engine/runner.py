@@ -62,10 +62,11 @@ def shortest_first(
     """Return the steps ``first``, and ``others`` that need only shorter steps, by the longest step
     that each needs.
 
-    Args: order: all steps, each after its inputs. first: steps whose results are needed before all
-            others are made.
-    seconds: of each step that must run, as predicted. A step of ``others`` that needs a step as
-    long as the longest that ``first`` need is left out.
+    Args:
+        order: all steps, each after its inputs
+        first: steps whose results are needed before all others are made
+        seconds: of each step that must run, as predicted. A step of ``others`` that needs a step as
+            long as the longest that ``first`` need is left out.
     """
     longest: dict[str, float] = {}
     for name in order:
@@ -170,13 +171,19 @@ def run(
 ) -> Result:
     """Return the values of the steps ``outputs``; compute the values that are not in ``store``.
 
-    Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
-    ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this
-    process. memory: bytes that this process, and each GPU, may use; if None, most of the memory
-    that is free. show: is called with each result, while later steps wait. series: what earlier
-    runs found that holds for this one as well. anew: steps that are computed, with all that follow
-    from them, although their results are stored. Raises `RunError`, which names the step, and
-    ValueError for a device that this machine does not have.
+    Args:
+        outputs: if None, the outputs of the recipe
+        device: one or several devices, such as ``cuda:0,cuda:1,cpu``, the preferred device first
+        executor: computes the steps in place of this process
+        memory: bytes that this process, and each GPU, may use; if None, most of the memory that is
+            free
+        show: is called with each result, while later steps wait
+        series: what earlier runs found that holds for this one as well
+        anew: steps that are computed, with all that follow from them, although their results are
+            stored
+
+    Raises: `RunError`, which names the step, and ValueError for a device that this machine does not
+            have.
     """
     began = time.perf_counter()
     check_devices(device)

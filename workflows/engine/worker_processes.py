@@ -85,9 +85,10 @@ def shared(
     None in place of the tuple means that the caller must do this piece itself. With one worker that
     is every piece.
 
-    Args: apart: each worker takes a run of ``order`` of its own, and helps the others when its own
-            is done. This keeps
-    neighbours, which share results, with one worker. By default all workers take the next piece.
+    Args:
+        apart: each worker takes a run of ``order`` of its own, and helps the others when its own is
+            done. This keeps neighbours, which share results, with one worker. By default all
+            workers take the next piece.
     """
     if workers < 2:
         yield from ((number, None) for number in order)

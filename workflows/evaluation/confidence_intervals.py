@@ -159,9 +159,11 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
     """Return the ratio of the sums of two values over pictures, and its 95 % interval over
     photographs.
 
-    Args: top, bottom: (picture,) values of the same unit, or 1 as ``bottom`` for the mean of
-            ``top``. photographs:
-    (picture,) the number of the photograph of each picture. seed: of the draws.
+    Args:
+        top, bottom: (picture,) values of the same unit, or 1 as ``bottom`` for the mean of ``top``
+        photographs: (picture,) the number of the photograph of each picture
+        seed: of the draws
+
     The limits are NaN for fewer than five photographs. For fewer than thirty each end is that of
     the bootstrap or of Student's t distribution, whichever lies farther away, times the root of
     n/(n - 1), by which drawn sets of n photographs scatter too little; skewed photographs need

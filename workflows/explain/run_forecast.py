@@ -224,9 +224,10 @@ def report_peak(
 ) -> float:
     """Return the predicted peak memory of this process in bytes while the report is written.
 
-    Args: works: the steps that only the report needs. keys: the keys of the results that are shown,
-            by step.
-    running: the predicted peak memory of this process while the steps run.
+    Args:
+        works: the steps that only the report needs
+        keys: the keys of the results that are shown, by step
+        running: the predicted peak memory of this process while the steps run
     """
     schedule = prepare(works, costs, {}, lanes, list(keys.values())).schedule if works else None
     making_peak = max(schedule.peak.values(), default=0.0) if schedule else 0.0

@@ -145,7 +145,7 @@ def _line(item: ast.AST) -> int:
 
 
 #: types whose values are compared by ``==``
-_UNLIKE = (bool, int, float, complex, str, bytes, type(None))
+_COMPARED_BY_VALUE = (bool, int, float, complex, str, bytes, type(None))
 _SYSTEM = "sys"  #: the module that Python itself changes often; it is not compared
 _Told = Callable[[], list[Taint]]
 _ABSENT = object()
@@ -207,7 +207,7 @@ def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
     kind = type(value)  # `type` and not `__class__`, which an object may define itself
     if issubclass(kind, ModuleType):
         return "module"
-    if kind in _UNLIKE:
+    if kind in _COMPARED_BY_VALUE:
         return f"{kind.__name__} {value!r}"
     # a fast description, which suits most functions
     if kind is FunctionType and _is_usual(value):
@@ -221,7 +221,7 @@ def _is_usual(function: FunctionType) -> bool:
     """
     if function.__kwdefaults__ or function.__closure__ or vars(function):
         return False
-    return all(type(default) in _UNLIKE for default in function.__defaults__ or ())
+    return all(type(default) in _COMPARED_BY_VALUE for default in function.__defaults__ or ())
 
 
 def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterator[str]:
@@ -374,7 +374,7 @@ def _is_of_package(value: Any, place: str) -> bool:
 def _is_alike(value: Any, other: Any) -> bool:
     """Return True for the same object, or for equal numbers and texts of one type."""
     return value is other or (
-        type(value) is type(other) and type(value) in _UNLIKE and value == other
+        type(value) is type(other) and type(value) in _COMPARED_BY_VALUE and value == other
     )
 
 

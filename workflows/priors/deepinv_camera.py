@@ -145,11 +145,12 @@ class SensorLikelihood(DataFidelity):  # type: ignore[misc]
     where the mask of the physics is 0, contributes the logarithm of the upper tail beyond the clip
     level.
 
-    Args: floor: expectations below this value, in the unit of the frame, have the variance of this
-            value, so that steps
-    of one size suit dark and bright pixels. scale: factor of the negative log-likelihood; 1 gives
-    nats; None gives the variance at the floor, so that a dark pixel counts as in `deepinv.optim.L2`
-    and a step size of about 1 suits.
+    Args:
+        floor: expectations below this value, in the unit of the frame, have the variance of this
+            value, so that steps of one size suit dark and bright pixels
+        scale: factor of the negative log-likelihood; 1 gives nats; None gives the variance at the
+            floor, so that a dark pixel counts as in `deepinv.optim.L2` and a step size of about 1
+            suits
     """
 
     def __init__(

@@ -40,17 +40,19 @@ def as_physics(
     frame of the recipe, ``mask`` is 0 where a pixel of it clipped, and `CameraPhysics.likelihood` a
     data fidelity that counts a clipped pixel as one that is at least as bright as the clip level.
 
-    Args: arm: ``mask`` or ``plain``. glare: known electrons beside the scene, such as those of a
-            laser,
-    (channel, y, x), at least as large as the frame, cropped to its middle; it is taken away from
-    the frame. unit: the electrons of a value of 1 in the scene; None: the full well, so that a
-    scene lies between 0 and 1, as denoisers expect. Frames are in units of ``frame_unit``, this
-    number times the largest gain of the blur. dtype: of the operator and the frame. store, device:
-    of the run of the recipe.
+    Args:
+        arm: ``mask`` or ``plain``
+        glare: known electrons beside the scene, such as those of a laser, (channel, y, x), at least
+            as large as the frame, cropped to its middle; it is taken away from the frame
+        unit: the electrons of a value of 1 in the scene; None: the full well, so that a scene lies
+            between 0 and 1, as denoisers expect. Frames are in units of ``frame_unit``, this number
+            times the largest gain of the blur.
+        dtype: of the operator and the frame
+        store, device: of the run of the recipe
+
     Raises: ModuleNotFoundError without deepinv or one of the packages that deepinv imports;
-            ValueError for a recipe
-    without these steps or with a sensor that is not of this kind, and for a glare of another number
-    of channels.
+            ValueError for a recipe without these steps or with a sensor that is not of this kind,
+            and for a glare of another number of channels.
     """
     physics_class = _deepinv_camera()
     needed_steps = [*_OPTICS, *(f"{name}[{arm}]" for name in ("psf", "clipped", *_SENSOR))]

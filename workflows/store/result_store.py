@@ -504,10 +504,10 @@ def compute_once(
     """Return the value that ``store`` has under ``key``, or compute and store the value if it is
     missing.
 
-    Args: kind: the type of the value. A dataclass is stored as the dict of its fields. about:
-            metadata of the value,
-    which get the date and the seconds that ``compute`` took. small: whether to store the value with
-    `Store.put_small`.
+    Args:
+        kind: the type of the value. A dataclass is stored as the dict of its fields.
+        about: metadata of the value, which get the date and the seconds that ``compute`` took
+        small: whether to store the value with `Store.put_small`
     """
     with suppress(KeyError):
         stored = store.get(key, dict if is_dataclass(kind) else kind)

@@ -54,10 +54,11 @@ def study_recipe(
 ) -> Path:
     """Run a study of ``recipe`` and return the folder of the study; ``kind`` is one of `KINDS`.
 
-    Args: store: keeps finished parts, so that an interrupted study continues. runs: the parent of
-            the study's folder.
-    progress: is called with a line of text for each finished part. options: arguments of the kind
-    of study.
+    Args:
+        store: keeps finished parts, so that an interrupted study continues
+        runs: the parent of the study's folder
+        progress: is called with a line of text for each finished part
+        options: arguments of the kind of study
     """
     module = import_module(f"neusee.workflows.studies.{kind.replace('-', '_')}_study")
     study_options = getattr(module, f"{kind.title().replace('-', '')}Options")(**options)

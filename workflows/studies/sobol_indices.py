@@ -190,8 +190,8 @@ def fit_polynomial(
     """Fit a sparse polynomial to ``y`` (draw,).
 
     Terms are selected among those of low degree, among more, and among all; the selection with the
-    least error of prediction counts. Args: draws: booleans (draw,) that select the draws of the
-    fit; None for all.
+    least error of prediction counts. The booleans ``draws`` (draw,) select the draws of the fit;
+    None for all.
     """
     columns, values = (
         (candidates.columns, y) if draws is None else (candidates.columns[draws], y[draws])
@@ -316,8 +316,10 @@ class SobolIndices:
 def indices(shapes: Sequence[Shape], z: FloatArray, y: FloatArray) -> SobolIndices:
     """Return the Sobol indices of independent inputs in the variance of ``y`` (draw,).
 
-    Args: shapes: distribution of each input. z: standard normal numbers (draw, input) from which
-            the inputs follow.
+    Args:
+        shapes: distribution of each input
+        z: standard normal numbers (draw, input) from which the inputs follow
+
     The interval combines the scatter between fits without an eighth of the draws (jackknife over
     `GROUPS` groups; each Sobol sequence is one group) and, upward, the share that the polynomial
     does not explain.

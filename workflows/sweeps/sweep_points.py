@@ -85,9 +85,10 @@ def best_order(
 
     The order is a list of indices of ``jobs``.
 
-    Args: jobs: one job for each point, in the order of the product of the axes, the last axis
-            fastest.
-    costs: known seconds by step. paired: the axes vary together like one axis.
+    Args:
+        jobs: one job for each point, in the order of the product of the axes, the last axis fastest
+        costs: known seconds by step
+        paired: the axes vary together like one axis
 
     If each axis changes a fixed set of steps, no other order recomputes less from point to point.
     """

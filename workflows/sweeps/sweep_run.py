@@ -379,8 +379,10 @@ def sweep(
 ) -> Sweep:
     """Run ``recipe`` at every combination of axis values.
 
-    Args: axes: by parameter or group, a list of values, or a text as on the command line, such
-    as ``"linspace(450 nm, 650 nm, 5)"``. overrides: changes that are the same at every point.
+    Args:
+        axes: by parameter or group, a list of values, or a text as on the command line, such as
+            ``"linspace(450 nm, 650 nm, 5)"``
+        overrides: changes that are the same at every point
 
     Raises: RecipeError with every mistake of every point, before anything runs.
     """

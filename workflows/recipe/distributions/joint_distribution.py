@@ -17,10 +17,8 @@ from neusee.nodes.file_headers import npy_needs, npz_needs
 from neusee.nodes.input_files import head_of, lines_of, refuse_other_than_file
 from neusee.nodes.units import read_any, read_written
 from neusee.workflows.graph.errors import Location
+from neusee.workflows.keys import sealed_files
 from neusee.workflows.keys.sealed_files import NotRegular, text_of
-from neusee.workflows.keys.sealed_files import (
-    refuse_other_than_file as refuse_other_than_file_regular_file,
-)
 from neusee.workflows.recipe.distributions.shapes import FloatArray, scores_between
 from neusee.workflows.recipe.text.other_spellings import POSTERIOR_NAMES
 from neusee.workflows.recipe.text.recipe_files import refuse_outside
@@ -375,7 +373,7 @@ def read_posterior(path: Path, mark: Location | None = None) -> Posterior:
         path = path / "posterior.json"
     if mark is not None:
         refuse_outside(path, mark)
-    refuse_other_than_file_regular_file(path)
+    sealed_files.refuse_other_than_file(path)
     if not path.is_file():
         raise ValueError(f"there is no posterior file {path}: give {_FILES}")
     try:
