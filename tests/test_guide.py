@@ -218,19 +218,26 @@ def test_the_readme_says_the_two_commands_that_are_tested():
         assert f'say "README: {command.replace(chr(34), chr(92) + chr(34))}"' in tested
 
 
+def imported(module, name):
+    """Return what ``from module import name`` gives: an attribute, or else a module inside."""
+    found = importlib.import_module(module)
+    if not hasattr(found, name):
+        return importlib.import_module(f"{module}.{name}")
+    return getattr(found, name)
+
+
 @pytest.mark.parametrize("code", cases(lambda page: blocks(page, "python")))
 def test_every_python_block_compiles_and_its_names_exist(code):
     tree = ast.parse(code)
     import_or_skip(code)
     modules = {}
-    for item in (item for item in tree.body if isinstance(item, ast.ImportFrom | ast.Import)):
-        for alias in item.names:
-            module = importlib.import_module(
-                item.module if isinstance(item, ast.ImportFrom) else alias.name
-            )
-            modules[alias.asname or alias.name] = (
-                getattr(module, alias.name) if hasattr(item, "module") else module
-            )
+    for item in tree.body:
+        if isinstance(item, ast.Import):
+            for alias in item.names:
+                modules[alias.asname or alias.name] = importlib.import_module(alias.name)
+        elif isinstance(item, ast.ImportFrom):
+            for alias in item.names:
+                modules[alias.asname or alias.name] = imported(item.module, alias.name)
     for item in ast.walk(tree):
         if (
             isinstance(item, ast.Attribute)
