@@ -66,9 +66,9 @@ def descriptor_of(path: Path) -> Path:
     finding = (
         f"has {len(descriptors)} descriptors"
         if descriptors
-        else "has no descriptor, a .txt with levels in lines b and d"
+        else "has no descriptor, which is a .txt file with levels in lines b and d"
     )
-    raise ValueError(f"{path} {finding}: name one file")
+    raise ValueError(f"{path} {finding}: name one descriptor file")
 
 
 def quoted(text: str) -> str:
@@ -200,8 +200,8 @@ def _corrections(levels: FolderLevels, progress: Progress, every_pixel: bool) ->
     divisor = _shift(levels)
     if divisor > 1:
         progress(
-            f"all numbers are multiples of {divisor}: shifted to the left in the files, and divided"
-            f" by {divisor}"
+            f"all numbers are multiples of {divisor}: they are shifted to the left in the files,"
+            f" and divided by {divisor} here"
         )
     if every_pixel:
         return _Corrections(divisor, ())

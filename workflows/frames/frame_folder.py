@@ -150,7 +150,7 @@ def find_table(folder: Path) -> Path | None:
     if len(tables) > 1:
         raise ValueError(
             f"{folder} has {len(tables)} tables of frames, {', '.join(p.name for p in tables)}:"
-            " keep one"
+            " keep one table"
         )
     return tables[0] if tables else None
 
@@ -280,9 +280,9 @@ def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
     half_of_lit = float(np.median(lit_medians))
     if half_of_lit <= max(dark_medians):
         yield (
-            f"{folder}: dark frames have means up to {max(dark_medians):.0f} DN, and half of"
-            " the lit levels no more than "
-            f"{half_of_lit:.0f} DN: cover the lens, or check which files are dark"
+            f"{folder}: dark frames have means up to {max(dark_medians):.0f} DN, and half of the"
+            f" lit levels have at most {half_of_lit:.0f} DN: cover the lens, or check which files"
+            " are dark"
         )
         return
     darkest, brightest = min(dark_medians), max(level_medians)
@@ -327,12 +327,11 @@ def _misfit_of_level(
             f"{_name(first_file, folder)} and {_name(second_file, folder)} count as one"
             f" level, but have means of {first_mean:.1f} and"
         )
-        return f"{both_named} {second_mean:.1f} DN: check names and table"
+        return f"{both_named} {second_mean:.1f} DN: check the names and the table"
     file, mean = max(frames, key=lambda pair: abs(pair[1] - middle))
     return (
-        f"{_name(file, folder)} has a mean of {mean:.1f} DN, but its level {middle:.1f} DN, "
-        "which may differ by "
-        f"{room:.1f} DN: check its name, or remove it"
+        f"{_name(file, folder)} has a mean of {mean:.1f} DN, but its level has {middle:.1f} DN"
+        f" and may differ by {room:.1f} DN: check the name of the file, or remove the file"
     )
 
 
@@ -450,18 +449,17 @@ def find_levels(folder: Path, progress: Progress = silent) -> FolderLevels:
 def _no_frames(folder: Path, unread: Sequence[Path]) -> str:
     """Return why a folder has no frames: it is empty, or its pictures are of other kinds."""
     if not unread:
-        return f"{folder}: no frames: {_HOW_TO_NAME}"
+        return f"{folder}: the folder contains no frames: {_HOW_TO_NAME}"
     kinds = "/".join(sorted({path.suffix.lower() for path in unread}))
     are_lossy = all(path.suffix.lower() in _LOSSY for path in unread)
     reason = (
-        "JPEG and its like change the noise of each pixel"
+        "JPEG and similar formats change the noise of each pixel"
         if are_lossy
-        else "no raw grey numbers are read from them"
+        else "they contain no raw grey values"
     )
     return (
-        f"{_some(unread, folder)}: {kinds} cannot be calibrated: {reason}; save the raw frames of "
-        "one channel as PNG "
-        f"or TIFF of 16 bits, FITS or NumPy, and {_HOW_TO_NAME}"
+        f"{_some(unread, folder)}: {kinds} cannot be used for a calibration: {reason}; save the"
+        f" raw frames of one channel as PNG or TIFF of 16 bits, FITS or NumPy, and {_HOW_TO_NAME}"
     )
 
 
@@ -583,7 +581,7 @@ def _contradiction(
         return
     speaker = f"{table.name}:{row.line}" if table and row else "its name"
     yield (
-        f"{_short(frame.file, folder)}: {speaker} says {stated_exposure:g} s, its header"
+        f"{_short(frame.file, folder)}: {speaker} says {stated_exposure:g} s, but its header says"
         f" {header_exposure:g} s"
     )
 
@@ -601,9 +599,9 @@ def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) 
         return
     seconds = float(re.findall(r"\d+", name.doubtful)[-1])
     yield (
-        f"{_short(frame.file, folder)}: {name.doubtful} may be 1/{seconds:g} s, or number 1 of "
-        f"{seconds:g} s: write "
-        f"{_readable(1 / seconds).replace(' ', '')} or {seconds:g}s, or a table frames.csv"
+        f"{_short(frame.file, folder)}: {name.doubtful} may mean 1/{seconds:g} s, or number 1 of"
+        f" {seconds:g} s: write {_readable(1 / seconds).replace(' ', '')} or {seconds:g}s, or a"
+        " table frames.csv"
     )
 
 
@@ -638,8 +636,8 @@ def _sizes(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
             other_values = ", ".join(sorted(counts.keys() - {usual_value}))
             yield (
                 f"{_some(unusual_files, folder)}: {other_values} {quantity}, but"
-                f" {counts[usual_value]} files have {usual_value}"
-                f" {quantity}: give frames of one sensor and one setting"
+                f" {counts[usual_value]} files have {usual_value} {quantity}: give frames of the"
+                " same sensor and the same settings"
             )
 
 
@@ -652,8 +650,8 @@ def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
     lit_frames = [frame for frame in frames if not frame.dark]
     if frames and len(lit_frames) == len(frames):
         yield (
-            f"{folder}: no dark frames: cover the lens, take two or more, and name them such as"
-            " dark_10ms_1.png"
+            f"{folder}: there are no dark frames: cover the lens, take two or more frames, and"
+            " name them such as dark_10ms_1.png"
         )
     yield from _partly_known("photons", lit_frames, folder)
     yield from _partly_known("light", lit_frames, folder)
@@ -664,8 +662,8 @@ def _partly_known(name: str, lit: Sequence[Frame], folder: Path) -> Iterator[str
     missing = [frame.file for frame in lit if getattr(frame, name) is None]
     if 0 < len(missing) < len(lit):
         yield (
-            f"{_some(missing, folder)}: no {name}, which {len(lit) - len(missing)} other lit"
-            f" files have: {_HOW_TO_NAME}"
+            f"{_some(missing, folder)}: {name} is missing, which {len(lit) - len(missing)} other"
+            f" lit files have: {_HOW_TO_NAME}"
         )
 
 
@@ -727,15 +725,15 @@ def _numbers(
     single_frames = [frames[0].file for frames in groups.values() if _count(frames) < 2]
     if single_frames:
         yield (
-            f"{_some(single_frames, folder)}: one frame of its level: take two or more frames"
-            " of each exposure and light, "
-            "or give frames of one level one name with a number at its end, such as _1 and _2"
+            f"{_some(single_frames, folder)}: the level has a single frame: take two or more"
+            " frames of each exposure and light, or give the frames of a level the same name with"
+            " a number at its end, such as _1 and _2"
         )
     lit_count = len({level.light for level in levels if not level.dark})
     if lit_count < _LIT:
         yield (
-            f"{folder}: {lit_count} lit level{'s' * (lit_count != 1)}: take {_LIT} or more of"
-            " different light, up to saturation"
+            f"{folder}: {lit_count} lit level{'s' * (lit_count != 1)}: take {_LIT} or more levels"
+            " of different light, up to saturation"
         )
 
 
@@ -752,4 +750,4 @@ def _light_problems(levels: Sequence[FolderLevel], light: Light) -> Iterator[str
         return
     lit_exposures = [level.exposure for level in levels if not level.dark]
     if len(set(lit_exposures)) < len(lit_exposures):
-        yield f"the light of levels of one exposure is unknown: {_HOW_TO_NAME}"
+        yield f"the light of levels with the same exposure is unknown: {_HOW_TO_NAME}"

@@ -105,11 +105,10 @@ def sensor_text(results: Path, frames: SensorFrames) -> str:
     budget = json.loads(text_of(results / "budget.json"))["quantities"]
     if posterior["failed"]:
         raise ValueError(
-            f"{posterior['failed']} checks of the calibration fail, so that no sensor group is"
-            " written"
+            f"{posterior['failed']} checks of the calibration fail, so no sensor group is written"
         )
     if "gain" not in budget:
-        raise ValueError("the frames do not tell the gain, so that no sensor group is written")
+        raise ValueError("the frames do not determine the gain, so no sensor group is written")
     npz_needs(results / "draws.npz", 1.0, 8.0)
     with np.load(results / "draws.npz") as file:
         draws = {name: np.asarray(file[name], np.float64) for name in file}
@@ -184,7 +183,8 @@ def _head(frames: SensorFrames, source: str) -> list[str]:
     """Return the lines of the values that do not follow from the calibration."""
     return [
         f"{FIRST}: {source}.",
-        "# What the frames do not tell is that of the packaged sensor: check pixel_pitch.",
+        "# Values that the frames do not determine come from the packaged sensor: check"
+        " pixel_pitch.",
         "defaults: [small]",
         "sensor:",
         f"  shape: [{frames.shape[0]}, {frames.shape[1]}]",

@@ -234,7 +234,10 @@ def _refuse_keys(block: Value, values: Mapping[str, Value], wiring: Wiring) -> N
     )
     for key in ("step", "value", "rtol"):
         if key not in values and f"did you mean {key}?" not in unknown.values():
-            message = f"needs {key}: {{step, value, rtol}} and perhaps at"
+            message = (
+                f"needs {key}: write {{step, value, rtol}}, and `at` if the result has several"
+                " numbers"
+            )
             wiring.diagnostics.append(Diagnostic(block.key, block.name, message))
 
 

@@ -100,7 +100,9 @@ def _overrides(camera: Value) -> list[Override]:
     overrides = [_override(str(value.plain), value) for value in camera.items.values()]
     if of_training := [override for override in overrides if override.path[0] == _TRAIN]:
         raise RecipeError(
-            Diagnostic(override.mark, camera.name, f"{override.text} is no setting of a camera")
+            Diagnostic(
+                override.mark, camera.name, f"{override.text} does not set a parameter of a camera"
+            )
             for override in of_training
         )
     return overrides

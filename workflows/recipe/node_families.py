@@ -39,7 +39,7 @@ from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 GROUP = "neusee.nodes"  #: group of the entry points by which packages install families of nodes
 
-NO_FAMILY = "no family of your own is called"  #: first words of a mistake
+NO_FAMILY = "no family of your own has the name"  #: first words of a mistake
 Own = Mapping[str, ModuleType]  #: modules of the families that a recipe names, by family
 _NO_OWN: Own = {}
 #: family of each module of a user, because a node has one name in a process
@@ -168,13 +168,13 @@ def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
     }
     if not nodes and not network_classes(module):
         raise LookupError(
-            f"{name} defines no node: decorate a function with @node() of neusee.nodes, or write a"
-            " network class"
+            f"{name} defines no node: decorate a function with @node() of neusee.nodes, or write"
+            " a network class"
         )
     if _family_of.setdefault(name, family) != family:
         raise LookupError(
-            f"{name} is the family {_family_of[name]} in this process: use that name, or a new"
-            " process"
+            f"{name} already has the name {_family_of[name]} in this process: use that name, or"
+            " start a new process"
         )
     for key, node in nodes.items():
         node.path = f"{family}.{key}"
@@ -208,7 +208,7 @@ def import_own(where: str, folder: Path) -> ModuleType:
     except ModuleNotFoundError as error:
         if not is_path and error.name and f"{where}.".startswith(f"{error.name}."):
             hint = f"; write ./{where} for the folder" if path.is_dir() else ""
-            raise LookupError(f"no module {where} is installed{hint}") from None
+            raise LookupError(f"there is no installed module {where}{hint}") from None
         raise LookupError(_failure(where, error)) from None
     except (Exception, SystemExit) as error:
         raise LookupError(_failure(where, error)) from None
@@ -223,9 +223,8 @@ def _with_parameters(node: Node) -> Node:
     try:
         if without_annotation := unannotated(node):
             raise LookupError(
-                f"{source_line}: {name} does not say what {without_annotation[0]} is: write a"
-                f" type such as `{without_annotation[0]}:"
-                " float`, or a unit of neusee.nodes.units"
+                f"{source_line}: {name} gives no type for {without_annotation[0]}: write a type"
+                f" such as `{without_annotation[0]}: float`, or a unit of neusee.nodes.units"
             )
         # made at the first use, which reads the annotations
         assert node.params
@@ -309,7 +308,9 @@ def _load(family: str) -> ModuleType:
         names = " and ".join(
             sorted({point.dist.name if point.dist else point.value for point in points})
         )
-        raise LookupError(f"{names} both install a family of nodes {family}: uninstall one")
+        raise LookupError(
+            f"{names} both install a family of nodes {family}: uninstall one of the packages"
+        )
     module, distribution = (
         points[0].value,
         points[0].dist.name if points[0].dist else points[0].value,
@@ -422,8 +423,10 @@ def _add(own: OwnFamilies, family: str, where: Value) -> None:
         other_file = getattr(
             own.modules.get(family_name), "__file__", "neusee or an installed package"
         )
-        text = f"a family of nodes {family_name} is there already, of {other_file}"
-        raise LookupError(f"{text}: name yours, as in `nodes: [my_{family_name}: {where.data}]`")
+        text = f"there is already a family of nodes {family_name}, from {other_file}"
+        raise LookupError(
+            f"{text}: choose another name, as in `nodes: [my_{family_name}: {where.data}]`"
+        )
     # raises for a module without a node
     own_nodes(family_name, module)
     own.modules[family_name] = module

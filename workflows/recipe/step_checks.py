@@ -506,8 +506,8 @@ def _wrong_index(expected: Expectation, result: Any) -> str:
             size = selected.shape[axis]
             if not -size <= index < size:
                 return (
-                    f"index {index} is out of range: {_described(expected.step, selected)};"
-                    f" axis {axis} has 0 to {size - 1}"
+                    f"index {index} is out of range: {_described(expected.step, selected)}; the"
+                    f" indices of axis {axis} are 0 to {size - 1}"
                 )
             # each number selects along one more axis of the tensor
             axis += 1

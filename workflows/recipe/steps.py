@@ -114,7 +114,9 @@ def _written_steps(root: Value, diagnostics: list[Diagnostic]) -> list[tuple[str
         mark = root.mark if block is None else block.mark
         diagnostics.append(
             Diagnostic(
-                mark, "steps", "a recipe needs steps, or a group with steps (`camera: neusee`)"
+                mark,
+                "steps",
+                "a recipe needs steps, or a group with steps, such as `camera: neusee`",
             )
         )
         return []
@@ -244,7 +246,7 @@ def _item_lists(root: Value) -> dict[str | int, Value]:
 
 def _wrong_items(block: Value) -> list[Diagnostic]:
     """Return a diagnostic for each item whose name cannot stand in the brackets of a step."""
-    message = "an item's name must not have a space, comma or bracket"
+    message = "an item's name must not contain a space, comma or bracket"
     return [
         Diagnostic(item.key, item.name, message)
         for key, item in block.items.items()
@@ -369,7 +371,7 @@ class Wiring:
         if not isinstance(sources.data, dict):
             if node.inputs:
                 return {node.inputs[0]: sources}
-            self.refuse(sources, sources.name, f"{node.path} takes no inputs: leave `from` out")
+            self.refuse(sources, sources.name, f"{node.path} takes no inputs: remove `from`")
             return None
         for name, value in sources.data.items():
             if name not in node.inputs:
@@ -441,9 +443,8 @@ class Wiring:
         producer = self._named(value)
         open_lists = ", ".join(dim for dim in producer.dims if dim not in reader_items)
         message = (
-            f"{node.path} takes one step as {name}; {producer.name} is a step for each of"
-            f" {open_lists}:"
-            f" write {_example_of(producer)}"
+            f"{node.path} takes one step as {name}, but {producer.name} is a step for each of"
+            f" {open_lists}: write {_example_of(producer)}"
         )
         self.refuse(value, path, message)
 
@@ -459,7 +460,7 @@ class Wiring:
         instead = (
             f"{parsed[0]}, which is null ({null_step.mark})" if parsed and null_step else "null"
         )
-        self.refuse(value, path, f"{node.path} needs {name}, but the input is {instead}")
+        self.refuse(value, path, f"{node.path} needs {name}, but this input is {instead}")
 
     def _producers(
         self, value: Value, path: str, reader_items: Mapping[str, str], makers: str = ""
@@ -509,7 +510,7 @@ class Wiring:
         A single item may be in any of the lists of the step.
         """
         if not producer.dims:
-            self.refuse(value, path, f"{producer.name} has no items: leave out the brackets")
+            self.refuse(value, path, f"{producer.name} has no items: remove the brackets")
             return None
         open_lists = list(producer.dims)
         selected: dict[str, str] = {}

@@ -167,7 +167,7 @@ def _is_single(law: Law, low: float, high: float) -> bool:
 def _advice(law: Law, low: float, high: float) -> str:
     """Return the advice for a distribution with too much probability outside the allowed values."""
     if law.kind == "truncated":
-        return "give it tighter bounds"
+        return "set tighter bounds"
     if isinstance(law.shape, Discrete):
         return "remove these values"
     unit = "e-/DN" if law.reciprocal else law.unit

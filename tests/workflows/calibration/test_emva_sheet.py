@@ -288,7 +288,7 @@ def test_a_folder_has_one_descriptor(archive, tmp_path):
         descriptor_of(tmp_path)
     for name in ("one.txt", "two.txt"):
         (tmp_path / name).write_text("v 3.0\nd 000.00\ni x.png\n")
-    with pytest.raises(ValueError, match="has 2 descriptors: name one file"):
+    with pytest.raises(ValueError, match="has 2 descriptors: name one descriptor file"):
         descriptor_of(tmp_path)
 
 

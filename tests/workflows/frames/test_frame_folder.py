@@ -181,7 +181,7 @@ def missing_file(folder):
 @pytest.mark.parametrize(
     ("mistake", "words"),
     [
-        (one_frame, ["flat_2000ph_1ms_1.png: one frame of its level: take two or more"]),
+        (one_frame, ["flat_2000ph_1ms_1.png: the level has a single frame: take two or more"]),
         (other_size, ["flat_2000ph_1ms_0.png: 8 x 8 pixels, but 13 files have 10 x 8 pixels"]),
         (eight_bits, ["flat_2000ph_1ms_0.png: 8 bits, but 13 files have 16 bits"]),
         (no_darks, ["no dark frames: cover the lens"]),
@@ -196,7 +196,7 @@ def missing_file(folder):
         (no_photons, ["flat_1ms_0.png, flat_1ms_1.png: no photons, which 8 other lit files have"]),
         (few_levels, ["2 lit levels: take 4 or more"]),
         (colour, ["flat_2000ph_1ms_0.png is PNG with pixels of kind RGB, not raw grey"]),
-        (other_time, ["flat_2000ph_1ms_0.png: its name says 0.001 s, its header 0.02 s"]),
+        (other_time, ["flat_2000ph_1ms_0.png: its name says 0.001 s, but its header says 0.02 s"]),
         (bright_darks, ["dark frames have means up to 690 DN"]),
         (
             missing_file,
@@ -224,7 +224,7 @@ def test_an_empty_folder_is_told_how_to_name_files(tmp_path, capsys):
     assert typed(["calibrate", str(tmp_path)]) == 2
     told = capsys.readouterr().err
     assert told.startswith(
-        f"nothing was drawn: {tmp_path}: no frames: name files such as dark_10ms_1.png"
+        f"nothing was drawn: {tmp_path}: the folder contains no frames: name files such as dark_10ms_1.png"
     )
 
 

@@ -77,7 +77,7 @@ def test_a_number_before_seconds_that_may_be_a_fraction_is_refused_with_what_to_
     for number in (1, 2):
         (tmp_path / f"dark_2ms_{number - 1}.png").rename(tmp_path / f"{name}_{number}.png")
     with pytest.raises(
-        FolderRefused, match=r"may be 1/200 s, or number 1 of 200 s: write 5ms or 200s"
+        FolderRefused, match=r"may mean 1/200 s, or number 1 of 200 s: write 5ms or 200s"
     ):
         find_levels(tmp_path)
 
@@ -139,8 +139,8 @@ def test_a_folder_of_jpeg_is_refused_by_name(tmp_path, capsys):
         app.main(["calibrate", str(tmp_path)])
     assert ended.value.code == 2
     told = capsys.readouterr().err
-    assert "dark_1ms_1.jpg, flat_1ms_1.JPEG: .jpeg/.jpg cannot be calibrated" in told
-    assert "JPEG and its like change the noise of each pixel; save the raw frames" in told
+    assert "dark_1ms_1.jpg, flat_1ms_1.JPEG: .jpeg/.jpg cannot be used for a calibration" in told
+    assert "JPEG and similar formats change the noise of each pixel; save the raw frames" in told
 
 
 def test_previews_beside_frames_are_told(tmp_path):

@@ -82,7 +82,7 @@ def test_two_packages_with_one_family_are_named(install, write, tmp_path):
     write(USES.format("gauge.double"))
     [problem] = problems("mine.yaml", (), tmp_path)
     assert problem.endswith(
-        "kit_one and kit_two both install a family of nodes gauge: uninstall one"
+        "kit_one and kit_two both install a family of nodes gauge: uninstall one of the packages"
     )
 
 

@@ -146,7 +146,7 @@ def test_a_folder_is_a_family_and_an_entry_may_name_it(write, tmp_path):
     write("nodes: [optics_of_ours: ./lab_b]\n" + USES.format("optics_of_ours.tilt"), "other.yaml")
     [problem] = problems("other.yaml", (), tmp_path)
     assert problem.endswith(
-        "lab_b is the family lab_b in this process: use that name, or a new process"
+        "lab_b already has the name lab_b in this process: use that name, or start a new process"
     )
     node_families._family_of.clear()
     assert load("other.yaml", (), tmp_path).steps["b"].node.path == "optics_of_ours.tilt"
@@ -159,7 +159,7 @@ BAD = {
     "[none_such.mod]": "no module none_such.mod is installed",
     "[lab_c]": "no module lab_c is installed; write ./lab_c for the folder",
     "[optics: ok_c.py]": (
-        "a family of nodes optics is there already, of neusee or an installed package: name yours"
+        "there is already a family of nodes optics, from neusee or an installed package: choose"
     ),
     "[ok_c.py, sub/ok_c.py]": f"sub/ok_c.py {FAILS}the name ok_c is that of",
     "ok_c.py": "must be a list of files and modules, not a string",
@@ -203,10 +203,7 @@ def test_a_mistake_is_located_once_and_hides_what_follows_from_it(write, tmp_pat
     [
         (
             "by=1.0",
-            (
-                "tilt_d.py:5: tilt does not say what by is: write a type such as `by: float`, or a"
-                " unit"
-            ),
+            ("tilt_d.py:5: tilt gives no type for by: write a type such as `by: float`, or a unit"),
         ),
         (
             "by: 'None_such' = 1",

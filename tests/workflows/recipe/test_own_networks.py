@@ -229,7 +229,7 @@ MISTAKES = [
     (
         "network.architecture=other.Small",
         (
-            "no family of your own is called other; there are: net_m; list the file of the class,"
+            "no family of your own has the name other; there are: net_m; list the file of the class,"
             " such as `nodes"
         ),
     ),

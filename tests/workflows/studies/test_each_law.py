@@ -312,7 +312,7 @@ def test_a_bound_of_a_parameter_never_ends_a_study_midway(own):
         ),
         (
             "truncated(normal(2 e-, 1 e-), -3 e-, inf)",
-            r"2\.27% of this distribution .*: give it tighter bounds",
+            r"2\.27% of this distribution .*: set tighter bounds",
         ),
         (
             "normal(2 e-, 1 e-)",

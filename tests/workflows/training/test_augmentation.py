@@ -82,5 +82,5 @@ def test_a_training_says_that_it_turns_its_pool_and_needs_a_pool_for_it(tmp_path
         == "turned_mask"
     )
     assert Path(trained([], tmp_path)) != folder
-    with pytest.raises(RecipeError, match="there is no pool to turn"):
+    with pytest.raises(RecipeError, match="there is no pool whose pictures could be turned"):
         load("train_small", [*TINY, POOLED[1]])

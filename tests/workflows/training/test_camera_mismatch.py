@@ -270,10 +270,10 @@ def test_a_mask_is_trained_for_what_is_told_of_it(tmp_path, photograph):
             "optics.defocus=normal(0 nm, 1 nm)",
             "added to optics.defocus, whose unit is waves, not m",
         ),
-        ("optics.defocus=lognormal(1, 2)", "optics.defocus is 0, which lognormal"),
+        ("optics.defocus=lognormal(1, 2)", "optics.defocus is 0, and 0 times lognormal"),
         (
             "sensor.offset=lognormal(1 e-, 2)",
-            "lognormal multiplies sensor.offset: write it without the unit e-",
+            "lognormal multiplies sensor.offset: write the distribution without the unit e-",
         ),
         (
             "optics.defocus=normal(0 waves, 0 waves)",
@@ -281,7 +281,7 @@ def test_a_mask_is_trained_for_what_is_told_of_it(tmp_path, photograph):
         ),
         ("optics.defocus=maybe", "maybe is neither a number nor a quantity"),
         ("optics.aberrations=normal(0 nm, 1 nm)", "neither a number nor a quantity"),
-        ("mask.levels=normal(0, 1)", "mask.levels is null, from which nothing can differ"),
+        ("mask.levels=normal(0, 1)", "mask.levels is null, so no distribution can vary it"),
     ],
 )
 def test_a_law_that_no_value_can_have_is_one_located_mistake_of_the_recipe(law, said):

@@ -26,7 +26,10 @@ def test_the_exported_graph_is_the_trained_network(tmp_path):
 
 
 def test_what_cannot_be_exported_is_refused_before_the_training(tmp_path, monkeypatch):
-    with pytest.raises(RecipeError, match="export: the scan of fft_mamba"):
+    with pytest.raises(
+        RecipeError,
+        match=r"export: torch\.export and ONNX cannot represent the scan of the network fft_mamba",
+    ):
         load("train_small", [*TINY, "train.network.kind=fft_mamba", "train.export=[onnx]"])
     found = importlib.util.find_spec
     monkeypatch.setattr(

@@ -110,7 +110,7 @@ def test_a_photograph_that_cannot_be_decoded_is_held_out_and_not_restored(folder
 
 
 def test_patience_without_held_out_photographs_is_a_mistake(folder):
-    with pytest.raises(RecipeError, match="patience: nothing is held out"):
+    with pytest.raises(RecipeError, match="patience: without held-out pictures no improvement"):
         tiny(folder, "train.held_out=null", "train.patience=3")
 
 

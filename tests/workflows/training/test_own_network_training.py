@@ -209,13 +209,13 @@ MISTAKES = [
     (
         [f"{NET}.width=8"],
         f"argument 11 | {NET}.width",
-        "width is of the networks of neusee: write parameters: {{width",
+        "width is a setting of the networks of neusee: for your own class write parameters: {{width",
     ),
     ([f"{NET}.parameters=4"], f"argument 11 | {NET}.parameters", "must be a mapping"),
     (
         [f"{NET}.architecture={{0}}.Fixed", f"{NET}.parameters=null"],
         f"argument 11 | {NET}.architecture",
-        "{0}.Fixed has nothing to train: it has no parameters",
+        "{0}.Fixed has no parameters, so training would change nothing",
     ),
     (
         [f"{NET}.architecture={{0}}.Single", f"{NET}.parameters=null", "train.precision=float64"],
@@ -229,7 +229,7 @@ MISTAKES = [
     (
         [f"{NET}.architecture=null"],
         f"mine.yaml:9:79 | {NET}.parameters",
-        "is of a class of your own: name it by arch",
+        "is a setting for a network class of your own: add arch",
     ),
 ]
 

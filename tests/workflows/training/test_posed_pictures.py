@@ -99,11 +99,11 @@ def test_under_a_mismatch_the_problem_is_that_of_the_recipe(photograph, store):
     ("word", "message"),
     [
         ("train.patch=[8, 8]", "restores a whole picture behind a fixed mask: write patch: null"),
-        ("train.export=[pt2]", "is in no graph of torch.export"),
+        ("train.export=[pt2]", "torch.export and ONNX cannot represent the filter"),
         ("train.augment.pooled=turned_mask", "write augment.pooled: none"),
         (
             "train.network={kind: unet, steps: 3}",
-            "only the network unrolled has such options, not unet",
+            "these options belong to the network unrolled, not to unet",
         ),
     ],
 )

@@ -456,7 +456,7 @@ def test_a_mistake_is_located(change, said):
 def test_options_of_one_network_are_refused_of_another():
     with pytest.raises(
         RecipeError,
-        match="shuffle: only the network fft_mamba has such options, not unet",
+        match="shuffle: these options belong to the network fft_mamba, not to unet",
     ):
         load("train_small", ["train.network.kind=unet", "train.network.shuffle=4"])
 
@@ -633,7 +633,7 @@ def test_the_recommended_mask_is_that_of_trainings_that_say_nothing_of_it():
         ("+train.mask.fish=1", "train.mask.fish: unknown; "),
         ("+train.mask.weights.lsrr=1", "train.mask.weights.lsrr: unknown; .*lsr"),
         ("train.mask.max_height=3", "train.mask.max_height: .*needs a unit"),
-        ("+train.mask.slopes=[9, 3]", "train.mask: .*give the smaller slope first"),
+        ("+train.mask.slopes=[9, 3]", "train.mask: .*write the smaller slope first"),
         ("+train.mask.start=no.npy", "train.mask.start: .*no such file"),
     ],
 )

@@ -97,11 +97,11 @@ def test_a_photograph_counts_once_whatever_the_number_of_its_pictures():
         (["train.cameras=[[sensor.well=3]]"], r"argument \d+.*unknown"),
         (
             ["train.cameras=[[doe=flat, train.pool=3]]"],
-            r"train\.cameras\.0.*train\.pool=3 is no setting of a camera",
+            r"train\.cameras\.0.*train\.pool=3 does not set a parameter of a camera",
         ),
         (
             ["train.cameras=[[doe=flat]]", "train.learn=height"],
-            "where no mask is trained: write learn: null",
+            "need a mask that is not trained: write learn: null",
         ),
     ],
 )

@@ -169,7 +169,7 @@ class Laser(SettingsBlock):
     @model_validator(mode="after")
     def _has_one_air(self) -> Laser:
         if self.air_transmittance is not None and self.visibility is not None:
-            raise ValueError("the air is stated twice: leave air_transmittance or visibility out")
+            raise ValueError("the air is given twice: remove air_transmittance or visibility")
         return self
 
 
@@ -287,7 +287,8 @@ class EyeDazzle(SettingsBlock):
         for angle in angles:
             if not math.radians(0.1) <= angle <= math.radians(100):
                 raise ValueError(
-                    f"{math.degrees(angle):.3g} deg: the glare equation holds from 0.1 to 100 deg"
+                    f"an angle of {math.degrees(angle):.3g} deg is outside the glare equation,"
+                    " which holds from 0.1 to 100 deg"
                 )
         return angles
 
@@ -295,7 +296,9 @@ class EyeDazzle(SettingsBlock):
     @classmethod
     def _is_lit(cls, backgrounds: tuple[float, ...]) -> tuple[float, ...]:
         if min(backgrounds) <= 0:
-            raise ValueError("a background without light shows no target: give cd/m2 above 0")
+            raise ValueError(
+                "a background without light shows no target: write a background above 0 cd/m2"
+            )
         return backgrounds
 
     @field_validator("size")
@@ -303,7 +306,8 @@ class EyeDazzle(SettingsBlock):
     def _has_a_threshold(cls, size: float) -> float:
         if not 1 <= math.degrees(size) * 60 <= 60.000001:
             raise ValueError(
-                f"{math.degrees(size) * 60:.3g} arc minutes: the threshold is known from 1 to 60"
+                f"a target of {math.degrees(size) * 60:.3g} arc minutes has no known threshold:"
+                " write a size from 1 to 60 arc minutes"
             )
         return size
 
@@ -356,7 +360,8 @@ class SafetySettings(SettingsBlock):
     def _rises(cls, distances: tuple[float, float]) -> tuple[float, float]:
         if not distances[0] < distances[1]:
             raise ValueError(
-                f"from {distances[0]:g} m to {distances[1]:g} m: write the shorter distance first"
+                f"the distances run from {distances[0]:g} m to {distances[1]:g} m: write the"
+                " shorter distance first"
             )
         return distances
 
@@ -367,8 +372,7 @@ class SafetySettings(SettingsBlock):
         if self.dazzle is not None and lacking:
             names = ", ".join(lacking)
             raise ValueError(
-                f"dazzle needs {names} of the sensor: give sensor.{lacking[0]}, or write dazzle:"
-                " null"
+                f"dazzle needs {names} of the sensor: write sensor.{lacking[0]}, or dazzle: null"
             )
         return self
 
@@ -489,7 +493,7 @@ def _laser_of(
     if setting is not None and setting.data is not None:
         if str(setting.data) not in lasers:
             message = (
-                f"{setting.data} is no laser of the recipe; {nearest(str(setting.data), lasers)}"
+                f"the recipe has no laser {setting.data}; {nearest(str(setting.data), lasers)}"
             )
             diagnostics.append(Diagnostic(setting.mark, setting.name, message))
             return None

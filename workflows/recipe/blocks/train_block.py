@@ -208,23 +208,23 @@ class MaskSettings(SettingsBlock):
     def _rising(self) -> Self:
         """Refuse settings that contradict each other: slopes, a peak limit and a learnt stop."""
         if not self.slopes[0] < self.slopes[1]:
-            raise ValueError(f"slopes = {self.slopes}: give the smaller slope first")
+            raise ValueError(f"slopes = {self.slopes}: write the smaller slope first")
         if self.limit is not None and not self.weights.protected:
             text = (
-                "set weights.filtered_error or weights.information, or remove limit; of"
-                " weights.lsr, `enough` is it"
+                "set weights.filtered_error or weights.information, or remove limit; for"
+                " weights.lsr the limit is `enough`"
             )
-            raise ValueError(f"limit = {self.limit:g} acts on no term of the loss: {text}")
+            raise ValueError(f"limit = {self.limit:g} affects no term of the loss: {text}")
         if self.learn_stop and not self.weights.protected:
             text = (
-                "only weights.filtered_error and weights.information know what a stop costs: set"
-                " one, or remove it"
+                "only weights.filtered_error and weights.information include the cost of a stop:"
+                " set one of the two weights, or remove learn_stop"
             )
             raise ValueError(f"learn_stop = true: {text}")
         if self.learn_stop and self.kind == "five_half_rings":
             raise ValueError(
-                "learn_stop = true: kind five_half_rings has no gradient: choose another kind, or"
-                " remove it"
+                "learn_stop = true: a mask of the kind five_half_rings has no gradient: choose"
+                " another kind, or remove learn_stop"
             )
         return self
 
@@ -313,7 +313,7 @@ class Network(SettingsBlock):
         if self.architecture is None and misplaced:
             owner = next(iter(misplaced.values()))
             raise ValueError(
-                f"{', '.join(misplaced)}: only the network {owner} has such options, not"
+                f"{', '.join(misplaced)}: these options belong to the network {owner}, not to"
                 f" {self.kind}"
             )
         return self
@@ -439,8 +439,10 @@ class Training(SettingsBlock):
     @model_validator(mode="after")
     def _exports(self) -> Training:
         if self.export and self.network.architecture is None and self.network.kind == "fft_mamba":
-            text = "export: the scan of fft_mamba is in no graph of torch.export or ONNX"
-            raise ValueError(f"{text}: train network.kind: nafnet or unet, or a class of your own")
+            text = (
+                "export: torch.export and ONNX cannot represent the scan of the network fft_mamba"
+            )
+            raise ValueError(f"{text}: choose network.kind: nafnet or unet, or a class of your own")
         return self
 
     @model_validator(mode="after")
@@ -454,8 +456,8 @@ class Training(SettingsBlock):
             return self
         if self.export:
             raise ValueError(
-                f"export: the filter before the network {kind} is in no graph of torch.export or"
-                " ONNX"
+                "export: torch.export and ONNX cannot represent the filter before the network"
+                f" {kind}"
             )
         not_for_both = {"learn": self.learn, "size": self.size, "patch": self.patch}
         if self.augment.pooled != "none" and kind == "unrolled":
@@ -476,8 +478,7 @@ class Training(SettingsBlock):
         """Refuse further cameras together with a mask that is trained."""
         if self.cameras and self.learn is not None:
             raise ValueError(
-                "cameras: pictures are of several cameras where no mask is trained: write learn:"
-                " null"
+                "cameras: several cameras need a mask that is not trained: write learn: null"
             )
         return self
 
@@ -485,7 +486,7 @@ class Training(SettingsBlock):
     def _validates(self) -> Training:
         if self.patience is not None and self.held_out is None:
             raise ValueError(
-                "patience: nothing is held out that could stay without a better state: set held_out"
+                "patience: without held-out pictures no improvement can be measured: set held_out"
             )
         return self
 
@@ -493,7 +494,8 @@ class Training(SettingsBlock):
     def _turns_a_pool(self) -> Training:
         if self.augment.pooled != "none" and self.pool is None:
             raise ValueError(
-                "augment.pooled: there is no pool to turn: set pool, or write pooled: none"
+                "augment.pooled: there is no pool whose pictures could be turned: set pool, or"
+                " write pooled: none"
             )
         return self
 
@@ -585,7 +587,9 @@ def _wrong_network(block: Value, training: Training) -> Iterator[Diagnostic]:
         net = own_network(network.architecture, network.parameters, network.multiple)
         if not any(parameter.requires_grad for parameter in net.parameters()):
             raise ParameterError(
-                "architecture", f"{network.architecture} has nothing to train: it has no parameters"
+                "architecture",
+                f"{network.architecture} has no parameters, so training would change nothing:"
+                " choose a class with parameters",
             )
         try_network(net, training.dtype)
     except ParameterError as error:
@@ -600,7 +604,9 @@ def _without_class(block: Value) -> Iterator[Diagnostic]:
     for name in _OF_CLASS[1:]:
         value = block.child(name)
         if value and value.plain:
-            message = "is of a class of your own: name it by architecture: mynet.MyClass"
+            message = (
+                "is a setting for a network class of your own: add architecture: mynet.MyClass"
+            )
             yield Diagnostic(value.mark, value.name, message)
             return
 
@@ -612,8 +618,8 @@ def _of_packaged_networks(block: Value) -> Iterator[Diagnostic]:
     for name, value in block.items.items():
         if name not in _OF_CLASS and not Path(value.mark.folder).is_relative_to(packaged()):
             text = (
-                f"{name} is of the networks of neusee: write parameters: {{{name}: {value.plain}}}"
-                " for your class"
+                f"{name} is a setting of the networks of neusee: for your own class write"
+                f" parameters: {{{name}: {value.plain}}}"
             )
             yield Diagnostic(value.mark, value.name, text)
 

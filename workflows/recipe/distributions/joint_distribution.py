@@ -250,9 +250,9 @@ class Joint:
             raise ValueError("every standard deviation must be greater than 0")
         if not np.allclose(np.diag(correlation), 1.0) or np.linalg.eigvalsh(correlation)[0] < -1e-9:
             raise ValueError(
-                "the correlation matrix must have ones on its diagonal and no negative eigenvalue;"
-                f" the least eigenvalue is {np.linalg.eigvalsh(correlation)[0]:.3g}, so that no"
-                " distribution has this matrix"
+                "the correlation matrix must have ones on its diagonal and no negative"
+                " eigenvalue, but its least eigenvalue is"
+                f" {np.linalg.eigvalsh(correlation)[0]:.3g}, so no distribution has this matrix"
             )
         return cls(tuple(names), mean, sd, _factor(correlation))
 
@@ -499,13 +499,12 @@ def _refuse_other_moments(moments: Mapping[str, Any]) -> None:
     """
     if strange := sorted(set(moments) - {"mean", "sd", "correlation", "covariance"}):
         raise ValueError(
-            f"unknown key {strange[0]}: give mean, sd and perhaps correlation, or mean and"
-            " covariance"
+            f"unknown key {strange[0]}: write mean and sd, with correlation if you know it, or"
+            " mean and covariance"
         )
     if not isinstance(moments.get("mean"), dict) or ("sd" in moments) == ("covariance" in moments):
         raise ValueError(
-            "a summary needs mean: {name: value}, and either sd: {name: value} or covariance:"
-            " [[…], …]"
+            "a summary needs mean: {name: value}, and sd: {name: value} or covariance: [[…], …]"
         )
 
 

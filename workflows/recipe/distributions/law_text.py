@@ -51,7 +51,7 @@ KINDS = {
     "triangular": ("triangular(9 e-, 10 e-, 12 e-)", "least, most probable and largest value"),
     "beta": (
         "beta(2, 5, 0 e-, 20 e-)",
-        "two shape parameters, then least and largest value, which may be left out",
+        "two shape parameters, then the least and the largest value, which may be omitted",
     ),
     "truncated": (
         "truncated(normal(2 e-, 1 e-), 0 e-, inf)",
@@ -63,7 +63,7 @@ KINDS = {
     ),
     "empirical": (
         "empirical(noise.csv, column read_noise, unit e-)",
-        "samples in a file, its column, and their unit; column and unit may stand in the file",
+        "samples in a file, its column, and their unit; the file may give the column and the unit",
     ),
 }
 _NAMES = "|".join(KINDS)
@@ -199,7 +199,7 @@ def _lognormal(kind: str, text: str, arguments: Sequence[str]) -> Law:
     numbers = _numbers(arguments[:1])
     median, factor = numbers.values[0], _plain(arguments[1], "the factor of one standard deviation")
     if not (median > 0 and factor > 1):
-        raise ValueError("the median must be greater than 0, and the factor than 1")
+        raise ValueError("the median must be greater than 0, and the factor greater than 1")
     return _law(kind, text, LogNormal(median, factor), numbers)
 
 
@@ -245,7 +245,7 @@ def _discrete(kind: str, text: str, arguments: Sequence[str]) -> Law:
         ]
     )
     if len(set(numbers.values)) < len(arguments) or len(arguments) < 2:
-        raise ValueError("a discrete distribution needs two or more values, all different")
+        raise ValueError("a discrete distribution needs two or more different values")
     weights = _weights([match[2] for match in matches if match], len(arguments))
     return _law(kind, text, Discrete.of(np.array(numbers.values), np.array(weights)), numbers)
 
@@ -258,7 +258,7 @@ def _weights(written: Sequence[str], count: int) -> list[float]:
         raise ValueError("write a weight for every value, or for none: " + KINDS["discrete"][0])
     weights = [_plain(weight, "a weight") for weight in written]
     if not min(weights) > 0:
-        raise ValueError("every weight must be greater than 0: remove values that cannot occur")
+        raise ValueError("every weight must be greater than 0: remove the values of weight 0")
     if abs(math.fsum(weights) - 1.0) > _SUM:
         raise ValueError(f"the weights sum to {math.fsum(weights):.6g}, not to 1")
     return weights
@@ -459,8 +459,8 @@ def _difference(path: str, leaf: Value, root: Value) -> Difference:
     )
     if law.reciprocal:
         raise ValueError(
-            "a gain in e-/DN has no difference that is added: write lognormal(1, …), not"
-            f" {law.text}"
+            "a distribution in e-/DN cannot be added to a gain: write a factor, such as"
+            f" lognormal(1, …), not {law.text}"
         )
     if law.multiplies:
         _refuse_factor(law, path, value)
@@ -475,10 +475,12 @@ def _difference(path: str, leaf: Value, root: Value) -> Difference:
 def _refuse_factor(law: Law, path: str, value: float) -> None:
     """Raise ValueError for a factor with a unit, and for a value of 0, which no factor changes."""
     if law.unit:
-        raise ValueError(f"{law.kind} multiplies {path}: write it without the unit {law.unit}")
+        raise ValueError(
+            f"{law.kind} multiplies {path}: write the distribution without the unit {law.unit}"
+        )
     if not value:
         raise ValueError(
-            f"{path} is 0, which {law.text} would multiply: write normal(…, …) or uniform(…, …)"
+            f"{path} is 0, and 0 times {law.text} is always 0: write normal(…, …) or uniform(…, …)"
         )
 
 
@@ -489,7 +491,7 @@ def _own(path: str, own: Value) -> tuple[float, str]:
     if path.rpartition(".")[2] == ANGLE:
         return 0.0, "rad"
     if own.data is None:
-        raise ValueError(f"{path} is null, from which nothing can differ: give it a value first")
+        raise ValueError(f"{path} is null, so no distribution can vary it: write a value first")
     return read_any(own.plain)
 
 

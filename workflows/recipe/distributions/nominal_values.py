@@ -265,7 +265,7 @@ class _Reader:
         ]
         if untold_values and setting is None:
             self.notes.append(
-                f"the posterior does not tell {', '.join(untold_values)}: the recipe's own"
+                f"the posterior does not contain {', '.join(untold_values)}: the recipe's own"
                 " value counts as certain"
             )
         self._conventions(posterior, pairs)
@@ -337,7 +337,8 @@ class _Reader:
                     self._fail(
                         value.mark,
                         path,
-                        "the value has a distribution here and in the posterior: remove one",
+                        "the value has a distribution both here and in the posterior: remove one"
+                        " of the two",
                     )
                 self.notes.append(f"{path} comes from the argument, not from the posterior")
                 continue

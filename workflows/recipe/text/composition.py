@@ -57,7 +57,10 @@ class Groups:
         for option in choice.options:
             file = self._file(option, open_)
             if file is None and option.is_optional:
-                note = f"{option.group}: {option.name} is optional, and there is no such option"
+                note = (
+                    f"{option.group}: there is no option {option.name}; the entry is optional, so"
+                    " it is ignored"
+                )
                 self.notes.append(note)
             elif file is None:
                 self._report(option, self._absent(option, open_))
@@ -131,8 +134,8 @@ class Groups:
             return f"options extend each other in a circle: {circle}"
         if "," in option.name:
             return (
-                f"no option {option.name} in {option.group}: several options are a list,"
-                f" [{option.name}], and several runs are `neusee sweep`"
+                f"there is no option {option.name} in {option.group}: write several options of"
+                f" one run as a list, [{option.name}], and use `neusee sweep` for several runs"
             )
         return f"no option {option.name} in {option.group}; {nearest(option.name, names)}"
 

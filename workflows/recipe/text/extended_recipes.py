@@ -294,9 +294,7 @@ class Extension:
             if isinstance(layer, Choice) and layer.group == entry.group:
                 if entry.is_optional:
                     correct_form = entry.shown.removeprefix("optional ")
-                    message = (
-                        f"takes the place of {layer.shown} ({layer.mark}): write `{correct_form}`"
-                    )
+                    message = f"replaces {layer.shown} ({layer.mark}): write `{correct_form}`"
                     self._refuse(entry.mark, entry.shown, message)
                     return
                 self.replaced.append(layer)
@@ -416,14 +414,17 @@ def _chosen_before(entry: Extended, layers: Sequence[Layer], before: Sequence[La
     of_same_file = [layer for layer in earlier if layer.mark.file == entry.mark.file]
     if of_same_file:
         return (
-            f"has the group {of_same_file[0].group} too: write `{of_same_file[0].shown}`"
+            f"contains the group {of_same_file[0].group} too: write `{of_same_file[0].shown}`"
             f" after {entry.name}"
         )
     if not earlier:
         return ""
     names = ", ".join(layer.group for layer in earlier[:6])
     further = f" and {len(earlier) - 6} more" if len(earlier) > 6 else ""
-    return f"has the groups of an earlier recipe ({names}{further}): extend only one of the two"
+    return (
+        f"contains the groups of an earlier recipe ({names}{further}): extend only one of the two"
+        " recipes"
+    )
 
 
 def choices_in(layers: Iterable[Layer]) -> list[Choice]:

@@ -14,10 +14,10 @@ from itertools import product
 
 _PACKAGE = "a recipe has no packages"
 _NO_SETTINGS = (
-    "a recipe has no settings of Hydra: remove it; `--out` names the folder of a run, and"
-    " `neusee sweep` runs several values"
+    "a recipe has no settings of Hydra: remove this setting; `--out` names the folder of a run,"
+    " and `neusee sweep` runs several values"
 )
-_NODE = "a recipe names no Python object: write a step, `steps: {NAME: {node: family.name}}`"
+_NODE = "a recipe contains no Python objects: write a step, `steps: {NAME: {node: family.name}}`"
 _ADVICE_ON_KEYS = {
     "_target_": _NODE,
     "_partial_": _NODE,
@@ -65,20 +65,20 @@ def advice_on_group(written: str, option: str) -> str:
         return _NO_SETTINGS
     if "override" in words[:-1]:
         return (
-            f"write `{group}: {option}`: an option in this list takes the place of that of an"
+            f"write `{group}: {option}`: an option in this list replaces the option of an"
             " extended recipe"
         )
     if "@" in written:
         return f"{_PACKAGE}: write `{group}: {option}`"
     if "/" in written:
-        return f"groups have no path: write `{group.rpartition('/')[2]}: {option}`"
+        return f"the name of a group contains no path: write `{group.rpartition('/')[2]}: {option}`"
     return ""
 
 
 def advice_on_option(option: str) -> str:
     """Return what to write in place of the option of an entry in ``defaults``, or an empty text."""
     if "${" in option:
-        return "an entry of `defaults` refers to no values: write the name of the option"
+        return "an entry of `defaults` cannot contain a reference: write the name of the option"
     if option == "???":
         return "write the name of an option, or null for none; an argument can replace it"
     return ""
@@ -87,7 +87,7 @@ def advice_on_option(option: str) -> str:
 def advice_on_recipe(name: str, groups: Iterable[str]) -> str:
     """Return what to write in place of the name of a recipe in ``defaults``, or an empty text."""
     if name.startswith(("optional ", "override ")):
-        return "only a group has such a word: write `optional group: option`"
+        return "only a group can be optional: write `optional group: option`"
     plain = name.partition("@")[0]
     if "@" in name:
         return f"{_PACKAGE}: write `{plain}`"
@@ -117,11 +117,11 @@ def advice_on_reference(text: str) -> str:
     """Return what to write in place of a reference with the text ``text``, or an empty text."""
     if ":" in text:
         return (
-            f"${{{text}}} is a function of Hydra, and a recipe has none: write the value, or"
-            " give it as an argument"
+            f"${{{text}}} is a function of Hydra, which recipes do not have: write the value, or"
+            " give the value as an argument"
         )
     if text.startswith("."):
-        return f"a reference has the whole path: write ${{block.name}}, not ${{{text}}}"
+        return f"a reference contains the whole path: write ${{block.name}}, not ${{{text}}}"
     return ""
 
 

@@ -23,8 +23,8 @@ _DEEPEST = 50  #: longest chain of references
 _MOST_VALUES = 100_000  #: values to which references may expand one value
 _MOST_CHARACTERS = 100_000  #: characters to which references may expand one text
 #: what to do about a block that lacks values, in a recipe and in an option of the user
-_ADVICE_IN_RECIPE = "give them, or name an option that has them in `defaults`"
-_ADVICE_IN_OPTION = "extend an option that has them, such as `defaults: [small]`"
+_ADVICE_IN_RECIPE = "set these values, or name an option that sets them in `defaults`"
+_ADVICE_IN_OPTION = "extend an option that sets these values, such as `defaults: [small]`"
 
 
 @dataclass(frozen=True, slots=True)

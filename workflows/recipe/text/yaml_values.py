@@ -63,8 +63,8 @@ def directive_mistake(text: str) -> YamlMistake | None:
             )
         if version[1] != "1.2":
             advice = (
-                "remove this line, and see that the file means the same in YAML 1.2 (on is a word,"
-                " 010 is ten)"
+                "remove this line, and check that the values mean the same in YAML 1.2 (on is a"
+                " word, 010 is ten)"
             )
             return YamlMistake(
                 number, version.start(1), f"recipes are YAML 1.2, not {version[1]}: {advice}"
@@ -118,8 +118,7 @@ def _open_quote(error: MarkedYAMLError, text: str) -> YamlMistake | None:
     start = quotes_over_lines[-1].start_mark
     message = (
         "the quote that opens here closes only in line"
-        f" {quotes_over_lines[-1].end_mark.line + 1}: close it in"
-        " its line"
+        f" {quotes_over_lines[-1].end_mark.line + 1}: close the quote in the same line"
     )
     return YamlMistake(start.line, start.column, message)
 
@@ -175,7 +174,7 @@ def _text_goes_on(error: MarkedYAMLError, text: str) -> YamlMistake | None:
         return _unfinished_key(text, value_start.line, value_start.column)
     indent = column - len(text.splitlines()[line][:column].lstrip())
     message = (
-        "a wrong indent: as it stands, this line is more of the value in line"
+        "a wrong indent: with this indent the line continues the value in line"
         f" {value_start.line + 1}"
     )
     return YamlMistake(line, indent, message)
@@ -199,10 +198,10 @@ def _open_bracket(error: MarkedYAMLError, text: str) -> YamlMistake | None:
 #: what to do, by a phrase in the problem of the parser
 _SENTENCES = {
     "mapping values are not allowed": (
-        "a second ':' on this line, or a wrong indent: quote the text, or begin a new line"
+        "a second ':' in this line, or a wrong indent: quote the text, or begin a new line"
     ),
     "but found another document": "a second document (---): a recipe must be a single document",
-    "expected '<document start>'": "a line --- must follow %YAML: write it, or remove %YAML",
+    "expected '<document start>'": "a line --- must follow %YAML: write this line, or remove %YAML",
 }
 
 
@@ -218,7 +217,7 @@ def _sentence(problem: str, here: str, column: int) -> str:
     if "cannot start any token" in problem:
         return f"a text cannot begin with {here[column : column + 1]}: quote the text"
     if alias := re.search(r"found undefined alias '(.*)'", problem):
-        return f"no value above has the anchor &{alias[1]}: refer to values with ${{…}}"
+        return f"no earlier value has the anchor &{alias[1]}: refer to values with ${{…}}"
     if "expected <block end>" in problem:
         return _wrong_indent(problem, here)
     return f"is not YAML: {problem}"
@@ -238,10 +237,7 @@ def _wrong_indent(problem: str, here: str) -> str:
     indent = len(here) - len(here.lstrip(" "))
     if problem.endswith(("'<scalar>'", "'<alias>'", "'<tag>'")):
         return "text after the end of a value: quote the whole value, or begin a new line"
-    return (
-        f"a wrong indent: the {indent} spaces before this line are those of no line above in the"
-        " same block"
-    )
+    return f"a wrong indent: no line above in the same block has the {indent} spaces of this line"
 
 
 def _short(text: str) -> str:
@@ -543,7 +539,7 @@ class _Builder:
         if not tags:
             return ""
         if tags == ["!"]:
-            return "a ! alone: remove it, and quote a text that looks like a number"
+            return "a ! without a name: remove it, and quote a text that looks like a number"
         return "" if _fits(node, tag) else f"the tag {tag} does not fit this value: remove the tag"
 
     def _end_fault(self, node: Node) -> str:

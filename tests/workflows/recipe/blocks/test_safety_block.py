@@ -32,7 +32,7 @@ MISTAKES = [
      "'kim'"),
     ("visibility of 0", ["+lasers.pointer.visibility=0 km"], "lasers.pointer.visibility", "greater than 0"),
     ("misspelt value of a laser", ["+lasers.pointer.visiblity=5 km"], "lasers.pointer.visiblity", "unknown"),
-    ("no such laser", ["+safety.laser=green"], "safety.laser", "green is no laser of the recipe; there are: pointer"),
+    ("no such laser", ["+safety.laser=green"], "safety.laser", "the recipe has no laser green; there are: pointer"),
     ("two lasers", ["+lasers.other={wavelength: 638 nm}"], "safety", "write safety.laser=NAME"),
     ("saturation without QE", ["~safety.sensor.quantum_efficiency"], "safety", "dazzle needs quantum_efficiency"),
     ("QE above 1", ["safety.sensor.quantum_efficiency=65"], "safety.sensor.quantum_efficiency",

@@ -204,7 +204,7 @@ def test_values_that_are_one_and_the_same_are_drawn_as_such():
         (
             "a.yaml",
             "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [2, 1]]",
-            "the least eigenvalue is -1, so that no distri",
+            "its least eigenvalue is -1, so no distribution",
         ),
         ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 0.5], [0.4, 1]]", "symmetric"),
         ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 0], [0, -1]]", "positive variances"),
@@ -332,7 +332,7 @@ def test_a_law_and_a_posterior_of_one_value_are_refused(calibrated, tmp_path):
     own.write_text("\n".join(text))
     with pytest.raises(
         RecipeError,
-        match=r"own.yaml:13.*sensor.gain +the value has a distribution here and in the posterior",
+        match=r"own.yaml:13.*sensor.gain +the value has a distribution both here and in the posterior",
     ):
         load(own)
 

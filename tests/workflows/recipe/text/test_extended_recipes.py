@@ -68,10 +68,10 @@ REFUSED = {
     " -> mine.yaml",
     "[base, base]": "2:18 | defaults.base | given twice, first in line 2",
     "[base, base.yaml]": "2:18 | base.yaml | is extended already, by mine.yaml:2:12: remove this",
-    "[base, other/two.yaml]": "2:18 | other/two.yaml | has the groups of an earlier recipe (lens,"
+    "[base, other/two.yaml]": "2:18 | other/two.yaml | contains the groups of an earlier recipe (lens,"
     " laser): extend only one of the two",
-    "[laser: red, base]": "2:24 | base | has the group laser too: write `laser: red` after base",
-    "[base, optional lens: tele]": "2:33 | optional lens: tele | takes the place of lens: wide"
+    "[laser: red, base]": "2:24 | base | contains the group laser too: write `laser: red` after base",
+    "[base, optional lens: tele]": "2:33 | optional lens: tele | replaces lens: wide"
     " (base.yaml:2:18): write `lens: tele`",
     "[_self_, base, _self_]": "2:26 | defaults._self_ | given twice, first in line 2",
     "[lens: wide, lens: tele]": "2:24 | defaults.lens | given twice, first in line 2",
@@ -79,8 +79,8 @@ REFUSED = {
     "[laser: [red, rde]]": "2:25 | laser: [red, rde] | no option rde in laser; did you mean red?",
     "[laser: [red, null]]": "2:25 | laser: [red, null] | must be the name of an option, a list of",
     "[laser: [[red]]]": "2:20 | laser: [[red]] | must be the name of an option, a list of names, or",
-    "[laser: 'red,green']": "2:19 | laser: red,green | no option red,green in laser: several options"
-    " are a list, [red,green], and several runs are `neusee sweep`",
+    "[laser: 'red,green']": "2:19 | laser: red,green | there is no option red,green in laser: write"
+    " several options of one run as a list, [red,green], and use `neusee sweep` for several runs",
     "[3]": "2:12 | defaults.0 | must be one `group: option`, such as `doe: axicon`, or the name of a",
     "[null]": "2:12 | defaults.0 | must be one `group: option`",
     "[[base]]": "2:12 | defaults.0 | must be one `group: option`",
@@ -90,33 +90,33 @@ REFUSED = {
     "[broken]": "broken.yaml:1:1 |  | the file contains a string: write a mapping, `key: value`",
     # habits of Hydra
     "[base, override lens: tele]": "2:18 | override lens: tele | write `lens: tele`: an option in"
-    " this list takes the place of that of an extended recipe",
+    " this list replaces the option of an extended recipe",
     "[base, override optional lens: tele]": "2:18 | override optional lens: tele | write `lens: tele`",
     "[laser@of: red]": "2:12 | laser@of: red | a recipe has no packages: write `laser: red`",
-    "[/laser: red]": "2:12 | /laser: red | groups have no path: write `laser: red`",
-    "[a/laser: red]": "2:12 | a/laser: red | groups have no path: write `laser: red`",
+    "[/laser: red]": "2:12 | /laser: red | the name of a group contains no path: write `laser: red`",
+    "[a/laser: red]": "2:12 | a/laser: red | the name of a group contains no path: write `laser: red`",
     "[override hydra/launcher: joblib]": "2:12 | override hydra/launcher: joblib | a recipe has no"
-    " settings of Hydra: remove it; ",
+    " settings of Hydra: remove this setting; ",
     "[base@of]": "2:12 | base@of | a recipe has no packages: write `base`",
     "[laser/red]": "2:12 | laser/red | write `laser: red` for an option of a group",
     "[/laser/red]": "2:12 | /laser/red | write `laser: red` for an option of a group",
     "[far/base]": "2:12 | far/base | write `far/base.yaml` for a recipe in another folder",
-    "[optional base]": "2:12 | optional base | only a group has such a word: write `optional group:",
-    "[base, laser: '${lens}']": "2:25 | laser: ${lens} | an entry of `defaults` refers to"
-    " no values: write the name of the option",
+    "[optional base]": "2:12 | optional base | only a group can be optional: write `optional group:",
+    "[base, laser: '${lens}']": "2:25 | laser: ${lens} | an entry of `defaults` cannot"
+    " contain a reference: write the name of the option",
     "[laser: '???']": "2:19 | laser: ??? | write the name of an option, or null for none",
-    "[]\nhydra: {run: {dir: x}}": "3:1 | hydra | a recipe has no settings of Hydra: remove it; ",
-    "[]\nlens: {_target_: a.B, _partial_: true}": "3:8 | lens._target_ | a recipe names no Python"
-    " object: write a step, `steps: {NAME: {node: family.name}}`",
-    "[]\nlens: {_partial_: true}": "3:8 | lens._partial_ | a recipe names no Python object",
+    "[]\nhydra: {run: {dir: x}}": "3:1 | hydra | a recipe has no settings of Hydra: remove this setting; ",
+    "[]\nlens: {_target_: a.B, _partial_: true}": "3:8 | lens._target_ | a recipe contains no Python"
+    " objects: write a step, `steps: {NAME: {node: family.name}}`",
+    "[]\nlens: {_partial_: true}": "3:8 | lens._partial_ | a recipe contains no Python objects",
 }
 
 ARGUMENTS = {
     "++lens.f=4": "write lens.f=4 to change a value, or +lens.f=4 to add one",
     "laser@of=red": "a recipe has no packages: write laser=red",
-    "hydra.run.dir=x": "a recipe has no settings of Hydra: remove it; `--out` names the folder",
-    "hydra/launcher=x": "a recipe has no settings of Hydra: remove it; ",
-    "laser=red,green": "no option red,green in laser: several options are a list, [red,green], and",
+    "hydra.run.dir=x": "a recipe has no settings of Hydra: remove this setting; `--out` names the folder",
+    "hydra/launcher=x": "a recipe has no settings of Hydra: remove this setting; ",
+    "laser=red,green": "there is no option red,green in laser: write several options of one run as",
     "+laser=red": "laser is already set to null: remove the +",
     "+lens=[tele]": "lens is already set to wide: remove the +",
     "lens=[tele, wdie]": "no option wdie in lens; did you mean wide?",
@@ -201,7 +201,7 @@ def test_an_argument_replaces_the_option_of_an_extended_recipe(files, write):
 def test_an_optional_option_that_is_not_there_is_said(files, write):
     write("defaults: [optional laser: blue]\n", "mine.yaml")
     assert compose("mine.yaml", (), files).notes == (
-        "laser: blue is optional, and there is no such option",
+        "laser: there is no option blue; the entry is optional, so it is ignored",
     )
 
 

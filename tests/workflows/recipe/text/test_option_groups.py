@@ -189,4 +189,4 @@ def test_a_block_of_a_recipe_that_lacks_values_is_one_mistake(read):
     [problem] = [p for p in caught.value.diagnostics if p.path == "sensor"]
     assert str(problem.mark) == "mine.yaml:2:1"
     assert not [p for p in caught.value.diagnostics if "sensor." in p.message]
-    assert problem.message.startswith("lacks x, y, z, which steps need: give them, or name")
+    assert problem.message.startswith("lacks x, y, z, which steps need: set these values, or name")

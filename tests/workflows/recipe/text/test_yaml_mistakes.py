@@ -35,23 +35,28 @@ MISTAKES = [
         "name: first\n  seed: 1\n",
         2,
         3,
-        "a wrong indent: as it stands, this line is more of the value",
+        "a wrong indent: with this indent the line continues the value",
     ),
     (
         "note: hello\n  world\n  again: 5\n",
         3,
         3,
-        "a wrong indent: as it stands, this line is more of the value in line 1",
+        "a wrong indent: with this indent the line continues the value in line 1",
     ),
     (
         "a: 1\nsensor:\n  bits: 12\n    gain: 3\n",
         4,
         5,
-        "a wrong indent: as it stands, this line is more of the value",
+        "a wrong indent: with this indent the line continues the value",
     ),
-    ("sensor:\n  bits: 12\n gain: 3\n", 3, 2, "a wrong indent: the 1 spaces before this line"),
+    (
+        "sensor:\n  bits: 12\n gain: 3\n",
+        3,
+        2,
+        "a wrong indent: no line above in the same block has the 1 spaces",
+    ),
     # several keys on one line
-    ("a: b: c\n", 1, 5, "a second ':' on this line"),
+    ("a: b: c\n", 1, 5, "a second ':' in this line"),
     # a tab
     ("sensor:\n\tbits: 12\n", 2, 1, "a tab: indent YAML with spaces"),
 ]
@@ -93,7 +98,7 @@ def test_a_text_of_yaml_1_2_has_no_mistake(text):
 READ_OTHERWISE = {
     "a: {?b: 1}": (1, 6, "quote a name that begins with ? within brackets"),
     "a: [?b]": (1, 6, "quote a name that begins with ? within brackets"),
-    "a: ! 12": (1, 4, "a ! alone: remove it, and quote a text that looks like a number"),
+    "a: ! 12": (1, 4, "a ! without a name: remove it, and quote a text that looks like a number"),
     'a: !!int "3"': (1, 4, "the tag !!int does not fit this value: remove the tag"),
     "a: !!int 3.5": (1, 4, "the tag !!int does not fit"),
     "a: !!float b": (1, 4, "the tag !!float does not fit"),

@@ -109,7 +109,10 @@ def test_a_stop_has_a_gradient_in_light_and_in_peak(recipe, store):
             {"limit": None, "weights": {"lsr": 1}},
             "learn_stop = true: only weights.filtered_error and",
         ),
-        ({"kind": "five_half_rings"}, "learn_stop = true: kind five_half_rings has no gradient"),
+        (
+            {"kind": "five_half_rings"},
+            "learn_stop = true: a mask of the kind five_half_rings has no gradient",
+        ),
         ({"degree": 1}, "greater than or equal to 2"),
         ({"wavelength_spread": "-1 nm"}, "greater than or equal to 0"),
         ({"direction_spread": "-1 mrad"}, "greater than or equal to 0"),

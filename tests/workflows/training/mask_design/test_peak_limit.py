@@ -107,7 +107,7 @@ def test_a_law_of_defocus_is_drawn_in_learning_and_averaged_in_the_end(recipe, s
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"weights": {"lsr": 1}}, "limit = 0.03 acts on no term"),
+        ({"weights": {"lsr": 1}}, "limit = 0.03 affects no term"),
         ({"weights": {"lsr": 0, "bsr": 0}}, "every weight of the loss is 0: set lsr, bsr"),
         ({"limit": 2}, "less than or equal to 1"),
         ({"light": "0 e-"}, "greater than 0"),
