@@ -110,13 +110,13 @@ def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
     )
     agrees = abs(worst.apart) <= _MOST_COMBINED_SD
     if not agrees:
-        text += ": refused, one of them is wrong, and the frames do not say which"
+        text += ": refused, because one of the two is wrong, and the frames do not show which"
     mark: Mark = "pass" if agrees else "fail"
     return [
         Check(
             "the posterior agrees with its least squares",
             text,
-            f"within {_MOST_COMBINED_SD:.0f} combined sd",
+            f"at most {_MOST_COMBINED_SD:.0f} combined sd",
             mark,
         )
     ]
@@ -201,7 +201,7 @@ def _reason(measured: Levels) -> str:
         least_squares(measured)
     except ValueError as reason:
         return str(reason)
-    return "it gives no value"
+    return "the fit gives no value"
 
 
 def _row(row: ParameterEstimate, comparison: Comparison) -> tuple[str, str, str, str, str, float]:

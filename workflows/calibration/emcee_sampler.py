@@ -247,7 +247,7 @@ def move(name: str) -> Any:
     if "snooker" in name.lower():
         raise ValueError(
             "DESnookerMove of emcee up to 3.1.6 draws from a distribution that is 18 % too narrow"
-            " (emcee's pull request 531 corrects it): use de or stretch"
+            " (emcee's pull request 531 corrects this): use de or stretch"
         )
     raise ValueError(f"unknown move {name!r}: write de or stretch")
 
@@ -386,8 +386,8 @@ def _alive(
         if len(likely_points) >= walkers:
             return likely_points[:walkers]
     raise ValueError(
-        "samples around the mode have almost no posterior density, so no chain can start there:"
-        " give narrower priors"
+        "the samples around the mode have almost no posterior density, so no chain can start"
+        " there: set narrower priors"
     )
 
 

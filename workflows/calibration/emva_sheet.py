@@ -128,8 +128,8 @@ def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = Non
     if table_steps := _steps_of(recipe, "calibrate.table"):
         return _tabled(recipe, store, table_steps[0].name)
     raise ValueError(
-        f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames"
-        " of a sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`"
+        f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so it has no frames"
+        " for a sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`"
     )
 
 
@@ -396,16 +396,14 @@ _LEVELS, _EXPOSURES, _SERIES = (
 )  #: number of lit levels, dark exposures and frames per series that the standard requires
 #: name of the frame test that has the same meaning as `_COARSE`
 _ROUNDING = "the dark noise exceeds rounding"
-_COARSE = """the temporal dark noise is below 0.49 DN; the standard asks for more, because \
+_COARSE = """the temporal dark noise is below 0.49 DN; the standard requires more, because \
 rounding hides the noise: \
-dark noise, thresholds and dynamic range are limits only, and K is doubtful"""
-_TESTED = """Each test asks if the frames are such as the model of the standard describes. Modelled:
-the quantities allow for it. Widened: it is found, and the error of K or of the noise that may
-follow is small. Refused: this error may exceed 2 %, or is unknown. Numbers and limits of noise and
-patterns are in standard deviations of chance."""
-_MOMENTS = (
-    "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
-)
+dark noise, thresholds and dynamic range are only limits, and K is doubtful"""
+_TESTED = """Each test asks if the frames agree with the model of the standard. Modelled:
+the quantities allow for it. Widened: the fault is found, and the error of K or of the noise that
+may follow is small. Refused: this error may exceed 2 %, or is unknown. Numbers and limits of noise
+and patterns are in standard deviations of chance."""
+_MOMENTS = "Only moments are given, so noise, patterns and numbers of the frames are not tested."
 _VARIANCE: dict[Release, str] = {
     "3": "includes the difference of the means of its frames, as in release 3.0",
     "4": "excludes the difference of the means of its frames, as since release 3.1",

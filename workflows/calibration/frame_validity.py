@@ -125,10 +125,9 @@ def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) ->
     lit_levels = len(set(levels.photons[is_fitted & (levels.photons > 0)].tolist()))
     if lit_levels < len(terms) + 2:
         raise ValueError(
-            f"{lit_levels} lit levels do not separate a response of {len(terms)} terms from a"
-            " drifting"
-            f" lamp: give {len(terms) + 2} or more levels of different light below saturation, or"
-            f" fix {' and '.join(terms[max(0, lit_levels - 2) :])} at 0"
+            f"{lit_levels} lit levels cannot distinguish a response of {len(terms)} terms from a"
+            f" drifting lamp: give {len(terms) + 2} or more levels of different light below"
+            f" saturation, or fix {' and '.join(terms[max(0, lit_levels - 2) :])} at 0"
         )
 
 
@@ -154,7 +153,7 @@ def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior
     mode = search_mode(problem)
     if not mode.settled:
         raise ValueError(
-            f"no posterior mode of {', '.join(problem.names)} was found: give narrower priors"
+            f"no posterior mode of {', '.join(problem.names)} was found: set narrower priors"
         )
     samples, log_weight = draw_samples(problem, mode, rng)
     weight = normalised(log_weight)
@@ -320,7 +319,7 @@ def frame_checks(tests: Sequence[FrameTest], has_frames: bool = True) -> list[Ch
         Check(t.name, f"{t.verdict}: {t.sentence}", _bar(t), _MARKS[t.verdict]) for t in tests
     ]
     if len(tests) < 2 and has_frames:
-        text = "only moments are given: noise, patterns and numbers of the frames are not tested"
+        text = "only moments are given, so noise, patterns and numbers of the frames are not tested"
         checks.append(Check("the frames are tested", text, "frames in the recipe", "warn"))
     return checks
 
@@ -337,10 +336,12 @@ def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[
     ]
     faults = " and ".join(sorted({fault.fault for fault in hidden}))
     bar = (
-        "more pixels hide less; a fault that the camera cannot have is `none` in the step of the"
-        " priors"
+        "more pixels leave smaller errors hidden; for a fault that the camera cannot have, set"
+        " `none` in the step of the priors"
     )
-    text = f"{' and '.join(error_texts)}, which the frames show or may hide; nothing is corrected"
+    text = (
+        f"the frames show or may hide errors of {' and '.join(error_texts)}; no value is corrected"
+    )
     return [Check(f"intervals include {faults}", text, bar, "pass")]
 
 
@@ -355,7 +356,8 @@ def data_check(pairs: float) -> Check:
     are_enough = pairs >= CLEAN_PAIRS
     if not are_enough:
         text += (
-            ": intervals are wider than by statistics alone, because so few may hide mixing and lag"
+            ": intervals are wider than the statistics alone require, because so few pairs may"
+            " hide mixing and lag"
         )
     bar = (
         f"at least {CLEAN_PAIRS:.2g}, such as 10 levels of 2 frames of {picture_side} x"
@@ -383,8 +385,7 @@ def frame_section(tests: Sequence[FrameTest]) -> Section:
         measurements."""
     if len(tests) < 2:
         text = (
-            "Only moments are given, so that noise, patterns and numbers of the frames are not"
-            " tested."
+            "Only moments are given, so noise, patterns and numbers of the frames are not tested."
         )
     rows = [
         (t.name, abs(t.number), abs(t.limit), Marked(t.verdict, _MARKS[t.verdict]), t.sentence)

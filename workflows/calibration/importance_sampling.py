@@ -254,6 +254,5 @@ def _refuse_few(problem: SensorPosterior, fraction: float) -> None:
     if fraction < _LEAST_FRACTION:
         raise ValueError(
             f"{DRAWS} draws of {', '.join(problem.names)} have an effective sample size of"
-            f" {fraction * DRAWS:.0f}: hold the parameters that the levels do not determine at"
-            " fixed values"
+            f" {fraction * DRAWS:.0f}: fix the parameters that the levels do not determine"
         )

@@ -250,7 +250,7 @@ def initial_theta(problem: SensorPosterior) -> FloatArray:
     is_possible = np.isfinite(problem.log_posterior(samples))
     if not is_possible.any():
         raise ValueError(
-            "no sensor allowed by the priors can produce these numbers: check rounding, bits and"
+            "no sensor that the priors allow can produce these numbers: check rounding, bits and"
             " priors, then run least_squares"
         )
     start: FloatArray = samples[int(is_possible.argmax())]
@@ -320,8 +320,8 @@ def _unsettled(problem: SensorPosterior, fits: list[LaplaceFit]) -> str:
         f"{name} {float(x):.3g}" for name, x in problem.parameters(highest_fit.theta).items()
     )
     well_hint = (
-        ". If the well of this sensor ends the electrons before the read noise is added, set share:"
-        " 0.7 in the step of calibrate.sufficient"
+        ". If the well of this sensor limits the electrons before the read noise is added, set"
+        " share: 0.7 in the step of calibrate.sufficient"
     )
     return (
         f"none of {len(fits)} searches ends at a mode of the posterior (the highest stops at"

@@ -93,9 +93,8 @@ def misfits(
             # Bonferroni correction for two tests: twice the smaller probability
             p_value = min(1.0, 2 * min(runs(deviation), waves(deviation)))
             text = (
-                f"{_signs(deviation)} runs of sign over {len(deviation)} levels, waves of"
-                f" {_strength(deviation):.1f}; p ="
-                f" {p_value:.2g}"
+                f"{_signs(deviation)} runs of sign over {len(deviation)} levels, slow waves of"
+                f" strength {_strength(deviation):.1f}; p = {p_value:.2g}"
             )
             yield Misfit(
                 f"the {name} deviate without a trend",
@@ -130,11 +129,11 @@ def _prediction(deviations: Deviations) -> Misfit:
     )
     if not is_good:
         why = (
-            "its light or exposure may not be as stated"
+            "its light or exposure may differ from the stated value"
             if quantity == "mean"
             else "its frames may be disturbed"
         )
-        text += f": {why}; measure it again, or leave it out"
+        text += f": {why}; measure this level again, or remove it"
     return Misfit(
         "each level is predicted by the others", text, f"at most {largest_allowed:.1f} sd", is_good
     )
@@ -145,13 +144,16 @@ def _widths(problem: SensorPosterior, theta: FloatArray) -> Iterator[Misfit]:
     params = problem.recipe.steps[problem.step].params
     values = {**params, **{name: float(x) for name, x in problem.parameters(theta).items()}}
     words = {
-        "lamp": "the light scatters from level to level",
-        "scatter": "the variances scatter beyond chance",
+        "lamp": "the light varies from level to level",
+        "scatter": "the variances vary more than chance explains",
     }
     for name, bound in BOUNDS.items():
         text = f"{words[name]} by {values[name]:.2%}"
         yield Misfit(
-            f"{name} is that of a laboratory", text, f"at most {bound:.0%}", values[name] <= bound
+            f"the {name} is as small as in a laboratory",
+            text,
+            f"at most {bound:.0%}",
+            values[name] <= bound,
         )
 
 
@@ -410,16 +412,15 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     is_accepted = least_accepted <= chains.accepted <= largest
     yield Check(
         "moves are accepted",
-        f"{chains.accepted:.0%} of the moves",
+        f"{chains.accepted:.0%} of the proposed moves are accepted",
         f"{least_accepted:.0%} to {largest:.0%}",
         _mark(is_accepted, "warn"),
     )
     # R-hat does not show stranded walkers if all ensembles have them
     stranded_walkers = emcee_sampler.stranded(chains.log)
     text = (
-        f"{stranded_walkers} of {chains.log.shape[0] * chains.log.shape[2]} lie"
-        f" {emcee_sampler.STRANDED:.0f}"
-        " nats below the rest"
+        f"{stranded_walkers} walkers lie {chains.log.shape[0] * chains.log.shape[2]} nats below"
+        " the rest"
     )
     yield Check("no walker is stranded", text, "none", _mark(stranded_walkers == 0))
 

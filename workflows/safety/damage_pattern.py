@@ -319,8 +319,8 @@ def refuse_other_lens(recipe: Recipe, safety: Safety, store: Store | None) -> No
         width = f"{min(float(stop.diameter), grid_width) * 1e3:.4g} mm"
         if float(stop.diameter) > grid_width * (1 + _SAME):
             problem_text = (
-                f"the step {name} clips its disc to a square of {width}, and an estimate is of a"
-                " round lens"
+                f"the step {name} clips its disc to a square of {width}, but an estimate assumes"
+                " a round lens"
             )
             problems.append(
                 _problem(
@@ -329,9 +329,12 @@ def refuse_other_lens(recipe: Recipe, safety: Safety, store: Store | None) -> No
             )
         elif not math.isclose(float(stop.diameter), lens.diameter, rel_tol=_SAME):
             problem_text = (
-                f"the stop of the recipe ({name}) has {width}, and the lens of the estimate"
+                f"the stop of the recipe ({name}) has {width}, but the lens of the estimate"
             )
-            fix = "write one diameter in both; reading.aperture=stretched keeps that of the recipe"
+            fix = (
+                "write the same diameter in both; reading.aperture=stretched keeps the diameter"
+                " of the recipe"
+            )
             problems.append(
                 _problem(
                     safety, "lens.diameter", f"{problem_text} {lens.diameter * 1e3:.4g} mm: {fix}"
@@ -344,7 +347,9 @@ def refuse_other_lens(recipe: Recipe, safety: Safety, store: Store | None) -> No
             f" {lens.diameter * 1e3:.4g} mm"
         )
         problems.append(
-            _problem(safety, "protection.stop", f"{problem} and stops nothing: give a smaller one")
+            _problem(
+                safety, "protection.stop", f"{problem}, so it blocks nothing: write a smaller stop"
+            )
         )
     if problems:
         raise RecipeError(problems)
@@ -365,10 +370,12 @@ def _other_focal_length(recipe: Recipe, safety: Safety) -> Iterator[Diagnostic]:
         step_length = recipe.steps[name].params["focal_length"]
         if not math.isclose(step_length, focal_length, rel_tol=_SAME):
             text = (
-                f"the step {name} has {step_length * 1e3:.4g} mm, and the lens of the estimate"
-                f" {focal_length * 1e3:.4g} mm"
+                f"the step {name} has a focal length of {step_length * 1e3:.4g} mm, but the lens"
+                f" of the estimate has {focal_length * 1e3:.4g} mm"
             )
-            yield _problem(safety, "lens.focal_length", f"{text}: write one focal length in both")
+            yield _problem(
+                safety, "lens.focal_length", f"{text}: write the same focal length in both"
+            )
             return
 
 

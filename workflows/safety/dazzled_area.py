@@ -316,19 +316,20 @@ def area_of(safety: Safety, option: Option, ranked: Sequence[Ranked]) -> Area | 
     if option.masked:
         if "mask" not in arms:
             return (
-                "the recipe does not compute it. Add `- safety: masked_dazzle` to its defaults, or"
-                " name a step of laser.bright_pixels in safety.protection.pixels.mask"
+                "the recipe does not compute the dazzled area. Add `- safety: masked_dazzle` to"
+                " its defaults, or name a step of laser.bright_pixels in"
+                " safety.protection.pixels.mask"
             )
         if not math.isfinite(arms["mask"].error):
             return (
-                "the pupil of safety.protection.pixels.mask has no wavefront, so that its spot is"
-                " of one distance"
+                "the pupil of safety.protection.pixels.mask has no wavefront, so its spot belongs"
+                " to a single distance"
             )
         return Area(option, safety, arms["mask"])
     plain_spots = arms.get("plain") if option.diameter is None else None
     if plain_spots is not None and not math.isfinite(plain_spots.error):
         return (
-            "the pupil of safety.protection.pixels.plain has no wavefront, so that its spot is of"
-            " one distance"
+            "the pupil of safety.protection.pixels.plain has no wavefront, so its spot belongs to"
+            " a single distance"
         )
     return Area(option, safety, plain_spots)

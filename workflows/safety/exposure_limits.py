@@ -68,7 +68,7 @@ def with_channels(recipe: Recipe, safety: Safety, store: Store | None) -> Safety
     line_step = recipe.steps[str(step.wires["bands"])]
     if line_step.node.path != _LINE:
         raise _refused(
-            safety, f"the step {step.name} is not of a laser line: name a step that reads one"
+            safety, f"the step {step.name} does not read a laser line: name a step that reads one"
         )
     result = run(recipe, store, [step.name])
     largest = float(result[step.name].max())
@@ -94,7 +94,7 @@ def _step(recipe: Recipe, safety: Safety, named: str) -> Step:
     step = recipe.steps[name]
     if step.node.path != _RESPONSES:
         raise _refused(
-            safety, f"the step {name} is of the node {step.node.path}: name a step of {_RESPONSES}"
+            safety, f"the step {name} has the node {step.node.path}: name a step of {_RESPONSES}"
         )
     return step
 
@@ -490,8 +490,8 @@ def mean_in_frame(exposures: Exposures, exposure: float) -> FloatArray:
 
 DAZZLE_SOURCE = (
     "veil: CIE 146:2002, general disability glare equation; threshold: Adrian, Lighting Res."
-    " Technol. 21, 181 (1989); MDE and NODD as Williamson and McLin (Appl. Opt. 54, 1564, 2015)"
-    " define them, not by their table"
+    " Technol. 21, 181 (1989); MDE and NODD as defined by Williamson and McLin (Appl. Opt. 54,"
+    " 1564, 2015), not from their table"
 )
 
 
@@ -550,7 +550,7 @@ def eye_finding(safety: Safety, exposures: Exposures) -> EyeFinding | str:
             ]
         )
     except ParameterError as error:
-        return f"Nothing is said of the eye: {error}."
+        return f"No statement about the eye: {error}."
     quantity = "fluence" if beam.is_pulsed else "irradiance"
     exposure_here = (
         exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0]

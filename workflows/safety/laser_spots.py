@@ -798,21 +798,19 @@ def _step(recipe: Recipe, safety: Safety, arm: str, named: str) -> str:
     ranking_step, params = recipe.steps[step], recipe.steps[step].params
     value, problem = safety.values[setting], ""
     if ranking_step.node.path != _RANKS:
-        problem = (
-            f"the step {step} is of the node {ranking_step.node.path}: name a step of {_RANKS}"
-        )
+        problem = f"the step {step} has the node {ranking_step.node.path}: name a step of {_RANKS}"
     elif (
         not math.isclose(params["pixel_pitch"], sensor.pixel_pitch)
         or tuple(params["shape"]) != sensor.shape
     ):
         problem = (
-            f"the step {step} has another sensor: give it safety.sensor.pixel_pitch and"
+            f"the step {step} has another sensor: set its sensor to safety.sensor.pixel_pitch and"
             " safety.sensor.shape"
         )
     elif any(source.node.path == "flare.stray_light" for source in _upstream(recipe, step)):
         problem = (
-            f"the step {step} has stray light, which the estimate adds itself: rank the PSF before"
-            " flare.stray_light"
+            f"the step {step} includes stray light, which the estimate adds itself: rank the PSF"
+            " before flare.stray_light"
         )
     if problem:
         raise RecipeError([Diagnostic(value.mark, value.name, problem)])

@@ -284,7 +284,7 @@ def state_of_finding(finding: Finding) -> State:
 
 
 _ARMS = {"plain": "plain lens", "mask": "mask"}
-_REMEDY = "more optics.samples, and a step laser.wavefront, carry a nearer one"
+_REMEDY = "increase optics.samples and add a step laser.wavefront to compute nearer distances"
 
 
 def scatter_text(veil: Veil | None) -> str:
@@ -293,20 +293,20 @@ def scatter_text(veil: Veil | None) -> str:
     """
     if veil is None:
         return (
-            "The lens scatters no light (safety.lens.scatter: null). A real lens scatters, and is"
-            " dazzled from farther away and from nearer by than is said here."
+            "The lens scatters no light (safety.lens.scatter: null). A real lens scatters light,"
+            " and is dazzled at larger and at smaller distances than those given here."
         )
     share = f"Lens scatter {100 * float(veil.share[0]):.2g} %"
-    source = "as the recipe says"
+    source = "as given in the recipe"
     if veil.assumed:
         source = (
-            f"assumed, within a factor of {ASSUMED:g} (one standard deviation): give"
-            " safety.lens.scatter of yours"
+            f"assumed, within a factor of {ASSUMED:g} (one standard deviation): set"
+            " safety.lens.scatter to the scatter of your lens"
         )
     return (
-        f"{share}, {source}. It is a veil that falls beside the spot behind a mask as well as"
-        " behind the plain lens, and is counted in dazzle. It does not raise the peak, and so not"
-        " the damage."
+        f"{share}, {source}. The scattered light is a veil beside the spot, behind a mask as well"
+        " as behind the plain lens, and counts as dazzle. It does not raise the peak, so it adds"
+        " no damage."
     )
 
 
@@ -319,8 +319,9 @@ def focus_text(safety: Safety) -> str:
         return "The lens is focused on the laser at every distance, which gives the highest peak."
     name = "infinity" if focus == "infinity" else f"{focus:g} m"
     return (
-        f"The lens is focused at {name} (safety.lens.focus), and a laser elsewhere is out of focus."
-        " A camera that focuses on the laser has a higher peak: safety.lens.focus: laser."
+        f"The lens is focused at {name} (safety.lens.focus), so a laser at another distance is"
+        " out of focus. A camera that focuses on the laser has a higher peak: set"
+        " safety.lens.focus: laser."
     )
 
 
@@ -331,23 +332,24 @@ def counted(safety: Safety) -> Iterator[str]:
     beam, m_squared = safety.settings.beam, safety.laser.beam().m_squared
     if beam.hot_spots > 1 or "beam.hot_spots" in safety.values:
         yield (
-            f"Hot spots of the beam: counted, factor {beam.hot_spots:g} on the irradiance of an"
+            f"Hot spots of the beam: included, factor {beam.hot_spots:g} on the irradiance of an"
             " even Gaussian beam."
         )
     else:
-        yield "Hot spots of the beam: not counted (safety.beam.hot_spots is 1)."
+        yield "Hot spots of the beam: not included (safety.beam.hot_spots is 1)."
     if beam.cn2 is None:
-        yield "Turbulence of the air (scintillation): not counted (safety.beam.cn2 is not given)."
+        yield "Turbulence of the air (scintillation): not included (safety.beam.cn2 is not set)."
     else:
         yield (
-            f"Turbulence of the air: counted, Cn2 {beam.cn2:g} m^(-2/3); the exposure is the one"
-            f" that is exceeded for {100 * (1 - beam.worst):.2g} % of the time, by Rytov's variance"
-            " of a plane wave, an upper bound."
+            f"Turbulence of the air: included, Cn2 {beam.cn2:g} m^(-2/3); the exposure is"
+            f" exceeded for {100 * (1 - beam.worst):.2g} % of the time, by Rytov's variance of a"
+            " plane wave, an upper bound."
         )
     if m_squared > 1 + 1e-6:
         yield (
-            f"M2 of {m_squared:.3g}: counted in the width of the beam. Its light is focused as one"
-            " Gaussian mode, an upper bound of the peak: a beam of many modes has a wider spot."
+            f"M2 of {m_squared:.3g}: included in the width of the beam. The light is focused as a"
+            " single Gaussian mode, an upper bound of the peak: a beam of many modes has a wider"
+            " spot."
         )
     else:
         yield (
@@ -361,15 +363,15 @@ def ladder_text(ranked: tuple[Ranked, ...], peaks: Peaks | None) -> str:
     interpolation error between them.
     """
     text = (
-        "The spot of the clear lens is computed at every distance; from where the beam fills the"
-        f" lens to (D / 2w)^2 = {FAR_FILL:g} with {FAR_WAVES:g} waves of curvature it is that of a"
-        " distant laser."
+        "The spot of the clear lens is computed at every distance. Where the beam fills the lens"
+        f" to (D / 2w)^2 = {FAR_FILL:g} with {FAR_WAVES:g} waves of curvature, and beyond, the"
+        " spot is that of a distant laser."
     )
     spots = [(spot.arm, len(spot.distances), spot.error) for spot in ranked]
     if peaks and len(peaks.along) > 1:
         spots.append(("peak behind the mask", len(peaks.along), peaks.error))
     parts = [
-        f"{arm}: {count} distances, within {max(100 * error, 0.1):.2g} % between them, counted"
+        f"{arm}: {count} distances, interpolated within {max(100 * error, 0.1):.2g} %, rounded"
         " upward"
         for arm, count, error in spots
         if math.isfinite(error)
@@ -387,9 +389,9 @@ def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> 
     """
     if peaks and peaks.along[0][0] > asked:
         yield (
-            f"Nearer than {peaks.along[0][0]:.3g} m the beam in front of the mask is not computed"
-            f" ({_REMEDY}): its peak counts as that of the clear lens in focus there, which no mask"
-            " exceeds."
+            f"At less than {peaks.along[0][0]:.3g} m the beam in front of the mask is not"
+            f" computed ({_REMEDY}): there the peak counts as the peak of the clear lens in"
+            " focus, which no mask exceeds."
         )
     if peaks and peaks.outside:
         missing = max(share for _, share in peaks.outside)
@@ -399,15 +401,15 @@ def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> 
         )
         yield (
             f"At {where_text}, the window of the spot behind the mask lacks light (up to"
-            f" {100 * missing:.2g} %) that may be brighter outside: it counts as one spot, as sharp"
-            " as that of the clear lens. Choose a larger window."
+            f" {100 * missing:.2g} %) that may be brighter outside the window: this light counts"
+            " as one spot, as sharp as the spot of the clear lens. Choose a larger window."
         )
     for spot in ranked:
         if math.isfinite(spot.error) and spot.distances[0] > asked:
             yield (
-                f"Nearer than {spot.distances[0]:.3g} m the pixels behind the {_ARMS[spot.arm]} are"
-                f" not computed ({_REMEDY}): all light counts in the pixels that may be lost, the"
-                " most that there can be."
+                f"At less than {spot.distances[0]:.3g} m the pixels behind the {_ARMS[spot.arm]}"
+                f" are not computed ({_REMEDY}): all light counts in the pixels that may be lost,"
+                " which is an upper bound."
             )
 
 
@@ -424,7 +426,7 @@ def unsaid_of_damage(safety: Safety, verdicts: Sequence[DamageVerdict]) -> Itera
     the recipe has no damage settings.
     """
     if safety.settings.damage is None:
-        yield "Nothing is said of damage: the recipe does not ask for it (safety.damage)."
+        yield "No statement about damage: the recipe does not request it (safety.damage)."
         return
     reasons: dict[str, dict[str, None]] = {}
     for verdict in verdicts:
@@ -432,8 +434,8 @@ def unsaid_of_damage(safety: Safety, verdicts: Sequence[DamageVerdict]) -> Itera
             reasons.setdefault(row.reason, {})[row.part] = None
     for reason, parts in reasons.items():
         yield (
-            f"Not judged for damage: the {' and the '.join(parts)}: {reason}. Give a table of your"
-            " own: safety.damage.file."
+            f"Damage is not judged for the {' and the '.join(parts)}: {reason}. Name a table of"
+            " your own: safety.damage.file."
         )
 
 
@@ -444,26 +446,29 @@ def unsaid_of_dazzle(safety: Safety, areas: Mapping[str, Area | str]) -> Iterato
     dazzle, sensor = safety.settings.dazzle, safety.settings.sensor
     if dazzle is None:
         lacking = [name.replace("_", " ") for name in SATURATION if getattr(sensor, name) is None]
-        reason = "the recipe does not ask for it (safety.dazzle)"
+        reason = "the recipe does not request it (safety.dazzle)"
         if lacking:
-            reason = f"the recipe gives no {', '.join(lacking)} of the sensor at this wavelength"
-        yield f"Nothing is said of dazzle: {reason}."
+            reason = (
+                f"the recipe does not set {', '.join(lacking)} of the sensor at this wavelength"
+            )
+        yield f"No statement about dazzle: {reason}."
         return
     if not sees(safety.channels):
         yield (
-            "Nothing is said of dazzle: no channel of the camera sees"
-            f" {safety.laser.wavelength * 1e9:.4g} nm, by the table of its responses. A sensor"
-            " without its filters may see it."
+            "No statement about dazzle: by the table of its responses, no channel of the camera"
+            f" detects {safety.laser.wavelength * 1e9:.4g} nm. A sensor without its filters may"
+            " detect it."
         )
         return
     yield from _unsaid_areas(areas)
     level = veil_level(dazzle)
     if level <= 0:
-        yield "The feature of safety.dazzle is lost without any laser, so that no veil is stated."
+        yield "The feature of safety.dazzle is lost even without a laser, so no veil is computed."
     elif level >= sensor.fills:
         yield (
-            f"The feature of safety.dazzle is seen through {level:.3g} e- of veiling light a pixel,"
-            " more than the full well: a pixel is lost when it saturates, and no veil is stated."
+            f"The feature of safety.dazzle is visible through {level:.3g} e- of veiling light per"
+            " pixel, more than the full well: a pixel is lost when it saturates, so no veil is"
+            " computed."
         )
 
 
@@ -477,7 +482,7 @@ def _unsaid_areas(areas: Mapping[str, Area | str]) -> Iterator[str]:
             reasons.setdefault(area, []).append(name)
     for reason, names in reasons.items():
         yield (
-            f"Nothing is said of dazzle behind {' and '.join(f'the {name}' for name in names)}:"
+            f"No statement about dazzle behind {' and '.join(f'the {name}' for name in names)}:"
             f" {reason}."
         )
 
@@ -492,8 +497,8 @@ def beyond_window(shares: Mapping[str, float]) -> Iterator[str]:
             f"{100 * share:.2g} % behind the {name}" for name, share in shares_to_name.items()
         )
         yield (
-            "The window of the point-spread function does not hold the dazzled area at every"
-            f" distance: of its pixels up to {parts} have the light of a radial law (the third"
+            "The window of the point-spread function does not contain the dazzled area at every"
+            f" distance: up to {parts} of its pixels have the light of a radial law (the third"
             " power of the distance), and light that this law does not explain counts where it"
             " dazzles most. Choose a larger window."
         )
@@ -505,7 +510,7 @@ def beyond_window(shares: Mapping[str, float]) -> Iterator[str]:
 # distance.
 
 
-CERTIFICATE = "An estimate, no certificate: neusee decides nothing about eyes or sensors."
+CERTIFICATE = "An estimate, not a certificate: neusee decides nothing about eyes or sensors."
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def zones_text(zones: Zones) -> str:
         return "; ".join(map(zone_text, zones.zones))
     if zones.reach is None:
         return "nowhere"
-    return f"nowhere at the nominal values; in some draws out to {end(zones.reach)}"
+    return f"nowhere at the nominal values; in some draws up to {end(zones.reach)}"
 
 
 def share(value: float) -> str:
@@ -132,7 +132,7 @@ def probability(finding: Finding) -> str:
     """Return the probability of damage as text with its interval; a dash where none is stated."""
     spread = finding.probability
     if spread is None:
-        return "–" if finding.limit.effect == "dazzle" else "not known: no spread published"
+        return "–" if finding.limit.effect == "dazzle" else "not known: no spread was published"
     middle_text, low_text, high_text = map(share, (spread.value, spread.low, spread.high))
     return (
         middle_text
@@ -216,9 +216,13 @@ def intervals_text(estimate: Estimate) -> str:
     """Return a sentence on the meaning of the numbers in brackets."""
     laws = estimate.draws.laws
     laws_text = f" {', '.join(f'{name} {text}' for name, text in laws.items())};" if laws else ""
-    text = f"In brackets: the middle 90 % of {estimate.draws.count} draws of all that is uncertain"
+    text = f"In brackets: the middle 90 % of {estimate.draws.count} draws of all uncertain values"
     if not estimate.damage:
-        return f"{text}:{laws_text.removesuffix(';')}." if laws_text else f"{text}; nothing is."
+        return (
+            f"{text}:{laws_text.removesuffix(';')}."
+            if laws_text
+            else f"{text}; no value is uncertain."
+        )
     return (
         f"{text}:{laws_text} the thresholds of damage. A published threshold has a bracket and no"
         " probability: a third of the draws each takes its lower end, its middle and its upper"
@@ -304,7 +308,7 @@ def _sooner_text(estimate: Estimate) -> str:
         f"{factor:.3g} times less light" if factor > 1 else f"{1 / factor:.3g} times more light"
     )
     return (
-        f"Behind the mask {compared} at the lens than behind the plain lens gives:"
+        f"Behind the mask, {compared} at the lens than behind the plain lens reaches this limit:"
         f" {dazzle_findings[1].limit.name}."
     )
 
@@ -363,12 +367,12 @@ def damage_sentence(verdict: DamageVerdict, estimate: Estimate) -> str:
     if verdict.state == "not judged":
         parts = " and the ".join(dict.fromkeys(row.part for row in verdict.unjudged))
         text = (
-            f"Damage is not judged {place_text}, because no law judges the {parts}:"
+            f"Damage is not judged {place_text}, because no damage law applies to the {parts}:"
             f" {verdict.unjudged[0].reason}."
         )
         if nearest.state == "not judged":
             return text
-        return f"{text} Of what is judged, {exposure_text} {zones_sentence}".rstrip()
+        return f"{text} Of the judged parts, {exposure_text} {zones_sentence}".rstrip()
     opening = "Damage cannot be excluded" if verdict.state == "within" else "No damage is expected"
     return f"{opening} {place_text}: {exposure_text} {zones_sentence}"
 
@@ -418,7 +422,7 @@ def _zones(verdict: DamageVerdict, finding: Finding) -> str:
     if finding.zones.reach is None:
         return "It exceeds the threshold nowhere."
     return (
-        "It exceeds the threshold nowhere at the nominal values, but in some draws out to"
+        "It exceeds the threshold nowhere at the nominal values, but in some draws up to"
         f" {end(finding.zones.reach)}."
     )
 
@@ -645,7 +649,7 @@ def _notch_note(remedy: Remedy) -> str:
     if remedy.band is None:
         return ""
     low, high = (f"{wavelength * 1e9:.4g}" for wavelength in remedy.band)
-    return f"blocks {low} to {high} nm; the colour of the laser has to be known"
+    return f"blocks {low} to {high} nm; the wavelength of the laser must be known"
 
 
 def _picture_notes(remedy: Remedy) -> Iterator[str]:
@@ -672,7 +676,7 @@ def sentences(remedies: Sequence[Remedy]) -> Iterator[str]:
             remedy.means for remedy in remedies if remedy.limit == limit and remedy.value is None
         }
         if {"grey filter", "stop"} <= helpless:
-            yield f"{limit}: no grey filter and no stop helps."
+            yield f"{limit}: neither a grey filter nor a stop helps."
 
 
 # --- safety text ----------------------------------------------------------------------------------

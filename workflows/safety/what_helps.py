@@ -51,7 +51,7 @@ _UNCHANGED_RATIO = 1e-6  #: relative difference of ratios that count as equal
 _FLOOR, _CEILING = 1e-300, 1e300
 
 MET = "not needed"
-OPEN = "not judged: nothing is known of exposures below this limit"
+OPEN = "not judged: exposures below this limit are not known"
 UNSAFE = "no value holds in 95 % of the draws"
 
 
@@ -366,7 +366,7 @@ def _remedy(limit: str, way: _Way) -> Remedy:
             limit,
             way.means,
             None,
-            reason="not judged: the dazzled area behind it is not known",
+            reason="not judged: the dazzled area behind this protection is not known",
         )
     # (factor, 1 + draw)
     ratio_table = np.stack(judged_ratios)
@@ -511,13 +511,13 @@ def _why_not(problem: Problem, means: Means, table: FloatArray) -> str:
     # nominal ratio at the strongest factor over that at the present one
     changes_ratio = bool(np.abs(table[-1, 0] / table[0, 0] - 1) > _UNCHANGED_RATIO)
     if problem == "damage" and means == "exposure" and not changes_ratio:
-        return "the exposure never changes damage"
+        return "a shorter exposure does not change damage"
     if means == "exposure" and not changes_ratio:
-        return "scene and laser change alike with the exposure"
+        return "the exposure changes scene and laser alike"
     if problem == "contrast" and means == "grey filter":
-        return "a grey filter dims the scene as much as the laser"
+        return "a grey filter weakens the scene as much as the laser"
     if problem == "contrast" and means == "stop":
-        return "a stop dims the scene too: no stop down to f/64 helps"
+        return "a stop weakens the scene too: no stop down to f/64 helps"
     return {
         "stop": "no stop down to f/64 helps",
         "exposure": "no exposure down to a millionth helps",

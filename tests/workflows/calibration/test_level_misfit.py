@@ -34,7 +34,10 @@ PREDICTED, VARIANCES, MEANS = (
     "the variances deviate without a trend",
     "the means deviate without a trend",
 )
-LAMP, SCATTER = "lamp is that of a laboratory", "scatter is that of a laboratory"
+LAMP, SCATTER = (
+    "the lamp is as small as in a laboratory",
+    "the scatter is as small as in a laboratory",
+)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +122,7 @@ def test_the_level_that_deviates_is_named_with_what_to_do(folder, change, says):
     lit = [row for row in rows if float(row["photons"]) > 0]
     name = f"of {float(lit[4]['photons']):.5g} photons and {float(lit[4]['exposure_s']):.4g} s"
     assert found[PREDICTED].found.startswith(f"the {says.format(name)}")
-    assert found[PREDICTED].found.endswith("measure it again, or leave it out")
+    assert found[PREDICTED].found.endswith("measure this level again, or remove it")
     assert PREDICTED in wrong(found)
 
 

@@ -140,7 +140,7 @@ def test_too_few_levels_are_refused_with_what_would_do(store, tmp_path):
     with pytest.raises(
         ValueError,
         match=(
-            r"3 lit levels do not separate a response of 2 terms .* give 4 or more .* fix twist"
+            r"3 lit levels cannot distinguish a response of 2 terms .* give 4 or more .* fix twist"
             r" at 0$"
         ),
     ):

@@ -46,7 +46,9 @@ def test_the_terminal_has_limits_distances_eye_and_sources(neusee, tmp_path):
     code, out, err = neusee("safety", "safety_pointer", *QUICK)
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert lines[1] == "An estimate, no certificate: neusee decides nothing about eyes or sensors."
+    assert (
+        lines[1] == "An estimate, not a certificate: neusee decides nothing about eyes or sensors."
+    )
     for words in (
         "MPE",
         "NOHD",
@@ -76,12 +78,12 @@ def test_json_is_one_object_and_says_why_there_is_no_dazzle_at_1550_nm(neusee):
     assert all(each["source"] for each in found["limits"])
     assert found["not_said"] == [
         (
-            "Not judged for damage: the mean and the accumulation: no law of damage at 1550 nm:"
-            " published laws are used from 400 to 1100 nm. Give a table of your own:"
+            "Damage is not judged for the mean and the accumulation: no law of damage at 1550 nm:"
+            " published laws are used from 400 to 1100 nm. Name a table of your own:"
             " safety.damage.file."
         ),
         (
-            "Nothing is said of dazzle: the recipe gives no quantum efficiency, full well, exposure"
+            "No statement about dazzle: the recipe does not set quantum efficiency, full well, exposure"
             " of the sensor at this wavelength."
         ),
     ]
@@ -136,7 +138,7 @@ def test_damage_need_not_be_asked_for(neusee, tmp_path, monkeypatch):
         found = json.loads(out)
         assert (code, found["damage"], found["limits"]) == (0, [], [])
         assert (
-            "Nothing is said of damage: the recipe does not ask for it (safety.damage)."
+            "No statement about damage: the recipe does not request it (safety.damage)."
             in found["not_said"]
         )
 

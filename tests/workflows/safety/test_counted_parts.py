@@ -45,19 +45,19 @@ def ranked(error=0.013):
 
 def test_hot_spots_and_turbulence_are_counted_with_their_value_or_said_not_to_be():
     even = list(counted(case()))
-    assert even[0] == "Hot spots of the beam: not counted (safety.beam.hot_spots is 1)."
-    assert "not counted (safety.beam.cn2 is not given)" in even[1]
+    assert even[0] == "Hot spots of the beam: not included (safety.beam.hot_spots is 1)."
+    assert "not included (safety.beam.cn2 is not set)" in even[1]
     assert even[2].startswith("M2 is 1")
     uneven = list(
         counted(
             case(beam={"hot_spots": 2.5, "cn2": 1e-14, "worst": 0.95}, waist="1 mm", m_squared=None)
         )
     )
-    assert "counted, factor 2.5" in uneven[0]
+    assert "included, factor 2.5" in uneven[0]
     assert "Cn2 1e-14" in uneven[1]
     assert "for 5 % of the time" in uneven[1]
     quality = 1e-3 * 1e-3 * math.pi / (2 * 532e-9)
-    assert uneven[2].startswith(f"M2 of {quality:.3g}: counted in the width")
+    assert uneven[2].startswith(f"M2 of {quality:.3g}: included in the width")
 
 
 def test_the_veil_is_said_with_its_share_in_per_cent_and_where_it_comes_from():
@@ -65,7 +65,7 @@ def test_the_veil_is_said_with_its_share_in_per_cent_and_where_it_comes_from():
     assumed = scatter_text(Veil(np.array([0.005]), True, np.zeros_like))
     assert assumed.startswith("Lens scatter 0.5 %, assumed, within a factor of 1.5")
     assert scatter_text(Veil(np.array([0.012]), False, np.zeros_like)).startswith(
-        "Lens scatter 1.2 %, as the recipe"
+        "Lens scatter 1.2 %, as given in the recipe"
     )
 
 
@@ -77,10 +77,10 @@ def test_the_focus_is_said(focus, text):
 
 def test_the_number_of_distances_and_the_error_between_them_are_said():
     text = ladder_text((ranked(),), Peaks(0.1, ((2.0, 0.4), (20.0, 0.02)), 0.03))
-    assert "mask: 3 distances, within 1.3 %" in text
-    assert "peak behind the mask: 2 distances, within 3 %" in text
+    assert "mask: 3 distances, interpolated within 1.3 %" in text
+    assert "peak behind the mask: 2 distances, interpolated within 3 %" in text
     assert "(D / 2w)^2 = 0.02 with 0.03 waves" in text
-    assert "distances, within" not in ladder_text(
+    assert "distances, interpolated" not in ladder_text(
         (ranked(math.inf),), Peaks(0.1, ((2.0, 0.4),), 0.0)
     )
 
@@ -88,8 +88,8 @@ def test_the_number_of_distances_and_the_error_between_them_are_said():
 def test_a_bound_is_said_only_where_nearer_distances_are_asked_for():
     peaks = Peaks(0.1, ((3.0, 0.4), (20.0, 0.02)), 0.03)
     both = list(near_text(1.0, (ranked(),), peaks))
-    assert both[0].startswith("Nearer than 3 m the beam in front of the mask is not computed")
-    assert both[1].startswith("Nearer than 2 m the pixels behind the mask are not computed")
+    assert both[0].startswith("At less than 3 m the beam in front of the mask is not computed")
+    assert both[1].startswith("At less than 2 m the pixels behind the mask are not computed")
     assert len(list(near_text(2.0, (ranked(),), peaks))) == 1
     assert list(near_text(3.0, (ranked(),), peaks)) == []
     assert list(near_text(1.0, (ranked(math.inf),), None)) == []

@@ -88,7 +88,7 @@ def test_the_limit_of_dazzle_behind_a_mask_is_that_of_its_own_integral(said):
     assert dazzle(said, "mask")["at_lens"]["value"] == pytest.approx(axicon_at_the_lens(), rel=0.02)
     assert "bright_pixels" in dazzle(said, "mask")["source"]
     assert "clear round pupil" in dazzle(said, "plain lens")["source"]
-    assert not any(line.startswith("Nothing is said of dazzle") for line in said["not_said"])
+    assert not any(line.startswith("No statement about dazzle") for line in said["not_said"])
 
 
 def test_the_zone_of_dazzle_behind_a_mask_ends_at_its_root_with_the_interval_of_the_laws(said):
@@ -141,7 +141,7 @@ def test_an_area_beyond_the_window_has_a_safe_limit_and_is_said_with_the_way_out
         (
             ["steps.laser_pixels.with.pixel_pitch=1.15 um"],
             "pixels.mask",
-            "give it safety.sensor.pixel_pitch",
+            "set its sensor to safety.sensor.pixel_pitch",
         ),
         (["safety.protection.pixels.mask=laser_pixel"], "pixels.mask", "laser_pixels"),
     ],

@@ -161,7 +161,7 @@ def test_a_laser_that_no_channel_sees_is_not_judged_and_not_called_safe(tmp_path
 @pytest.mark.parametrize(
     ("change", "message"),
     [("safety.sensor.responses=lost", "no step 'lost'"), ("safety.sensor.responses=line", "name a step of spectra"),
-     ("safety.sensor.responses=responses", "is not of a laser line"),
+     ("safety.sensor.responses=responses", "does not read a laser line"),
      ("safety.sensor.offset=30000 e-", "leaves no room for light")],
 )  # fmt: skip
 def test_a_step_of_another_kind_is_refused(tmp_path, change, message):

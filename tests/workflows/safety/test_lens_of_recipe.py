@@ -129,14 +129,14 @@ def test_the_ratio_to_the_threshold_grows_with_the_fourth_power_of_the_diameter(
     ("recipe", "changes", "path", "message"),
     [
         ("first_light", ["reading.aperture=inscribed", "optics.diameter=25 mm", "optics.pitch=12.6225 um"],
-         "optics.diameter", r"has 8\.078 mm, and the lens of the estimate 25 mm"),
+         "optics.diameter", r"has 8\.078 mm, but the lens of the estimate 25 mm"),
         ("first_light", ["reading.aperture=clipped", "optics.diameter=11 mm", "optics.pitch=12.6225 um"],
          "optics.diameter", r"clips its disc to a square of 8\.078 mm"),
         ("first_light", ["safety.lens.diameter=25 mm"], "safety.lens.diameter", r"has 8\.078 mm, .* 25 mm"),
-        ("first_light", ["safety.protection.stop=9 mm"], "safety.protection.stop", "stops nothing"),
+        ("first_light", ["safety.protection.stop=9 mm"], "safety.protection.stop", "blocks nothing"),
         ("safety_pointer", ["safety.lens.diameter=25 mm"], "safety.lens.diameter", "has 12 mm, .* 25 mm"),
-        ("safety_pointer", ["safety.lens.focal_length=25 mm"], "safety.lens.focal_length", "has 50 mm, .* 25 mm"),
-        ("safety_pointer", ["safety.protection.stop=20 mm"], "safety.protection.stop", "stops nothing"),
+        ("safety_pointer", ["safety.lens.focal_length=25 mm"], "safety.lens.focal_length", "has a focal length of 50 mm, .* 25 mm"),
+        ("safety_pointer", ["safety.protection.stop=20 mm"], "safety.protection.stop", "blocks nothing"),
     ],
 )  # fmt: skip
 def test_another_lens_than_that_of_the_steps_is_refused(tmp_path, recipe, changes, path, message):

@@ -12,9 +12,9 @@ from neusee.workflows.safety.safety_text import zones_text
         (None, "nowhere"),
         (
             Spread(1.02, 1.0, 1.06),
-            "nowhere at the nominal values; in some draws out to 1.02 m (1 m to 1.06 m)",
+            "nowhere at the nominal values; in some draws up to 1.02 m (1 m to 1.06 m)",
         ),
-        (Spread(2e3, 2e3, 2e3), "nowhere at the nominal values; in some draws out to 2 km"),
+        (Spread(2e3, 2e3, 2e3), "nowhere at the nominal values; in some draws up to 2 km"),
     ],
 )
 def test_a_limit_that_only_draws_exceed_says_how_far_out(reach, text):

@@ -253,7 +253,7 @@ def test_each_part_of_the_light_has_a_row_judged_or_not(worked):
         assert unjudged == ["mean", "accumulation"]
         assert "nowhere" not in plain["sentence"]
         assert any(
-            line.startswith("Not judged for damage: the mean and the accumulation")
+            line.startswith("Damage is not judged for the mean and the accumulation")
             for line in said["not_said"]
         )
 
