@@ -26,6 +26,7 @@ __depends__ = (
     "unaffected:file",
     "unaffected:CXX",
     "unaffected:XDG_CACHE_HOME",
+    "unaffected:HOME",
     "unaffected:ctypes",
     "unaffected:subprocess",
     "unaffected:platform",
@@ -126,11 +127,12 @@ def _compile(code: Path, rounding: str, where: Path) -> None:
 
 @functools.cache
 def _library(
-    sources: tuple[Path, ...], rounding: str, build: Path, compiler: str | None
+    sources: tuple[Path, ...], rounding: str, compiler: str | None, *homes: str | None
 ) -> ctypes.CDLL | NoCompilerError:
-    """Return the compiled library, or the error if compilation failed; for each folder and compiler
-    it is tried only once.
+    """Return the compiled library, or the error if compilation failed; for each compiler and each
+    of the ``homes``, which decide the folder, it is tried only once.
     """
+    build = folder()
     texts = [source.read_text(encoding="utf-8") for source in (*sources, VECTOR)]
     words = [*texts, *FLAGS, rounding, compiler or "", _processor()]
     digest = hashlib.sha256(chr(0).join(words).encode()).hexdigest()[:32]
@@ -153,7 +155,9 @@ def load(*sources: Path, rounding: str = FUSED) -> ctypes.CDLL:
     results for every vector width and every compiler. Raises `NoCompilerError` if the source cannot
     be compiled.
     """
-    library = _library(sources, rounding, folder(), os.environ.get("CXX"))
+    # three names are looked up in each call; the path of the folder is made only once from them
+    homes = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
+    library = _library(sources, rounding, os.environ.get("CXX"), *homes)
     if isinstance(library, NoCompilerError):
         raise library
     return library

@@ -5,6 +5,7 @@ Also support for `torch.func`: a test for active transforms, and `vmap` by repea
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -48,7 +49,8 @@ def refuse_not_finite(why: str, **values: Tensor | float) -> None:
     message.
     """
     for name, x in values.items():
-        if not bool(torch.as_tensor(x).isfinite().all()):
+        is_finite = bool(x.isfinite().all()) if isinstance(x, Tensor) else math.isfinite(x)
+        if not is_finite:
             raise ValueError(f"{name} holds values that are not finite: {why}")
 
 

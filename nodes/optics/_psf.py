@@ -321,14 +321,15 @@ def _clear_lens(
     """
     alphas = [turns_per_pixel(pupil, camera, band) for band in range(pupil.wavelengths.numel())]
     # peak of a pupil without phase: |sum of the field|^2 alpha^2 / light
-    point_peaks = torch.tensor(alphas, dtype=torch.float64).square() * (total**2 / area)
-    cut_off = (point_peaks * (4 / math.pi)).sqrt()
+    point_peaks = [alpha * alpha * (total**2 / area) for alpha in alphas]
+    cut_offs = [math.sqrt(peak * (4 / math.pi)) for peak in point_peaks]
+    cut_off = torch.tensor(cut_offs, dtype=torch.float64)
     if camera.sensor != "integrated":
-        return point_peaks, cut_off, torch.zeros_like(point_peaks)
+        return torch.tensor(point_peaks, dtype=torch.float64), cut_off, torch.zeros_like(cut_off)
     averaged_peaks = torch.tensor(
         clear_averages(pupil.aperture, alphas, camera.pixel == "zoh"), dtype=torch.float64
     )
-    return averaged_peaks / area, cut_off, torch.ones_like(point_peaks)
+    return averaged_peaks / area, cut_off, torch.ones_like(cut_off)
 
 
 def _intensity_at_points(
@@ -373,9 +374,10 @@ def _intensity_over_pixels(
 
 def _light_and_field(amplitude: Tensor) -> tuple[float, float]:
     """Return the sum of the squares and the sum of all samples of an amplitude in the pupil."""
-    parts = torch.split(
-        amplitude.detach().flatten(), _PART_SAMPLES
-    )  # read from memory once for both sums
+    samples = amplitude.detach().flatten()
+    if samples.numel() <= _PART_SAMPLES:
+        return float(torch.dot(samples, samples)), float(samples.sum())
+    parts = torch.split(samples, _PART_SAMPLES)  # read from memory once for both sums
     light, field = zip(*((torch.dot(x, x), x.sum()) for x in parts), strict=True)
     total_light, total_field = (
         float(torch.stack(sums).sum(dtype=torch.float64)) for sums in (light, field)

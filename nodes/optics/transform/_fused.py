@@ -5,7 +5,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -297,6 +297,48 @@ def available(device: torch.device) -> bool:
     )
 
 
+class _Plan(NamedTuple):
+    """Both axes in the layout of the C++ code, and what follows from them for each call."""
+
+    rows: CAxis
+    columns: CAxis
+    samples: int  #: number of samples of the field and of its transform
+    type_name: str  #: name of the types in the C++ functions
+    type_between: torch.dtype  #: type of all steps from the first FFT on
+    #: numbers of memory for the frequencies along y of all columns, before and behind sweep 2
+    numbers_between: tuple[int, int]
+
+
+@functools.lru_cache(maxsize=64)
+def _plan(rows: Axis, columns: Axis, dtype: torch.dtype, vector_bytes: int) -> _Plan:
+    """Return the plan of the transform along two axes for vectors of ``vector_bytes``; it is
+    cached.
+    """
+    kind = last_type(*work_by_axis(rows, columns), dtype, _FLOAT64_WORK_SHARE)
+    row_axis, column_axis = (
+        fused_axis(rows, dtype, dtype, kind),
+        fused_axis(columns, dtype, kind, kind),
+    )
+    # whole vectors along both axes, and one more, so that the start can be aligned
+    numbers_per_vector, columns_per_vector = (
+        vector_bytes // kind.itemsize,
+        vector_bytes // dtype.itemsize,
+    )
+    before, behind = (
+        2 * _rounded_up(row_axis.kept, numbers_per_vector) * _rounded_up(n, columns_per_vector)
+        + numbers_per_vector
+        for n in (columns.n_in, columns.n_out)
+    )
+    samples = rows.n_in * columns.n_in + rows.n_out * columns.n_out
+    return _Plan(row_axis, column_axis, samples, _NAMES[dtype, kind], kind, (before, behind))
+
+
+@functools.lru_cache(maxsize=64)
+def _distances(samples: int) -> Tensor:
+    """Return the distances of samples from their middle, in samples, float64; it is cached."""
+    return centred(samples, torch.device("cpu"))
+
+
 class FusedPupil:
     """The factors of the pupil in the layout of the C++ code, with the transforms of the field to
     and from a focal plane.
@@ -311,6 +353,8 @@ class FusedPupil:
         # a null pointer if the path is 0: the C++ code then skips it
         self.path = screens_of_kind[2] if screens.longest > 0 else None
         self.dtype, self.work = dtype, work
+        self.operators = operators()
+        self.vector_bytes = self.operators.neusee_psf_vector_bytes()
 
     def forward(
         self, view: View, intensity: Tensor | None, add: bool, field: Tensor | None
@@ -360,10 +404,7 @@ class FusedPupil:
 
     def _pupil(self, view: View) -> "_StructureWithArrays":
         """Return the structure of the pupil in one view, with the tilts that it points to."""
-        v, u = (
-            centred(n, torch.device("cpu")).mul_(tilt)
-            for n, tilt in zip(self.height.shape, view.tilt, strict=True)
-        )
+        v, u = (_distances(n) * tilt for n, tilt in zip(self.height.shape, view.tilt, strict=True))
         pointers = [address_of(x) for x in (self.amplitude, self.height, self.path)]
         turns_per_metre = view.turns_height, view.turns_path
         return _StructureWithArrays(
@@ -381,38 +422,24 @@ class FusedPupil:
         """Call the C++ function ``name`` for the types of this pupil, with axes, threads, memory
         and arguments.
         """
-        last_type_used = last_type(*work_by_axis(rows, columns), self.dtype, _FLOAT64_WORK_SHARE)
-        row_axis, column_axis = (
-            fused_axis(rows, self.dtype, self.dtype, last_type_used),
-            fused_axis(columns, self.dtype, last_type_used, last_type_used),
-        )
-        operator = getattr(operators(), f"neusee_psf_{name}_{_NAMES[self.dtype, last_type_used]}")
-        tiles = [
-            self._tiles(label, row_axis, n, last_type_used)
-            for label, n in (("before", column_axis.n_in), ("behind", column_axis.n_out))
+        plan = _plan(rows, columns, self.dtype, self.vector_bytes)
+        operator = getattr(self.operators, f"neusee_psf_{name}_{plan.type_name}")
+        between = [
+            self._memory(label, size, plan.type_between)
+            for label, size in zip(("before", "behind"), plan.numbers_between, strict=True)
         ]
         structures = [
             ctypes.byref(s) if isinstance(s, ctypes.Structure) else s
-            for s in (row_axis, column_axis, *arguments)
+            for s in (plan.rows, plan.columns, *arguments)
         ]
-        samples = rows.n_in * columns.n_in + rows.n_out * columns.n_out
         # a single thread for few samples
-        threads = min(torch.get_num_threads(), 1 + samples // _SAMPLES_PER_THREAD)
-        operator(*structures[:2], ctypes.c_int64(threads), *tiles, *structures[2:])
+        threads = min(torch.get_num_threads(), 1 + plan.samples // _SAMPLES_PER_THREAD)
+        operator(*structures[:2], ctypes.c_int64(threads), *between, *structures[2:])
 
-    def _tiles(self, label: str, y: CAxis, n: int, kind: torch.dtype) -> Any:
-        """Return the address of memory for all frequencies along y of ``n`` columns, aligned to the
-        vector registers.
-        """
-        vector = operators().neusee_psf_vector_bytes()
-        numbers_per_vector, columns_per_vector = (
-            vector // kind.itemsize,
-            vector // self.dtype.itemsize,
-        )
-        size = 2 * _rounded_up(y.kept, numbers_per_vector) * _rounded_up(n, columns_per_vector)
-        # one extra vector, so that the start can be aligned
-        memory = self.work.take(label, size + numbers_per_vector, dtype=kind)
-        return ctypes.c_void_p(_rounded_up(memory.data_ptr(), vector))
+    def _memory(self, label: str, size: int, kind: torch.dtype) -> Any:
+        """Return the address of memory for ``size`` numbers, aligned to the vector registers."""
+        address = self.work.take(label, size, dtype=kind).data_ptr()
+        return ctypes.c_void_p(_rounded_up(address, self.vector_bytes))
 
 
 class _StructureWithArrays:

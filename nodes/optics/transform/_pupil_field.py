@@ -51,9 +51,15 @@ class Screens(NamedTuple):
         """Return the pupil's factors and largest height and path; raise ValueError if height or
         path is not finite.
         """
-        extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
+        extents = [_largest_magnitude(x.detach()) for x in (height, path)]
         refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
         return cls(amplitude, height, path, *extents)
+
+
+def _largest_magnitude(lengths: Tensor) -> float:
+    """Return the largest absolute value, or NaN if there is a NaN."""
+    lowest, highest = lengths.aminmax()
+    return max(float(highest), -float(lowest))
 
 
 def refuse_too_many_turns(screens: Screens, views: Sequence[View]) -> None:
