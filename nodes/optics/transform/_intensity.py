@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 from neusee.nodes.optics.transform._fused import FusedPupil, available, operators
 from neusee.nodes.optics.transform._pupil_field import Field, Screens, View, refuse_too_many_turns
@@ -53,9 +54,21 @@ def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Samp
     """Return the intensity of the PSF, differentiable by back-propagation and by the transforms
     of `torch.func`.
     """
+    factors = amplitude, height, path
+    if not _is_differentiated(factors):
+        return _intensity_and_fields(Screens.of(*factors), sampling, False)[0]
     form = _Transformed if transformed() else PupilIntensity
-    result: Tensor = form.apply(amplitude, height, path, sampling)  # type: ignore[no-untyped-call]
+    result: Tensor = form.apply(*factors, sampling)  # type: ignore[no-untyped-call]
     return result
+
+
+def _is_differentiated(factors: Sequence[Tensor]) -> bool:
+    """Return True if a derivative with respect to one of the factors may be asked for."""
+    return (
+        transformed()
+        or any(unpack_dual(x).tangent is not None for x in factors)  # type: ignore[no-untyped-call]
+        or (torch.is_grad_enabled() and any(x.requires_grad for x in factors))
+    )
 
 
 class PupilIntensity(torch.autograd.Function):

@@ -138,6 +138,23 @@ def test_the_bits_depend_on_no_thread(monkeypatch):
     assert torch.equal(*found)
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")
+def test_a_forward_derivative_outside_of_torch_func_is_refused_and_not_lost():
+    light = rough(20, 20)
+    with torch.autograd.forward_ad.dual_level():
+        height = torch.autograd.forward_ad.make_dual(light.height, torch.ones(20, 20))
+        with pytest.raises(NotImplementedError, match="forward mode"):
+            _psf._focus(light._replace(height=height), camera((8, 8)), torch.float32, "fused")
+
+
+@pytest.mark.parametrize(("name", "value"), [("height", math.nan), ("path", -math.inf)])
+def test_a_length_that_is_not_finite_is_refused(name, value):
+    light = rough(20, 20)
+    getattr(light, name)[3, 4] = value
+    with pytest.raises(ValueError, match=f"{name} holds values that are not finite"):
+        _psf._focus(light, camera((8, 8)), torch.float32, "fused")
+
+
 def test_not_a_number_in_the_amplitude_is_seen():
     light = rough(40, 40)
     light.amplitude[0, 0] = math.nan
