@@ -387,7 +387,7 @@ def safety(
     The recipe needs a block `safety` and a laser in watts: see safety_pointer. The page has the
     limits of the sensor with their sources, the distances where the laser exceeds them, behind the
     plain lens, a mask, a grey filter and a smaller stop, and the limit of the eye beside them. It
-    is an estimate, no certificate.
+    is an estimate, not a certificate.
     """
     recipe, command = load(words, "safety")
     store = the_store()

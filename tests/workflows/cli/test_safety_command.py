@@ -53,14 +53,14 @@ def test_the_terminal_has_limits_distances_eye_and_sources(neusee, tmp_path):
         "MPE",
         "NOHD",
         "Schwarz et al.",
-        "no veil is stated",
+        "no veil is computed",
         "IEC 60825-1:2014",
         "may blind people",
     ):
         assert words in " ".join(out.split()), words
     page = tmp_path / "runs" / lines[-1].rpartition("runs/")[2]
     text = page.read_text(encoding="utf-8")
-    assert text.count("An estimate, no certificate") >= 5
+    assert text.count("An estimate, not a certificate") >= 5
     assert (page.parent / "limits.csv").read_text().startswith("protection,limit,effect")
     assert {path.name for path in (page.parent / "figures").iterdir()} == {
         "irradiance.png",
@@ -73,7 +73,7 @@ def test_json_is_one_object_and_says_why_there_is_no_dazzle_at_1550_nm(neusee):
     code, out, _ = neusee("safety", "safety_car_lidar_1550", *QUICK, "--json")
     found = json.loads(out)
     assert code == 0
-    assert found["certificate"].startswith("An estimate, no certificate")
+    assert found["certificate"].startswith("An estimate, not a certificate")
     assert {each["effect"] for each in found["limits"]} == {"damage"}
     assert all(each["source"] for each in found["limits"])
     assert found["not_said"] == [

@@ -156,8 +156,8 @@ FAILS = "cannot be imported: "
 BAD = {
     "[blom.py]": f"blom.py {FAILS}there is no file",
     "[./none]": f"./none {FAILS}there is no file",
-    "[none_such.mod]": "no module none_such.mod is installed",
-    "[lab_c]": "no module lab_c is installed; write ./lab_c for the folder",
+    "[none_such.mod]": "there is no installed module none_such.mod",
+    "[lab_c]": "there is no installed module lab_c; write ./lab_c for the folder",
     "[optics: ok_c.py]": (
         "there is already a family of nodes optics, from neusee or an installed package: choose"
     ),

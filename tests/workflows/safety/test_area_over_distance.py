@@ -170,7 +170,7 @@ def test_an_option_has_its_own_spots_or_says_why_it_has_none():
     assert area_of(case(), PLAIN, (plain, mask)).ranked is plain
     assert area_of(case(), STOP, (plain, mask)).ranked is None
     assert area_of(case(), masked, (plain, mask)).ranked is mask
-    assert "does not compute it" in area_of(case(), masked, (plain,))
+    assert "does not compute the dazzled area" in area_of(case(), masked, (plain,))
     single = Ranked("mask", (6.0,), (spot(1e-4),), math.inf)
     assert "no wavefront" in area_of(case(), masked, (single,))
     assert "no wavefront" in area_of(

@@ -155,7 +155,7 @@ def test_a_laser_that_no_channel_sees_is_not_judged_and_not_called_safe(tmp_path
     found = estimate(load("first_light", words(tmp_path, "Nikon 5100", 740), tmp_path))
     assert not found.dazzled
     assert not [each for each in found.findings if each.limit.effect == "dazzle"]
-    assert any("no channel of the camera sees 740 nm" in text for text in found.unsaid)
+    assert any("no channel of the camera detects 740 nm" in text for text in found.unsaid)
 
 
 @pytest.mark.parametrize(

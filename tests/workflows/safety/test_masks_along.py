@@ -329,6 +329,6 @@ def test_bounds_count_where_the_samples_do_not_carry_the_curvature(tmp_path):
     rows, not_said = behind_mask(
         write(case, power, threshold, tmp_path), [], Store(tmp_path / "store")
     )
-    assert any("Nearer than" in sentence for sentence in not_said), not_said
+    assert any("At less than" in sentence for sentence in not_said), not_said
     assert rows["damage"]["ratio"] > own_margins(case, power, threshold, "damage", 0.3)[0]
     assert rows["dazzle"]["ratio"] > own_margins(case, power, threshold, "with scatter", 0.3)[0]

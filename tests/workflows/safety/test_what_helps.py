@@ -125,7 +125,7 @@ def test_the_density_and_the_stop_against_damage_are_those_of_the_closed_form():
             math.log10(ratio), abs=2e-3
         )
         assert found["damage", "exposure"].value is None
-        assert "never changes damage" in found["damage", "exposure"].reason
+        assert "does not change damage" in found["damage", "exposure"].reason
         slowest = min(0.5 * lens["diameter_m"], lens["focal_m"] / 64)
         if peak(laser, lens, slowest) > 3e8:
             assert stop.value is None
