@@ -7,7 +7,7 @@ import importlib
 import inspect
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
@@ -247,6 +247,10 @@ class Hooks:
     approximation_error: Callable[[Any], tuple[float, float]] | None = None
     #: (parameters): True if the result is the same for every band
     band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
+    #: (parameters): names of the parameters that change nothing beside the others, such as the law
+    #: of a draw where a value is given; with ``rng`` if the node then draws nothing. The cache key
+    #: leaves them out
+    unused: Callable[[Mapping[str, Any]], Collection[str]] | None = None
     #: (*, parameters): notes for the user before the run; may raise `ParameterError`; an argument
     #: with the name of an input receives the input as far as it is known before the run (see
     #: ``shape``), else None
@@ -285,6 +289,7 @@ class Hooks:
 #     @digitize.skip_bound       # upper bound of the change if the step is skipped
 #     @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
 #     @digitize.rounding_error   # the same with what rounding to whole numbers adds, an estimate
+#     @digitize.unused           # parameters that change nothing beside the others
 #     @digitize.preflight        # checks the parameters before anything runs
 #     @digitize.check            # checks that the result is plausible
 #     @digitize.shape            # shape and type of the result, before anything runs
@@ -508,9 +513,13 @@ class Node:
         _attaches("rounding_error"),
     )
     propagate_draw, skip_draw = _attaches("propagate_draw"), _attaches("skip_draw")
-    band_invariant = _attaches("band_invariant")
+    band_invariant, unused = _attaches("band_invariant"), _attaches("unused")
     expected_range = _attaches("expected_range")
     shape, work, example = _attaches("shape"), _attaches("work"), _attaches("example")
+
+    def unused_parameters(self, params: Mapping[str, Any]) -> frozenset[str]:
+        """Return the names of the parameters that change nothing beside the others."""
+        return frozenset(self.hooks.unused(params) if self.hooks.unused else ())
 
     @property
     def preflight_inputs(self) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ an exposure, and its attenuation by filters and a stop.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, NamedTuple
 
 import torch
@@ -190,6 +191,12 @@ def light(
         pulses=double(pulses),
         pulse_fluence=double((beam.pulse_energy or 0.0) * peak_density),
     )
+
+
+@light.unused
+def _(params: Mapping[str, Any]) -> Collection[str]:
+    # a laser with a strength gives zeros
+    return () if params["strength"] is None else params.keys() - {"strength"}
 
 
 @light.check

@@ -1,6 +1,7 @@
 """The direction of a laser, and its spot on the sensor as irradiance."""
 
 import math
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
 import torch
@@ -76,6 +77,12 @@ def _drawn_within(sigma: float, edge: float, rng: Generator) -> Tensor:
             return drawn.cpu()
 
 
+@direction.unused
+def _(params: Mapping[str, Any]) -> Collection[str]:
+    # a given angle is not drawn
+    return () if params["angle"] is None else ("shape", "share", "rule", "rng")
+
+
 @direction.preflight
 def _(
     *,
@@ -87,7 +94,7 @@ def _(
     rule: Rule,
 ) -> list[str]:
     if angle is not None:
-        return angle_notes(angle)
+        return [*angle_notes(angle), *_beyond_notes(angle, focal_length, pixel_pitch, shape)]
     if rule == "focal_length_over_width":
         tilt = share * focal_length / (shape[1] * pixel_pitch)
         raise ParameterError(
@@ -96,6 +103,19 @@ def _(
             " the axis: set `angle`, or set rule: width_over_focal_length",
         )
     return []
+
+
+def _beyond_notes(
+    angle: tuple[float, float], focal_length: float, pixel_pitch: float, shape: tuple[int, int]
+) -> list[str]:
+    """Return a note for an angle whose spot lies beyond the edge of the sensor."""
+    y, x = (component * focal_length / pixel_pitch for component in angle)
+    if abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2:
+        return []
+    return [
+        f"the spot lies {y:+.1f}, {x:+.1f} px (y, x) off the axis, beyond the sensor of"
+        f" {shape[0]} x {shape[1]} px, where only glare reaches the picture"
+    ]
 
 
 def angle_notes(angle: tuple[float, float]) -> list[str]:
@@ -121,16 +141,10 @@ def angle_notes(angle: tuple[float, float]) -> list[str]:
 
 
 @direction.check
-def _(
-    result: Tensor, *, focal_length: float, pixel_pitch: float, shape: tuple[int, int], **_: Any
-) -> list[Check]:
+def _(result: Tensor, *, focal_length: float, pixel_pitch: float, **_: Any) -> list[Check]:
     y, x = (float(n) * focal_length / pixel_pitch for n in result)
-    on_sensor = abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2
     degrees = math.degrees(math.hypot(*(float(n) for n in result)))
-    beyond_text = "" if on_sensor else ": beyond the sensor, where only glare reaches the picture"
-    return [
-        Check(f"spot {y:+.1f}, {x:+.1f} px (y, x) off the axis, {degrees:.3g} deg{beyond_text}")
-    ]
+    return [Check(f"spot {y:+.1f}, {x:+.1f} px (y, x) off the axis, {degrees:.3g} deg")]
 
 
 # --- laser spot -----------------------------------------------------------------------------------

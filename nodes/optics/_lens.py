@@ -5,8 +5,9 @@ irradiance of a white surface on the sensor.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -210,6 +211,13 @@ _UNEQUAL_WIDTHS = (
     "the bands differ in width, so that one unit of the image is another power in each: use the"
     " node spectra.bands"
 )
+
+
+@white_irradiance.unused
+def _(params: Mapping[str, Any]) -> Collection[str]:
+    # without a brightness the result is 0
+    stated = {"illuminance", "luminance"}
+    return () if any(params[name] is not None for name in stated) else params.keys() - stated
 
 
 @white_irradiance.preflight

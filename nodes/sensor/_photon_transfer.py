@@ -1,5 +1,6 @@
 """Photon-transfer curve of a sensor, measured with simulated pairs of flat fields."""
 
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import torch
@@ -105,6 +106,12 @@ def _mean_and_variance(first: Tensor, second: Tensor) -> tuple[float, float]:
     frames.
     """
     return float((first + second).mean() / 2), float((first - second).square().mean() / 2)
+
+
+@photon_transfer.unused
+def _(params: Mapping[str, Any]) -> Collection[str]:
+    # only a dark current per second grows with the exposure
+    return () if isinstance(params["dark"], ElectronsPerSecond) else ("exposure",)
 
 
 @photon_transfer.preflight

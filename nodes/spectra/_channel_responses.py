@@ -1,8 +1,9 @@
 """Spectral responses of the channels of a sensor, and weights of the bands in them."""
 
 import re
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -75,6 +76,12 @@ def responses(
     if quantum_efficiency is not None and isinstance(camera, Path) and camera_curves(camera)[1]:
         largest = largest.new_tensor(quantum_efficiency)
     return (table.over(bands) / largest).clamp_min(0).to(bands.centres.device)
+
+
+@responses.unused
+def _(params: Mapping[str, Any]) -> Collection[str]:
+    # only a table of the user may be absolute
+    return () if isinstance(params["camera"], Path) else ("quantum_efficiency",)
 
 
 @responses.preflight

@@ -23,7 +23,13 @@ from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork, may_fork
 from neusee.workflows.graph.errors import RunError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.cache_key import Key, device_kind, file_stamps, is_private, plain
+from neusee.workflows.keys.cache_key import (
+    Key,
+    counted_params,
+    device_kind,
+    file_stamps,
+    is_private,
+)
 from neusee.workflows.keys.user_code import OwnCode, hold_back, may_be_stored
 from neusee.workflows.observation.observed_call import (
     call_observed,
@@ -338,11 +344,8 @@ def _value(work: StepJob, inputs: list[Any], observations: _Seen) -> Any:
 
 def _refuse_changed_files(work: StepJob, stamps: Any) -> None:
     """Raise `RunError` if an input file changed after the step began."""
-    params = work.step.params
-    is_unchanged = stamps == file_stamps(params)
-    if not is_unchanged or work.origin["params"] != {
-        name: plain(param) for name, param in params.items()
-    }:
+    is_unchanged = stamps == file_stamps(work.step.params)
+    if not is_unchanged or work.origin["params"] != counted_params(work.step):
         raise RunError(work.step, [], OSError("an input file changed while it was read: run again"))
 
 

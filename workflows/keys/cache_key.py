@@ -251,18 +251,24 @@ def key_of(
     key_parts: dict[str, Any] = {
         "node": node.path,
         "code": code_of(step, code),
-        "params": {name: plain(value) for name, value in step.params.items()},
+        "params": counted_params(step),
         "inputs": [_keys_of(step.wires.get(name), keys) for name in node.inputs],
     }
     if notes := written(step):
         key_parts["written"] = notes
-    if node.random:
+    if node.random and "rng" not in node.unused_parameters(step.params):
         key_parts["stream"] = [seed, step.name, device_kind(device)]
     is_private_key = not step.cached or any(
         map(is_private, [key_parts["code"], *(keys[name] for name in step.sources)])
     )
     # 24 digits after the prefix, so that every key has 32 characters
     return (PRIVATE + digest(key_parts)[:24] if is_private_key else digest(key_parts)), key_parts
+
+
+def counted_params(step: Step) -> dict[str, Any]:
+    """Return the parameters on which the result of a step depends, as JSON values."""
+    unused = step.node.unused_parameters(step.params)
+    return {name: plain(value) for name, value in step.params.items() if name not in unused}
 
 
 def code_of(step: Step, code: Code) -> str:

@@ -56,8 +56,13 @@ def test_the_printed_rule_is_refused_with_its_shift():
 def test_the_check_says_where_the_spot_is():
     (line,) = optics.direction.hooks.check(torch.tensor([1e-3, 0.0]), **PAPER)
     assert "+37.9, +0.0 px" in line.text
-    (line,) = optics.direction.hooks.check(torch.tensor([0.1, 0.0]), **PAPER)
-    assert "beyond the sensor" in line.text
+
+
+def test_an_angle_beyond_the_sensor_is_told_before_the_run():
+    (note,) = optics.direction.hooks.preflight(angle=(0.1, 0.0), **PAPER, **RULE)
+    assert "+3793.1, +0.0 px" in note
+    assert "beyond the sensor of 2048 x 2048 px" in note
+    assert optics.direction.hooks.preflight(angle=(1e-3, 0.0), **PAPER, **RULE) == []
 
 
 def test_a_wired_direction_moves_the_spot_like_an_angle():
