@@ -97,6 +97,7 @@ NO_SIZE = {
     "workflows/keys/module_origin.py:_text": SOURCE,
     "workflows/keys/loaded_state.py:workflows_digest": SOURCE,
     "workflows/keys/sealed_files.py:opened": OPENS,
+    "workflows/recipe/remembered_checks.py:edition_of_code": SOURCE,
     "workflows/recipe/text/other_spellings.py:module": PACKAGED,
     "workflows/report/contents.py:module": PACKAGED,
     "workflows/report/run_crate.py:_samples": PACKAGED,

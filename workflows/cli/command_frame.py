@@ -27,7 +27,7 @@ from neusee.workflows.graph.errors import RecipeError, visible
 from neusee.workflows.keys.sealed_files import text_of
 from neusee.workflows.report.run_folder import writable_folder
 from neusee.workflows.report.terminal_text import json_line, lasts
-from neusee.workflows.store.cache_settings import parse_size
+from neusee.workflows.store.cache_settings import default_root, parse_size
 from neusee.workflows.store.remote_store import open_store
 
 if TYPE_CHECKING:
@@ -109,15 +109,25 @@ def search_for_garbage() -> None:
 
 
 def load(
-    words: list[str] | None, *command: str, before: int = 0, exact: bool = False
+    words: list[str] | None,
+    *command: str,
+    before: int = 0,
+    exact: bool = False,
+    runs: bool = True,
 ) -> tuple[Recipe, list[str]]:
     """Return the recipe that the arguments ``words`` name, with the changes that they ask for, and
     the command line that runs it again.
+
+    Unless the command ``runs`` steps, the recipe may have its nodes as far as a check reads them.
     """
     name, changes, first_number = split(words, before)
 
     with refusing():
-        recipe = lazy.loading.load(name, changes, first=first_number)
+        recipe, is_without_nodes = lazy.remembered_checks.load(
+            _folder_of_cache(), name, changes, first_number
+        )
+    if runs and is_without_nodes:
+        recipe = lazy.remembered_checks.with_nodes(recipe)
     search_for_garbage()
     command_line = ["neusee", *command, name, *changes]
     return (
@@ -125,6 +135,13 @@ def load(
         if exact
         else (recipe, command_line)
     )
+
+
+def _folder_of_cache() -> Path | None:
+    """Return the folder of the cache, or None for a cache at a URL."""
+    with suppress(ValueError):
+        return default_root()
+    return None
 
 
 @contextmanager

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from neusee.workflows.handbook import json_schema as json_schema
     from neusee.workflows.recipe import loading as loading
     from neusee.workflows.recipe import node_families as node_families
+    from neusee.workflows.recipe import remembered_checks as remembered_checks
+    from neusee.workflows.report import checked_recipe as checked_recipe
     from neusee.workflows.report import console as console
     from neusee.workflows.report import study_report as study_report
     from neusee.workflows.restoration import frame_recipes as frame_recipes
@@ -89,7 +91,9 @@ _MODULES = (
     "workflows.handbook.json_schema",
     "workflows.recipe.loading",
     "workflows.recipe.node_families",
+    "workflows.recipe.remembered_checks",
     "workflows.report.console",
+    "workflows.report.checked_recipe",
     "workflows.report.study_report",
     "workflows.restoration.frame_recipes",
     "workflows.safety.run_safety",

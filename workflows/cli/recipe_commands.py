@@ -173,7 +173,7 @@ def _opening(recipe: Recipe, command: Sequence[str], silent: bool) -> list[str]:
     """Print the lines before a run, unless silent, and return them."""
     if silent:
         return []
-    lines = lazy.console.opening(recipe, shlex.join(command[1:]))
+    lines = lazy.checked_recipe.opening(recipe, shlex.join(command[1:]))
     say(lines)
     return lines
 
@@ -268,14 +268,18 @@ def validate(words: Words = None, as_json: AsJson = False, debug: Debug = False)
 
     All mistakes are listed at once, each with its file, line and column and the nearest known name.
     """
-    recipe, command = load(words, "run")
+    recipe, command = load(words, "run", runs=False)
 
     if as_json:
         text = json_line(
-            {"valid": True, "command": shlex.join(command), **lazy.console.contents_of(recipe)}
+            {
+                "valid": True,
+                "command": shlex.join(command),
+                **lazy.checked_recipe.contents_of(recipe),
+            }
         )
     else:
-        text = "\n".join(lazy.console.opening(recipe, shlex.join(command[1:])))
+        text = "\n".join(lazy.checked_recipe.opening(recipe, shlex.join(command[1:])))
     say_and_keep(text, recipe)
 
 
@@ -350,9 +354,9 @@ def config(words: Words = None, debug: Debug = False) -> None:
 
     The output is YAML: a recipe that can be run.
     """
-    recipe, _ = load(words)
+    recipe, _ = load(words, runs=False)
 
-    say_and_keep("\n".join(lazy.simulate_recipe.recipe_text(recipe).splitlines()), recipe)
+    say_and_keep("\n".join(lazy.checked_recipe.recipe_text(recipe).splitlines()), recipe)
 
 
 def report(
@@ -550,7 +554,7 @@ def _restored(
         options.memory,
     )
     if not silent:
-        say(lazy.console.opening(recipe, shlex.join(command[1:])))
+        say(lazy.checked_recipe.opening(recipe, shlex.join(command[1:])))
     cheaper_recipe = lazy.cheaper_steps.with_substitutions(recipe, lazy.wanted_steps.wanted(recipe))
     with lazy.console.RunTable(
         cheaper_recipe,

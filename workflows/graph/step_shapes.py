@@ -9,7 +9,9 @@ whose results have few numbers.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +23,32 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Form = Any  #: a tensor, a named tuple of tensors, or None where the shape is not known
+
+
+@dataclass(frozen=True, slots=True)
+class TensorForm:
+    """What another process found of a tensor; it stands in place of the tensor without torch."""
+
+    shape: tuple[int, ...]
+    dtype: str
+    bytes_each: int  #: of one element
+    values: str = ""  #: digest of the values, empty where they are not known
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    def numel(self) -> int:
+        return math.prod(self.shape)
+
+    def element_size(self) -> int:
+        return self.bytes_each
+
+
+def is_tensor(form: Form) -> bool:
+    """Return True for a tensor, and for what another process found of one; import no torch."""
+    torch = sys.modules.get("torch")  # without it there is no tensor
+    return isinstance(form, TensorForm) or (torch is not None and isinstance(form, torch.Tensor))
 
 
 def forms_of(recipe: Recipe, order: Iterable[str]) -> dict[str, Form]:
@@ -116,11 +144,9 @@ def bytes_of(form: Form) -> float:
     )
 
 
-def tensors_of(form: Form) -> list[Tensor]:
+def tensors_of(form: Form) -> list[Tensor | TensorForm]:
     """Return the tensors of a result, or of a list of results."""
-    from torch import Tensor
-
-    if isinstance(form, Tensor):
+    if is_tensor(form):
         return [form]
     if isinstance(form, tuple | list):
         return list(chain.from_iterable(map(tensors_of, form)))

@@ -11,7 +11,6 @@ import json
 import os
 import re
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
@@ -29,14 +28,13 @@ from neusee.workflows.keys.cache_key import Stamp, file_stamp
 from neusee.workflows.keys.module_origin import distributions_of
 from neusee.workflows.keys.sealed_files import (
     bytes_of,
-    inherit,
-    make_folders,
     opened,
     seal_file,
     seal_record,
     secrets,
     unseal_file,
     unseal_record,
+    write_shared,
 )
 from neusee.workflows.keys.source_summary import Summary
 
@@ -139,7 +137,7 @@ def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
     )
     summaries_json = json.dumps(dict(list(summaries.items())[-_KEPT:])).encode()
     content = b"\n".join([outlines_and_contents, summaries_json])
-    _write(
+    write_shared(
         memo, b"\n".join([seal_file("sources", memo.name, content), content]), memo.parent / "tmp"
     )
 
@@ -166,23 +164,7 @@ def write_parts(root: Path, code: str, parts: Parts) -> None:
         if _right.get(path) == stamp or read_parts(root, code):
             _right[path] = stamp
             return
-    _write(path, seal_record("definitions", {**parts, "key": f"code/{code}"}), root / "tmp")
-
-
-def _write(path: Path, content: bytes, folder: Path) -> None:
-    """Write a file by atomic rename; do nothing if the folder cannot be written.
-
-    ``folder`` is the folder of temporary files, directly below the root of the store.
-    """
-    root = str(folder.parent)
-    # one temporary file for each process and thread
-    partial = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
-    with suppress(OSError):
-        make_folders(str(folder), root)
-        make_folders(str(path.parent), root)
-        partial.write_bytes(content)
-        inherit(str(partial), root, 0o444)
-        os.replace(partial, path)
+    write_shared(path, seal_record("definitions", {**parts, "key": f"code/{code}"}), root / "tmp")
 
 
 # --- installed content ----------------------------------------------------------------------------

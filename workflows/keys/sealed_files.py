@@ -10,6 +10,7 @@ import hmac
 import json
 import os
 import stat
+import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from io import BufferedReader
@@ -141,6 +142,22 @@ def inherit(path: str, root: str, mask: int) -> None:
             os.chmod(path, (own_status.st_mode | wanted_mode) & 0o7777)
 
 
+def write_shared(path: Path, content: bytes, folder: Path) -> None:
+    """Write a file by atomic rename; do nothing if the folder cannot be written.
+
+    ``folder`` is the folder of temporary files, directly below the root of the store.
+    """
+    root = str(folder.parent)
+    # one temporary file for each process and thread
+    partial = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
+    with suppress(OSError):
+        make_folders(str(folder), root)
+        make_folders(str(path.parent), root)
+        partial.write_bytes(content)
+        inherit(str(partial), root, 0o444)
+        os.replace(partial, path)
+
+
 # --- seal -----------------------------------------------------------------------------------------
 
 # The seal of a record of the cache consists of the format version, a checksum and, if a secret is
@@ -169,6 +186,7 @@ Kind = Literal[
     "sources",
     "definitions",
     "answer",
+    "checks",
     "draws",
     "worker",
 ]

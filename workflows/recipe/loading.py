@@ -16,6 +16,7 @@ from neusee.workflows.graph.final_values import Config, Setting, changes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.keys.sealed_files import head_of
 from neusee.workflows.recipe import lazy_imports as lazy
+from neusee.workflows.recipe.asked_nodes import THEMSELVES, AskedNodes
 from neusee.workflows.recipe.distributions.law_text import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.global_settings import (
@@ -233,43 +234,58 @@ def load(
     """
     name, base_folder = os.fspath(name_or_path), Path(folder or ".").absolute()
     changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, base_folder))
-    composed = compose(name, changes, base_folder, first)
-    recipe = check(composed)
+    return load_with(THEMSELVES, name, changes, base_folder, first)
+
+
+def load_with(
+    asked: AskedNodes,
+    name: str,
+    changes: Sequence[str | Override],
+    folder: Path,
+    first: int = 1,
+) -> Recipe:
+    """Return a recipe as `load` does, where ``asked`` answers in place of the nodes."""
+    composed = compose(name, changes, folder, first)
+    recipe = check(composed, asked)
     if recipe.training and recipe.training.cameras:
         recipe = with_cameras(
             recipe,
             composed,
-            lambda words: check(compose(name, [*changes, *words], base_folder, first)),
+            lambda words: check(compose(name, [*changes, *words], folder, first), asked),
         )
     # expected numbers of an extended recipe hold only if the changes do not affect them
     for extended in composed.extended if recipe.expect else ():
-        recipe = _without_changed_numbers(recipe, extended, base_folder)
+        recipe = _without_changed_numbers(recipe, extended, folder, asked)
     if recipe.expect and changes:
-        recipe = unaffected_expectations(recipe, _as_written(name, base_folder))
-    if recipe.expect and (problems := list(refuse_indices(recipe))):
+        recipe = unaffected_expectations(recipe, _as_written(name, folder, asked))
+    if recipe.expect and (problems := list(refuse_indices(recipe, asked))):
         raise RecipeError(problems)
     return recipe
 
 
-def _without_changed_numbers(recipe: Recipe, extended: Path, folder: Path) -> Recipe:
+def _without_changed_numbers(
+    recipe: Recipe, extended: Path, folder: Path, asked: AskedNodes
+) -> Recipe:
     """Return a recipe without the expected numbers of an extended recipe that its changes affect.
 
     A file that is not a valid recipe by itself has no expected numbers.
     """
-    extended_recipe = _as_written(str(extended), folder)
+    extended_recipe = _as_written(str(extended), folder, asked)
     return recipe if extended_recipe is None else unaffected_expectations(recipe, extended_recipe)
 
 
-def _as_written(name: str, folder: Path) -> Recipe | None:
+def _as_written(name: str, folder: Path, asked: AskedNodes) -> Recipe | None:
     """Return a recipe without the user's overrides, or None if the recipe is not valid without the
     overrides.
 
     The result is cached while the files and nodes of the recipe are unchanged.
     """
     composed = compose(name, (), folder)
-    graph = cached_graph(composed.root, read_own_families(composed.root, []).modules)
+    graph = None
+    if asked.reuses_checks:
+        graph = cached_graph(composed.root, read_own_families(composed.root, []).modules)
     try:
-        return check(composed) if graph is None else _checked(composed, graph)
+        return check(composed, asked) if graph is None else _checked(composed, graph)
     except RecipeError:
         return None
 
@@ -303,11 +319,12 @@ def _settings_blocks(
     return composed, training, lifting, evaluation, traceability
 
 
-def check(composed: Composed) -> Recipe:
+def check(composed: Composed, asked: AskedNodes = THEMSELVES) -> Recipe:
     """Return a composed recipe after a check of all its values; raise `RecipeError` with all
-    mistakes.
+    mistakes. ``asked`` answers in place of the nodes.
     """
     blocks = [composed.root.items[key] for key in BLOCKS if key in composed.root.items]
+    asked.refuse_code_of({*composed.root.items} & {KEY, SAFETY, *BLOCKS})
     mistakes: list[Diagnostic] = []
     # code of the user first, because blocks and steps may name it
     own_families = read_own_families(composed.root, mistakes)
@@ -322,11 +339,11 @@ def check(composed: Composed) -> Recipe:
     root = composed.root
     # the steps, and what they read
     references = References(root, diagnostics, dict(composed.replaced))
-    checker = Checker([], own=own_families.modules)
+    checker = Checker([], own=own_families.modules, asked=asked)
     checker.files[(KEY,)] = own_families.places
-    graph = cached_graph(root, own_families.modules)
+    graph = cached_graph(root, own_families.modules) if asked.reuses_checks else None
     memory = graph.memory if graph else None
-    steps, absent = _declared(graph, root, references, diagnostics, own_families)
+    steps, absent = _declared(graph, root, references, diagnostics, own_families, asked)
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
     bound = {step.name: step for step in _bind(wiring, checker, graph, checked)}
     cycles_found = _cycles(bound, steps, graph)
@@ -345,7 +362,8 @@ def check(composed: Composed) -> Recipe:
     references.finish()
     _refuse_mistakes(composed, diagnostics, checker, own_families)
     # only a recipe without mistakes comes this far
-    if graph is None:
+    asked.learn(checked)
+    if graph is None and asked.are_imported:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     settings = final_values(wiring, bound, checker, uncertain, memory)
     note_lists = (composed.notes, own_families.notes, checker.notes, references.notes)
@@ -377,13 +395,14 @@ def _declared(
     references: References,
     diagnostics: list[Diagnostic],
     own: OwnFamilies,
+    asked: AskedNodes,
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
     """Return the declared steps of a recipe and its null steps, from the cached graph if there is
     one.
     """
     if graph is not None:
         return graph.steps, graph.absent
-    return declare(root, references, diagnostics, own)
+    return declare(root, references, diagnostics, own, asked)
 
 
 def _refuse_mistakes(

@@ -11,7 +11,7 @@ import pkgutil
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -52,15 +52,26 @@ def find_node(name: str, own: Own = _NO_OWN) -> Node:
     """
     family, _, attribute = name.partition(".")
     nodes = nodes_of(family, own) if _exists(family, own) else {}
-    if attribute not in nodes and (renaming := instead(name)):
-        raise LookupError(f"{name} {renaming}")
-    if not nodes:
-        hint = _elsewhere(attribute, own) or nearest(family, families(own))
-        raise LookupError(f"no family of nodes {family}; {hint}")
     if attribute not in nodes:
-        hint = nearest(attribute, nodes).replace("did you mean ", f"did you mean {family}.")
-        raise LookupError(f"no node {name}; {_elsewhere(attribute, own) or hint}")
+        all_names = (other_name for other_name, _ in all_nodes(own))
+        raise LookupError(why_no_node(name, nodes, own, all_names))
     return nodes[attribute] if _is_ours(family) else _with_parameters(nodes[attribute])
+
+
+def why_no_node(name: str, of_family: Collection[str], own: Own, all_names: Iterable[str]) -> str:
+    """Return the message for a name that no node has, with the most similar name.
+
+    ``of_family`` has the names of the nodes in the family that the name states, and ``all_names``
+    the names with their families.
+    """
+    family, _, attribute = name.partition(".")
+    if renaming := instead(name):
+        return f"{name} {renaming}"
+    if not of_family:
+        hint = _elsewhere(attribute, all_names) or nearest(family, families(own))
+        return f"no family of nodes {family}; {hint}"
+    hint = nearest(attribute, of_family).replace("did you mean ", f"did you mean {family}.")
+    return f"no node {name}; {_elsewhere(attribute, all_names) or hint}"
 
 
 def families(own: Own = _NO_OWN) -> list[str]:
@@ -111,6 +122,11 @@ def broken_families() -> dict[str, str]:
         except LookupError as error:
             broken[family] = str(error.args[0])
     return broken
+
+
+def are_installed() -> bool:
+    """Return True if installed packages have families of nodes."""
+    return bool(_installed())
 
 
 def is_known(family: str) -> bool:
@@ -325,9 +341,9 @@ def _load(family: str) -> ModuleType:
         ) from None
 
 
-def _elsewhere(attribute: str, own: Own) -> str:
+def _elsewhere(attribute: str, all_names: Iterable[str]) -> str:
     """Return a hint with the nodes of other families that have the name of an unknown node."""
-    names = [name for name, _ in all_nodes(own) if name.partition(".")[2] == attribute]
+    names = [name for name in all_names if name.partition(".")[2] == attribute]
     return f"did you mean {' or '.join(names)}?" if names else ""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 from collections.abc import (
     Callable,
@@ -26,17 +27,17 @@ from neusee.workflows.graph.errors import Diagnostic, Location, nearest, shorten
 from neusee.workflows.graph.final_values import Setting
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order, ordered
 from neusee.workflows.graph.step_shapes import (
-    Form,
+    TensorForm,
     alike,
     bytes_of,
-    form_of,
     has_path,
     inputs_of,
     is_same,
+    is_tensor,
     tensors_of,
 )
-from neusee.workflows.keys.cache_key import files_in, is_own
-from neusee.workflows.recipe import lazy_imports as lazy
+from neusee.workflows.keys.cache_key import files_in
+from neusee.workflows.recipe.asked_nodes import AskedNodes
 from neusee.workflows.recipe.node_families import Own, class_context, nodes_of
 from neusee.workflows.recipe.steps import Declared
 from neusee.workflows.recipe.text.field_errors import message_of
@@ -70,6 +71,7 @@ class Checker:
     files: dict[tuple[str | int, ...], Any] = field(default_factory=dict)
     #: the user's families of nodes, whose network classes a parameter may name
     own: Own = field(default_factory=dict)
+    asked: AskedNodes = field(default_factory=AskedNodes)
 
     def read(self, node: Node, block: Value, step: Location) -> dict[str, Any] | None:
         """Return the validated parameters of a step with the defaults of its node, or None if a
@@ -89,6 +91,7 @@ class Checker:
             self.diagnostics += _problems(error, node, values, block, step)
             return None
         params = {name: getattr(model, name) for name in node.params.model_fields}
+        self.asked.note_values(node, plain, params)
         refused_files = _strange_files(params, values)
         self.diagnostics += refused_files
         return None if refused_files else params
@@ -110,9 +113,7 @@ class Checker:
             return ()
         try:
             forms = {name: inputs.get(name) for name in bound.node.preflight_inputs}
-            return _checked(
-                bound, functools.partial(bound.node.hooks.preflight, **bound.params, **forms)
-            )
+            return self.asked.notes(bound, forms)
         except ParameterError as error:
             # the node may blame a parameter of the step that feeds one of its inputs
             fed_input, _, name = error.parameter.rpartition(".")
@@ -178,13 +179,6 @@ def _strange(parameter: Any, value: Value) -> str:
     except ValueError as error:
         return str(error)
     return ""
-
-
-def _checked(bound: Step, hook: Callable[[], Sequence[str]]) -> Sequence[str]:
-    """Run a node's own check and return its notes; the check of a user's node is observed."""
-    if not is_own(bound.node.fn.__module__):
-        return hook()
-    return lazy.observed_call.call_hook(bound.node, hook, bound.params)
 
 
 def _problems(
@@ -385,7 +379,8 @@ class _FormChecks:
         """
         current_step, known_form = self.by_name[name], self.earlier_forms.get(name)
         try:
-            self.results[name] = form = _form(current_step.step, self.results)
+            inputs = inputs_of(current_step.step, self.results)
+            self.results[name] = form = self.checker.asked.form(current_step.step, inputs)
             if known_form is not None and alike(form, known_form.form):
                 # the same object, so that later steps need no new check
                 self.results[name] = known_form.form
@@ -414,13 +409,14 @@ def _set_aside(step: Step, inputs: Mapping[str, Any], checker: Checker) -> list[
     return [f"{problem.path}: {problem.message} (no output needs the step {step.name})"]
 
 
-def refuse_indices(recipe: Recipe) -> Iterator[Diagnostic]:
+def refuse_indices(recipe: Recipe, asked: AskedNodes) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each expected number whose index or field the result cannot have."""
     results: dict[str, Any] = {}
     for name in in_order(
         {name: step.sources for name, step in recipe.steps.items()}, [e.step for e in recipe.expect]
     ):
-        results[name] = _form(recipe.steps[name], results)
+        step = recipe.steps[name]
+        results[name] = asked.form(step, inputs_of(step, results))
     for expected in recipe.expect:
         if problem := _wrong_index(expected, results.get(expected.step)):
             yield Diagnostic(
@@ -442,15 +438,6 @@ def _params(by_name: Mapping[str, CheckedStep], wire: Wire) -> Mapping[Any, Valu
     """Return the recipe values of the parameters of the step that feeds an input."""
     source = by_name.get(wire) if isinstance(wire, str) else None
     return {} if source is None else source.params.items
-
-
-def _form(step: Step, results: Mapping[str, Form]) -> Form:
-    """Return the known form of the result of a step; a step with `before_run` is computed, and
-    raises for its own mistakes.
-    """
-    if step.node.before_run:
-        return step.node(**step.params)
-    return form_of(step.node, inputs_of(step, results), step.params)
 
 
 def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float) -> str:
@@ -476,7 +463,7 @@ def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float
     )
 
 
-def _numbers_of(tensor: Tensor) -> int:
+def _numbers_of(tensor: Tensor | TensorForm) -> int:
     return tensor.numel()
 
 
@@ -484,8 +471,6 @@ def _wrong_index(expected: Expectation, result: Any) -> str:
     """Return a message if the indices ``at`` of an expected number do not select one number of a
     result.
     """
-    from torch import Tensor
-
     selected, axis = result, 0
     for index in expected.at:
         # nothing is known of the result before the run
@@ -497,7 +482,7 @@ def _wrong_index(expected: Expectation, result: Any) -> str:
                     f"the result of {expected.step} has no field {index}; {nearest(index, fields)}"
                 )
             selected = getattr(selected, index)
-        elif isinstance(selected, Tensor):
+        elif is_tensor(selected):
             if axis >= selected.ndim:
                 return (
                     f"{_described(expected.step, selected)}: give {selected.ndim} indices,"
@@ -511,7 +496,7 @@ def _wrong_index(expected: Expectation, result: Any) -> str:
                 )
             # each number selects along one more axis of the tensor
             axis += 1
-    if isinstance(selected, Tensor) and selected.shape[axis:].numel() != 1:
+    if is_tensor(selected) and math.prod(selected.shape[axis:]) != 1:
         return (
             f"{_described(expected.step, selected)}, of which `at` must select one: give"
             f" {selected.ndim} indices"
@@ -519,7 +504,7 @@ def _wrong_index(expected: Expectation, result: Any) -> str:
     return ""
 
 
-def _described(step: str, tensor: Tensor) -> str:
+def _described(step: str, tensor: Tensor | TensorForm) -> str:
     return f"{step} has {' x '.join(map(str, tensor.shape)) or '1'} values"
 
 

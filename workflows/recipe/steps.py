@@ -14,7 +14,8 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from neusee.nodes import Node
 from neusee.workflows.graph.errors import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
-from neusee.workflows.recipe.node_families import OwnFamilies, find_node, is_known
+from neusee.workflows.recipe.asked_nodes import AskedNodes
+from neusee.workflows.recipe.node_families import OwnFamilies, is_known
 from neusee.workflows.recipe.text.other_spellings import became_input, new_name
 from neusee.workflows.recipe.text.references import BROKEN, References, Scope, broken
 from neusee.workflows.recipe.text.yaml_values import Value, kind
@@ -73,7 +74,11 @@ class Declared:
 
 
 def declare(
-    root: Value, references: References, diagnostics: list[Diagnostic], own: OwnFamilies
+    root: Value,
+    references: References,
+    diagnostics: list[Diagnostic],
+    own: OwnFamilies,
+    asked: AskedNodes,
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
     """Return the declared steps of a recipe and the steps that are null; report mistakes in the
     declarations.
@@ -84,7 +89,7 @@ def declare(
     written = _written_steps(root, diagnostics)
     absent = {name: value for name, value in written if value.data is None}
     steps, step_count = dict[str, Declared](), 0
-    find = functools.cache(functools.partial(find_node, own=own.modules))
+    find = functools.cache(functools.partial(asked.find, own=own.modules))
     for name, value in written:
         if value.data is None:
             continue

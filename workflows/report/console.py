@@ -21,7 +21,6 @@ from rich.live import Live
 from rich.segment import Segment
 
 from neusee.workflows.graph.recipe_graph import Event, StepRecord, by_family
-from neusee.workflows.report.paper_readings import consequences
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
 from neusee.workflows.report.run_summary import SENTENCES
 from neusee.workflows.report.terminal_text import indented, lasts, wrapped
@@ -344,38 +343,6 @@ def note(families: dict[str, Family], event: Event) -> Family:
         # a second attempt replaces the record of the first
         family.done = [*(copy for copy in family.done if copy.step != event.step), event.done]
     return family
-
-
-def contents_of(recipe: Recipe) -> dict[str, Any]:
-    """Return the title of a recipe, its numbers of steps, nodes and parameters, its outputs and
-    its notes.
-    """
-    nodes = {step.node.path for step in recipe.steps.values()}
-    values = sum(len(step.params) for step in recipe.steps.values())
-    sizes = {"steps": len(recipe.steps), "nodes": len(nodes), "parameters": values}
-    return {
-        "recipe": recipe.name,
-        "title": recipe.title,
-        **sizes,
-        "outputs": recipe.outputs,
-        "notes": recipe.notes,
-    }
-
-
-def opening(recipe: Recipe, command: str) -> list[str]:
-    """Return the lines to print before a run: recipe title, numbers of checked steps and
-    parameters, and notes.
-    """
-    counts = contents_of(recipe)
-    sizes_text = (
-        f"{counts['steps']} steps of {counts['nodes']} nodes, {counts['parameters']} parameters"
-    )
-    notes = [f"note     {line}" for line in (*recipe.notes, *consequences(recipe.config.values))]
-    return [
-        f"neusee {command}: {recipe.title or recipe.name}",
-        f"checked  {sizes_text}: all right",
-        *notes,
-    ]
 
 
 def forecast_line(seconds: float, steps: int, unknown: int) -> str:

@@ -2,5 +2,5 @@
 
 The command `neusee run` without its console output: a run, with the reasons for each step,
 pictures, files and page. No sweep, training or study belongs here.
-Offers: `simulate_recipe.simulate`, `simulate_recipe.Simulation`, `simulate_recipe.recipe_text`.
+Offers: `simulate_recipe.simulate`, `simulate_recipe.Simulation`.
 """

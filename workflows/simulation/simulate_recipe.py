@@ -21,6 +21,7 @@ from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Event, Recipe, StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_folder, run_page
+from neusee.workflows.report.checked_recipe import recipe_text
 from neusee.workflows.report.data_exports import data_files, exports
 from neusee.workflows.report.files_beside import FilesBeside, GraphAhead
 from neusee.workflows.report.run_folder import NotWritten, RunFolder, code_text, new_run
@@ -214,14 +215,3 @@ def _last_pictures(result: Result, folder: RunFolder, beside: FilesBeside) -> Ca
         beside.finish()
 
     return finish
-
-
-def recipe_text(recipe: Recipe) -> str:
-    """Return the recipe as YAML that can be run again: all final values, with the source of each
-    as a comment.
-    """
-    head = (
-        f"# {recipe.title or recipe.name}\n# Final values; the comment after each value names its"
-        " source.\n"
-    )
-    return head + recipe.config.to_yaml()

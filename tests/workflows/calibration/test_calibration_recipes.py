@@ -10,7 +10,8 @@ from neusee.workflows.cli.catalogue import node_lines
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.simulation.simulate_recipe import recipe_text, simulate
+from neusee.workflows.report.checked_recipe import recipe_text
+from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["flats.shape=[64, 64]"]

@@ -139,3 +139,23 @@ def test_the_page_of_a_run_is_written_again_without_torch(place):
     done.page.unlink()
     assert asked(place, "report latest") == [[0, "runs/latest/report.html\n", ""]]
     assert done.page.read_bytes() == before
+
+
+def test_a_recipe_that_was_checked_before_is_checked_without_torch(tmp_path, monkeypatch):
+    """Its final values, and the first mistakes that are made in it."""
+    (tmp_path / "cache").mkdir()
+    env = {**os.environ, "NEUSEE_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT / ".src")}
+    words = [sys.executable, "-m", "neusee", "validate", "first_light"]
+    subprocess.run(words, cwd=tmp_path, env=env, check=True, capture_output=True)
+    commands = {
+        "validate first_light --json": 0,
+        "config first_light": 0,
+        "validate first_light sensor.read_nois=20": 2,
+        "run first_light sensor.read_noise=20": 2,
+        "plan first_light sensor.bits=99 doe=axico": 2,
+        "config first_light steps.restored.node=restore.wienr": 2,
+    }
+    answers = asked(tmp_path, *commands)
+    for (command, code), answer in zip(commands.items(), answers, strict=True):
+        assert answer == here(tmp_path, monkeypatch, command), command
+        assert answer[0] == code, command

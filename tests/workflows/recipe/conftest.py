@@ -6,6 +6,7 @@ import pytest
 
 import neusee.nodes.own_modules as own_modules
 from neusee.workflows.recipe import node_families
+from tests.workflows.recipe.both_ways import checked_both_ways as checked_both_ways
 
 
 @pytest.fixture

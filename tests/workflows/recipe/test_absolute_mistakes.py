@@ -7,6 +7,8 @@ import pytest
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 
+pytestmark = pytest.mark.usefixtures("checked_both_ways")
+
 MINE = """\
 # My camera.
 defaults: [camera: neusee, scene: siemens, illuminant: daylight, lift: lmmse, optics: small, sensor: small, doe: flat,

@@ -11,6 +11,8 @@ import pytest
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.loading import load
 
+pytestmark = pytest.mark.usefixtures("checked_both_ways")
+
 MINE = """\
 # My camera.
 defaults:

@@ -273,6 +273,7 @@ def _table():
         )
 
 
+@pytest.mark.usefixtures("checked_both_ways")
 @pytest.mark.parametrize(("old", "new", "diagnostics"), [*_table()])
 def test_a_mistake_gets_its_message(mistakes, old, new, diagnostics):
     assert mistakes(swap(old, new)) == diagnostics

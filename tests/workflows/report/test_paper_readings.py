@@ -9,7 +9,7 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.cli.catalogue import node_lines
-from neusee.workflows.report.console import opening
+from neusee.workflows.report.checked_recipe import opening
 from neusee.workflows.report.paper_readings import READINGS, SETTLED, consequences, in_force
 
 PAGE = Path(__file__).parents[3] / "recipes" / "guide" / "readings.md"

@@ -137,6 +137,7 @@ def test_a_cache_that_nobody_changed_says_all(tmp_path, signed):
         "journal.jsonl",
         "speeds.json",
         "files",
+        "checks.json",
         "code.json",
         "code",
         "answers",

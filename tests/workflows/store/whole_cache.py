@@ -11,6 +11,7 @@ import torch
 from neusee.workflows.answers.stored_answer import Answer, read_answer, write_answer
 from neusee.workflows.answers.witnesses import Witnesses
 from neusee.workflows.keys.module_digest import read_memo, read_parts, write_memo, write_parts
+from neusee.workflows.recipe.remembered_checks import Answers
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Speeds, Store
 
@@ -61,6 +62,8 @@ def fill(root, numbers=(1, 2), version=0):
         with suppress(OSError):  # as its caller does
             write_answer(store.disk, f"{number:032x}", answer)
     write_memo(root / "code.json", {})
+    checks = {f"question {number}": f"{number}.{version}" for number in numbers}
+    Answers("edition", {}, checks).write(root / "checks.json")
     Speeds(store.disk).learn("read", 1 << 30, 1e-2 * (1 + version))
     return root
 
@@ -97,6 +100,8 @@ def believed(root, numbers=(1, 2)):
             said[f"answer {number}"] = getattr(
                 read_answer(store.disk, f"{number:032x}"), "text", None
             )
+        checks = Answers.read(root / "checks.json", "edition").by_question
+        said |= {f"check {number}": checks.get(f"question {number}") for number in numbers}
         said["sources"] = None if read_memo(root / "code.json") == {} else "another memo"
         said["speeds"] = json.dumps(Speeds(store.disk)._stored() or None)
         rows = frozenset(json.dumps(row) for row in store.journal.rows())

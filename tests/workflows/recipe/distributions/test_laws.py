@@ -20,7 +20,7 @@ from neusee.workflows.recipe.distributions.shapes import (
     scores_between,
     share_between,
 )
-from neusee.workflows.simulation.simulate_recipe import recipe_text
+from neusee.workflows.report.checked_recipe import recipe_text
 
 LAWS = [
     ("triangular(9 e-, 10 e-, 12 e-)", stats.triang(1 / 3, 9, 3)),

@@ -16,7 +16,7 @@ from neusee.workflows import load
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe.distributions.joint_distribution import Joint, read_posterior, summary
 from neusee.workflows.recipe.distributions.law_text import is_law, read_law
-from neusee.workflows.simulation.simulate_recipe import recipe_text
+from neusee.workflows.report.checked_recipe import recipe_text
 
 NOISE = "sensor.read_noise=normal(10.5 e-, 0.5 e-)"
 
