@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import neusee.nodes
-from neusee.nodes import Node, ParameterError
+from neusee.nodes import Node, ParameterError, input_files
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, Step, ordered
 from neusee.workflows.graph.step_shapes import Form, TensorForm, has_path, inputs_of, is_tensor
@@ -320,6 +320,23 @@ def _value_question(node: str, parameter: str, given: Any) -> str | None:
         return None
 
 
+@contextmanager
+def _asked_for_memory() -> Iterator[list[bool]]:
+    """Yield a list that is empty as long as no reader of a file has asked for the free memory."""
+    asked: list[bool] = []
+    measure = input_files._measures[-1]
+
+    def noted() -> input_files.Room:
+        asked.append(True)
+        return measure()
+
+    input_files.measured_by(noted)
+    try:
+        yield asked
+    finally:
+        input_files.measured_by(measure)
+
+
 # --- answers of this process ----------------------------------------------------------------------
 
 
@@ -331,6 +348,7 @@ class RecordedNodes(AskedNodes):
     def __init__(self, answers: Answers) -> None:
         self.answers, self._questions = answers, Questions()
         self._is_recording, self.is_new = True, False
+        self._large_files = set[Path]()
         #: found in this process, by question
         self._notes: dict[str, Sequence[str]] = {}
         self._forms: dict[str, Form] = {}
@@ -355,7 +373,7 @@ class RecordedNodes(AskedNodes):
         if question is not None and question in self._notes:
             return self._notes[question]
         try:
-            with self._unless_warned() as record:
+            with self._recording(step) as record:
                 notes = super().notes(step, forms)
                 record(question, ["notes", *notes])
             if question is not None:
@@ -375,7 +393,7 @@ class RecordedNodes(AskedNodes):
         if question is not None and question in self._forms:
             return self._forms[question]
         try:
-            with self._unless_warned() as record:
+            with self._recording(step) as record:
                 form = super().form(step, inputs)
                 text = self._questions.text(form)
                 # a form may be unknown because a file could not be read
@@ -397,17 +415,24 @@ class RecordedNodes(AskedNodes):
             self._record(question, answer)
 
     @contextmanager
-    def _unless_warned(self) -> Iterator[Any]:
-        """Yield the function that records an answer, which is not kept if there was a warning."""
+    def _recording(self, step: Step) -> Iterator[Any]:
+        """Yield the function that records an answer, which is not kept if there was a warning.
+
+        It is not kept either if a file is so large that the free memory decided whether it is read.
+        """
         noted: list[tuple[str | None, Any]] = []
-        with warnings.catch_warnings(record=True) as caught:
+        files = set(files_in(step.params))
+        with warnings.catch_warnings(record=True) as caught, _asked_for_memory() as measured:
             warnings.simplefilter("always")
             yield lambda question, answer: noted.append((question, answer))
         for warning in caught:
             warnings.warn_explicit(
                 warning.message, warning.category, warning.filename, warning.lineno
             )
-        for question, answer in noted if not caught else ():
+        # a process may keep a file that it has read, and does not ask again
+        self._large_files |= files if measured else set()
+        is_kept = not caught and self._large_files.isdisjoint(files)
+        for question, answer in noted if is_kept else ():
             self._record(question, answer)
 
     def _record(self, question: str | None, answer: Any) -> None:

@@ -13,7 +13,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from neusee.nodes import node
+from neusee.nodes import input_files, node
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.recipe import remembered_checks
 from neusee.workflows.recipe.asked_nodes import THEMSELVES
@@ -215,6 +215,28 @@ def test_a_file_counts_by_its_content(toy, write, tmp_path):
         load_with(recorded, *words)
     # a file may be read better the next time
     assert len(answers.by_question) == count
+
+
+def test_a_file_that_the_free_memory_may_refuse_is_not_remembered(write, tmp_path, monkeypatch):
+    """The next process may have less memory, or a limit."""
+    write("wavelength (nm),power (1)\n500,1\n600,2\n", "light.csv")
+    write("steps: {line: {node: spectra.line_table, with: {file: light.csv}}}\noutputs: [line]\n")
+    monkeypatch.setattr("neusee.nodes.input_files.SMALL", 0)
+    answers, words = signed(), ("mine.yaml", (), tmp_path)
+    spent = [1e12, 1e12, 1e12, 1e12, 1e12]
+
+    def measure():
+        return input_files.Room(spent.pop())
+
+    input_files.measured_by(measure)
+    try:
+        load_with(RecordedNodes(answers), *words)
+        assert len(spent) < 5
+        assert input_files._measures[-1] is measure
+        with pytest.raises(NotRemembered):
+            load_with(RememberedNodes(answers), *words)
+    finally:
+        input_files.measured_by(input_files.free_memory)
 
 
 def test_an_answer_with_a_warning_is_not_remembered(toy, write, tmp_path):
