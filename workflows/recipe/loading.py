@@ -341,7 +341,7 @@ def check(composed: Composed, asked: AskedNodes = THEMSELVES) -> Recipe:
     references = References(root, diagnostics, dict(composed.replaced))
     checker = Checker([], own=own_families.modules, asked=asked)
     checker.files[(KEY,)] = own_families.places
-    graph = cached_graph(root, own_families.modules) if asked.reuses_checks else None
+    graph = _known_graph(root, own_families.modules, asked)
     memory = graph.memory if graph else None
     steps, absent = _declared(graph, root, references, diagnostics, own_families, asked)
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
@@ -363,8 +363,7 @@ def check(composed: Composed, asked: AskedNodes = THEMSELVES) -> Recipe:
     _refuse_mistakes(composed, diagnostics, checker, own_families)
     # only a recipe without mistakes comes this far
     asked.learn(checked)
-    if graph is None and asked.are_imported:
-        cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
+    _offer_graph(graph, root, steps, absent, bound, asked)
     settings = final_values(wiring, bound, checker, uncertain, memory)
     note_lists = (composed.notes, own_families.notes, checker.notes, references.notes)
     return Recipe(
@@ -387,6 +386,24 @@ def check(composed: Composed, asked: AskedNodes = THEMSELVES) -> Recipe:
         traceability=traceability,
         exports=exports,
     )
+
+
+def _known_graph(root: Value, own: Own, asked: AskedNodes) -> CachedGraph | None:
+    """Return the cached step graph of a recipe, if an earlier check may stand for this one."""
+    return cached_graph(root, own) if asked.reuses_checks else None
+
+
+def _offer_graph(
+    graph: CachedGraph | None,
+    root: Value,
+    steps: dict[str, Declared],
+    absent: dict[str, Value],
+    bound: Mapping[str, Step],
+    asked: AskedNodes,
+) -> None:
+    """Add the step graph of a recipe to the cache, unless it is there or has no nodes."""
+    if graph is None and asked.are_imported:
+        cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
 
 
 def _declared(

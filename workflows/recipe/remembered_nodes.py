@@ -34,12 +34,13 @@ class _NoJson(Exception):
 
 # --- types ----------------------------------------------------------------------------------------
 
-_NAMED = {
+_NAMED: dict[str, Any] = {
     "float": float,
     "int": int,
     "str": str,
     "bool": bool,
     "None": NoneType,
+    "...": Ellipsis,
     "Path": Path,
     "Any": Any,
     "object": object,
@@ -66,12 +67,16 @@ def _said(hint: Any) -> Any:
     if origin in (Union, UnionType):
         return ["union", *map(_said, arguments)]
     if origin in _CONTAINERS.values():
-        types = ["..." if argument is Ellipsis else _said(argument) for argument in arguments]
-        return [origin.__name__, *types]
-    name = next((name for name, type_ in _NAMED.items() if hint is type_), None)
-    if hint is not None and name is None:
-        raise _NoJson
-    return name or "None"
+        return [origin.__name__, *map(_said, arguments)]
+    return _name_of(hint)
+
+
+def _name_of(type_: Any) -> str:
+    """Return the name of a single type."""
+    for name, named_type in _NAMED.items():
+        if type_ is named_type:
+            return name
+    raise _NoJson
 
 
 def _said_constraint(constraint: Any) -> Any:
@@ -79,29 +84,32 @@ def _said_constraint(constraint: Any) -> Any:
     if isinstance(constraint, units.IsFile):
         return ["file"]
     if isinstance(constraint, FieldInfo):
-        limits = {
-            name: getattr(limit, name)
-            for limit in constraint.metadata
-            for name in _LIMITS
-            if hasattr(limit, name)
-        }
-        if repr(Field(**limits)) == repr(constraint):
-            return ["limits", limits]
-    if isinstance(constraint, BeforeValidator | AfterValidator):
-        kind = "before" if isinstance(constraint, BeforeValidator) else "after"
-        reader = constraint.func
-        if isinstance(reader, units.QuantityReader):
-            return ["quantity", reader.si]
-        name = getattr(reader, "__name__", "")
-        if _READERS.get(name) is reader:
-            return [kind, name]
-    raise _NoJson
+        return _said_limits(constraint)
+    if not isinstance(constraint, BeforeValidator | AfterValidator):
+        raise _NoJson
+    reader = constraint.func
+    if isinstance(reader, units.QuantityReader):
+        return ["quantity", reader.si]
+    name = getattr(reader, "__name__", "")
+    if _READERS.get(name) is not reader:
+        raise _NoJson
+    return ["before" if isinstance(constraint, BeforeValidator) else "after", name]
+
+
+def _said_limits(field: FieldInfo) -> list[Any]:
+    """Return the limits of a number or a length as JSON; a field that says more has no JSON."""
+    limits: dict[str, Any] = {}
+    for limit in field.metadata:
+        limits |= {name: getattr(limit, name) for name in _LIMITS if hasattr(limit, name)}
+    if repr(Field(**limits)) != repr(field):
+        raise _NoJson
+    return ["limits", limits]
 
 
 def _type_of(said: Any) -> Any:
     """Return the type annotation that `_said` has written."""
     if isinstance(said, str):
-        return Ellipsis if said == "..." else _NAMED[said]
+        return _NAMED[said]
     kind, *parts = said
     if kind == "literal":
         return Literal[tuple(parts)]
@@ -170,8 +178,7 @@ def _class_of(module: str, name: str, *parents: Any) -> type:
 
 def signature_of(node: Node) -> dict[str, Any] | None:
     """Return what a check reads of a node as JSON, or None for a node that JSON cannot describe."""
-    arguments = inspect.signature(node.fn).parameters.values()
-    parameters = [p for p in arguments if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
+    parameters = _parameters_of(node)
     wires = [name for name in (*node.inputs, "return") if name in node.hints]
     hooks = node.hooks
     try:
@@ -192,6 +199,12 @@ def signature_of(node: Node) -> dict[str, Any] | None:
         }
     except _NoJson:
         return None
+
+
+def _parameters_of(node: Node) -> list[inspect.Parameter]:
+    """Return the arguments of a node that a recipe gives as parameters."""
+    arguments = inspect.signature(node.fn).parameters.values()
+    return [p for p in arguments if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
 
 
 def _said_parameter(parameter: inspect.Parameter, hint: Any) -> dict[str, Any]:
