@@ -393,21 +393,26 @@ class RecordedNodes(AskedNodes):
         if question is not None and question in self._forms:
             return self._forms[question]
         try:
-            with self._recording(step) as record:
-                form = super().form(step, inputs)
-                text = self._questions.text(form)
-                # a form may be unknown because a file could not be read
-                if text is not None and (form is not None or not has_path(step.params)):
-                    record(question, ["form", json.loads(text)])
-            if question is not None:
-                self._forms[question] = form
-            return form
+            form = self._new_form(question, step, inputs)
         except OverflowError as error:
             self._record_mistake(question, step, ["overflow", str(error)])
             raise
         except ValueError as error:
             self._record_mistake(question, step, ["value", str(error)])
             raise
+        if question is not None:
+            self._forms[question] = form
+        return form
+
+    def _new_form(self, question: str | None, step: Step, inputs: Sequence[Form]) -> Form:
+        """Return the form of a result that this process has not asked for yet."""
+        with self._recording(step) as record:
+            form = super().form(step, inputs)
+            text = self._questions.text(form)
+            # a form may be unknown because a file could not be read
+            if text is not None and (form is not None or not has_path(step.params)):
+                record(question, ["form", json.loads(text)])
+        return form
 
     def _record_mistake(self, question: str | None, step: Step, answer: Any) -> None:
         """Record a mistake, unless a file or the memory of the machine may be its cause."""
@@ -450,14 +455,9 @@ class RecordedNodes(AskedNodes):
         """
         by_name = {candidate.step.name: candidate for candidate in checked}
         steps = {name: candidate.step for name, candidate in by_name.items()}
-        is_of_user = any(is_own(step.node.fn.__module__) for step in steps.values())
-        if not self._is_recording or not self.is_new or is_of_user:
+        if not self._is_recording or not self.is_new or _are_of_user(steps.values()):
             return
-        sources = {
-            name: tuple(source for source in step.sources if source in steps)
-            for name, step in steps.items()
-        }
-        order = ordered(sources, by_name)
+        order = ordered({name: step.sources for name, step in steps.items()}, steps)
         forms: dict[str, Form] = {}
         for name in order:
             forms[name] = self._asked(steps[name], forms)
@@ -487,6 +487,11 @@ class RecordedNodes(AskedNodes):
             return self.form(step, inputs)
         except (ValueError, OSError, OverflowError):
             return None
+
+
+def _are_of_user(steps: Iterable[Step]) -> bool:
+    """Return True if one of the steps has a node of a user."""
+    return any(is_own(step.node.fn.__module__) for step in steps)
 
 
 def _with_one_mistake(checked: Iterable[CheckedStep]) -> Iterator[frozenset[str]]:
