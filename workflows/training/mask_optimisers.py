@@ -28,7 +28,7 @@ from neusee.nodes.doe import (
 from neusee.nodes.values import Stop
 from neusee.workflows.recipe.blocks.train_block import DesignError, MaskTraining, half_cosine
 from neusee.workflows.training.design_terms import Terms
-from neusee.workflows.training.resumable_loop import Progress, StateFile
+from neusee.workflows.training.resumable_loop import CheckpointClock, Progress, StateFile
 
 # --- learnt mask ----------------------------------------------------------------------------------
 
@@ -183,9 +183,9 @@ def _one_start(
     progress: Progress,
 ) -> None:
     """Optimise a mask by Adam from one set of initial parameters, with a checkpoint every
-    ``save_every`` iterations.
+    ``save_every`` iterations, and earlier if two minutes of work could be lost.
     """
-    settings = terms.settings
+    settings, clock = terms.settings, CheckpointClock()
     adam = torch.optim.Adam(shape.parameters(), lr=settings.rate)
     # continue an interrupted start
     if "shape" in state:
@@ -196,14 +196,18 @@ def _one_start(
             group["lr"] = rate(settings, number)
         row = _step(terms, shape, adam, start, number)
         state["history"].append(row)
-        if (number + 1) % settings.save_every == 0:
+        clock.end_iteration()
+        is_at_interval = (number + 1) % settings.save_every == 0
+        if is_at_interval:
             progress(f"{number + 1}/{settings.iterations}  {_losses_line(row)}")
+        if is_at_interval or clock.is_due:
             state |= {
                 "shape": shape.state_dict(),
                 "adam": adam.state_dict(),
                 "iteration": number + 1,
             }
             file.write(state)
+            clock.restart()
 
 
 def _step(
@@ -292,6 +296,7 @@ class _LossOfGenes:
         self.terms, self.state = terms, state
         self.known: list[float] = list(state.read(strict=False).get("values", []))
         self.asked, self.chosen = 0, terms.even()  # None: all bands
+        self.clock = CheckpointClock()
         if self.known:
             progress(f"continues after {len(self.known)} masks")
 
@@ -309,8 +314,11 @@ class _LossOfGenes:
                     f"mask number {self.asked}: the loss at slopes {slopes} is NaN or infinite"
                 )
             self.known.append(loss)
-            if len(self.known) % (self.terms.settings.save_every * 10) == 0:
+            self.clock.end_iteration()
+            is_at_interval = len(self.known) % (self.terms.settings.save_every * 10) == 0
+            if is_at_interval or self.clock.is_due:
                 self.state.write({"values": self.known})
+                self.clock.restart()
         self.asked += 1
         return self.known[self.asked - 1]
 

@@ -171,6 +171,44 @@ def export(
     write_whole(folder / f"{name}.safetensors", save(copies, about or None))
 
 
+# --- checkpoints by time --------------------------------------------------------------------------
+
+# A training that is killed loses the work since its last checkpoint. A number of iterations does
+# not bound this work, because an iteration takes from a tenth of a second to minutes.
+
+
+_LOST_SECONDS = 120.0  #: the most work that a killed training loses, if an iteration is no longer
+#: time that is kept free for the next iteration, if the one before it took less
+_ITERATION_SECONDS = 60.0
+
+
+class CheckpointClock:
+    """The time since the last checkpoint of a training.
+
+    A checkpoint is due if the next iteration could end later than two minutes after the last one.
+    The next iteration counts as long as the one before it, and as a minute at least.
+    """
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Count from now on: a checkpoint was written, or there is nothing yet that can be lost."""
+        self._kept = self._ended = time.monotonic()
+        self._last_seconds = 0.0
+
+    def end_iteration(self) -> None:
+        """Note that an iteration ends now."""
+        now = time.monotonic()
+        self._last_seconds, self._ended = now - self._ended, now
+
+    @property
+    def is_due(self) -> bool:
+        """Return True if a checkpoint must be written before the next iteration."""
+        next_seconds = max(self._last_seconds, _ITERATION_SECONDS)
+        return self._ended - self._kept + next_seconds > _LOST_SECONDS
+
+
 # --- resumable loop -------------------------------------------------------------------------------
 
 # The loop of every training; a stopped training continues from its last checkpoint with
@@ -241,6 +279,7 @@ class ResumableLoop(ABC, Generic[L]):
         self.rows, self.state = Rows(folder / "losses.csv", columns), StateFile(folder / "state.pt")
         self.stage, self.iteration, self.batch, self.began = 0, 0, 1, timestamp()
         self.inputs = inputs  #: digest of all inputs of the training
+        self.clock = CheckpointClock()
 
     @abstractmethod
     def iterate(self) -> Losses:
@@ -260,6 +299,11 @@ class ResumableLoop(ABC, Generic[L]):
         empty by default.
         """
         return {}
+
+    @property
+    def validates_next(self) -> bool:
+        """Return True if the next iteration has a validation, which may take minutes."""
+        return False
 
     @property
     def stops_early(self) -> bool:
@@ -305,13 +349,21 @@ class ResumableLoop(ABC, Generic[L]):
         self.batch = batch
         if self.writes and self.iteration < iterations:
             remove_crate(self.folder)
+        self.clock.restart()
         while self.iteration < iterations and not self.stops_early:
             losses = self._next_row()
             has_ended = self.iteration == iterations or self.stops_early
             self._show_at_intervals(has_ended)
             self.note(losses)
-            if not has_ended and self.iteration % self.keep_every == 0:
+            self.clock.end_iteration()
+            if not has_ended and self._must_keep():
                 self.keep()
+                self.clock.restart()
+
+    def _must_keep(self) -> bool:
+        """Return True if a checkpoint must be written between two iterations."""
+        is_at_interval = self.iteration % self.keep_every == 0
+        return is_at_interval or self.clock.is_due or self.validates_next
 
     def _show_at_intervals(self, ended: bool) -> None:
         if self.writes and (ended or self.iteration % self.show_every == 0):

@@ -333,9 +333,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         No state of stage 1 counts as the best, because the PSNR does not measure laser suppression:
         a flat mask has the best pictures.
         """
-        if not self.split.judged or (
-            iterations % self.settings.validate_every and iterations != self._length
-        ):
+        if not self._has_validation(iterations):
             return {}
         network: Any = self.learner.average.module if self.learner.average else self.learner.net
         losses = self.validation(
@@ -352,6 +350,16 @@ class _TrainingLoop(ResumableLoop[Learner]):
             f" {held_out.validation_line(losses, is_best)}"
         )
         return losses
+
+    def _has_validation(self, iterations: int) -> bool:
+        """Return True if the held-out pictures are restored after so many iterations."""
+        is_at_interval = iterations % self.settings.validate_every == 0
+        return bool(self.split.judged) and (is_at_interval or iterations == self._length)
+
+    @property
+    def validates_next(self) -> bool:
+        """Return True if the next iteration ends with a validation."""
+        return self._has_validation(self.iteration + 1)
 
     @property
     def stops_early(self) -> bool:
