@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from neusee.nodes import ParameterError, losses, metrics
 from neusee.nodes.doe import PARAMETRISATIONS
@@ -403,20 +402,23 @@ class Learner:
             peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
             for band in range(len(psf.clear_peak)):
-                loss = checkpoint(
-                    self._suppression, psf.intensity, psf.clear_peak, band, use_reentrant=False
-                )
-                (self.stage.lsr / process_count * loss).backward()
+                self._add_suppression_gradient(psf, slice(band, band + 1))
         return {"LSR": float(peaks.mean()) / process_count}
 
-    def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
-        """Return the laser suppression loss of one band.
+    def _add_suppression_gradient(self, psf: Psf, band: slice) -> None:
+        """Add the gradient of the laser suppression loss of one band to that of the PSF.
 
-        ``intensity`` (band, y, x) is the PSF, and ``clear`` (band,) its peak without a mask.
+        The band is a leaf of its own: the gradient of a slice of the PSF would have the size of all
+        bands.
         """
-        psf = Psf(intensity[band : band + 1], clear[band : band + 1])
-        loss: Tensor = losses.suppression_loss(psf, log=self.settings.logarithm)
-        return loss
+        read = (psf.intensity, psf.clear_peak)
+        leaves = [x[band].detach().requires_grad_(x.requires_grad) for x in read]
+        loss = losses.suppression_loss(Psf(*leaves), log=self.settings.logarithm)
+        (self.stage.lsr / self.mesh.size * loss).backward()
+        for x, leaf in zip(read, leaves, strict=True):
+            if leaf.grad is not None:
+                x.grad = torch.zeros_like(x) if x.grad is None else x.grad
+                x.grad[band] += leaf.grad
 
     def _restoration_terms(
         self, sample: Sample
