@@ -5,7 +5,9 @@ All get u, dt, A, B and C and return y; forward and backward, the decays and the
 included, batch 1, d 96, n 16, float32. With one thread, in turns within one process, so that a
 loaded machine slows all alike; with two after that. Beside the wall clock stands the processor's
 own time, which other work does not lengthen. Memory: what the peak of a process of its own rises by
-during its first call. The error is of y against a loop in float64. Prints tables in Markdown.
+during its first call. The error is of y against a loop in float64. Prints tables in Markdown. With
+the word `operations` it counts the operations of torch on a GPU, in pairs of steps and in chunks as
+they were before; for this it needs no GPU.
 """
 
 import os
@@ -19,10 +21,16 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 warnings.simplefilter("ignore")
 
-from neusee.nodes.restore.networks import reference, selective_scan  # noqa: E402
+from neusee.nodes.restore.networks import (  # noqa: E402
+    ScanPlan,
+    _selective_scan,
+    reference,
+    selective_scan,
+)
 
 D, N, LENGTHS = 96, 16, (4096, 65_536)
 LOOP = 4096  #: steps beyond which the loop is not worth waiting for
@@ -143,8 +151,42 @@ def table(length, threads, repeats):
               f"{sum(cpu) / best:.1f} | {used} | {errors[name]:.0e} |", flush=True)  # fmt: skip
 
 
+class Operations(TorchDispatchMode):
+    """Counts the operations that compute something; a view does not."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += not func.is_view
+        return func(*args, **(kwargs or {}))
+
+
+#: how a GPU divided sequences of 1536 numbers a step before it scanned them in pairs
+CHUNKS = {4096: ScanPlan(64, 64), 65_536: ScanPlan(75, 73)}
+
+
+def operations():
+    """Count the operations of a forward and backward scan, for 1536 numbers a step; the lines
+    themselves are narrow, which changes no count.
+    """
+    plan_scan = _selective_scan.plan_scan
+    os.environ["NEUSEE_SCAN"] = "torch"
+    print("| length | scan | operations |\n|---|---|---|")
+    for length in LENGTHS:
+        in_pairs = plan_scan(length, D * N, cuda=True)
+        for name, plan in (("chunks", CHUNKS[length]), ("pairs", in_pairs)):
+            _selective_scan.plan_scan = lambda *sizes, plan=plan: plan
+            u, B, C = (torch.randn(1, length, 1, requires_grad=True) for _ in range(3))
+            dt, A = torch.rand(1, length, 1, requires_grad=True), -torch.rand(1, 1)
+            with Operations() as counted:
+                selective_scan(u, dt, A.requires_grad_(), B, C).sum().backward()
+            print(f"| {length} | {name} | {counted.count} |", flush=True)
+
+
 if __name__ == "__main__":
-    if "--memory" in sys.argv:
+    if "operations" in sys.argv:
+        operations()
+    elif "--memory" in sys.argv:
         memory(sys.argv[-2], int(sys.argv[-1]))
     else:
         repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 9

@@ -147,27 +147,32 @@ def refuse_twice() -> None:
 
 # --- in torch operations --------------------------------------------------------------------------
 
-# The sequence is divided into segments that fit in a cache, and each segment into chunks that are
-# scanned in parallel. A segment takes one tensor operation for each step of a chunk, and one more
-# for the carry of each chunk. Only the states between segments are stored; back-propagation
-# computes all other states again. A decay is stored as exp(x) - 1, because the rounding error of a
-# decay near 1 would act at each step. The carry between chunks is float64, because a state that
-# hardly decays would be rounded at each carry.
+# The sequence is divided into segments, and only the states between segments are stored;
+# back-propagation computes all other states again. On a processor a segment fits in a cache, and is
+# divided into chunks that are scanned in parallel: it takes one tensor operation for each step of a
+# chunk, and one more for the carry of each chunk. On a GPU, where the number of operations counts,
+# a segment is scanned in pairs of steps, pairs of pairs and so on: some ten operations for each
+# doubling of its length. A decay is stored as exp(x) - 1, because the rounding error of a decay
+# near 1 would act at each step. The carry between chunks and segments is float64, because a state
+# that hardly decays would be rounded at each carry.
 
 #: number of elements in the states of a segment, and in one operation: the fastest on one core for
 #: 1536 elements a step, by 3 % over segments twice as long, by a tenth over no chunks. Smaller
 #: operations take longer to call than to compute
 SEGMENT, ROW = 1 << 17, 1 << 14
-SEGMENT_CUDA, ROW_CUDA = 1 << 23, 1 << 17  #: the same two numbers on a GPU: chosen, not measured
+SEGMENT_CUDA = 1 << 25  #: elements of a segment on a GPU, 128 MB in float32: chosen, not measured
 
 
 class ScanPlan(NamedTuple):
     """The division of a sequence into segments of ``chunks`` chunks, each of ``steps`` time
     steps.
+
+    With ``in_pairs`` a segment is one chunk, whose steps are scanned in pairs.
     """
 
     steps: int
     chunks: int
+    in_pairs: bool = False
 
     @property
     def segment(self) -> int:
@@ -178,9 +183,10 @@ def plan_scan(length: int, width: int, cuda: bool) -> ScanPlan:
     """Return the division into segments and chunks of a sequence of ``length`` time steps with
     ``width`` elements each.
     """
-    row, segment_numbers = (ROW_CUDA, SEGMENT_CUDA) if cuda else (ROW, SEGMENT)
-    segment = min(length, max(16, segment_numbers // width))
-    chunks = max(1, min(row // width, int(segment**0.5)))
+    if cuda:
+        return ScanPlan(min(length, max(16, SEGMENT_CUDA // width)), chunks=1, in_pairs=True)
+    segment = min(length, max(16, SEGMENT // width))
+    chunks = max(1, min(ROW // width, int(segment**0.5)))
     return ScanPlan(-(-segment // chunks), chunks)
 
 
@@ -218,6 +224,8 @@ class _Segment:
         last state in float64.
         """
         h = self.pushed[..., None] * self.into[..., None, :]
+        if self.division.in_pairs:
+            return h, _walk_in_pairs(h, self.lost, start)
         return h, _walk(h, list(self.lost.unbind(0)), start)
 
     def slopes(self, output_slope: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
@@ -229,10 +237,15 @@ class _Segment:
         """
         state_slopes = output_slope[..., None] * self.out[..., None, :]
         first_decay, *later_decays = self.lost.unbind(0)
+        # of each chunk, the first decay of the next one; ``end`` has that of the next segment
         next_first_decay = torch.cat([first_decay[1:], torch.zeros_like(first_decay[:1])])
-        slope_at_first = _walk(
-            state_slopes, [next_first_decay, *later_decays[::-1]], end, back=True
-        )
+        if self.division.in_pairs:
+            lost_after_step = torch.cat([self.lost[1:], next_first_decay[None]])
+            slope_at_first = _walk_in_pairs(state_slopes, lost_after_step, end, back=True)
+        else:
+            slope_at_first = _walk(
+                state_slopes, [next_first_decay, *later_decays[::-1]], end, back=True
+            )
         return state_slopes, slope_at_first + first_decay[0] * slope_at_first
 
     def gradients(self, dy: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, ...]:
@@ -293,6 +306,56 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
     # each state plus the contribution s + l s of the start s of its chunk, with l = growth - 1
     h.addcmul_(growth, chunk_starts).add_(chunk_starts)
     return start
+
+
+def _walk_in_pairs(h: Tensor, lost: Tensor, start: Tensor, back: bool = False) -> Tensor:
+    """Convert the inputs ``h`` (step, 1, ...) of a scan to states in place, as `_walk` does, with
+    ``lost`` (step, 1, ...) in the order of the steps, in few operations.
+    """
+    growth, last = lost.clone(), 0 if back else -1
+    _scan_in_pairs(h, growth, back)
+    end = (h[last, 0].double() + start).addcmul_(growth[last, 0].double(), start)
+    first_state = start.to(h)
+    h.addcmul_(growth, first_state).add_(first_state)
+    return end
+
+
+def _scan_in_pairs(h: Tensor, growth: Tensor, back: bool) -> None:
+    """Add to each state the decayed state before it, h_i <- h_i + (1 + growth_i) h_(i-1), and
+    multiply the decays in ``growth``, all pairs of steps at once and in place; ``back``: h_(i+1).
+
+    The number of products is proportional to the length, as in a loop, and the number of operations
+    to its logarithm.
+    """
+    steps = len(h)
+    if steps == 1:
+        return
+    early, late, single, before_single = _steps_of_pairs(steps, back)
+    _add_step(h, growth, late, early)
+    _scan_in_pairs(h[late], growth[late], back)
+    # the later states of all pairs are complete: one more step gives the others
+    _add_step(h, growth, single, before_single)
+
+
+def _add_step(h: Tensor, growth: Tensor, step: slice, before: slice) -> None:
+    """Add the states ``before`` to the states ``step``, and their decay to that of these steps."""
+    h[step].addcmul_(growth[step], h[before]).add_(h[before])
+    # (1 + e)(1 + l) - 1 = l + l e + e, precise near 0
+    growth[step].addcmul_(growth[step], growth[before]).add_(growth[before])
+
+
+def _steps_of_pairs(steps: int, back: bool) -> tuple[slice, slice, slice, slice]:
+    """Return the earlier and the later step of each pair in the order of a scan, the earlier steps
+    that follow a pair, and the last step of this pair.
+
+    An odd step that is left over follows the last pair.
+    """
+    odd = steps % 2
+    if back:
+        early, late = slice(odd + 1, None, 2), slice(odd, steps - 1, 2)
+        return early, late, slice(1 - odd, steps - 1, 2), slice(2 - odd, None, 2)
+    early, late = slice(0, steps - odd, 2), slice(1, None, 2)
+    return early, late, slice(2, None, 2), slice(1, steps - 1, 2)
 
 
 def _segments(length: int, division: ScanPlan) -> Iterator[slice]:

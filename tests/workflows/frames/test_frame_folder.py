@@ -193,7 +193,10 @@ def missing_file(folder):
             wrong_name,
             ["flat_2000ph_1ms_0.png and flat_2000ph_1ms_1.png count as one level", "flat_8000ph"],
         ),
-        (no_photons, ["flat_1ms_0.png, flat_1ms_1.png: photons is missing, which 8 other lit files have"]),
+        (
+            no_photons,
+            ["flat_1ms_0.png, flat_1ms_1.png: photons is missing, which 8 other lit files have"],
+        ),
         (few_levels, ["2 lit levels: take 4 or more"]),
         (colour, ["flat_2000ph_1ms_0.png is PNG with pixels of kind RGB, not raw grey"]),
         (other_time, ["flat_2000ph_1ms_0.png: its name says 0.001 s, but its header says 0.02 s"]),

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from neusee.nodes import cpp_library
 from neusee.nodes.restore.networks import ScanPlan, _selective_scan, reference, selective_scan
@@ -29,17 +30,26 @@ def cpp():
     _selective_scan.operators()  # where there is a compiler, code that does not compile is a failure
 
 
-@pytest.fixture(params=["torch", "cpp"])
+#: the scan in torch as it runs on a processor and, in pairs of steps, on a GPU; and the one in C++
+@pytest.fixture(params=["torch", "pairs", "cpp"])
 def backend(request):
     if request.param == "cpp":
         request.getfixturevalue("cpp")
     return request.param
 
 
+def plan_of_a_gpu(length, width, cuda, plan=_selective_scan.plan_scan):
+    return plan(length, width, cuda=True)
+
+
 def scan_by(*values, backend):
-    """The scan by one of the two backends, as the environment selects it."""
+    """The scan by one of the two backends, as the environment selects it; ``pairs`` is that in
+    torch with the plan of a GPU.
+    """
     with pytest.MonkeyPatch.context() as environment:
-        environment.setenv("NEUSEE_SCAN", backend)
+        environment.setenv("NEUSEE_SCAN", "torch" if backend == "pairs" else backend)
+        if backend == "pairs":
+            environment.setattr(_selective_scan, "plan_scan", plan_of_a_gpu)
         return selective_scan(*values)
 
 
@@ -107,7 +117,7 @@ def test_a_long_line_is_that_of_the_loop(rate, even, backend):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("steps", [(16, 1), (10, 9)])
+@pytest.mark.parametrize("steps", [(16, 1), (10, 9), (1000, 1, True)])
 def test_a_state_that_hardly_decays_is_not_rounded_away_in_wide_lines(monkeypatch, steps, seed):
     """As many carries as lines of 1536 numbers and more have; 2e-6 where they are in single
     precision.
@@ -145,18 +155,54 @@ def test_gradients_in_single_precision(rate):
     values = draw(1500, 3, 2, rate=rate, kind=torch.float32)
     seen = torch.randn(1, 1500, 3, generator=torch.Generator().manual_seed(1))
     truth = gradients(reference, [x.double() for x in values], seen.double())
-    for backend in ("torch", "cpp"):
+    for backend in ("torch", "pairs", "cpp"):
         found = gradients(lambda *x, b=backend: scan_by(*x, backend=b), values, seen)
         assert max(map(worst, found, truth)) < 5e-6, backend
 
 
-@pytest.mark.parametrize("steps", [(1, 1), (5, 1), (3, 4), (1, 7), (40, 1), (6, 7)])
+@pytest.mark.parametrize(
+    "steps",
+    [
+        *[(1, 1), (5, 1), (3, 4), (1, 7), (40, 1), (6, 7)],
+        *[(1, 1, True), (2, 1, True), (3, 1, True), (13, 1, True), (40, 1, True)],
+    ],
+)
 def test_any_cut_of_the_length_gives_the_same(monkeypatch, steps):
     values, seen = draw(40, 3, 2), torch.randn(1, 40, 3, dtype=torch.float64)
     monkeypatch.setattr(_selective_scan, "plan_scan", lambda *_: ScanPlan(*steps))
     found = gradients(lambda *x: scan_by(*x, backend="torch"), values, seen)
     for one, truth in zip(found, gradients(reference, values, seen), strict=True):
         assert worst(one, truth) < 1e-12
+
+
+class Operations(TorchDispatchMode):
+    """Counts the operations of torch and the elements that they write."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = self.elements = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        if not func.is_view:
+            self.count += 1
+            self.elements += result.numel()
+        return result
+
+
+def test_pairs_take_few_operations_and_work_in_proportion_to_the_length():
+    """A loop would take as many operations as steps; pairs without reuse the length times its
+    logarithm of products.
+    """
+    cost = {}
+    for length in (512, 4096):
+        h, lost = torch.rand(length, 1, 1, 2, 2), -torch.rand(length, 1, 1, 2, 2)
+        with Operations() as cost[length]:
+            _selective_scan._scan_in_pairs(h, lost, back=False)
+    added_levels = 3
+    assert cost[4096].count - cost[512].count <= 8 * added_levels
+    assert cost[4096].count <= 8 * 12
+    assert cost[4096].elements <= 8.1 * cost[512].elements
 
 
 @pytest.mark.usefixtures("cpp")
