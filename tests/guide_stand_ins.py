@@ -109,6 +109,10 @@ DEMONSTRATION = (
     "train.pool=2",
     "train.size=null",
 )
+NIGHT = {
+    "train.stages.1.iterations=3000": "train.stages.1.iterations=1",
+    "train.stages.2.iterations=8000": "train.stages.2.iterations=1",
+}
 SMALLNET = (*TRAINING[:-2], "train.stages.2.iterations=2", "train.critics.width=4")
 
 
@@ -249,6 +253,8 @@ STAND_INS = {
     "+height_error=smooth "
     "\"train.mismatch={height_error.rms: 'uniform(0 nm, 20 nm)', height_error.depth: 'normal(0, 0.01)'}\"": StandIn(
         "ten minutes", more=(*TRAINING, *ONE)),
+    "train train_small train.photographs=my_photographs train.stages.1.iterations=3000 "
+    "train.stages.2.iterations=8000": StandIn("a night", more=TRAINING, instead=NIGHT),
     'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
     "train train_informed train.photographs=my_photographs +mismatch=usual": StandIn("half an hour", more=(
         *TRAINING[:-2], "train.network.width=2", "train.pool=2", "train.cameras=[[doe=flat]]",
