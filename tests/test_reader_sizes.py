@@ -85,6 +85,7 @@ NO_SIZE = {
     "workflows/engine/machine_resources.py:process_memory": SYSTEM,
     "workflows/engine/machine_resources.py:there_is": SYSTEM,
     "workflows/engine/machine_resources.py:free_processors": SYSTEM,
+    "workflows/engine/processor_speed.py:_model": SYSTEM,
     "workflows/observation/system_calls.py:memory": SYSTEM,
     "workflows/observation/system_calls.py:status": SYSTEM,
     "workflows/explain/change_causes.py:_lines": SOURCE,

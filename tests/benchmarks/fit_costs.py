@@ -20,17 +20,21 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from measured_runs import FIT, file_of
 from scipy.optimize import nnls
 
 from neusee.nodes import registered_nodes
 from neusee.workflows.engine import cost_model as cost_laws
+from neusee.workflows.engine.processor_speed import probed_seconds, processor
 from neusee.workflows.engine.wanted_steps import steps_of, wanted
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TARGET = Path(__file__).parents[2] / "workflows" / "engine" / "node_costs.json"
 LIBRARIES = "colour", "kornia"  #: that take long to load
+#: entries of the file that the fit writes
+OWN = "processor", "threads", "probe", "guess", "nodes"
 SMALLEST = 16e6  #: B; below, memory that earlier steps freed hides what a step needs
 #: B of the inputs, the result or the work; below, they cannot be what takes the memory
 SMALL_PART = 1e6
@@ -278,13 +282,22 @@ def upper(groups):
 def write(laws, guess):
     """Write the file of the laws, and have it read again."""
     lines = ",\n".join(f'  "{node}": {json.dumps(each)}' for node, each in sorted(laws.items()))
-    TARGET.write_text(f'{{"guess": {json.dumps(guess)},\n"nodes": {{\n{lines}\n}}}}\n')
+    # the laws of import, report and training are measured by other scripts
+    others = {name: x for name, x in json.loads(TARGET.read_text()).items() if name not in OWN}
+    here = processor()
+    head = {"processor": here.name, "threads": here.threads, "probe": short(probed_seconds(1))}
+    parts = [f'"{name}": {json.dumps(x)}' for name, x in (head | others | {"guess": guess}).items()]
+    text = ",\n".join([*parts, f'"nodes": {{\n{lines}\n}}'])
+    TARGET.write_text(f"{{{text}}}\n")
     for cached in (cost_laws._file, cost_laws.shipped, cost_laws.guess):
         cached.cache_clear()
 
 
 def fit(folder):
-    """Fit the laws to the runs that are not held out, and write them."""
+    """Fit the laws to the runs that are not held out, and write them with this processor, which
+    must be that of the runs.
+    """
+    torch.set_num_threads(1)  # as in the runs
     runs = read(folder, FIT)
     most, loading = unruled(runs), loaders([run for run in runs if "grown" in run])
     before = json.loads(TARGET.read_text())

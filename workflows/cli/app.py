@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 #: environment variables that set how a thread of OpenMP waits
 _WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 _NUMBER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
-_DRAWN = ("run",)  #: commands during whose steps another process draws pictures
+#: the command during whose steps another process draws pictures, and its forecast
+_DRAWN = ("run", "plan")
 _TIMED = ("study",)  #: commands whose stored times depend on the number of threads
 
 

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from neusee.workflows.tolerance import cheaper_steps as cheaper_steps
     from neusee.workflows.training import process_mesh as process_mesh
     from neusee.workflows.training import resumable_loop as resumable_loop
+    from neusee.workflows.training import training_forecast as training_forecast
 
 #: modules below neusee
 _MODULES = (
@@ -103,6 +104,7 @@ _MODULES = (
     "workflows.tolerance.cheaper_steps",
     "workflows.training.process_mesh",
     "workflows.training.resumable_loop",
+    "workflows.training.training_forecast",
 )
 _BY_NAME = {module.rpartition(".")[2]: module for module in _MODULES}
 

@@ -251,6 +251,8 @@ def _forecast_of(plan: Plan) -> str:
     """Return the line that says how long a run will take, or an empty text."""
     unknown_count = sum(not estimate.known for estimate in plan.expected.values())
     seconds = plan.schedule.makespan if plan.schedule else 0.0
+    if plan.expected:
+        seconds += lazy.run_forecast.report_seconds(plan)
     return lazy.console.forecast_line(seconds, len(plan.expected), unknown_count)
 
 
@@ -301,7 +303,8 @@ def plan(
 
     Nothing is computed. Bytes follow from the shape of each result; seconds and memory from laws of
     each node that were measured, and from earlier runs on this machine, each with its range. A
-    guess for a node without a measurement is marked and counts at its upper end. With --devices the
+    guess for a node without a measurement is marked and counts at its upper end. Of a recipe that
+    trains, the answer is the training: iterations, hours and memory. With --devices the
     run is simulated on machines that you do not have: makespan, utilisation and critical path.
     """
     with within_memory(memory) as limit:
@@ -314,6 +317,8 @@ def plan(
             forecast = lazy.run_forecast.Forecast(
                 lazy.run_forecast.simulated_lines(recipe, store, devices), [], {}, False
             )
+    elif recipe.training is not None or recipe.lifting is not None:
+        forecast = lazy.training_forecast.forecast_training(recipe, store)
     else:
         forecast = lazy.run_forecast.forecast(recipe, store, device, limit)
     text = (

@@ -16,8 +16,11 @@ from statistics import median
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import torch
+
 from neusee.nodes import Node
 from neusee.workflows.engine.node_call import bands_in
+from neusee.workflows.engine.processor_speed import probed_seconds, processor
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.step_shapes import (
     Form,
@@ -42,7 +45,8 @@ from neusee.workflows.recipe.step_checks import machine_memory
 # work`` bytes, and its time is ``e + f operations`` seconds. ``node_costs.json`` has the
 # coefficients of each shipped node, which tests/benchmarks/fit_costs.py fits to runs of the shipped
 # recipes on a CPU, and the spread of the runs about the law. Seconds are the processor time of one
-# thread, so that a busy machine does not make a law slow.
+# thread, so that a busy machine does not make a law slow. The file names the processor of the runs
+# and the time of a probe on it; on another processor the laws are scaled by the probe.
 
 
 #: bytes of a result whose shape is not known, in a recipe without any known shape
@@ -127,6 +131,25 @@ def guess() -> Law:
     return _law(_file()["guess"])
 
 
+class Pace(NamedTuple):
+    """The time of this processor as a multiple of the laws, and the range about it."""
+
+    factor: float = 1.0
+    range: Range = Range()
+
+
+#: range of the pace of steps about that of the probe, on a processor other than that of the laws
+_OTHER_PROCESSOR = Range(0.5, 2.0)
+
+
+def pace() -> Pace:
+    """Return the pace of this processor: 1 on that of the laws, and otherwise by a short probe."""
+    laws = _file()
+    if processor().takes_as_long(laws["processor"], laws["threads"]):
+        return Pace()
+    return Pace(probed_seconds(torch.get_num_threads()) / laws["probe"], _OTHER_PROCESSOR)
+
+
 def _law(law: Mapping[str, Any]) -> Law:
     """Return the law that one entry of ``node_costs.json`` describes."""
     # least and largest multiple of the law: of the memory first, then of the seconds
@@ -134,6 +157,61 @@ def _law(law: Mapping[str, Any]) -> Law:
     # the names of the libraries, then the bytes and the seconds of loading them
     loads = Loading(tuple(law["loads"][0]), *law["loads"][1:]) if "loads" in law else None
     return Law(tuple(law["memory"]), tuple(law["seconds"]), spread, loads, law.get("most", 0.0))
+
+
+class ProgramLaw(NamedTuple):
+    """The time of a command beside its steps: import of the program, and its report."""
+
+    loading: float  #: s, of libraries, recipe and plan
+    report: tuple[float, float, float]  #: s, s for each figure, and s for each step
+    spread: tuple[float, float]  #: least and largest multiple of both
+
+    def seconds(self, figures: int, steps: int) -> tuple[float, float]:
+        """Return the processor time in s of import and of report on this processor."""
+        factor, (fixed, of_figure, of_step) = pace().factor, self.report
+        return factor * self.loading, factor * (fixed + of_figure * figures + of_step * steps)
+
+    @property
+    def range(self) -> Range:
+        """Return the range about both times."""
+        return _product(Range(*self.spread), pace().range)
+
+
+@cache
+def program_law() -> ProgramLaw:
+    """Return the law of a command beside its steps."""
+    law = _file()["program"]
+    return ProgramLaw(law["loading"], tuple(law["report"]), tuple(law["spread"]))
+
+
+class TrainingLaw(NamedTuple):
+    """The costs of one pass forward and back of a network of a training.
+
+    Each is a sum over 1, pixels, width x pixels and width² x pixels.
+    """
+
+    seconds: tuple[float, float, float, float]
+    bytes: tuple[float, float, float, float]
+
+    def time(self, width: int, pixels: float) -> float:
+        """Return the processor time in s of a pass of one picture on this processor."""
+        return pace().factor * _sum(self.seconds, width, pixels)
+
+    def saved_bytes(self, width: int, pixels: float) -> float:
+        """Return the memory in bytes that a pass keeps for its way back."""
+        return _sum(self.bytes, width, pixels)
+
+
+def _sum(coefficients: Sequence[float], width: int, pixels: float) -> float:
+    terms = (1.0, pixels, width * pixels, width**2 * pixels)
+    return sum(x * term for x, term in zip(coefficients, terms, strict=True))
+
+
+@cache
+def training_laws() -> Mapping[str, TrainingLaw]:
+    """Return the laws of the networks of trainings, by kind."""
+    laws = _file()["training"].items()
+    return {kind: TrainingLaw(tuple(law["seconds"]), tuple(law["bytes"])) for kind, law in laws}
 
 
 def libraries_of(paths: Iterable[str]) -> float:
@@ -354,6 +432,7 @@ class Estimate:
     sized: bool = True  #: False where the size of the result is a guess as well
     #: memory (bytes) of the libraries that the step loads, which count as memory of the program
     libraries: float = 0.0
+    measured: bool = False  #: True if runs on this processor decide the time
 
     @property
     def peak(self) -> float:
@@ -362,10 +441,10 @@ class Estimate:
 
 
 def _of_size(rows: Iterable[Row], size: Size) -> Iterator[Row]:
-    """Yield the runs of a step of about this size."""
+    """Yield the runs of a step of about this size, with a time that holds on this processor."""
     for row in rows:
         measured = _size_of_work(row)
-        if measured and _alike(measured, size):
+        if measured and _alike(measured, size) and _is_timed(row):
             yield row
 
 
@@ -395,7 +474,7 @@ class Costs:
     def learn(self, rows: Iterable[Row]) -> None:
         """Add measured costs of later runs; of each step and node only the newest are kept."""
         has_other_kinds = False
-        for row in rows:
+        for row in map(_comparable, rows):
             if row.get("node") and row.get("step") and _is_measured(row):
                 _append(self._steps.setdefault(f"{row['step']} {row['node']}", []), row)
                 _append(self._nodes.setdefault(row["node"], []), row)
@@ -409,13 +488,15 @@ class Costs:
         """
         size = self._sizes.get(step.name)
         # the same result was computed before
-        if exact and _is_measured(exact):
+        exact = exact and _comparable(exact)
+        if exact and _is_measured(exact) and _is_timed(exact):
             return self._repeated([exact], kinds, size)
         # the size is known: use runs of the node at this size, or its law
         if size is not None and size.known:
             return self._predicted(step.node.path, kinds, size)
         # the size is unknown: use earlier runs of this very step, or a guess
-        rows = self._steps.get(f"{step.name} {step.node.path}", [])[-_NEWEST:]
+        rows = self._steps.get(f"{step.name} {step.node.path}", [])
+        rows = [row for row in rows if _is_timed(row)][-_NEWEST:]
         return (
             self._repeated(rows, kinds, None) if rows else self._guess(step.node.path, kinds, size)
         )
@@ -454,10 +535,11 @@ class Costs:
         """
         size = self._sizes.get(step.name)
         rows = self._nodes.get(step.node.path, [])
+        exact = exact and _comparable(exact)
         return (
-            bool(exact and _is_measured(exact))
+            bool(exact and _is_measured(exact) and _is_timed(exact))
             or size is None
-            or any(_alike(_size_of_work(row), size) for row in rows if _size_of_work(row))
+            or any(True for _ in _of_size(rows, size))
         )
 
     def with_sizes(self, sizes: Mapping[str, Size]) -> Costs:
@@ -488,13 +570,22 @@ class Costs:
             return self._guess(path, kinds, size, runs_with_size[-_NEWEST:])
         law_or_guess = law or guess()
         # ratio of the newest runs on this machine to the law
-        memory_and_time_factors = _scales(law_or_guess, runs_with_size[-_NEWEST:], self._faster)
-        peak = max(size.result, memory_and_time_factors[0] * law_or_guess.peak(size))
-        cpu_seconds = memory_and_time_factors[1] * law_or_guess.time(size)
+        memory_factor, time_pace = _scales(law_or_guess, runs_with_size[-_NEWEST:], self._faster)
+        peak = max(size.result, memory_factor * law_or_guess.peak(size))
+        cpu_seconds = time_pace.factor * law_or_guess.time(size)
         seconds = {kind: cpu_seconds / self._faster(kind) for kind in kinds}
+        memory_spread, time_spread = law_or_guess.spread
+        spread = (memory_spread, _product(time_spread, time_pace.range))
         # `Estimate.work` is the peak without the result
+        measured = any(map(_is_timed, runs_with_size))
         return Estimate(
-            seconds, size.result, peak - size.result, True, law_or_guess.spread, size.bands
+            seconds,
+            size.result,
+            peak - size.result,
+            True,
+            spread,
+            size.bands,
+            measured=measured,
         )
 
     def _repeated(
@@ -513,8 +604,9 @@ class Costs:
             _range(peaks, peak, usual_spread[0]),
             _range([row["seconds"] for row in rows], None, usual_spread[1]),
         )
+        bands = size.bands if size else 0
         return Estimate(
-            seconds, result_bytes, peak - result_bytes, True, spread, size.bands if size else 0
+            seconds, result_bytes, peak - result_bytes, True, spread, bands, measured=True
         )
 
     def _guess(
@@ -527,12 +619,11 @@ class Costs:
         is increased by the same factor.
         """
         size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path) or guess()
+        memory_factor, time_pace = _scales(law, rows, self._faster)
         # never below the law, because a guess is an upper limit
-        memory_and_time_factors = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
-        cpu_seconds, peak = (
-            memory_and_time_factors[1] * law.spread[1].most * law.time(size),
-            memory_and_time_factors[0] * law.spread[0].most * law.peak(size),
-        )
+        slowest = max(1.0, time_pace.factor * time_pace.range.most)
+        cpu_seconds = slowest * law.spread[1].most * law.time(size)
+        peak = max(1.0, memory_factor) * law.spread[0].most * law.peak(size)
         seconds = {kind: cpu_seconds / self._faster(kind) for kind in kinds}
         # the guess is the largest value; the memory is at least that of the result
         spread = (Range(size.result / peak if peak else 0.0, 1.0), Range(0.0, 1.0))
@@ -561,7 +652,7 @@ class Costs:
         ratios_by_kind: dict[str, list[float]] = {}
         for rows in self._steps.values():
             seconds_by_kind: dict[str, list[float]] = {}
-            for row in rows:
+            for row in filter(_is_timed, rows):
                 seconds_by_kind.setdefault(_kind(row), []).append(row["seconds"])
             cpu_seconds = median(seconds_by_kind.pop("cpu", [0.0]))
             for kind, seconds in seconds_by_kind.items():
@@ -579,7 +670,8 @@ def _append(rows: list[Row], row: Row) -> None:
 
 def _loading(cost: Estimate, loads: Loading) -> Estimate:
     """Return the costs of a step that loads a library before it computes."""
-    seconds = {kind: time + loads.seconds for kind, time in cost.seconds.items()}
+    loading_seconds = pace().factor * loads.seconds
+    seconds = {kind: time + loading_seconds for kind, time in cost.seconds.items()}
     return replace(cost, seconds=seconds, libraries=loads.memory)
 
 
@@ -593,19 +685,39 @@ def _range(values: Sequence[float], expected: float | None, usual: Range) -> Ran
     return Range(min(1.0, min(values) / expected), max(1.0, max(values) / expected))
 
 
-def _is_measured(row: Row) -> bool:
-    """Return True for a journal line with a time, a size and a peak of memory that this machine
-    can have.
+def _comparable(row: Row) -> Row:
+    """Return a journal line whose ``seconds`` can be compared with those of this machine: processor
+    time of this processor, or None.
+
+    The time of the clock, which lines of earlier versions have alone, is that of a GPU only: other
+    work on the machine lengthens a step on a CPU by any factor.
     """
+    if _kind(row) != "cpu":
+        return row
+    is_of_here = processor().takes_as_long(row.get("processor"), row.get("threads"))
+    return {**row, "seconds": row.get("processor_seconds") if is_of_here else None}
+
+
+def _is_timed(row: Row) -> bool:
+    return row.get("seconds") is not None
+
+
+def _is_measured(row: Row) -> bool:
+    """Return True for a journal line with bytes and a peak of memory that this machine can have."""
     # a peak above the memory of this machine is damaged, or comes from another machine
     fits = _kind(row) != "cpu" or (row.get("peak") or 0) <= machine_memory()
-    return fits and row.get("seconds") is not None and row.get("bytes") is not None
+    return fits and row.get("bytes") is not None
 
 
-def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:
-    """Return the median ratios of the runs on this machine to a law, for memory and for time; 1 if
-    nothing was measured.
+def _product(spread: Range, other: Range) -> Range:
+    """Return the range of a product of two factors."""
+    return Range(spread.least * other.least, spread.most * other.most)
 
+
+def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, Pace]:
+    """Return the median ratios of the runs on this machine to a law, for memory and for time.
+
+    If nothing was measured, they are 1 for memory, and the pace of the processor for time.
     Small steps are left out, because allocators and overheads dominate their cost.
     """
     peak_ratios, time_ratios = [], []
@@ -613,11 +725,10 @@ def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:
         size = _size_of_work(row)
         if row.get("peak") and law.peak(size) > _NOISE_BYTES and _kind(row) == "cpu":
             peak_ratios.append(row["peak"] / law.peak(size))
-        if law.time(size) > _OVERHEAD_SECONDS:
+        if _is_timed(row) and law.time(size) > _OVERHEAD_SECONDS:
             time_ratios.append(row["seconds"] * faster(_kind(row)) / law.time(size))
-    return (median(peak_ratios) if peak_ratios else 1.0), (
-        median(time_ratios) if time_ratios else 1.0
-    )
+    time_pace = Pace(median(time_ratios)) if time_ratios else pace()
+    return (median(peak_ratios) if peak_ratios else 1.0), time_pace
 
 
 def _size_of_work(row: Row) -> Any:

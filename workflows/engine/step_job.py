@@ -19,6 +19,12 @@ from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.cost_model import measured_size
 from neusee.workflows.engine.machine_resources import PeakMemory, guarded, refusing_allocations
 from neusee.workflows.engine.node_call import call, call_in_parts, examine
+from neusee.workflows.engine.processor_speed import (
+    Processor,
+    process_seconds,
+    processor,
+    thread_seconds,
+)
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork, may_fork
 from neusee.workflows.graph.errors import RunError
@@ -183,7 +189,10 @@ class Outcome:
     facts: TensorStats | None = None
     checks: tuple[Check, ...] = ()
     began: float = 0.0  #: start time (s), from `time.time`
-    seconds: float = 0.0
+    seconds: float = 0.0  #: of the clock, which other work on the machine lengthens
+    #: processor time (s) of the step and the processes that it started; None on a GPU
+    processor_seconds: float | None = None
+    processor: Processor | None = None  #: where the step ran; None on a GPU
     bytes: int = 0
     #: error of a cheaper form: `Node.approximation_error`
     deviation: tuple[float, float] | None = None
@@ -295,7 +304,10 @@ def _computed(work: StepJob, inputs: list[Any]) -> Outcome:
     step, hooks = work.step, work.step.node.hooks
     observations = _Seen()
     file_stamps_before = file_stamps(step.params)
-    began, clock_start = time.time(), time.perf_counter()
+    on_cpu = device_kind(work.device) == "cpu"
+    # code of the user may run in a thread of its own
+    work_clock = thread_seconds if work.own is None else process_seconds
+    began, clock_start, work_start = time.time(), time.perf_counter(), work_clock()
     input_bytes = sum(t.nbytes for t in tensors_in(inputs))
     # a small and quick step is not worth the measurement
     is_watched = input_bytes >= _WATCHED_BYTES or not work.unlocked
@@ -311,7 +323,7 @@ def _computed(work: StepJob, inputs: list[Any]) -> Outcome:
     ):
         value = _value(work, inputs, observations)
         checks = _observing(examine, work, observations)(step, value, inputs) if hooks.check else ()
-    seconds = time.perf_counter() - clock_start
+    seconds, work_seconds = time.perf_counter() - clock_start, work_clock() - work_start
     _refuse_changed_files(work, file_stamps_before)
     return Outcome(
         work,
@@ -323,6 +335,8 @@ def _computed(work: StepJob, inputs: list[Any]) -> Outcome:
         checks=checks,
         began=began,
         seconds=seconds,
+        processor_seconds=work_seconds if on_cpu else None,
+        processor=processor() if on_cpu else None,
         # the memory of a forked process is counted separately
         peak=None if peak.bytes is None else peak.bytes + observations.peak,
         taints=tuple(dict.fromkeys(observations.taints)),
@@ -485,6 +499,9 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "facts": outcome.facts and {name: getattr(outcome.facts, name) for name in _STATISTICS},
         "checks": [[check.text, check.ok] for check in outcome.checks],
         "seconds": outcome.seconds,
+        "processor_seconds": outcome.processor_seconds,
+        "processor": outcome.processor and outcome.processor.name,
+        "threads": outcome.processor and outcome.processor.threads,
         "bytes": outcome.bytes,
         "peak": outcome.peak,
         "size": outcome.size,

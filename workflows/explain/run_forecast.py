@@ -10,7 +10,7 @@ from itertools import chain
 from textwrap import wrap
 from typing import Any
 
-from neusee.workflows.engine.cost_model import Costs, Estimate, Range, sizes_of
+from neusee.workflows.engine.cost_model import Costs, Estimate, Range, program_law, sizes_of
 from neusee.workflows.engine.local_executor import lanes_of, memory_limit, program_memory
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import past_costs, prepare, running_peak
@@ -466,14 +466,46 @@ def _totals(plan: Plan) -> dict[str, Any]:
     """
     makespan = plan.schedule.makespan if plan.schedule else None
     least_and_most = _range_of(makespan, plan.expected.values()) if makespan else {}
+    steps = makespan and {"expected": makespan, **least_and_most}
     return {
         "steps": len(plan.expected),
         "guesses": sum(not cost.known for cost in plan.expected.values()),
-        "seconds": makespan and {"expected": makespan, **least_and_most},
+        # steps whose time follows from runs on this processor
+        "measured": sum(cost.measured for cost in plan.expected.values()),
+        "seconds": steps,
+        **(_seconds_of_command(plan, steps) if steps else {}),
         "bytes": sum(cost.bytes for cost in plan.expected.values()),
         "memory_of_steps": plan.running or None,
         "memory_of_report": plan.reporting or None,
     }
+
+
+def _seconds_of_command(plan: Plan, steps: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Return the processor time (s) of import and report of a run, and of the whole command."""
+    law = program_law()
+    importing, reporting = (
+        _ranged(seconds, law.range)
+        for seconds in law.seconds(_shown_figures(plan.recipe), len(plan.order))
+    )
+    whole = {
+        end: importing[end] + reporting[end] + steps.get(end, steps["expected"])
+        for end in ("expected", "least", "most")
+    }
+    return {
+        "seconds_of_import": importing,
+        "seconds_of_report": reporting,
+        "seconds_of_command": whole,
+    }
+
+
+def report_seconds(plan: Plan) -> float:
+    """Return the expected processor time (s) of the report of a run."""
+    return program_law().seconds(_shown_figures(plan.recipe), len(plan.order))[1]
+
+
+def _shown_figures(recipe: Recipe) -> int:
+    """Return the number of pictures of the report that show results of a recipe."""
+    return sum(bool(steps) for steps in _jobs(recipe)[0])
 
 
 def _range_of(took: float, costs: Collection[Estimate]) -> dict[str, float]:
@@ -511,7 +543,7 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
     """
     lines = []
     if undecided := [name for name, decision in plan.left_out.items() if decision is None]:
-        lines += _wrapped(
+        lines += wrapped_text(
             f"left out or not, depending on the values of the inputs: {', '.join(undecided)}"
         )
     time_text = _took_text(totals["seconds"])
@@ -525,10 +557,23 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
         f"{totals['steps']} of {len(plan.order)} steps would"
         f" run{guess_text if totals['guesses'] else ''}"
     )
-    lines += _wrapped(f"{run_text}: {time_text}, {bytes_new} new, {bytes_read} to load")
+    lines += wrapped_text(f"{run_text}: {time_text}, {bytes_new} new, {bytes_read} to load")
     if plan.expected:
-        lines += _memory_lines(plan, lanes)
-    return [*lines, *(_wrapped(f"refused: {plan.refused}") if plan.refused else [])]
+        lines += [*_command_lines(totals), *_memory_lines(plan, lanes)]
+    return [*lines, *(wrapped_text(f"refused: {plan.refused}") if plan.refused else [])]
+
+
+def _command_lines(totals: Mapping[str, Any]) -> list[str]:
+    """Return lines with the time of the whole command, and with where the times come from."""
+    if not totals["seconds"]:
+        return []
+    importing, reporting, whole = (
+        seconds_text(totals[f"seconds_of_{name}"]) for name in ("import", "report", "command")
+    )
+    text = f"with import {importing} s and report {reporting} s: {whole} s of processor time"
+    if totals["measured"]:
+        return wrapped_text(text)
+    return wrapped_text(f"{text}; a guess by laws, before a step ran on this processor")
 
 
 def _took_text(seconds: Mapping[str, float] | float | None) -> str:
@@ -547,7 +592,7 @@ def _memory_lines(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
             lines.append(f"memory  {name}: {peak} at most, of {format_size(max(lane.memory, 0.0))}")
     if plan.running:
         program_bytes = format_size(max(lane.held for lane in lanes.values()))
-        lines += _wrapped(
+        lines += wrapped_text(
             f"memory  process: {format_size(plan.running)} while the steps run, of which the"
             f" program itself holds {program_bytes}; {format_size(plan.reporting)} while the report"
             " is written"
@@ -555,7 +600,7 @@ def _memory_lines(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
     return lines
 
 
-def _wrapped(text: str) -> list[str]:
+def wrapped_text(text: str) -> list[str]:
     """Return a text as lines of at most 80 columns; the later lines are indented."""
     return wrap(text, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 

@@ -25,7 +25,9 @@ from neusee.workflows.store.shared_folder import Disk, append, read_file
 
 Row = dict[str, Any]
 _FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "size", "date")
-_CHECKED = [(name, FIELDS[name]) for name in (*_FIELDS, "kept")]
+#: fields that lines of earlier versions lack: the time of the clock alone says little of a step
+_LATER_FIELDS = ("processor_seconds", "processor", "threads")
+_CHECKED = [(name, FIELDS[name]) for name in (*_FIELDS, *_LATER_FIELDS, "kept")]
 _START, NO_VALUE = b'{"key":"', b'"kept":false'  #: bytes that cannot occur inside a JSON text
 _KEY = slice(len(_START), len(_START) + 32)
 _NAMES = {"key", "node", "kept", *_FIELDS}
@@ -40,7 +42,7 @@ def row_of(key: str, about: Row) -> Row:
     node = (about.get("origin") or {}).get("node")
     return {
         "key": key,
-        **{f: about.get(f) for f in _FIELDS},
+        **{f: about.get(f) for f in (*_FIELDS, *_LATER_FIELDS)},
         "node": node,
         "kept": metadata.is_kept(about),
     }
@@ -74,8 +76,9 @@ class Journal:
     def rows(self) -> list[Row]:
         """Return every line of the journal as a dict, which the caller must not change.
 
-        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, size, date
-        and kept.
+        The fields of a line are key, step, recipe, node, seconds (of the clock), bytes, device,
+        peak, size, date and kept, and of a step that ran on a CPU its processor_seconds,
+        processor and threads.
         """
         self._read()
         return self._rows
@@ -291,7 +294,8 @@ def _is_row(row: Row) -> bool:
         and (node is None or is_text(node))
         and row["kept"] is not None
     )
-    return is_valid and all(row[name] is None or is_right(row[name]) for name, is_right in _CHECKED)
+    values = ((row.get(name), is_right) for name, is_right in _CHECKED)
+    return is_valid and all(value is None or is_right(value) for value, is_right in values)
 
 
 def _opened(path: str, flags: int) -> int:

@@ -21,8 +21,9 @@ from neusee.nodes.own_modules import Architecture
 from neusee.nodes.restore import Restorer, export_network, require_exportable
 from neusee.nodes.restore import network as network_node
 from neusee.nodes.scene import Photographs
+from neusee.workflows.engine.processor_speed import thread_seconds
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import Stamp, file_digest, file_stamps
+from neusee.workflows.keys.cache_key import Stamp, device_kind, file_digest, file_stamps
 from neusee.workflows.keys.code_digest import Code, outline
 from neusee.workflows.recipe.blocks.train_block import KEY, Network, Stage, Training
 from neusee.workflows.store.result_store import Store
@@ -45,6 +46,7 @@ from neusee.workflows.training.resumable_loop import (
     TrainingSession,
     export,
 )
+from neusee.workflows.training.training_forecast import IterationTimes
 from neusee.workflows.training.training_iteration import Learner, WarmStart
 from neusee.workflows.training.training_page import curves, png, strip, write_page
 from neusee.workflows.training.training_pictures import PictureSource, require_alone, samples_of
@@ -208,6 +210,12 @@ class _TrainingLoop(ResumableLoop[Learner]):
             [*photograph_split.trained.paths, *photograph_split.judged]
         )
         self.mask_content = ""  #: digest of the mask used in stage 2
+        #: None on a GPU, and where several processes share a batch
+        self.times = (
+            IterationTimes(recipe, settings, session.store)
+            if device_kind(session.device) == "cpu" and mesh.size == 1
+            else None
+        )
         progress(str(photograph_split))
         if settings.augment.pooled != "none":
             progress(
@@ -323,7 +331,10 @@ class _TrainingLoop(ResumableLoop[Learner]):
         value.
         """
         rate = self.learner.set_rates(self.iteration)
+        began = thread_seconds()
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
+        if self.times is not None:
+            self.times.add(self.stage, self.iteration, thread_seconds() - began)
         return losses | {"rate": rate}
 
     def validate(self, iterations: int) -> Losses:
@@ -386,6 +397,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
         if self.board:
             self.board.flush()
         super().keep()
+        if self.times is not None:
+            self.times.keep()
 
     def show(self) -> None:
         """Write a PNG file with a picture of the last batch, its restoration and the true picture,

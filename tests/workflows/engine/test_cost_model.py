@@ -2,11 +2,13 @@
 
 import importlib
 import sys
+import time
 
 import pytest
 import torch
 
 from neusee.nodes import doe, node, optics, registered_nodes, shape_rules
+from neusee.workflows.engine import cost_model
 from neusee.workflows.engine.cost_model import (
     MOST_RESULTS,
     Costs,
@@ -20,11 +22,20 @@ from neusee.workflows.engine.cost_model import (
     sizes_of,
 )
 from neusee.workflows.engine.placement_inputs import MOST_PARTS, parts_of, past_costs
+from neusee.workflows.engine.processor_speed import Processor, probed_seconds, processor
 from neusee.workflows.graph.errors import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.store.result_store import Store
 
 SMALL, LARGE = Size(1e8, 1e8, 0.0, 5e7), Size(4e8, 4e8, 0.0, 2e8)
+
+
+@pytest.fixture(autouse=True)
+def laws_of_here(monkeypatch):
+    """Tests compute on the processor of the laws, whatever the machine is."""
+    here = {"processor": processor().name, "threads": processor().threads}
+    laws = {**cost_model._file(), **here}
+    monkeypatch.setattr(cost_model, "_file", lambda: laws)
 
 
 @node()
@@ -41,7 +52,11 @@ def row(name, seconds, size=100, device="cpu", peak=None, node=blur.path, of=Non
     return {
         "step": name,
         "node": node,
-        "seconds": seconds,
+        # the clock counts other work too, and decides on a GPU alone
+        "seconds": seconds if device.startswith("cuda") else 7 * seconds,
+        "processor_seconds": seconds,
+        "processor": processor().name,
+        "threads": processor().threads,
         "bytes": size,
         "device": device,
         "peak": peak,
@@ -294,6 +309,9 @@ def test_costs_follow_the_journal_and_read_each_line_once(tmp_path, monkeypatch)
             "recipe": "r",
             "origin": {"node": "toy.a"},
             "seconds": seconds,
+            "processor_seconds": seconds,
+            "processor": processor().name,
+            "threads": processor().threads,
             "device": "cpu",
         }
         date = f"2026-11-26 00:00:{n:02d}"
@@ -317,3 +335,59 @@ def test_only_the_newest_runs_of_a_step_are_kept():
     )
     newest = Costs([row("a", float(n), of=SMALL) for n in range(900, 1000)], {"a": SMALL})
     assert costs.with_sizes({"a": SMALL}).of(step("a"), ["cpu"]) == newest.of(step("a"), ["cpu"])
+
+
+def other_processor(monkeypatch, probe):
+    """Compute on a processor with another name, whose probe takes ``probe`` s; return the probes."""
+    probes = []
+    here = Processor("another processor, NEON", 1)
+    monkeypatch.setattr("neusee.workflows.engine.cost_model.processor", lambda: here)
+    monkeypatch.setattr(
+        "neusee.workflows.engine.cost_model.probed_seconds", lambda n: probes.append(n) or probe
+    )
+    return probes
+
+
+def test_a_law_is_scaled_by_the_probe_on_another_processor_and_has_a_wider_interval(monkeypatch):
+    law_probe = cost_model._file()["probe"]
+    psf = Step("psf", optics.psf, {}, {}, Location("t.yaml", 1, 1), {})
+    law = shipped()["optics.psf"]
+    probes = other_processor(monkeypatch, 3 * law_probe)
+    there = Costs([], {"psf": SMALL}).of(psf, ["cpu"])
+    assert there.seconds["cpu"] == pytest.approx(3 * law.time(SMALL))
+    assert there.spread[1].least < law.spread[1].least
+    assert there.spread[1].most > law.spread[1].most
+    assert probes
+
+
+def test_a_law_holds_as_it_is_on_its_own_processor_and_no_probe_runs(monkeypatch):
+    probes = other_processor(monkeypatch, 1.0)
+    monkeypatch.setitem(cost_model._file(), "processor", "another processor, NEON")
+    psf = Step("psf", optics.psf, {}, {}, Location("t.yaml", 1, 1), {})
+    found = Costs([], {"psf": SMALL}).of(psf, ["cpu"])
+    assert found.seconds["cpu"] == shipped()["optics.psf"].time(SMALL)
+    assert not probes
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"processor": "another processor, NEON"},
+        {"threads": 64},
+        # a line of an earlier version has the time of the clock alone
+        {"processor_seconds": None, "processor": None, "threads": None},
+    ],
+)
+def test_a_time_of_another_processor_or_of_the_clock_alone_predicts_nothing(change):
+    psf = Step("psf", optics.psf, {}, {}, Location("t.yaml", 1, 1), {})
+    line = row("psf", 1e3, peak=2e9, node="optics.psf", of=SMALL) | change
+    with_line, without = (Costs(rows, {"psf": SMALL}).of(psf, ["cpu"]) for rows in ([line], []))
+    assert with_line.seconds == without.seconds
+    assert not with_line.measured
+    assert Costs([line], {"psf": SMALL}).of(psf, ["cpu"], line).seconds == without.seconds
+
+
+def test_the_probe_takes_a_fifth_of_a_second_at_most():
+    began = time.thread_time()
+    assert probed_seconds(torch.get_num_threads()) > 0
+    assert time.thread_time() - began < 0.2

@@ -271,6 +271,8 @@ def test_memory_that_cannot_do_is_refused_before_anything_runs(store):
 
 def test_the_account_says_what_was_expected(store, monkeypatch):
     monkeypatch.setattr(step_job, "time", Ticks())
+    monkeypatch.setattr(step_job, "thread_seconds", Ticks().perf_counter)
+    monkeypatch.setattr(step_job, "process_seconds", Ticks().perf_counter)
     run(recipe("m", **DEAR), store)
     other = {**DEAR, "a": (slow, {}, {"seconds": 0.25})}
     result = run(recipe("m", **other), Store(store.root))

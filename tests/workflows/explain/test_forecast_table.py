@@ -4,8 +4,11 @@ import json
 
 import pytest
 
+from neusee.workflows.engine import cost_model
 from neusee.workflows.engine.cost_model import shipped
 from neusee.workflows.engine.local_executor import lanes_of
+from neusee.workflows.engine.processor_speed import processor
+from neusee.workflows.engine.runner import run
 from neusee.workflows.explain.run_forecast import (
     forecast,
     forecast_rows,
@@ -16,6 +19,14 @@ from neusee.workflows.explain.run_forecast import (
 )
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
+
+
+@pytest.fixture(autouse=True)
+def laws_of_here(monkeypatch):
+    """Tests compute on the processor of the laws, whatever the machine is."""
+    here = {"processor": processor().name, "threads": processor().threads}
+    laws = {**cost_model._file(), **here}
+    monkeypatch.setattr(cost_model, "_file", lambda: laws)
 
 
 def cost(least, expected, most):
@@ -87,3 +98,21 @@ def test_the_total_time_has_a_range_around_it(tmp_path):
     assert seconds["least"] < seconds["expected"] < seconds["most"]
     assert f"about {seconds_text(seconds)} s" in " ".join(" ".join(found.lines).split())
     assert found.totals["memory_of_steps"] > 10**8
+
+
+def test_a_forecast_counts_import_and_report_and_is_a_guess_before_a_step_ran(tmp_path):
+    found = forecast(load("first_light", []), Store(tmp_path), memory=10**11)
+    parts = [found.totals[f"seconds{part}"] for part in ("", "_of_import", "_of_report")]
+    whole = found.totals["seconds_of_command"]
+    for end in ("expected", "least", "most"):
+        assert whole[end] == pytest.approx(sum(part[end] for part in parts))
+    assert found.totals["measured"] == 0
+    assert "a guess by laws" in " ".join(found.lines)
+
+
+def test_nothing_is_probed_where_nothing_is_forecast(tmp_path, monkeypatch):
+    recipe, store = load("calibrate_camera", []), Store(tmp_path)
+    run(recipe, store)
+    monkeypatch.setattr(cost_model, "_file", lambda: {**shipped(), "processor": "another"})
+    monkeypatch.setattr(cost_model, "probed_seconds", lambda threads: pytest.fail("a probe"))
+    assert forecast(recipe, store, memory=10**11).totals["steps"] == 0

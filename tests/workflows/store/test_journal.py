@@ -12,6 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from neusee.workflows.keys.sealed_files import seal_record
 from neusee.workflows.store import journal
 from neusee.workflows.store.result_store import Store
 
@@ -72,6 +73,7 @@ def test_a_line_for_each_result_and_each_receipt(tmp_path):
     ]
     for i, row in enumerate(expected):
         row |= {"date": about(i)["date"], "node": "a.b", "kept": i == 0, "size": None}
+        row |= dict.fromkeys(("processor_seconds", "processor", "threads"))
     assert store.journal.rows() == expected
     assert Store(tmp_path).journal.rows() == expected
 
@@ -250,3 +252,13 @@ def test_the_newest_lines_of_a_long_journal_are_read_alone(tmp_path, monkeypatch
     assert len(found.rows()) == 61
     assert journal.Journal(writer.disk).totals()[::2] == (60, 1)
     assert len(found.latest()) == 61  # all are read by now
+
+
+def test_a_line_of_an_earlier_version_without_a_processor_is_read(tmp_path):
+    store = Store(tmp_path)
+    store.put(key_of(0), 1.0, about(0))
+    path = tmp_path / "journal.jsonl"
+    row = {k: v for k, v in store.journal.rows()[0].items() if not k.startswith(("proc", "thr"))}
+    head = path.read_bytes().split(b"\n")[0]
+    path.write_bytes(head + b"\n" + seal_record("journal", row))
+    assert Store(tmp_path).journal.rows() == [row]
