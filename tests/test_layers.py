@@ -87,7 +87,13 @@ STUDIES = {
     "stability": ("stability_study", "extreme_cases", "case_result"),
     "leave_out": ("leave_out_study", "left_out_steps"),
     "calibration": ("calibration_study", "posterior_tests"),
-    "uncertainty": ("uncertainty_study", "uncertainty_page", "sobol_indices", "output_draws"),
+    "uncertainty": (
+        "uncertainty_study",
+        "uncertainty_page",
+        "sobol_indices",
+        "output_draws",
+        "reused_choices",
+    ),
     "protection": ("protection_study",),
 }
 KIND_OF_STUDY = {name: kind for kind, names in STUDIES.items() for name in names}

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.recipe.distributions.shapes import FloatArray as ShapesFloatArray
 from neusee.workflows.recipe.uncertain_inputs import InputDraws, Inputs
 from neusee.workflows.store.result_store import Store, compute_once
+from neusee.workflows.studies.reused_choices import ReusedChoices
 
 # --- scatter estimate -----------------------------------------------------------------------------
 
@@ -240,13 +242,15 @@ class OutputDraws:
         of the uncertain inputs.
         """
         free_parameters = tuple(self.inputs.readers)
-        return as_function(
+        function = as_function(
             self.inputs.recipe,
             *free_parameters,
             outputs=self.outputs,
             store=self.store,
             device=self.device,
         )
+        self._choices = ReusedChoices(function.recipe, function.live, free_parameters)
+        return replace(function, caller=self._choices)
 
     def ready(self) -> float:
         """Compute the steps that depend on no uncertain input, and return the run time in s."""
@@ -259,6 +263,8 @@ class OutputDraws:
         now.
         """
         keys = [self.key(row) for row in values]
+        # so that the next command need not read the code of all nodes again
+        self._code.save()
         # None for a draw that is not stored
         stored = [record and record["numbers"] for record in map(self._kept, keys)]
         lacking = [draw for draw, numbers in enumerate(stored) if numbers is None]
@@ -363,10 +369,13 @@ class OutputDraws:
         began = time.perf_counter()
         _keep_memory()
         workers = workers_for(len(rows), self.workers) if self.device == "cpu" else 1
+        # choices that this process makes are known to all workers, which begin after it
+        alone = 1 if self._choices.is_waiting else 0
+        others = shared_in_order(
+            lambda number: self._result(rows[alone + number]), len(rows) - alone, workers
+        )
         with one_thread():
-            for result in shared_in_order(
-                lambda number: self._result(rows[number]), len(rows), workers
-            ):
+            for result in chain(map(self._result, rows[:alone]), others):
                 self.computed += 1
                 self.seconds += time.perf_counter() - began
                 yield result

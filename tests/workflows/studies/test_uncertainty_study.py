@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
+from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.errors import RecipeError
 from neusee.workflows.graph.recipe_graph import needed
@@ -29,7 +30,9 @@ from neusee.workflows.studies.output_draws import (
     refuse_combinations,
     scatter,
 )
+from neusee.workflows.studies.reused_choices import _serves
 from neusee.workflows.studies.run_study import StudyRefused, count_failures, study_recipe
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=7", "optics.window=[24, 24]"]
 SMALL += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]", "lasers.green.strength=1e6"]
@@ -611,3 +614,50 @@ def test_values_that_exclude_each_other_are_left_out_and_told(tmp_path):
         RecipeError, match="1 of the first 128 draws have values that are not allowed together"
     ):
         refuse_combinations(inputs, points.values[:2], few)
+
+
+# --- choices that are made once -------------------------------------------------------------------
+
+#: the lens of the recipe, whose image needs the PSFs of a few bands only
+WIDE = ["scene.shape=[64, 64]", "sensor.shape=[64, 64]"]
+EFFICIENCY = "sensor.quantum_efficiency=lognormal(0.56, 1.02)"
+
+
+@pytest.mark.slow
+def test_a_draw_with_a_choice_made_before_is_a_run_to_the_last_bit(store, monkeypatch):
+    """A quantum efficiency multiplies all responses: bands are chosen once, and draws are runs."""
+    computed, chosen = [], []
+
+    def noted(step, *values):
+        result = call(step, *values)
+        computed.append(step.node.path)
+        chosen.extend([len(result.used)] if step.node.path == "optics.few_bands" else [])
+        return result
+
+    monkeypatch.setattr("neusee.workflows.studies.reused_choices.call", noted)
+    outputs = "outputs=[saturated, developed_quality]"
+    inputs = Inputs.of(load("first_light", [outputs, *WIDE, EFFICIENCY, LAWS[0]]))
+    values = inputs.independent(3, 1).values
+    found = OutputDraws(inputs, store, workers=1).numbers(values)
+    # one for the plain lens and one for the mask, and fewer than all 31 bands for at least one
+    assert len(chosen) <= 2
+    assert min(chosen) < 31
+    assert computed.count("sensor.digitize") == 6
+    row = dict(zip(inputs.names, map(float, values[2]), strict=True))
+    assert found[2] == quantities(run(recipe_at(inputs.uncertain, row), store).values)
+
+
+def test_a_choice_is_made_anew_where_the_responses_change_their_shape():
+    recipe = with_substitutions(small("saturated"), ["saturated[mask]", "saturated[plain]"])
+    step = next(x for x in recipe.steps.values() if x.node.path == "optics.few_bands")
+    pupil, radiance, rows = object(), object(), torch.tensor([[1.0, 2.0], [3.0, 0.0]])
+    assert _serves(step, [pupil, radiance, rows], [pupil, radiance, 1.7 * rows])
+    tilted = rows * torch.tensor([1.0, 1.001])
+    for others in (
+        [pupil, radiance, tilted],
+        [pupil, radiance, -rows],
+        [pupil, radiance, 0 * rows],
+        [object(), radiance, rows],
+        [pupil, object(), rows],
+    ):
+        assert not _serves(step, [pupil, radiance, rows], others)
