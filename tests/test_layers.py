@@ -92,6 +92,8 @@ STUDIES = {
         "uncertainty_page",
         "sobol_indices",
         "output_draws",
+        "linear_propagation",
+        "linear_page",
         "reused_choices",
     ),
     "protection": ("protection_study",),

@@ -66,6 +66,13 @@ class Points(StrEnum):
     SOBOL = "sobol"
 
 
+class Method(StrEnum):
+    """The choices of ``--method``: how uncertain inputs are propagated to the outputs."""
+
+    SAMPLING = "sampling"
+    LINEAR = "linear"
+
+
 class Light(StrEnum):
     """The choices of ``--light``: the kind of laser light, which decides what must be equal behind
     all compared protections.
@@ -174,6 +181,13 @@ def uncertainty(
         Points,
         typer.Option("--points", help="Independent draws, or a Sobol sequence, which needs fewer."),
     ] = Points.DRAWS,
+    method: Annotated[
+        Method,
+        typer.Option(
+            "--method",
+            help="Sampling, or first linear propagation, and sampling only where it is too wrong.",
+        ),
+    ] = Method.SAMPLING,
     until: Annotated[
         list[str] | None,
         typer.Option(
@@ -208,6 +222,7 @@ def uncertainty(
         "error": error,
         "most": draws,
         "points": points.value,
+        "method": method.value,
         "workers": workers,
         "device": device,
     }

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,19 @@ from neusee.workflows.recipe.uncertain_inputs import (
 )
 from neusee.workflows.report.study_report import Content, Progress, StudyOutcome, StudyReport
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.linear_page import (
+    LinearResult,
+    lead_of_linear,
+    sections_of_linear,
+    tornado_of_linear,
+)
+from neusee.workflows.studies.linear_propagation import (
+    CHECKS,
+    FAR,
+    OutputRuns,
+    propagate,
+    without_distance,
+)
 from neusee.workflows.studies.output_draws import (
     AllowedDraws,
     FloatArray,
@@ -37,6 +50,7 @@ from neusee.workflows.studies.output_draws import (
 from neusee.workflows.studies.run_study import StudyRefused
 from neusee.workflows.studies.sobol_indices import indices
 from neusee.workflows.studies.uncertainty_page import (
+    Rung,
     UncertaintyResult,
     draw_pictures,
     lead,
@@ -44,12 +58,12 @@ from neusee.workflows.studies.uncertainty_page import (
 )
 
 LEAST = 64  #: draws before the first decision to stop
-_RARE = 3.09  #: normal score of the quantile at 99.9 %
 _ROUND = 16  #: independent draws in each further round
 #: number of draws for the mean and standard deviation of pictures; it gives the deviation to 13 %
 PICTURED = 32
 _PICTURE_STATISTICS = ("mean", "sd")  #: statistics of each picture
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
+_LINEAR_COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "bias", "error of sd")
 
 
 @dataclass(frozen=True)
@@ -59,6 +73,9 @@ class UncertaintyOptions:
     error: float = 0.05  #: relative error of each standard deviation
     most: int = 1000  #: draws
     points: str = "draws"  #: or ``"sobol"``
+    #: or ``"linear"``: linear propagation, and the draws only where its error is larger than
+    #: ``error``
+    method: str = "sampling"
     workers: int = 0  #: processes that draw on the CPU; 0 means one for each free processor
     device: str = "cpu"
     #: outputs or quantities whose standard deviations end the study; empty for all
@@ -80,7 +97,16 @@ def study(
     refuse_combinations(inputs, _ends(inputs), allowed)
     draws = OutputDraws(inputs, store, options.device, options.workers)
     rule = StopRule(options.error, sequences, tuple(options.until))
-    result = _measure(inputs, draws, allowed, progress, rule)
+    first_runs = _first_runs(draws, progress, rule)
+    rungs = []
+    if options.method == "linear":
+        linear = _linear(draws, allowed, first_runs, rule)
+        progress(linear.statement)
+        if linear.holds:
+            return _linear_outcome(linear, draws)
+        rungs.append(linear.rung)
+    result = _measure(draws, allowed, progress, rule, first_runs)
+    result = replace(result, rungs=(*rungs, _rung_of_draws(result, draws)))
     content = _document(result, draws)
     return StudyOutcome(digest(content["quantities"]), content, _report(result))
 
@@ -200,12 +226,17 @@ def _means(name: str, quantities: Sequence[str]) -> list[str]:
     ]
 
 
-def _measure(
-    inputs: Inputs, draws: OutputDraws, allowed: AllowedDraws, progress: Progress, rule: StopRule
-) -> UncertaintyResult:
-    """Draw samples until the standard deviations in question are known accurately enough, and
-    return the result.
-    """
+@dataclass(frozen=True)
+class _FirstRuns:
+    """The numbers of the first runs, and those that decide when the study ends."""
+
+    ends: list[Numbers]  #: all inputs at their medians, then each at its 5 % and its 95 % quantile
+    deciding: tuple[str, ...]
+
+
+def _first_runs(draws: OutputDraws, progress: Progress, rule: StopRule) -> _FirstRuns:
+    """Report the inputs and what does not vary, and return the first runs."""
+    inputs = draws.inputs
     _say_inputs(inputs, draws, rule.sequences, progress)
     end_runs = draws.numbers(_ends(inputs))
     if not end_runs[0]:
@@ -215,6 +246,20 @@ def _measure(
     # run 0 has all inputs at their medians
     deciding = _deciding(rule.until, list(end_runs[0]), draws.is_constant)
     _say_constant(inputs, draws, end_runs, deciding, progress)
+    return _FirstRuns(end_runs, deciding)
+
+
+def _measure(
+    draws: OutputDraws,
+    allowed: AllowedDraws,
+    progress: Progress,
+    rule: StopRule,
+    first_runs: _FirstRuns,
+) -> UncertaintyResult:
+    """Draw samples until the standard deviations in question are known accurately enough, and
+    return the result.
+    """
+    inputs, deciding = draws.inputs, first_runs.deciding
     pictures = draws.pictures(allowed.values[:PICTURED])
     numbers = list[Numbers]()
     # at least one round
@@ -235,13 +280,13 @@ def _measure(
         )
         if error <= rule.wanted:
             break
-    swings = _swings(inputs, end_runs, values, scattered)
+    swings = _swings(inputs, first_runs.ends, values, scattered)
     return UncertaintyResult(
         inputs=inputs,
         points=InputDraws(allowed.z, allowed.values),
         values=values,
         scatter=scattered,
-        middle=end_runs[0],
+        middle=first_runs.ends[0],
         swings=swings,
         shares={name: indices(inputs.shapes, allowed.z, values[name][:, 0]) for name in swings},
         pictures=pictures,
@@ -251,6 +296,126 @@ def _measure(
         deciding=deciding,
         left_out=allowed.statement,
     )
+
+
+# --- linear propagation ---------------------------------------------------------------------------
+
+
+def _linear(
+    draws: OutputDraws, allowed: AllowedDraws, first_runs: _FirstRuns, rule: StopRule
+) -> LinearResult:
+    """Return the linear estimate of each number, or why there is none."""
+    inputs = draws.inputs
+    far_values = _one_at_a_time(inputs, FAR)
+    if reason := _without_linear(inputs, far_values):
+        return LinearResult(inputs, first_runs.deciding, rule.wanted, reason)
+    far_runs = _by_quantity(draws.numbers(far_values))
+    checks = _by_quantity(draws.numbers(allowed.values[:CHECKS]))
+    near_runs = _by_quantity(first_runs.ends)
+    scattered = {name: scatter(np.concatenate([near_runs[name], checks[name]])) for name in checks}
+    estimates = {}
+    for name, near in near_runs.items():
+        by_input = (len(inputs.names), 2, near.shape[1])
+        runs = OutputRuns(
+            near[0], near[1:].reshape(by_input), far_runs[name].reshape(by_input), checks[name]
+        )
+        # infinite values make the error infinite
+        with np.errstate(invalid="ignore"):
+            estimates[name] = propagate(inputs.shapes, allowed.z[:CHECKS], runs)
+    return LinearResult(
+        inputs,
+        first_runs.deciding,
+        rule.wanted,
+        estimates=estimates,
+        middle=first_runs.ends[0],
+        swings=_swings(inputs, first_runs.ends, near_runs, scattered),
+        runs=len(first_runs.ends) + len(far_values) + CHECKS,
+        seconds_a_run=_seconds_a_draw(draws),
+        is_constant=draws.is_constant,
+    )
+
+
+def _without_linear(inputs: Inputs, far_values: FloatArray) -> str:
+    """Return why the inputs cannot be propagated linearly; empty if they can."""
+    if inputs.has_table:
+        return "some inputs are drawn as rows of a table, which has no derivative"
+    if separate := without_distance(inputs.names, inputs.shapes):
+        return f"{', '.join(separate)} has separate values, and no derivative"
+    problems = [problem for problem in map(inputs.problem, far_values) if problem is not None]
+    return f"a value far from its median is not allowed: {problems[0].message}" if problems else ""
+
+
+def _linear_outcome(linear: LinearResult, draws: OutputDraws) -> StudyOutcome:
+    """Return the numbers and the page of a study that linear propagation answers."""
+    quantities = {
+        name: {
+            "error": estimate.error,
+            "middle": list(linear.middle[name]),
+            **{
+                field: getattr(estimate, field).tolist()
+                for field in ("mean", "error_of_mean", "sd", "bias", "second_order", "ends")
+            },
+            "missed": estimate.missed.tolist(),
+            "shares": estimate.shares.tolist(),
+        }
+        for name, estimate in linear.estimates.items()
+    }
+    content = {
+        "method": "linear",
+        "draws": linear.runs,
+        "computed": draws.computed,
+        "seconds a draw": _seconds_a_draw(draws),
+        "failed": 0,
+        "error": linear.error,
+        "wanted": linear.wanted,
+        "decided by": list(linear.deciding),
+        "inputs": linear.input_rows,
+        "idle": list(linear.inputs.idle),
+        "still": list(linear.is_constant),
+        "cut off": dict(linear.inputs.notes),
+        "quantities": quantities,
+    }
+    picture = tornado_of_linear(linear)
+    report = StudyReport(
+        f"{linear.inputs.recipe.name}: uncertainty",
+        lead_of_linear(linear),
+        sections_of_linear(linear, picture),
+        {"tornado": picture} if picture else {},
+        tables={"table.csv": (_LINEAR_COLUMNS, _rows_of_linear(linear))},
+        shown=("command", "date", "seconds", "draws", "computed", "seconds a draw", "versions"),
+    )
+    return StudyOutcome(digest(quantities), content, report)
+
+
+def _rows_of_linear(linear: LinearResult) -> list[Sequence[Any]]:
+    """Return the rows of table.csv of a linear propagation: one for each element."""
+    rows: list[Sequence[Any]] = []
+    for name, estimate in linear.estimates.items():
+        off = np.abs(estimate.second_order) + estimate.ends + estimate.missed
+        columns = zip(
+            linear.middle[name], estimate.mean, estimate.sd, estimate.bias, off, strict=True
+        )
+        rows += [
+            (name, element if len(estimate.mean) > 1 else "", *row)
+            for element, row in enumerate(columns)
+        ]
+    return rows
+
+
+def _rung_of_draws(result: UncertaintyResult, draws: OutputDraws) -> Rung:
+    """Return how accurate the draws are, and what they took."""
+    kind = "Sobol points" if result.sequences else "draws"
+    # the first runs, with the inputs at their ends, belong to every method
+    runs = len(result.points.z) + 1 + 2 * len(result.inputs.names)
+    return Rung(kind, runs, _seconds_a_draw(draws), result.error, result.error <= result.wanted)
+
+
+def _seconds_a_draw(draws: OutputDraws) -> float | None:
+    """Return the mean run time of a draw, s; None if none was computed."""
+    return draws.seconds / draws.computed if draws.computed else None
+
+
+# --- first runs -----------------------------------------------------------------------------------
 
 
 def _say_inputs(inputs: Inputs, draws: OutputDraws, sequences: int, progress: Progress) -> None:
@@ -287,7 +452,7 @@ def _say_constant(
     """
     same_in_all = _constant(ends)
     if set(deciding) <= set(same_in_all):  # try the extreme ends of the distributions too
-        ends = [*ends, *draws.numbers(_one_at_a_time(inputs, _RARE))]
+        ends = [*ends, *draws.numbers(_one_at_a_time(inputs, FAR))]
         same_in_all = _constant(ends)
     if same_in_all:
         progress(
@@ -353,7 +518,8 @@ def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
         "draws": len(result.points.z),
         "points": "sobol" if result.sequences else "draws",
         "computed": draws.computed,
-        "seconds a draw": draws.seconds / draws.computed if draws.computed else None,
+        "seconds a draw": _seconds_a_draw(draws),
+        "rungs": [asdict(rung) for rung in result.rungs],
         "failed": result.failed,
         "error": result.error,
         "wanted": result.wanted,

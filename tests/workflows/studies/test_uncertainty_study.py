@@ -661,3 +661,51 @@ def test_a_choice_is_made_anew_where_the_responses_change_their_shape():
         [pupil, object(), rows],
     ):
         assert not _serves(step, [pupil, radiance, rows], others)
+
+
+# --- linear propagation ---------------------------------------------------------------------------
+
+
+def test_linear_propagation_answers_where_its_error_is_small(store, tmp_path):
+    """Dark noise K**2 (sigma**2 + dark) + 1/12 in sigma of 10.5 ± 1, with 13 runs."""
+    recipe = small("transfer", "sensor.read_noise=normal(10.5 e-, 1 e-)")
+    lines, folder = told_of(recipe, store, tmp_path, method="linear", until=("transfer",))
+    doc = json.loads((folder / "provenance.json").read_text())
+    floor = doc["quantities"]["transfer"]
+    assert doc["method"] == "linear"
+    assert doc["draws"] == 13
+    assert floor["sd"][2] == pytest.approx(2 * 10.5 * 1.0 / 0.37**2, rel=1e-3)
+    assert floor["bias"][2] == pytest.approx(1.0**2 / 0.37**2, rel=1e-2)
+    assert doc["error"] <= 0.05
+    assert any("is known to" in line for line in lines)
+    text = (folder / "report.html").read_text()
+    assert "Error against run time" in text
+    assert (folder / "table.csv").read_text().startswith("quantity,element,at the medians,mean,sd")
+
+
+def test_draws_go_on_where_linear_propagation_is_too_wrong(store, tmp_path):
+    """The count of saturated pixels is a step function of the strength."""
+    recipe = small("peak, saturated", "lasers.green.strength=lognormal(1e3, 3)")
+    lines, folder = told_of(recipe, store, tmp_path, method="linear", most=64, error=0.3)
+    told = next(line for line in lines if "of a linear propagation" in line)
+    assert told.endswith("; draws go on")
+    doc = json.loads((folder / "provenance.json").read_text())
+    assert [rung["name"] for rung in doc["rungs"]] == ["linear", "draws"]
+    assert not doc["rungs"][0]["holds"]
+    plain = study_recipe("uncertainty", recipe, store, tmp_path / "plain", most=64, error=0.3)
+    other = json.loads((plain / "provenance.json").read_text())
+    assert other["quantities"] == doc["quantities"]
+    assert [rung["name"] for rung in other["rungs"]] == ["draws"]
+    assert ">linear<" in (folder / "report.html").read_text()
+
+
+def test_inputs_without_a_derivative_are_told_and_drawn(store, tmp_path):
+    law = "sensor.read_noise=discrete(10 e- weight 0.5, 12 e- weight 0.5)"
+    lines, folder = told_of(
+        small("transfer", law), store, tmp_path, method="linear", most=64, error=1.0
+    )
+    assert (
+        "no linear propagation: sensor.read_noise has separate values, and no derivative; draws go"
+        " on" in lines
+    )
+    assert json.loads((folder / "provenance.json").read_text())["draws"] == 64
