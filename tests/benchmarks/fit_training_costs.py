@@ -18,7 +18,7 @@ from fit_costs import fitted, short
 from neusee.nodes.restore import critics
 from neusee.nodes.spectra import start_mst_plus_plus
 from neusee.workflows.recipe.blocks.train_block import Network
-from neusee.workflows.training.training_iteration import _network_of
+from neusee.workflows.training.training_iteration import network_of
 
 KINDS = "fft_mamba", "unet", "nafnet", "critic", "mst_plus_plus"
 WIDTHS, SIDES, TURNS = (8, 16, 32), (32, 64), 3
@@ -46,7 +46,7 @@ def network(kind, width):
         return critics(torch.Generator().manual_seed(0), width)[1]
     if kind == "mst_plus_plus":  # of one width only
         return start_mst_plus_plus(torch.Generator().manual_seed(0))
-    return _network_of(Network(kind=kind, width=width))
+    return network_of(Network(kind=kind, width=width))
 
 
 def law(kind):

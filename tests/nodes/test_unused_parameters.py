@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neusee.nodes import laser, optics, sensor, spectra
-from neusee.nodes._node import registered_nodes
+from neusee.nodes import laser, optics, registered_nodes, sensor, spectra
 from neusee.nodes.units import ElectronsPerSecond
 
 BANDS = spectra.bands(start=500e-9, stop=600e-9, count=3)

@@ -248,12 +248,20 @@ def _refuse_beyond_memory(plan: Plan, memory: int | None) -> None:
 
 
 def _forecast_of(plan: Plan) -> str:
-    """Return the line that says how long a run will take, or an empty text."""
-    unknown_count = sum(not estimate.known for estimate in plan.expected.values())
-    seconds = plan.schedule.makespan if plan.schedule else 0.0
-    if plan.expected:
-        seconds += lazy.run_forecast.report_seconds(plan)
-    return lazy.console.forecast_line(seconds, len(plan.expected), unknown_count)
+    """Return the line that says how long a run will take; empty if its steps take less than a
+    second, or if no time of a step is known.
+    """
+    estimates = plan.expected.values()
+    unknown_count = sum(not estimate.known for estimate in estimates)
+    seconds_of_steps = plan.schedule.makespan if plan.schedule else 0.0
+    if seconds_of_steps < 1 or unknown_count == len(estimates):
+        return ""
+    return lazy.console.forecast_line(
+        seconds_of_steps + lazy.run_forecast.report_seconds(plan),
+        len(estimates),
+        unknown_count,
+        sum(estimate.measured for estimate in estimates),
+    )
 
 
 def _loads(words: Sequence[str]) -> bool:

@@ -311,15 +311,11 @@ def _computed(work: StepJob, inputs: list[Any]) -> Outcome:
     input_bytes = sum(t.nbytes for t in tensors_in(inputs))
     # a small and quick step is not worth the measurement
     is_watched = input_bytes >= _WATCHED_BYTES or not work.unlocked
-    # True for code of the user in this process: only then the system limits its allocations
-    own_in_process = (
-        work.own is not None and work.device.startswith("cpu") and not _needs_own_process(work)
-    )
     with (
         PeakMemory(work.device, is_watched) as peak,
         torch.no_grad(),
         guarded(),
-        refusing_allocations(own_in_process),
+        refusing_allocations(_is_own_in_process(work)),
     ):
         value = _value(work, inputs, observations)
         checks = _observing(examine, work, observations)(step, value, inputs) if hooks.check else ()
@@ -341,6 +337,13 @@ def _computed(work: StepJob, inputs: list[Any]) -> Outcome:
         peak=None if peak.bytes is None else peak.bytes + observations.peak,
         taints=tuple(dict.fromkeys(observations.taints)),
     )
+
+
+def _is_own_in_process(work: StepJob) -> bool:
+    """Return True for code of the user in this process: only then the system limits its
+    allocations.
+    """
+    return work.own is not None and work.device.startswith("cpu") and not _needs_own_process(work)
 
 
 def _value(work: StepJob, inputs: list[Any], observations: _Seen) -> Any:

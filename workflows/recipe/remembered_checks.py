@@ -262,7 +262,9 @@ class RememberedNodes(AskedNodes):
         if attribute not in of_family:
             if are_installed():
                 raise NotRemembered("families of installed packages are not remembered")
-            all_names = (f"{other}.{node}" for other in signatures for node in signatures[other])
+            all_names = list[str]()
+            for other, nodes in signatures.items():
+                all_names += [f"{other}.{node}" for node in nodes]
             raise LookupError(why_no_node(name, of_family, own, all_names))
         try:
             return RememberedNode(name, of_family[attribute], self._value)

@@ -345,14 +345,13 @@ def note(families: dict[str, Family], event: Event) -> Family:
     return family
 
 
-def forecast_line(seconds: float, steps: int, unknown: int) -> str:
-    """Return a line with the predicted time of ``steps`` steps, of which ``unknown`` never ran;
-    empty for less than a second.
+def forecast_line(seconds: float, steps: int, unknown: int, measured: int) -> str:
+    """Return a line with the predicted time of ``steps`` steps, of which ``unknown`` have no law
+    and ``measured`` ran before on this processor.
     """
-    if seconds < 1 or unknown == steps:
-        return ""
-    new_steps = f"; {unknown} of {steps} steps never ran before" if unknown else ""
-    return f"time     about {lasts(seconds)}, as earlier runs took{new_steps}"
+    new_steps = f"; {unknown} of {steps} steps have no law of their time" if unknown else ""
+    source = "as earlier runs took" if measured else "a guess by laws"
+    return f"time     about {lasts(seconds)}, {source}{new_steps}"
 
 
 def closing(

@@ -55,7 +55,7 @@ class ReusedChoices:
         if step.name not in self._steps:
             return call(step, inputs, params, seed, device)
         made = self._made.get(step.name)
-        if made is None or not _serves(step, made.inputs, inputs):
+        if made is None or not serves(step, made.inputs, inputs):
             made = _Made(list(inputs), call(step, inputs, params, seed, device))
             self._made[step.name] = made
         return made.result
@@ -75,7 +75,7 @@ def _steps_of_choices(recipe: Recipe, live: Sequence[str], free: Collection[str]
     return steps
 
 
-def _serves(step: Step, before: Sequence[Any], now: Sequence[Any]) -> bool:
+def serves(step: Step, before: Sequence[Any], now: Sequence[Any]) -> bool:
     """Return True if a step has the same result for two lists of inputs: identical ones, but for a
     factor of one of them.
     """

@@ -401,6 +401,25 @@ def _lift_forecast(recipe: Recipe, settings: LiftTraining, store: Store) -> Fore
 def _forecast(stages: Sequence[StageForecast], memory: Memory) -> Forecast:
     """Return the lines of a forecast, and its totals as values for JSON."""
     total = sum((stage.seconds for stage in stages), Seconds())
+    is_guess = not all(stage.measured for stage in stages)
+    totals = {
+        "iterations": sum(stage.iterations for stage in stages),
+        "seconds": asdict(total),
+        "memory": {**asdict(memory), "total": memory.total},
+        "guess": is_guess,
+    }
+    wrapped_lines = list[str]()
+    for line in _lines(stages, total, memory, is_guess):
+        wrapped_lines += wrapped_text(line)
+    return Forecast(wrapped_lines, [asdict(stage) for stage in stages], totals, False)
+
+
+def _lines(
+    stages: Sequence[StageForecast], total: Seconds, memory: Memory, is_guess: bool
+) -> list[str]:
+    """Return the lines of a forecast: its stages, their sum, the memory, and what a guess rests
+    on.
+    """
     lines = [_stage_line(stage) for stage in stages]
     if len(stages) > 1:
         lines.append(f"both stages: {_duration(total)} of processor time")
@@ -410,19 +429,12 @@ def _forecast(stages: Sequence[StageForecast], memory: Memory) -> Forecast:
         f" {format_size(memory.gradients_and_optimiser)}, one iteration"
         f" {format_size(memory.activations)})"
     )
-    if not all(stage.measured for stage in stages):
+    if is_guess:
         lines.append(
             "a guess: from laws of the camera's steps and of the network, before an iteration was"
             " measured on this processor"
         )
-    totals = {
-        "iterations": sum(stage.iterations for stage in stages),
-        "seconds": asdict(total),
-        "memory": {**asdict(memory), "total": memory.total},
-        "guess": not all(stage.measured for stage in stages),
-    }
-    wrapped = [part for line in lines for part in wrapped_text(line)]
-    return Forecast(wrapped, [asdict(stage) for stage in stages], totals, False)
+    return lines
 
 
 def _stage_line(stage: StageForecast) -> str:

@@ -215,7 +215,7 @@ class Learner:
         on this device.
         """
         if network.architecture is None:
-            return start_network(lambda: _network_of(network), self._rng("network")).to(
+            return start_network(lambda: network_of(network), self._rng("network")).to(
                 self.settings.dtype
             )
         user_network = own_network(
@@ -563,7 +563,7 @@ def _backward(terms: Sequence[Tensor]) -> None:
         sum(terms[1:], terms[0]).backward()  # type: ignore[no-untyped-call]
 
 
-def _network_of(network: Network) -> Restorer:
+def network_of(network: Network) -> Restorer:
     """Return the built-in network of the settings, with random weights."""
     if network.kind == "fft_mamba":
         return FFTMamba(network.width, **network.options)

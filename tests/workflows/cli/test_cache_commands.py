@@ -162,7 +162,7 @@ def test_a_long_list_shows_its_newest_page_and_says_how_to_see_all(tmp_path, mon
             {"step": f"s{i}", "date": f"2026-01-01T00:00:{i:02d}"},
         )
     short = list(cache_commands.ls_lines(store))
-    monkeypatch.setattr("neusee.workflows.store.journal._LATEST", 14_000)
+    monkeypatch.setattr("neusee.workflows.store.journal._LATEST", 17_000)
     again = Store(tmp_path)
     assert again.journal.is_long()
     assert 50 < len(again.journal.latest()) < 60  # a part

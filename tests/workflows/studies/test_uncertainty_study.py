@@ -30,7 +30,7 @@ from neusee.workflows.studies.output_draws import (
     refuse_combinations,
     scatter,
 )
-from neusee.workflows.studies.reused_choices import _serves
+from neusee.workflows.studies.reused_choices import serves
 from neusee.workflows.studies.run_study import StudyRefused, count_failures, study_recipe
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
@@ -651,7 +651,7 @@ def test_a_choice_is_made_anew_where_the_responses_change_their_shape():
     recipe = with_substitutions(small("saturated"), ["saturated[mask]", "saturated[plain]"])
     step = next(x for x in recipe.steps.values() if x.node.path == "optics.few_bands")
     pupil, radiance, rows = object(), object(), torch.tensor([[1.0, 2.0], [3.0, 0.0]])
-    assert _serves(step, [pupil, radiance, rows], [pupil, radiance, 1.7 * rows])
+    assert serves(step, [pupil, radiance, rows], [pupil, radiance, 1.7 * rows])
     tilted = rows * torch.tensor([1.0, 1.001])
     for others in (
         [pupil, radiance, tilted],
@@ -660,7 +660,7 @@ def test_a_choice_is_made_anew_where_the_responses_change_their_shape():
         [object(), radiance, rows],
         [pupil, object(), rows],
     ):
-        assert not _serves(step, [pupil, radiance, rows], others)
+        assert not serves(step, [pupil, radiance, rows], others)
 
 
 # --- linear propagation ---------------------------------------------------------------------------
