@@ -160,12 +160,15 @@ def test_what_is_known_before_the_run_is_what_the_run_gives(tmp_path):
     """Shapes of every step that has a rule, against the results of a run in full."""
     from neusee.workflows import load, run
     from neusee.workflows.graph.recipe_graph import in_order
+    from neusee.workflows.graph.step_shapes import inputs_of
+    from neusee.workflows.recipe.asked_nodes import THEMSELVES
     from neusee.workflows.store.result_store import Store
 
     recipe = load("first_light", SMALL)
     known = {}
     for name in in_order({name: step.sources for name, step in recipe.steps.items()}, recipe.steps):
-        known[name] = step_checks._form(recipe.steps[name], known)
+        step = recipe.steps[name]
+        known[name] = THEMSELVES.form(step, inputs_of(step, known))
     found = {name: value for name, value in known.items() if value is not None}
     assert {
         "raw[mask]",

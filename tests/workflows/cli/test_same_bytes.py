@@ -136,6 +136,7 @@ DIFFERENT_FIELDS = {
     "seconds": "time of the command or of a step",
     "seconds a point": "time of a point that was computed",
     "seconds a draw": "time of a draw that was computed",
+    "seconds_a_run": "time of a run of a study that was computed",
     "computed": "how many points were computed",
     "timing": "time, memory and bytes of the steps",
     "counts": "how many steps were computed",
